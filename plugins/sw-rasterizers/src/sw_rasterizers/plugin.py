@@ -1,0 +1,3 @@
+"""What this package provides."""
+
+from splatwizard_core.plugins import Registry, hookimpl  # noqa: F401

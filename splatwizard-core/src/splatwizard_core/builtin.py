@@ -1,0 +1,50 @@
+"""The core as a plugin of itself: the loaders, metrics, exporters and the reference rasterizer that it ships."""
+
+from splatwizard_core.plugins.hookspecs import hookimpl
+from splatwizard_core.plugins.registry import Registry
+
+
+@hookimpl
+def register_rasterizers(registry: Registry) -> None:
+    registry.add(
+        "reference",
+        "splatwizard_core.rendering.reference:ReferenceRasterizer",
+        summary="pure-torch oracle: every feature, any device, slow",
+        devices=["cpu", "cuda"],
+        dtypes=["float32", "float64"],
+        features=[
+            "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES",
+            "SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM", "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM",
+            "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T",
+            "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_PIXEL_WEIGHT",
+            "SCORE_GRAD_SQ", "FLOAT64", "DETERMINISTIC",
+        ],
+        exactness="exact",
+        speed=0,
+    )  # fmt: skip
+
+
+@hookimpl
+def register_datasets(registry: Registry) -> None:
+    registry.add("colmap", "splatwizard_core.scene.loaders.colmap:ColmapDataset",
+                 summary="COLMAP reconstruction, binary or text, pinhole cameras")  # fmt: skip
+    registry.add("blender", "splatwizard_core.scene.loaders.blender:BlenderDataset",
+                 summary="transforms_train.json / transforms_test.json with RGBA pictures")  # fmt: skip
+    registry.add("demo", "splatwizard_core.scene.loaders.demo:DemoDataset",
+                 summary="procedural scene with exact geometry, made on the spot")  # fmt: skip
+
+
+@hookimpl
+def register_metrics(registry: Registry) -> None:
+    registry.add("psnr", "splatwizard_core.evaluation.image:psnr",
+                 summary="peak signal-to-noise ratio, dB, joint over channels", direction="higher")  # fmt: skip
+    registry.add("ssim", "splatwizard_core.evaluation.image:ssim",
+                 summary="structural similarity, 11x11 Gaussian window, zero padding", direction="higher")  # fmt: skip
+    registry.add("l1", "splatwizard_core.evaluation.image:l1",
+                 summary="mean absolute error", direction="lower")  # fmt: skip
+
+
+@hookimpl
+def register_exporters(registry: Registry) -> None:
+    registry.add("ply", "splatwizard_core.gaussians.ply:export_ply",
+                 summary="3DGS .ply, float32, as the original viewers read it", suffix=".ply")  # fmt: skip

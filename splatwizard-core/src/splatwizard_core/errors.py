@@ -1,0 +1,118 @@
+"""Every error a user may see, each with the facts as attributes and the process exit status it leads to.
+
+A message says what is wrong (with the value), where, and what to do, in one or two lines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+
+class SplatwizardError(Exception):
+    """Base of all errors raised on purpose; the command line prints them without a traceback."""
+
+    exit_status = 1
+
+
+class UserInputError(SplatwizardError):
+    """What was handed in is wrong: a path, key, value, scene or file. Exit status 2."""
+
+    exit_status = 2
+
+
+class ConfigError(UserInputError):
+    """A configuration key or value is unknown or out of bounds."""
+
+    def __init__(self, message: str, *, key: str | None = None) -> None:
+        super().__init__(message)
+        self.key = key
+
+
+class SceneError(UserInputError):
+    """A scene folder cannot be read or makes no sense."""
+
+    def __init__(self, message: str, *, path: str | None = None) -> None:
+        super().__init__(message)
+        self.path = path
+
+
+class BitstreamError(UserInputError):
+    """A file is damaged, truncated, hostile or of an unknown version."""
+
+    def __init__(self, message: str, *, section: str | None = None) -> None:
+        super().__init__(message)
+        self.section = section
+
+
+class ShapeError(UserInputError):
+    """A tensor does not have the shape, dtype or device that a function documents."""
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        actual: Sequence[int] | None = None,
+        expected: Sequence[int | str] | None = None,
+    ) -> None:
+        super().__init__(message)
+        self.actual = tuple(actual) if actual is not None else None
+        self.expected = tuple(expected) if expected is not None else None
+
+
+class PluginError(UserInputError):
+    """A plugin is missing, broken, or collides with another one."""
+
+
+class CapabilityError(UserInputError):
+    """Nothing installed offers what was asked for."""
+
+    def __init__(self, message: str, *, missing: Iterable[str] = ()) -> None:
+        super().__init__(message)
+        self.missing = frozenset(missing)
+
+
+class CheckpointError(UserInputError):
+    """A checkpoint is damaged or belongs to another plan or configuration."""
+
+
+class NothingToDo(UserInputError):  # noqa: N818 (the specification names it)
+    """A run is asked to resume at or past its last step."""
+
+
+class RunLockedError(UserInputError):
+    """Another process is writing into this run directory."""
+
+
+class NativeBuildError(SplatwizardError):
+    """A kernel module could not be compiled or loaded."""
+
+
+class TaskSignatureError(SplatwizardError):
+    """A schedule task asks for an argument that cannot be supplied."""
+
+
+class TaskError(SplatwizardError):
+    """A schedule task raised; the cause is chained."""
+
+    def __init__(self, stage: str, step: int, task: str, cause: BaseException) -> None:
+        super().__init__(f"task '{task}' ({stage}) failed at step {step}: {type(cause).__name__}: {cause}")
+        self.stage, self.step, self.task = stage, step, task
+
+
+class TrainingDiverged(SplatwizardError):  # noqa: N818 (the specification names it)
+    """The loss is not finite."""
+
+    def __init__(self, step: int, camera: str, part: str, value: float) -> None:
+        super().__init__(
+            f"training diverged at step {step}: loss part '{part}' is {value} on view '{camera}'; "
+            "lower the learning rates or inspect that view"
+        )
+        self.step, self.camera, self.part, self.value = step, camera, part, value
+
+
+class EmptyModel(SplatwizardError):  # noqa: N818 (the specification names it)
+    """Pruning removed every primitive."""
+
+    def __init__(self, step: int) -> None:
+        super().__init__(f"no primitive is left after pruning at step {step}; lower the pruning thresholds")
+        self.step = step

@@ -1,0 +1,72 @@
+"""A method: a name, a typed config, its stages, and one file that a fresh process decodes alone."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.params import OptimizationParams
+
+if TYPE_CHECKING:
+    import torch
+
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.scene.scene import Scene
+    from splatwizard_core.training.stage import Stage
+
+
+class Method:
+    """Base of every method. A subclass reads top to bottom like its paper's method section.
+
+    name            how it is asked for; written into its files
+    version         of its file layout: a decoder refuses other versions than it knows
+    Config          its hyper-parameters
+    PRESETS         preset name -> values by dotted key; "paper" (the defaults) and "quick" always exist
+    RATES           rate point name -> values by dotted key, r1 the smallest file
+    DEFAULT_RATE    what `--rate default` means
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[int] = 1
+    Config: ClassVar[type[OptimizationParams]] = OptimizationParams
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {}, "quick": {}}
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = {"r1": {}}
+    DEFAULT_RATE: ClassVar[str] = "r1"
+
+    def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
+        """config is None when decoding: the file is all there is."""
+        self.plugins = plugins
+        self._config = config
+
+    @property
+    def config(self) -> Any:
+        """The resolved hyper-parameters. Raises RuntimeError inside `decode`, which may not look at any."""
+        if self._config is None:
+            raise RuntimeError(f"{self.name}: decode() must not read the configuration; put it into the file")
+        return self._config
+
+    def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
+        """The model before its first step."""
+        raise NotImplementedError
+
+    def stages(self) -> Sequence[Stage]:
+        """The training stages in order."""
+        raise NotImplementedError
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        """Write everything that `decode` needs; must leave `model` as it is."""
+        raise NotImplementedError
+
+    def decode(self, reader: ContainerReader) -> SplatModel:
+        """Rebuild the model from the file alone."""
+        raise NotImplementedError
+
+
+def create_method(plugins: PluginManager, name: str, config: Mapping[str, Any] | None = None) -> Method:
+    """Another method by name, with values for its config by dotted key: how one method borrows from another."""
+    from splatwizard_core.experiments.config import apply_overrides
+
+    cls = plugins.methods.load(name)
+    return cls(plugins, apply_overrides(cls.Config(), dict(config or {}), source=f"config of '{name}'"))

@@ -1,0 +1,1 @@
+"""gaussians room."""

@@ -1,0 +1,144 @@
+"""What a rasterizer draws: activated Gaussians as plain tensors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import ShapeError
+
+
+@dataclass
+class SH:
+    """Spherical-harmonics colours in exactly one storage form. K = (degree + 1)^2 coefficients, then RGB.
+
+    dense           [N,K,3]
+    dc + rest       [N,1,3] and [N,K-1,3]
+    codebook        [M,K,3] with indices, or [M,K-1,3] together with dc
+    indices         [N] int64, row of the codebook for each Gaussian
+    active_degree   bands above it are not evaluated and get exactly zero gradient
+    """
+
+    dense: Tensor | None = None
+    dc: Tensor | None = None
+    rest: Tensor | None = None
+    codebook: Tensor | None = None
+    indices: Tensor | None = None
+    active_degree: int = 3
+
+    def to_dense(self) -> Tensor:
+        """[N,K,3], differentiable with respect to whatever is stored."""
+        if self.dense is not None:
+            return self.dense
+        rest = self.rest
+        if self.codebook is not None:
+            assert self.indices is not None
+            rest = self.codebook[self.indices]
+        if self.dc is None:
+            assert rest is not None
+            return rest
+        return self.dc if rest is None else torch.cat([self.dc, rest], dim=1)
+
+    def __len__(self) -> int:
+        for tensor in (self.dense, self.dc, self.indices):
+            if tensor is not None:
+                return tensor.shape[0]
+        return 0
+
+
+@dataclass
+class GaussianInputs:
+    """Activated Gaussians, all tensors on one device.
+
+    means           [N,3] world units
+    opacities       [N] in [0,1]
+    scales, quats   [N,3] > 0 (standard deviations, world units) and [N,4] (w,x,y,z), any norm;
+                    [M,3], [M,4] with geom_indices; scales [N,2] for surfels
+    cov3d           [N,6] upper triangle xx,xy,xz,yy,yz,zz; excludes scales and quats
+    geom_indices    [N] int64 rows of scales and quats
+    scale_factors   [N] multiplies the (indexed) scales
+    sh XOR colors   spherical harmonics, or [N,C] colours used as they are
+    features        [N,E] extra channels composited with the same weights
+    visible         [N] bool, Gaussians marked False are not drawn
+    extras          what the model wants its losses and tasks to see again in `RenderResult.extras`
+                    (a rate, a selection mask); no rasterizer looks at it
+    """
+
+    means: Tensor
+    opacities: Tensor
+    scales: Tensor | None = None
+    quats: Tensor | None = None
+    cov3d: Tensor | None = None
+    geom_indices: Tensor | None = None
+    scale_factors: Tensor | None = None
+    sh: SH | None = None
+    colors: Tensor | None = None
+    features: Tensor | None = None
+    visible: Tensor | None = None
+    extras: dict[str, Any] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        return self.means.shape[0]
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Every tensor that is present, by field name (`sh.dense`, `sh.dc`, ... for colours)."""
+        names = (
+            "means", "opacities", "scales", "quats", "cov3d", "geom_indices", "scale_factors",
+            "colors", "features", "visible",
+        )  # fmt: skip
+        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        if self.sh is not None:
+            for name in ("dense", "dc", "rest", "codebook", "indices"):
+                if (tensor := getattr(self.sh, name)) is not None:
+                    found[f"sh.{name}"] = tensor
+        return found
+
+    def requires_grad(self) -> bool:
+        """Whether autograd would record anything for these inputs now."""
+        return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors().values())
+
+    def validate(self) -> None:
+        """Raise ShapeError unless the fields fit together (values are the rasterizer's business)."""
+        n = self.means.shape[0]
+
+        def need(name: str, tensor: Tensor | None, *expected: int | str) -> None:
+            if tensor is None:
+                return
+            ok = tensor.dim() == len(expected) and all(
+                isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
+            )
+            if not ok:
+                wanted = ", ".join(str(e) for e in expected)
+                raise ShapeError(
+                    f"GaussianInputs.{name} must be [{wanted}], got {list(tensor.shape)}",
+                    actual=tensor.shape,
+                    expected=expected,
+                )
+
+        rows: int | str = n if self.geom_indices is None else "M"
+        need("means", self.means, n, 3)
+        need("opacities", self.opacities, n)
+        need("scales", self.scales, rows, "2 or 3")
+        need("quats", self.quats, rows, 4)
+        need("cov3d", self.cov3d, n, 6)
+        need("geom_indices", self.geom_indices, n)
+        need("scale_factors", self.scale_factors, n)
+        need("colors", self.colors, n, "C")
+        need("features", self.features, n, "E")
+        need("visible", self.visible, n)
+        if (self.cov3d is None) == (self.scales is None or self.quats is None):
+            raise ShapeError("GaussianInputs needs either scales and quats, or cov3d")
+        if (self.sh is None) == (self.colors is None):
+            raise ShapeError("GaussianInputs needs either sh or colors")
+        if self.sh is not None:
+            need("sh.dense", self.sh.dense, n, "K", 3)
+            need("sh.dc", self.sh.dc, n, 1, 3)
+            need("sh.rest", self.sh.rest, n, "K-1", 3)
+            need("sh.codebook", self.sh.codebook, "M", "K", 3)
+            need("sh.indices", self.sh.indices, n)
+        devices = {t.device for t in self.tensors().values()}
+        if len(devices) > 1:
+            raise ShapeError(f"GaussianInputs mixes devices: {', '.join(sorted(map(str, devices)))}")

@@ -1,0 +1,83 @@
+"""What a method trains: parameters, and how they become Gaussians."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.scene.camera import Camera
+
+if TYPE_CHECKING:
+    from splatwizard_core.rendering.rasterizer import Rasterizer
+
+
+class SplatModel(nn.Module):
+    """Parameters and mathematics of a scene; knows nothing of optimizers, schedules or files.
+
+    A renderer needs one thing of it: `gaussians(camera, rasterizer)`. Per-primitive parameters and buffers
+    (one row per Gaussian or anchor) are named in `ROWS`, so that densification and pruning can add and remove
+    rows of all of them together, whatever the model is.
+    """
+
+    ROWS: tuple[str, ...] = ()
+    """Names of the parameters and buffers whose first dimension is the primitive; attributes of the model."""
+
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
+
+        rasterizer  for a visibility pre-filter (`rasterizer.visible_filter`), nothing else
+        What losses and tasks want to see again goes into `GaussianInputs.extras`.
+        """
+        raise NotImplementedError
+
+    @property
+    def num_rows(self) -> int:
+        """How many primitives the model stores: Gaussians, or anchors."""
+        return int(getattr(self, self.ROWS[0]).shape[0])
+
+    @property
+    def device(self) -> torch.device:
+        return next(self.parameters()).device
+
+    def counts(self) -> dict[str, int]:
+        """What is reported: {"num_gaussians": ...}, and {"num_anchors": ...} for anchor methods."""
+        return {"num_gaussians": self.num_rows}
+
+    def prepare(self) -> None:
+        """Build caches that no view changes, once, before rendering a decoded model. Default: nothing."""
+
+    def state_dict_extra(self) -> dict[str, Any]:
+        """JSON-able state that is not a tensor: the active SH degree, mode flags. Part of every checkpoint."""
+        return {}
+
+    def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
+        """Inverse of `state_dict_extra`."""
+
+    def load_resized(self, state: dict[str, Tensor]) -> None:
+        """Load a state whose row counts differ from the model's: tensors take the shapes of the state."""
+        for name, value in state.items():
+            owner_name, _, leaf = name.rpartition(".")
+            owner = self.get_submodule(owner_name)
+            current = getattr(owner, leaf, None)
+            if isinstance(current, Tensor) and current.shape == value.shape:
+                continue
+            fresh = torch.empty_like(value, device=current.device if isinstance(current, Tensor) else None)
+            if isinstance(current, nn.Parameter):
+                setattr(owner, leaf, nn.Parameter(fresh, requires_grad=current.requires_grad))
+            else:
+                owner.register_buffer(leaf, fresh)
+        self.load_state_dict(state)
+
+    def digest(self) -> str:
+        """SHA-256 over names, shapes and bytes of all parameters, buffers and the extra state: equal models, equal text."""
+        import hashlib
+        import json
+
+        sha = hashlib.sha256(json.dumps(self.state_dict_extra(), sort_keys=True).encode())
+        for name, tensor in sorted(self.state_dict().items()):
+            sha.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
+            sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+        return sha.hexdigest()

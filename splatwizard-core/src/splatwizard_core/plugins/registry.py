@@ -1,0 +1,121 @@
+"""A registry of one kind of thing: light entries whose targets are imported only when asked for."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any
+
+from splatwizard_core.errors import PluginError
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One thing that a distribution provides.
+
+    kind            "rasterizer", "method", ...
+    name            how the user and other plugins ask for it
+    target          "module:attribute", imported by `load`
+    summary         one line for `sw list-plugins`
+    declared        what the kind declares besides (a rasterizer's features, a metric's direction)
+    distribution    the pip distribution it comes from, and its version
+    """
+
+    kind: str
+    name: str
+    target: str
+    summary: str
+    declared: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    distribution: str = ""
+    version: str = ""
+
+    def load(self) -> Any:
+        """Import the target. Raises PluginError that names the distribution."""
+        module_name, _, attribute = self.target.partition(":")
+        try:
+            found: Any = importlib.import_module(module_name)
+            for part in attribute.split("."):
+                found = getattr(found, part)
+        except Exception as error:
+            raise PluginError(
+                f"{self.kind} '{self.name}' of {self.distribution} {self.version} could not be loaded from "
+                f"{self.target}: {type(error).__name__}: {error}"
+            ) from error
+        return found
+
+
+class Registry:
+    """The entries of one kind, by name. Plugins see only `add`."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+        self._entries: dict[str, Entry] = {}
+        self._clashes: dict[str, list[Entry]] = {}
+        self._owner: tuple[str, str] = ("", "")
+
+    def add(self, name: str, target: str, *, summary: str, **declared: Any) -> None:
+        """Add one entry.
+
+        target      "module:attribute"; it is not imported now
+        summary     one line
+        declared    fields of the kind, plain values that can be printed as JSON
+
+        A name that another distribution claims too belongs to neither; asking for it is an error that names both.
+        Raises PluginError if the target is malformed.
+        """
+        distribution, version = self._owner
+        module_name, separator, attribute = target.partition(":")
+        if not (separator and module_name and attribute):
+            raise PluginError(
+                f"{distribution}: {self.kind} '{name}' has target '{target}'; it must be 'module:attribute'"
+            )
+        entry = Entry(self.kind, name, target, summary, MappingProxyType(dict(declared)), distribution, version)
+        if name in self._clashes:
+            self._clashes[name].append(entry)
+        elif name in self._entries:
+            # Neither wins: which one a name means must not depend on the order of installation.
+            self._clashes[name] = [self._entries.pop(name), entry]
+        else:
+            self._entries[name] = entry
+
+    def _withdraw(self, distribution: str) -> None:
+        """Take back everything that one distribution added (its hook failed half way)."""
+        self._entries = {n: e for n, e in self._entries.items() if e.distribution != distribution}
+
+    @property
+    def clashes(self) -> dict[str, list[Entry]]:
+        """Names that several distributions claim; asking for one is an error."""
+        return dict(self._clashes)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[Entry]:
+        return iter(sorted(self._entries.values(), key=lambda e: e.name))
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    @property
+    def names(self) -> list[str]:
+        return sorted(self._entries)
+
+    def entry(self, name: str) -> Entry:
+        """The entry called `name`. Raises PluginError that suggests the nearest installed name."""
+        if name in self._entries:
+            return self._entries[name]
+        if name in self._clashes:
+            owners = " and ".join(f"{e.distribution} {e.version}" for e in self._clashes[name])
+            raise PluginError(
+                f"{self.kind} '{name}' is claimed by {owners}: uninstall one, or restrict with SW_PLUGINS"
+            )
+        near = difflib.get_close_matches(name, self.names, n=1)
+        hint = f"did you mean '{near[0]}'?" if near else f"installed: {', '.join(self.names) or 'none'}"
+        raise PluginError(f"no {self.kind} is called '{name}'; {hint} (`sw list-plugins` shows all)")
+
+    def load(self, name: str) -> Any:
+        """Import and return what `name` stands for."""
+        return self.entry(name).load()

@@ -1,0 +1,45 @@
+"""What a dataset family provides, and the choice of one for a path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol as TypingProtocol
+
+from splatwizard_core.scene.scene import Scene
+
+
+@dataclass(frozen=True)
+class SceneOptions:
+    """How a scene is to be read; None means the family's own default.
+
+    images          picture folder of a COLMAP scene, such as "images_2"
+    resolution      -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
+    test_every      every n-th view by name is a test view
+    split           "every8" and the like, "file", "all"
+    background      "black" or "white"
+    principal_point "center" or "file"
+    init_points     how many random start points where there is no SfM
+    seed            of those points
+    """
+
+    images: str | None = None
+    resolution: int = -1
+    test_every: int = 8
+    split: str | None = None
+    background: str | None = None
+    principal_point: str = "center"
+    init_points: int = 100_000
+    seed: int = 0
+
+
+class Dataset(TypingProtocol):
+    """One family of scenes: detection is explicit, never by catching errors."""
+
+    def detect(self, path: Path) -> float:
+        """How surely `path` is of this family: 0 (no) to 1 (only this). Reads names, not pictures."""
+        ...
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """Read cameras, points and the list of pictures. Raises SceneError in one line."""
+        ...

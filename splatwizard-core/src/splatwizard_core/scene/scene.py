@@ -1,0 +1,129 @@
+"""A scene: its views, their split, start points, and the scale that learning rates and thresholds use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatwizard_core.scene.camera import Camera
+
+
+@dataclass(eq=False)
+class View:
+    """One photograph: a camera, a name, and a picture that is decoded on first use and kept as uint8.
+
+    camera      geometry, at the resolution of the picture
+    name        file name relative to the picture folder, unique in the scene
+    load        () -> uint8 array [H,W,3] or [H,W,4] (straight alpha) at the camera's size
+    """
+
+    camera: Camera
+    name: str
+    load: Callable[[], np.ndarray] | None = None
+    load_mask: Callable[[], np.ndarray] | None = None
+
+    @cached_property
+    def pixels(self) -> Tensor:
+        """uint8 [3,H,W] or [4,H,W] (RGBA, straight alpha), host memory, decoded once."""
+        if self.load is None:
+            raise ValueError(f"view '{self.name}' has no picture")
+        return torch.from_numpy(np.ascontiguousarray(self.load().transpose(2, 0, 1)))
+
+    @cached_property
+    def mask(self) -> Tensor | None:
+        """bool [H,W] or None."""
+        return None if self.load_mask is None else torch.from_numpy(self.load_mask()).bool()
+
+    def image(self, background: Tensor | None = None, device: torch.device | str = "cpu") -> Tensor:
+        """float32 [3,H,W] in 0..1 on `device`; an RGBA picture is composited on `background` [3] (None: black)."""
+        pixels = self.pixels.to(device)
+        rgb = pixels[:3].float() / 255
+        if pixels.shape[0] == 3:
+            return rgb
+        alpha = pixels[3:].float() / 255
+        if background is None:
+            return rgb * alpha
+        return rgb * alpha + background.to(device)[:, None, None] * (1 - alpha)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Start points: xyz [P,3] float32 world units, rgb [P,3] float32 in 0..1 (None: unknown)."""
+
+    xyz: Tensor
+    rgb: Tensor | None = None
+
+    def __len__(self) -> int:
+        return self.xyz.shape[0]
+
+
+@dataclass(frozen=True)
+class Protocol:
+    """What makes two results comparable; its id stands in every record.
+
+    dataset     family id, such as "mipnerf360", or "colmap" / "blender" / "demo"
+    images      picture folder
+    resolution  the rule of specs: -1, 1, 2, 4, 8 or a width
+    split       "every8", "every<n>", "file", "all"
+    background  "black" or "white"
+    quantize8   renders are rounded to 8 bit before metrics
+    """
+
+    dataset: str
+    images: str = "images"
+    resolution: int = -1
+    split: str = "every8"
+    background: str = "black"
+    principal_point: str = "center"
+    quantize8: bool = True
+
+    @property
+    def id(self) -> str:
+        """One line that names the protocol, stable across machines."""
+        return "/".join(
+            (
+                self.dataset, self.images, f"r{self.resolution}", self.split, self.background,
+                f"pp-{self.principal_point}", "q8" if self.quantize8 else "float",
+            )
+        )  # fmt: skip
+
+
+@dataclass(eq=False)
+class Scene:
+    """Everything a method may know of a scene.
+
+    name        last part of its path
+    train, test views, disjoint unless the split is "all"
+    points      start points (SfM, or random for Blender scenes); None if there are none
+    protocol    how pictures were chosen, resized and split
+    ground_truth    exact geometry where the scene has it (demo): "points" [P,3], "normals" [P,3],
+                    "depth": view name -> [1,H,W]; otherwise empty
+    warnings    one-line facts the user should see (dropped points, off-centre principal point)
+    """
+
+    name: str
+    train: list[View]
+    test: list[View]
+    points: PointCloud | None
+    protocol: Protocol
+    path: str | None = None
+    ground_truth: dict[str, Any] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    @property
+    def background(self) -> Tensor:
+        """[3] float32, the fixed background of evaluation."""
+        return torch.ones(3) if self.protocol.background == "white" else torch.zeros(3)
+
+    @cached_property
+    def extent(self) -> float:
+        """E = 1.1 x the largest distance of a training camera from their mean; 1.0 for a single camera."""
+        centers = torch.stack([v.camera.center.double().cpu() for v in self.train])
+        radius = 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
+        return radius if radius > 0 else 1.0

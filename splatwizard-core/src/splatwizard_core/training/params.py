@@ -1,0 +1,42 @@
+"""Typed configuration: what belongs to the run, and what belongs to the method."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class Params(BaseModel):
+    """Base of every configuration block: unknown keys and values out of bounds are errors; blocks may nest."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+
+
+class RasterParams(Params):
+    """Which rasterizers may serve."""
+
+    prefer: list[str] = Field([], description="rasterizers to take first if they can, by name")
+    forbid: list[str] = Field([], description="rasterizers never to take, by name")
+
+
+class PipelineParams(Params):
+    """Parameters of the run that no method owns (`ppl` in the paper's signature)."""
+
+    seed: int = Field(0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it")
+    device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA if its kernels can run, else CPU")
+    threads: int = Field(0, ge=0, description="CPU threads; 0: all cores that this process may use")
+    checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
+    keep_checkpoints: int = Field(1, ge=1, description="how many of the newest checkpoints stay")
+    eval_every: int = Field(0, ge=0, description="steps between evaluations on the test views; 0: only at the end")
+    random_background: bool = Field(False, description="a fresh background colour per step in training")
+    clamp_render: bool = Field(False, description="clamp the render to [0,1] before the loss (inria 2024)")
+    profile: Literal["none", "stages"] = Field("none", description="stages: time each stage of a step")
+    raster: RasterParams = Field(RasterParams(), description="which rasterizers may serve")
+
+
+class OptimizationParams(Params):
+    """Hyper-parameters of a method (`opt` in the paper's signature); each method subclasses it."""
+
+    iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
+    scale_schedule: bool = Field(
+        False, description="multiply every plan bound and interval, and lr max_steps, by iterations / 30000"
+    )

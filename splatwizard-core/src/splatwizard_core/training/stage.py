@@ -1,0 +1,153 @@
+"""A training stage: what it starts from, its schedule, its loss, its optimizer. The trainer runs it and knows no method."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
+from splatwizard_core.scene.scene import Scene, View
+from splatwizard_core.training.params import OptimizationParams, PipelineParams
+
+if TYPE_CHECKING:
+    from splatwizard_core.training.optimizer import SplatOptimizer
+    from splatwizard_core.training.scheduler import Scheduler
+
+
+@dataclass
+class LossPack:
+    """The loss of one step: `total` is what backward starts from, `parts` are what the log shows (scalars)."""
+
+    total: Tensor
+    parts: dict[str, Tensor] = field(default_factory=dict)
+
+
+class CameraSampler:
+    """Which view is trained next. Its whole state can be saved and restored.
+
+    Default: uniformly without replacement over the training views, refilled when empty.
+    A stage with its own idea (pseudo views, say) subclasses it; a view without a picture is legal if the
+    stage's loss does not ask for one.
+    """
+
+    def __init__(self, views: list[View], generator: torch.Generator) -> None:
+        if not views:
+            raise ValueError("a camera sampler needs at least one view")
+        self.views = views
+        self.generator = generator
+        self._order: list[int] = []
+
+    def next(self, step: int) -> View:
+        """The view of this step."""
+        if not self._order:
+            self._order = torch.randperm(len(self.views), generator=self.generator).tolist()
+        return self.views[self._order.pop()]
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-able, together with the generator's state as a tensor under "generator"."""
+        return {"order": list(self._order), "generator": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self._order = [int(i) for i in state["order"]]
+        self.generator.set_state(state["generator"])
+
+
+class CameraIterator:
+    """The cameras that schedule tasks iterate over: training views in order, independent of the training sampler."""
+
+    def __init__(self, views: list[View]) -> None:
+        self.views = views
+
+    def __iter__(self) -> Iterator[View]:
+        return iter(self.views)
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+
+@dataclass
+class StageContext:
+    """What the runner hands to a stage when it begins.
+
+    model       the model as the stage before left it (or as `Method.create_model` made it)
+    scene       the scene
+    ppl         run parameters
+    generator   (stream name) -> an independent seeded torch.Generator: "init", "split", "method", ...
+    trained     (method name) -> a frozen, trained model of this scene, from the cache or trained first;
+                for stages that start from, or are taught by, a trained 3DGS scene
+    """
+
+    model: SplatModel
+    scene: Scene
+    ppl: PipelineParams
+    generator: Callable[[str], torch.Generator]
+    trained: Callable[[str], SplatModel]
+
+
+class Stage:
+    """One training stage of a method. Subclass, override what differs; another method can take it over whole.
+
+    name        shown in plans and logs
+    opt         the hyper-parameters that its tasks see as OptimizationParams; a borrowed stage brings its own
+    """
+
+    name: str = "train"
+
+    def __init__(self, opt: OptimizationParams) -> None:
+        self.opt = opt
+
+    @property
+    def iterations(self) -> int:
+        """Steps s = 1 .. iterations."""
+        return self.opt.iterations
+
+    @property
+    def starts_from(self) -> str | None:
+        """Name of a method whose trained scene this stage starts from (the runner supplies it); None: from the stage before."""
+        return None
+
+    @property
+    def prefer(self) -> tuple[str, ...]:
+        """Rasterizers to take first if they are installed; the user's `raster.prefer` goes before them."""
+        return ()
+
+    def begin(self, context: StageContext) -> SplatModel:
+        """Return the model that this stage trains: the one it is given, or another built from it (masks, teacher).
+
+        On resume it is called too, then every tensor is overwritten from the checkpoint: whatever must
+        survive is a parameter, a buffer or in `state_dict_extra` of the returned model.
+        """
+        return context.model
+
+    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        """Parameter groups and learning rates."""
+        raise NotImplementedError
+
+    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
+        """Which view is trained next."""
+        return CameraSampler(scene.train, generator)
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        """Register what runs before rendering."""
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        """Register what runs between backward and the optimizer step."""
+
+    def raster_options(self, step: int, background: Tensor) -> RasterOptions:
+        """How this step is rendered. Must not ask for different features at different steps."""
+        return RasterOptions(background=background)
+
+    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
+        """The loss of this step. Default: 0.8 L1 + 0.2 (1 - SSIM) against the view's picture on `background`."""
+        from splatwizard_core.training.losses import photometric_loss
+
+        return photometric_loss(result.image, view.image(background, result.image.device))
+
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        """Called once after the last step; returns the model that the next stage, or the encoder, gets."""
+        return model
