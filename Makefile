@@ -1,0 +1,63 @@
+# make demo   set up .venv and run the procedural demo scene: train, encode, decode, evaluate, report
+# make test   set up .venv and run the default tests (no network, no GPU)
+# make lint   ruff and mypy
+# make bench  speed and memory, as ratios measured in one run
+# make kernels  compile every native module ahead of time
+
+PYTHON ?= python3
+VENV ?= .venv
+BIN := $(VENV)/bin
+PACKAGES := splatwizard-core plugins/sw-rasterizers plugins/sw-codecs plugins/sw-3dgs
+PROJECTS := $(addsuffix /pyproject.toml,$(PACKAGES))
+PIP := $(BIN)/python -m pip --disable-pip-version-check
+DEMO_OUT ?= out
+PYTEST_ARGS ?=
+
+.PHONY: demo test coverage lint format bench kernels docs clean
+
+demo: $(VENV)/.ready
+	@tools/check-system compiler
+	$(BIN)/sw run --method 3dgs --scene demo --rate all --out $(DEMO_OUT)
+
+test: $(VENV)/.ready-dev
+	$(BIN)/python -m pytest $(PYTEST_ARGS)
+
+coverage: $(VENV)/.ready-dev
+	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=85 $(PYTEST_ARGS)
+
+lint: $(VENV)/.ready-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+format: $(VENV)/.ready-dev
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+bench: $(VENV)/.ready-dev
+	$(BIN)/python benchmarks/rasterize_cpu.py
+	$(BIN)/python benchmarks/training_ops.py
+
+kernels: $(VENV)/.ready
+	@tools/check-system compiler
+	$(BIN)/sw build-kernels
+
+docs: $(VENV)/.ready
+	$(BIN)/python -m splatwizard_core.cli.docs docs/cli.md
+
+$(VENV)/bin/python:
+	@PYTHON=$(PYTHON) tools/check-system python
+	$(PYTHON) -m venv $(VENV)
+
+# hatchling first: with it at hand no package needs a build environment of its own.
+$(VENV)/.ready: $(VENV)/bin/python constraints.txt $(PROJECTS)
+	$(PIP) install -q -c constraints.txt hatchling editables
+	$(PIP) install -q -c constraints.txt --no-build-isolation $(addprefix -e ,$(PACKAGES))
+	@touch $@
+
+$(VENV)/.ready-dev: $(VENV)/.ready requirements-dev.txt
+	$(PIP) install -q -c constraints.txt -r requirements-dev.txt
+	@touch $@
+
+clean:
+	rm -rf $(VENV) out build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis .coverage*
