@@ -1,0 +1,215 @@
+"""Explicit 3D Gaussians: the model of 3DGS and of every method that prunes, quantises or refines its Gaussians."""
+
+from __future__ import annotations
+
+import logging
+import math
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.errors import SceneError, ShapeError
+from splatwizard_core.gaussians.inputs import SH, GaussianInputs
+from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.scene.camera import Camera
+from splatwizard_core.scene.scene import PointCloud
+from splatwizard_core.streams import stream
+
+if TYPE_CHECKING:
+    from splatwizard_core.rendering.rasterizer import Rasterizer
+
+log = logging.getLogger(__name__)
+
+SH_BAND0 = 0.28209479177387814
+"""Y_0, the constant spherical harmonic: rgb = 0.5 + SH_BAND0 * dc."""
+
+MIN_SQUARED_DISTANCE = 1e-7
+"""Floor of the squared neighbour distance at initialisation, world units squared (smallest sigma 3.162e-4)."""
+
+
+def logit(p: float) -> float:
+    """ln(p / (1 - p)), the inverse of the logistic function."""
+    return math.log(p / (1 - p))
+
+
+class GaussianModel(SplatModel):
+    """N Gaussians with raw (pre-activation) parameters, K = (max_sh_degree + 1)^2.
+
+    means           [N,3] world units
+    sh_dc           [N,1,3] SH band 0
+    sh_rest         [N,K-1,3] SH bands 1 .. max_sh_degree
+    opacity_logits  [N]; opacity = sigmoid
+    log_scales      [N,3]; standard deviation in world units = exp
+    quats           [N,4] (w,x,y,z), any norm; normalised where they are used
+    grad_accum, denom, max_radii2d
+                    [N] buffers, the statistics of adaptive density control (density.py)
+
+    active_sh_degree    bands above it are neither drawn nor trained
+    """
+
+    ROWS = (
+        "means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats",
+        "grad_accum", "denom", "max_radii2d",
+    )  # fmt: skip
+
+    means: nn.Parameter
+    sh_dc: nn.Parameter
+    sh_rest: nn.Parameter
+    opacity_logits: nn.Parameter
+    log_scales: nn.Parameter
+    quats: nn.Parameter
+    grad_accum: Tensor
+    denom: Tensor
+    max_radii2d: Tensor
+
+    def __init__(
+        self,
+        means: Tensor,
+        sh_dc: Tensor,
+        sh_rest: Tensor,
+        opacity_logits: Tensor,
+        log_scales: Tensor,
+        quats: Tensor,
+        *,
+        active_sh_degree: int | None = None,
+    ) -> None:
+        super().__init__()
+        n = means.shape[0]
+        for name, tensor, tail in (
+            ("means", means, (3,)),
+            ("sh_dc", sh_dc, (1, 3)),
+            ("sh_rest", sh_rest, (None, 3)),
+            ("opacity_logits", opacity_logits, ()),
+            ("log_scales", log_scales, (3,)),
+            ("quats", quats, (4,)),
+        ):
+            expected = (n, *("K-1" if size is None else size for size in tail))
+            fits = tensor.dim() == len(expected) and all(
+                isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
+            )
+            if not fits:
+                raise ShapeError(
+                    f"GaussianModel.{name} must be {list(expected)}, got {list(tensor.shape)}",
+                    actual=tensor.shape,
+                    expected=expected,
+                )
+            self.register_parameter(name, nn.Parameter(tensor.detach()))
+        degree = math.isqrt(sh_rest.shape[1] + 1) - 1
+        if (degree + 1) ** 2 != sh_rest.shape[1] + 1 or degree > 3:
+            raise ShapeError(
+                f"GaussianModel.sh_rest has {sh_rest.shape[1]} coefficients a channel; 0, 3, 8 or 15 are possible",
+                actual=sh_rest.shape,
+            )
+        self.max_sh_degree = degree
+        self.active_sh_degree = degree if active_sh_degree is None else active_sh_degree
+        if not 0 <= self.active_sh_degree <= degree:
+            raise ShapeError(f"active SH degree {active_sh_degree} is outside 0 .. {degree}")
+        for name in ("grad_accum", "denom", "max_radii2d"):
+            self.register_buffer(name, torch.zeros(n, dtype=means.dtype, device=means.device))
+        self.split_seed = 0
+        self._splits = 0
+
+    @classmethod
+    def from_tensors(
+        cls,
+        means: Tensor,
+        sh_dc: Tensor,
+        sh_rest: Tensor,
+        opacity_logits: Tensor,
+        log_scales: Tensor,
+        quats: Tensor,
+        *,
+        active_sh_degree: int | None = None,
+    ) -> GaussianModel:
+        """A model of copies of these raw tensors (shapes: the class). active_sh_degree None: the full degree."""
+        tensors = (means, sh_dc, sh_rest, opacity_logits, log_scales, quats)
+        return cls(*(t.detach().clone().contiguous() for t in tensors), active_sh_degree=active_sh_degree)
+
+    @classmethod
+    def from_points(
+        cls, points: PointCloud, *, max_sh_degree: int = 3, opacity: float = 0.1, scale_factor: float = 1.0
+    ) -> GaussianModel:
+        """One isotropic Gaussian a point, as large as the distance to its three nearest neighbours.
+
+        points          xyz [P,3]; points that are not finite are dropped with a warning; missing colours are grey
+        opacity         initial opacity, 0..1
+        scale_factor    multiplies the initial standard deviations (MCMC starts at 0.1)
+
+        The active SH degree starts at 0. Raises SceneError if no point is left.
+        Source: 3DGS (arXiv 2308.04079), code of the authors.
+        """
+        xyz = points.xyz.float()
+        rgb = points.rgb
+        finite = torch.isfinite(xyz).all(dim=1)
+        if rgb is not None:
+            finite &= torch.isfinite(rgb).all(dim=1)
+        dropped = int((~finite).sum())
+        if dropped:
+            log.warning("dropped %d of %d start points that are not finite", dropped, len(points))
+            xyz, rgb = xyz[finite], None if rgb is None else rgb[finite]
+        n = xyz.shape[0]
+        if n == 0:
+            raise SceneError("the scene has no usable start point: 3DGS needs SfM points or random ones")
+        if rgb is None:
+            log.warning("the %d start points have no colours; they start grey", n)
+            sh_dc = xyz.new_zeros(n, 1, 3)
+        else:
+            sh_dc = ((rgb.to(xyz) - 0.5) / SH_BAND0)[:, None, :]
+        squared = mean_squared_neighbor_distance(xyz).clamp_min(MIN_SQUARED_DISTANCE)
+        log_scales = (squared.sqrt() * scale_factor).log()[:, None].repeat(1, 3)
+        quats = xyz.new_zeros(n, 4)
+        quats[:, 0] = 1
+        return cls(
+            xyz.clone(),
+            sh_dc,
+            xyz.new_zeros(n, (max_sh_degree + 1) ** 2 - 1, 3),
+            xyz.new_full((n,), logit(opacity)),
+            log_scales,
+            quats,
+            active_sh_degree=0,
+        )
+
+    @property
+    def opacities(self) -> Tensor:
+        """[N] in 0..1."""
+        return torch.sigmoid(self.opacity_logits)
+
+    @property
+    def scales(self) -> Tensor:
+        """[N,3] standard deviations, world units."""
+        return torch.exp(self.log_scales)
+
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """All Gaussians, whatever the camera; colours stay in two tensors, so nothing is concatenated."""
+        rest = self.sh_rest if self.max_sh_degree > 0 else None
+        return GaussianInputs(
+            means=self.means,
+            opacities=self.opacities,
+            scales=self.scales,
+            quats=self.quats,
+            sh=SH(dc=self.sh_dc, rest=rest, active_degree=self.active_sh_degree),
+        )
+
+    def next_split_generator(self) -> torch.Generator:
+        """The random stream of the next split: a function of `split_seed` and of how many splits there were.
+
+        Lives on the CPU, so that a model splits alike on every device; its whole state is two integers of
+        `state_dict_extra`, so that a resumed run draws what the uninterrupted one would have drawn.
+        """
+        generator = stream(self.split_seed, f"split/{self._splits}")
+        self._splits += 1
+        return generator
+
+    def state_dict_extra(self) -> dict[str, Any]:
+        return {"active_sh_degree": self.active_sh_degree, "split_seed": self.split_seed, "splits": self._splits}
+
+    def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
+        self.active_sh_degree = int(extra["active_sh_degree"])
+        self.split_seed = int(extra["split_seed"])
+        self._splits = int(extra["splits"])
+
+    def load_resized(self, state: dict[str, Tensor]) -> None:
+        super().load_resized(state)
+        self.max_sh_degree = math.isqrt(self.sh_rest.shape[1] + 1) - 1

@@ -1,0 +1,168 @@
+"""The .ply of 3DGS: 62 float32 a Gaussian at SH degree 3, raw values, as the authors' code and all viewers read it."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement
+from torch import Tensor
+
+from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.splat_model import SplatModel
+
+MAX_HEADER = 1 << 16
+_SIZES = {
+    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
+    "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8,
+}  # fmt: skip
+
+
+def property_names(sh_rest: int) -> list[str]:
+    """The vertex properties in the order of the file, for `sh_rest` = K - 1 higher SH coefficients a channel."""
+    return [
+        "x", "y", "z", "nx", "ny", "nz",
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(3 * sh_rest)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]  # fmt: skip
+
+
+def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
+    """A model with exactly the values of the file, active SH degree = the degree that is stored (0 .. 3).
+
+    Any order of properties, float or double, binary or ASCII, is read; normals and unknown properties are ignored.
+    Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
+    """
+    path = Path(path)
+    count = _check_header(path)
+    try:
+        with path.open("rb") as file:
+            vertex = PlyData.read(io.BytesIO(file.read()))["vertex"].data
+    except Exception as error:  # plyfile raises many kinds for damaged files, MemoryError and IndexError among them
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise BitstreamError(f"{path.name}: not a readable .ply: {reason}", section="vertex") from error
+    if len(vertex) != count:
+        raise BitstreamError(f"{path.name}: {len(vertex)} vertices, header says {count}", section="vertex")
+    names = set(vertex.dtype.names or ())
+    rest = sum(1 for name in names if re.fullmatch(r"f_rest_\d+", name))
+    degree = math.isqrt(rest // 3 + 1) - 1
+    if rest % 3 or (degree + 1) ** 2 != rest // 3 + 1 or degree > 3:
+        raise SceneError(
+            f"{path.name}: {rest} f_rest properties; 0, 9, 24 or 45 (SH degree 0 to 3) are possible", path=str(path)
+        )
+    needed = [name for name in property_names(rest // 3) if name not in ("nx", "ny", "nz")]
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise SceneError(
+            f"{path.name}: not a 3DGS model, property '{missing[0]}' is missing ({len(missing)} in all)", path=str(path)
+        )
+
+    def columns(*wanted: str) -> Tensor:
+        table = np.empty((count, len(wanted)), dtype=np.float32)
+        for i, name in enumerate(wanted):
+            table[:, i] = vertex[name]
+        return torch.from_numpy(table)
+
+    # f_rest is channel-major: all K-1 coefficients of red, then green, then blue.
+    sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, rest // 3)
+    return GaussianModel(
+        columns("x", "y", "z"),
+        columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
+        sh_rest.transpose(1, 2).contiguous(),
+        columns("opacity")[:, 0],
+        columns("scale_0", "scale_1", "scale_2"),
+        columns("rot_0", "rot_1", "rot_2", "rot_3"),
+    )
+
+
+def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
+    """Write the raw parameters, binary little-endian, normals zero; `load_ply` gives every bit back.
+
+    The file is complete or absent: it is written beside `path` and then renamed.
+    """
+    path = Path(path)
+    n = model.num_rows
+    parts = [
+        model.means,
+        model.means.new_zeros(n, 3),
+        model.sh_dc[:, 0, :],
+        model.sh_rest.transpose(1, 2).reshape(n, -1),
+        model.opacity_logits[:, None],
+        model.log_scales,
+        model.quats,
+    ]
+    names = property_names(model.sh_rest.shape[1])
+    table: NDArray[np.float32] = np.empty((n, len(names)), dtype="<f4")
+    column = 0
+    for part in parts:
+        width = part.shape[1]
+        table[:, column : column + width] = part.detach().cpu().float().numpy()
+        column += width
+    rows = table.view([(name, "<f4") for name in names])[:, 0]
+    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<").write(str(beside))
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
+    """The exporter `ply`. Raises SceneError for models that are not explicit Gaussians."""
+    if not isinstance(model, GaussianModel):
+        raise SceneError(
+            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera", path=str(path)
+        )
+    save_ply(model, path)
+
+
+def _check_header(path: Path) -> int:
+    """The vertex count that the header claims, checked against the size of the file before anything is allocated."""
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            head = file.read(MAX_HEADER)
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
+    match = re.search(rb"(?:^|\n)end_header\r?\n", head)
+    if not head.startswith(b"ply") or match is None:
+        raise BitstreamError(f"{path.name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
+    binary, element = False, None
+    counts: dict[str, int] = {}
+    widths: dict[str, int] = {}
+    for line in head[: match.start()].decode("ascii", "replace").splitlines():
+        words = line.split()
+        if words[:1] == ["format"]:
+            binary = len(words) > 1 and words[1].startswith("binary")
+        elif words[:1] == ["element"]:
+            if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]):
+                raise BitstreamError(f"{path.name}: bad header line '{line[:60]}'", section="header")
+            element = words[1]
+            counts[element], widths[element] = int(words[2]), 0
+        elif words[:1] == ["property"] and element is not None:
+            if len(words) != 3 or words[1] not in _SIZES:
+                raise BitstreamError(
+                    f"{path.name}: property '{line[:60]}' has no place in a 3DGS model", section="header"
+                )
+            widths[element] += _SIZES[words[1]] if binary else 2
+    if "vertex" not in counts:
+        raise SceneError(f"{path.name}: not a 3DGS model: the header names no element 'vertex'", path=str(path))
+    # An ASCII value takes two bytes at least; an element without properties would loop for nothing.
+    claimed = sum(counts[name] * max(widths[name], 1) for name in counts)
+    have = size - match.end()
+    if claimed > have + (0 if binary else 1):
+        raise BitstreamError(
+            f"{path.name}: the header claims {claimed:,} bytes of data, the file holds {have:,}: it is truncated",
+            section="vertex",
+        )
+    return counts["vertex"]
