@@ -64,9 +64,18 @@ class Method:
         raise NotImplementedError
 
 
-def create_method(plugins: PluginManager, name: str, config: Mapping[str, Any] | None = None) -> Method:
-    """Another method by name, with values for its config by dotted key: how one method borrows from another."""
+def create_method(
+    plugins: PluginManager, name: str, config: Mapping[str, Any] | None = None, *, preset: str = "paper"
+) -> Method:
+    """Another method by name, with values for its config by dotted key: how one method borrows from another.
+
+    Raises PluginError if it is not installed, ConfigError for an unknown preset, key or value.
+    """
+    from splatwizard_core.errors import ConfigError
     from splatwizard_core.experiments.config import apply_overrides
 
-    cls = plugins.methods.load(name)
-    return cls(plugins, apply_overrides(cls.Config(), dict(config or {}), source=f"config of '{name}'"))
+    cls: type[Method] = plugins.methods.load(name)
+    if preset not in cls.PRESETS:
+        raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
+    values = {**cls.PRESETS[preset], **(config or {})}
+    return cls(plugins, apply_overrides(cls.Config(), values, source=f"config of '{name}'"))
