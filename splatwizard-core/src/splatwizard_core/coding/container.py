@@ -1,0 +1,341 @@
+"""The single file (`.swz`): everything that a decoder needs, in named sections, each with length and CRC-32.
+
+Layout, little-endian, byte by byte in docs/bitstream.md:
+
+    4 bytes   magic "SPWZ"
+    u16       container version, 1
+    u32       header length H
+    H bytes   header, UTF-8 JSON
+    u32       CRC-32 of the H header bytes
+    ...       the sections, back to back in the order of the section table
+
+The header holds `method`, `method_version`, `raster` (what a renderer must do, such as {"antialias": false}),
+`static` (whatever the method wants to remember) and `sections`, a list of [name, offset, length, crc32] whose
+offsets count from the end of the header's CRC. Source: specification of the codec library, container.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+import secrets
+import struct
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from splatwizard_core.coding.array_section import pack_array, unpack_array
+from splatwizard_core.coding.strict_json import dump_strict, load_strict
+from splatwizard_core.errors import BitstreamError
+
+MAGIC = b"SPWZ"
+VERSION = 1
+MAX_HEADER = 1 << 22  # 4 MiB; anything longer belongs into a section
+MAX_SECTIONS = 4096
+NAME = re.compile(r"(?!header$)[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}")  # "header" would clash in the breakdown
+METHOD_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
+PREFIX = struct.Struct("<4sHI")
+CRC = struct.Struct("<I")
+
+
+class ContainerWriter:
+    """Collects sections and writes them as one file.
+
+    method      name of the method that will decode the file
+    version     version of that method's own layout, >= 0
+    raster      what the decoded scene asks of a rasterizer, JSON values, such as {"antialias": False, "sh_degree": 3}
+
+    `static` is a dict of JSON values that goes into the header: fill it in place.
+    """
+
+    def __init__(self, method: str, version: int, *, raster: Mapping[str, Any] | None = None) -> None:
+        if not METHOD_NAME.fullmatch(method):
+            raise ValueError(f"method name {method!r} cannot be written into a file")
+        if isinstance(version, bool) or not 0 <= version < 1 << 31:
+            raise ValueError(f"method version {version!r} is not a small non-negative integer")
+        self.method, self.version = method, version
+        self.raster: dict[str, Any] = dict(raster or {})
+        self.static: dict[str, Any] = {}
+        self._sections: dict[str, bytes] = {}
+
+    def add(self, name: str, data: bytes | bytearray | memoryview) -> None:
+        """Append a section. Raises ValueError if the name is malformed or taken."""
+        if not NAME.fullmatch(name):
+            raise ValueError(f"section name {name!r} must match {NAME.pattern}")
+        if name in self._sections:
+            raise ValueError(f"section '{name}' was already added")
+        if len(self._sections) >= MAX_SECTIONS:
+            raise ValueError(f"a file holds at most {MAX_SECTIONS} sections")
+        self._sections[name] = bytes(data)
+
+    def add_array(self, name: str, array: npt.ArrayLike) -> None:
+        """Append a section that states dtype and shape: bool, (u)int8-64 or float16-64, at most 8 axes."""
+        self.add(name, pack_array(array))
+
+    @property
+    def sections(self) -> dict[str, int]:
+        """Bytes of each section added so far."""
+        return {name: len(data) for name, data in self._sections.items()}
+
+    def to_bytes(self) -> bytes:
+        """The whole file. Raises ValueError if `static` or `raster` hold something that is not JSON data."""
+        table, offset = [], 0
+        for name, data in self._sections.items():
+            table.append([name, offset, len(data), zlib.crc32(data)])
+            offset += len(data)
+        header = dump_strict(
+            {
+                "method": self.method,
+                "method_version": self.version,
+                "raster": self.raster,
+                "static": self.static,
+                "sections": table,
+            }
+        )
+        if len(header) > MAX_HEADER:
+            raise ValueError(f"the header is {len(header):,} bytes, at most {MAX_HEADER:,}: use a section")
+        prefix = PREFIX.pack(MAGIC, VERSION, len(header))
+        return b"".join([prefix, header, CRC.pack(zlib.crc32(header)), *self._sections.values()])
+
+    def write(self, path: str | os.PathLike[str]) -> int:
+        """Write the file and return its size in bytes.
+
+        Atomic: the path holds either what it held before or the complete new file, also after a crash.
+        """
+        data = self.to_bytes()
+        target = Path(path)
+        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+        try:
+            with temporary.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, target)
+        except BaseException:
+            with contextlib.suppress(OSError):
+                temporary.unlink()
+            raise
+        return len(data)
+
+
+class ContainerReader:
+    """A parsed file; everything is checked when it is opened.
+
+    data    the whole file
+    name    what error messages call it
+
+    method, version     which method decodes it, and the version of its layout
+    raster, static      header values, plain JSON data
+    sections            bytes of each section, in file order
+    size                bytes of the whole file = header_bytes + the sum over `sections`
+
+    Raises BitstreamError that names file, section and reason, in time and memory bounded by len(data).
+    """
+
+    def __init__(self, data: bytes, name: str = "file") -> None:
+        self.name = name
+        self.size = len(data)
+        header, start = self._header(data)
+        self.header_bytes = start
+        self.method: str = header["method"]
+        self.version: int = header["method_version"]
+        self.raster: dict[str, Any] = header["raster"]
+        self.static: dict[str, Any] = header["static"]
+        self._payload = self._split(header["sections"], data, start)
+        self.sections: dict[str, int] = {key: len(part) for key, part in self._payload.items()}
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str]) -> ContainerReader:
+        """Read a file. Raises BitstreamError also if the path is not a readable file."""
+        where = Path(path)
+        if not where.is_file():
+            raise BitstreamError(f"{where}: there is no such file")
+        try:
+            with where.open("rb") as file:
+                head = file.read(PREFIX.size)
+                cls._prefix(head, where.name)  # a wrong file is refused before it is read whole
+                data = head + file.read()
+        except OSError as error:
+            raise BitstreamError(f"{where}: cannot be read: {error.strerror}") from error
+        return cls(data, where.name)
+
+    @staticmethod
+    def _prefix(data: bytes, name: str) -> int:
+        """The header length."""
+        if data[:4] != MAGIC[: len(data[:4])] or not data:
+            raise BitstreamError(f"{name}: not a .swz file (it starts with {data[:4]!r}, not {MAGIC!r})")
+        if len(data) < PREFIX.size:
+            raise BitstreamError(f"{name}: {len(data)} bytes are too few for a .swz file: it is truncated")
+        _, version, length = PREFIX.unpack_from(data)
+        if version > VERSION:
+            raise BitstreamError(
+                f"{name}: container version {version} is newer than {VERSION}, the newest that this installation "
+                "reads: upgrade splatwizard-core"
+            )
+        if version < 1:
+            raise BitstreamError(f"{name}: container version {version} does not exist: the file is damaged")
+        if length > MAX_HEADER:
+            raise BitstreamError(f"{name}: header of {length:,} bytes, at most {MAX_HEADER:,} are allowed")
+        return int(length)
+
+    def _header(self, data: bytes) -> tuple[dict[str, Any], int]:
+        length = self._prefix(data[: PREFIX.size], self.name)
+        start = PREFIX.size + length + CRC.size
+        if len(data) < start:
+            raise self._damage(f"the file ends inside its header ({len(data):,} of {start:,} bytes): it is truncated")
+        raw = data[PREFIX.size : PREFIX.size + length]
+        (crc,) = CRC.unpack_from(data, PREFIX.size + length)
+        if zlib.crc32(raw) != crc:
+            raise self._damage("the CRC-32 of the header does not match: the file is damaged", "header")
+        try:
+            header = load_strict(raw)
+        except ValueError as error:
+            raise self._damage(f"header is not acceptable JSON: {error}", "header") from error
+        kinds: dict[str, type] = {
+            "method": str,
+            "method_version": int,
+            "raster": dict,
+            "static": dict,
+            "sections": list,
+        }
+        if not isinstance(header, dict) or set(header) != set(kinds):
+            raise self._damage(f"header must hold exactly {', '.join(kinds)}", "header")
+        for key, kind in kinds.items():
+            if not isinstance(header[key], kind) or isinstance(header[key], bool):
+                raise self._damage(f"header value '{key}' is not of type {kind.__name__}", "header")
+        if not METHOD_NAME.fullmatch(header["method"]) or not 0 <= header["method_version"] < 1 << 31:
+            raise self._damage("header names no valid method and version", "header")
+        return header, start
+
+    def _split(self, table: list[Any], data: bytes, start: int) -> dict[str, bytes]:
+        if len(table) > MAX_SECTIONS:
+            raise self._damage(f"{len(table):,} sections, at most {MAX_SECTIONS} are allowed", "header")
+        payload: dict[str, bytes] = {}
+        position = 0
+        for row in table:
+            if not isinstance(row, list) or len(row) != 4 or not isinstance(row[0], str):
+                raise self._damage("a row of the section table is not [name, offset, length, crc32]", "header")
+            key, *numbers = row
+            if not NAME.fullmatch(key) or key in payload:
+                raise self._damage(f"section name {key[:64]!r} is malformed or appears twice", "header")
+            if any(type(n) is not int or n < 0 for n in numbers) or numbers[0] != position:
+                raise self._damage("offset, length or crc32 make no sense in the section table", key)
+            _, length, crc = numbers
+            part = data[start + position : start + position + length]
+            if len(part) != length:
+                raise self._damage(f"is {len(part):,} bytes, header says {length:,}: the file is truncated", key)
+            if zlib.crc32(part) != crc:
+                raise self._damage("its CRC-32 does not match: the file is damaged", key)
+            payload[key] = part
+            position += length
+        if start + position != len(data):
+            raise self._damage(f"{len(data) - start - position:,} bytes follow the last section: the file is damaged")
+        return payload
+
+    def _damage(self, reason: str, section: str | None = None) -> BitstreamError:
+        if section is None or section == "header":
+            return BitstreamError(f"{self.name}: {reason}", section=section)
+        return BitstreamError(f"{self.name}: section '{section}': {reason}", section=section)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._payload
+
+    def section(self, name: str) -> bytes:
+        """The bytes of a section. Raises BitstreamError if the file has none of that name."""
+        if name not in self._payload:
+            raise self._damage("is missing", name)
+        return self._payload[name]
+
+    @contextlib.contextmanager
+    def decoding(self, name: str) -> Iterator[bytes]:
+        """The bytes of a section for a block that decodes them; what goes wrong in it is blamed on the section.
+
+        BitstreamError, ValueError and their like that leave the block become a BitstreamError which names file,
+        section and reason:
+
+            with reader.decoding("positions") as data:
+                points = codec.decode(data)
+        """
+        data = self.section(name)
+        try:
+            yield data
+        except BitstreamError as error:
+            if error.section is not None:
+                raise
+            raise self._damage(str(error), name) from error
+        except (ValueError, LookupError, ArithmeticError) as error:
+            raise self._damage(f"{type(error).__name__}: {error}", name) from error
+
+    def array(
+        self,
+        name: str,
+        *,
+        dtype: npt.DTypeLike,
+        ndim: int | None = None,
+        shape: Sequence[int | None] | None = None,
+        finite: bool = False,
+    ) -> npt.NDArray[Any]:
+        """An array written by `add_array`, writable, in native byte order.
+
+        dtype   what it must be
+        ndim    how many axes it must have
+        shape   its shape, with None for an axis of any length
+        finite  refuse NaN and infinities (float dtypes)
+
+        Raises BitstreamError if any of that does not hold.
+        """
+        try:
+            found = unpack_array(self.section(name))
+        except ValueError as error:
+            raise self._damage(str(error), name) from error
+        if found.dtype != np.dtype(dtype):
+            raise self._damage(f"dtype is {found.dtype}, must be {np.dtype(dtype)}", name)
+        if ndim is not None and found.ndim != ndim:
+            raise self._damage(f"shape is {list(found.shape)}, must have {ndim} axes", name)
+        if shape is not None and (
+            len(shape) != found.ndim
+            or any(want not in (None, have) for want, have in zip(shape, found.shape, strict=True))
+        ):
+            wanted = ", ".join("any" if n is None else str(n) for n in shape)
+            raise self._damage(f"shape is {list(found.shape)}, must be [{wanted}]", name)
+        if finite and not bool(np.isfinite(found).all()):
+            raise self._damage("holds values that are not finite", name)
+        return found
+
+    def integer(self, key: str, *, low: int, high: int) -> int:
+        """The integer `static[key]` in low..high. Raises BitstreamError if it is missing or outside."""
+        value = self.static.get(key)
+        if type(value) is not int or not low <= value <= high:
+            raise self._damage(f"header value '{key}' is {value!r:.80}, must be an integer in {low}..{high}", "header")
+        return value
+
+    def number(self, key: str, *, low: float, high: float) -> float:
+        """The number `static[key]` in low..high. Raises BitstreamError if it is missing or outside."""
+        value = self.static.get(key)
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not low <= value <= high:
+            raise self._damage(f"header value '{key}' is {value!r:.80}, must be a number in {low}..{high}", "header")
+        return float(value)
+
+    def text(self, key: str, *, choices: Sequence[str]) -> str:
+        """The string `static[key]`, one of `choices`. Raises BitstreamError otherwise."""
+        value = self.static.get(key)
+        if not isinstance(value, str) or value not in choices:
+            raise self._damage(f"header value '{key}' is {value!r:.80}, must be one of {', '.join(choices)}", "header")
+        return value
+
+    def summary(self) -> dict[str, Any]:
+        """What `sw info` prints: identity, requirements, and bytes by section that sum to `size`."""
+        return {
+            "container_version": VERSION,
+            "method": self.method,
+            "method_version": self.version,
+            "raster": self.raster,
+            "static": self.static,
+            "size": self.size,
+            "bytes": {"header": self.header_bytes, **self.sections},
+        }
