@@ -1,0 +1,283 @@
+"""Configuration of a run: defaults -> preset -> rate point -> file -> --set, every key and value checked."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from pydantic import TypeAdapter, ValidationError
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.experiments.keys import block_keys, field_at, flatten, nested, set_at, suggest
+from splatwizard_core.experiments.values import parse_text
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams
+
+if TYPE_CHECKING:
+    from splatwizard_core.experiments.method import Method
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ParamsT = TypeVar("ParamsT", bound=Params)
+
+RESERVED = ("method", "preset", "rate")
+SCENE_KEYS = ("images", "resolution", "test_every", "background", "principal_point", "split", "init_points")
+RATE_ALIASES = ("low", "default", "high", "all")
+
+
+def apply_overrides(config: ParamsT, values: Mapping[str, Any], *, source: str) -> ParamsT:
+    """`config` with some values replaced.
+
+    values  by dotted key; strings are parsed by the field's type ("true", "3e4", "[1, 2]", "none")
+    source  where they come from, for the message: "--set", "preset 'quick'", a file name
+
+    Raises ConfigError for an unknown key (with the nearest valid one) or a bad value.
+    """
+    cls = type(config)
+    content = config.model_dump()
+    for key, value in values.items():
+        annotation = field_at(cls, key)
+        if annotation is None:
+            raise unknown_key(key, block_keys(cls), source)
+        set_at(content, key, _parsed(annotation, key, value, source))
+    try:
+        return cls.model_validate(content)
+    except ValidationError as error:
+        raise _bad_value(error, values, source, block_keys(cls)) from None
+
+
+def _parsed(annotation: Any, key: str, value: Any, source: str) -> Any:
+    if not isinstance(value, str):
+        return value
+    try:
+        return parse_text(annotation, value)
+    except ValueError as error:
+        raise ConfigError(f"bad value '{value}' for '{key}' in {source}: {error}", key=key) from None
+
+
+def _bad_value(
+    error: ValidationError, values: Mapping[str, Any], source: str, described: Mapping[str, str]
+) -> ConfigError:
+    first = error.errors()[0]
+    location = [str(part) for part in first["loc"]]
+    # The culprit is the longest given key that the location starts with; a check over several fields has no location.
+    path = ".".join(location)
+    key = max((k for k in values if path == k or path.startswith(f"{k}.")), key=len, default=path)
+    reason = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    if not key:
+        return ConfigError(f"bad combination of values in {source}: {reason}")
+    value = values.get(key, first.get("input"))
+    about = f" ({described[key]})" if described.get(key) else ""
+    return ConfigError(f"bad value {value!r} for '{key}' in {source}: must be {reason}{about}", key=key)
+
+
+def unknown_key(key: str, known: Mapping[str, str] | Sequence[str], source: str) -> ConfigError:
+    """The error for a key that nothing has: it names the nearest valid one."""
+    near = suggest(key, list(known))
+    hint = f"did you mean '{near}'?" if near else f"the keys are {', '.join(sorted({k.split('.')[0] for k in known}))}"
+    return ConfigError(f"unknown key '{key}' in {source}: {hint}", key=key)
+
+
+@dataclass(frozen=True)
+class ResolvedConfig:
+    """What one run is made with, every value decided.
+
+    method, preset, rate    names
+    config                  the method's hyper-parameters
+    ppl                     run parameters
+    scene                   how the scene is read
+    provenance              dotted key -> "preset 'quick'", "rate 'r2'", a file name or "--set"; absent: the default
+    """
+
+    method: str
+    preset: str
+    rate: str
+    config: OptimizationParams
+    ppl: PipelineParams
+    scene: SceneOptions
+    provenance: Mapping[str, str]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values by block, None included; what the record keeps."""
+        return {
+            "method": self.method,
+            "preset": self.preset,
+            "rate": self.rate,
+            "config": self.config.model_dump(mode="json"),
+            "pipeline": self.ppl.model_dump(mode="json"),
+            "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
+            "provenance": dict(self.provenance),
+        }
+
+    def toml(self) -> str:
+        """A file that makes the same run again when given as `--config`."""
+        import tomli_w
+
+        content: dict[str, Any] = {"method": self.method, "preset": self.preset, "rate": self.rate}
+        # The blocks are merged upwards: first come keys of the method, where both have one.
+        content |= {key: getattr(self.scene, key) for key in SCENE_KEYS}
+        content |= self.ppl.model_dump(mode="json")
+        content |= self.config.model_dump(mode="json")
+        return tomli_w.dumps(_spell_none(content))
+
+    def training_hash(self) -> str:
+        """SHA-256 over everything that training depends on: not the `codec` block, the device or the rate's name."""
+        run = self.ppl.model_dump(mode="json", include={"seed", "random_background", "clamp_render", "raster"})
+        return content_hash(
+            {
+                "method": self.method,
+                "config": self.config.model_dump(mode="json", exclude={"codec"}),
+                "pipeline": run,
+                "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
+            }
+        )
+
+    def config_hash(self) -> str:
+        """SHA-256 over every value of the method, the run and the scene options."""
+        content = self.as_dict()
+        del content["provenance"]
+        return content_hash(content)
+
+
+def content_hash(content: Any) -> str:
+    """SHA-256 over JSON with sorted keys."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _spell_none(value: Any) -> Any:
+    """TOML has no null; the word "none" is parsed back by the field's type."""
+    if value is None:
+        return "none"
+    if isinstance(value, Mapping):
+        return {k: _spell_none(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_spell_none(v) for v in value]
+    return value
+
+
+def rate_points(method: type[Method], asked: str) -> list[str]:
+    """The rate points that "r1,r3", "low", "default", "high" or "all" mean, in the method's order."""
+    names = list(method.RATES)
+    aliases = {"low": [names[0]], "high": [names[-1]], "default": [method.DEFAULT_RATE], "all": names}
+    found: list[str] = []
+    for word in (w.strip() for w in asked.split(",")):
+        if word in aliases:
+            found += aliases[word]
+        elif word in names:
+            found.append(word)
+        else:
+            raise ConfigError(
+                f"method '{method.name}' has no rate point '{word}': "
+                f"one of {', '.join(names)}, or {', '.join(RATE_ALIASES)}",
+                key="rate",
+            )
+    return sorted(set(found), key=names.index)
+
+
+def read_config_file(path: str | Path) -> dict[str, Any]:
+    """The tables of a TOML file. Raises ConfigError that names the line."""
+    try:
+        with open(path, "rb") as file:
+            return tomllib.load(file)
+    except OSError as error:
+        raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path} is not valid TOML: {error}") from error
+
+
+def parse_set(assignments: Sequence[str]) -> dict[str, str]:
+    """`["a.b=1", ...]` -> {"a.b": "1", ...}; a later one wins."""
+    values: dict[str, str] = {}
+    for text in assignments:
+        key, equals, value = text.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set needs key=value, got '{text}'")
+        values[key.strip()] = value.strip()
+    return values
+
+
+def resolve(
+    method: type[Method],
+    preset: str | None = None,
+    rate: str | None = None,
+    config_file: str | Path | None = None,
+    sets: Mapping[str, Any] | None = None,
+    *,
+    default_preset: str = "paper",
+) -> ResolvedConfig:
+    """Every value of a run of `method`: defaults -> preset -> rate point -> file -> sets, the later wins.
+
+    preset, rate    names; None: what the file says, else `default_preset` and the method's DEFAULT_RATE
+    config_file     TOML; keys as in `sets`, tables for blocks, besides the reserved `method`, `preset`, `rate`
+    sets            by dotted key: a key of the method's config, else of PipelineParams, else a scene option
+
+    Raises ConfigError.
+    """
+    tables = read_config_file(config_file) if config_file is not None else {}
+    said = {name: tables.pop(name) for name in RESERVED if name in tables}
+    for name, asked in (("method", method.name), ("preset", preset), ("rate", rate)):
+        if asked is not None and said.get(name, asked) != asked:
+            raise ConfigError(
+                f"{config_file} was written for {name} '{said[name]}', not '{asked}': "
+                f"leave out --{name}, or take the key '{name}' and the values that follow from it out of the file",
+                key=name,
+            )
+    preset = preset or said.get("preset") or default_preset
+    rate = rate or said.get("rate") or method.DEFAULT_RATE
+    if preset not in method.PRESETS:
+        raise ConfigError(
+            f"method '{method.name}' has no preset '{preset}': one of {', '.join(method.PRESETS)}", key="preset"
+        )
+    points = rate_points(method, rate)
+    if len(points) != 1:
+        raise ConfigError(f"one rate point is needed here, not '{rate}'", key="rate")
+    (rate,) = points
+
+    layers: list[tuple[str, Mapping[str, Any]]] = [
+        (f"preset '{preset}'", method.PRESETS[preset]),
+        (f"rate '{rate}'", method.RATES[rate]),
+        (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
+        ("--set", sets or {}),
+    ]
+    config: OptimizationParams = method.Config()
+    ppl, scene = PipelineParams(), SceneOptions()
+    known = {**dict.fromkeys(SCENE_KEYS, ""), **block_keys(PipelineParams), **block_keys(method.Config)}
+    provenance: dict[str, str] = {}
+    for source, values in layers:
+        parts: tuple[dict[str, Any], dict[str, Any], dict[str, Any]] = ({}, {}, {})
+        for key, value in values.items():
+            if field_at(method.Config, key) is not None:
+                parts[0][key] = value
+            elif field_at(PipelineParams, key) is not None:
+                parts[1][key] = value
+            elif key in SCENE_KEYS:
+                parts[2][key] = value
+            else:
+                raise unknown_key(key, known, source)
+            provenance[key] = source
+        config = apply_overrides(config, parts[0], source=source)
+        ppl = apply_overrides(ppl, parts[1], source=source)
+        scene = _scene_options(scene, parts[2], source)
+    scene = dataclasses.replace(scene, seed=ppl.seed)
+    return ResolvedConfig(method.name, preset, rate, config, ppl, scene, provenance)
+
+
+def _scene_options(options: SceneOptions, values: Mapping[str, Any], source: str) -> SceneOptions:
+    hints = {f.name: TypeAdapter(nested(SceneOptions, f.name)) for f in dataclasses.fields(SceneOptions)}
+    changed = {}
+    for key, value in values.items():
+        parsed = _parsed(nested(SceneOptions, key), key, value, source)
+        try:
+            changed[key] = hints[key].validate_python(parsed)
+        except ValidationError as error:
+            raise _bad_value(error, {key: value}, source, {}) from None
+    return dataclasses.replace(options, **changed)

@@ -1,0 +1,107 @@
+"""Dotted keys of nested configuration blocks: which exist, what type they have, which is nearest to a typo."""
+
+from __future__ import annotations
+
+import difflib
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Union
+
+from pydantic import BaseModel
+
+
+def strip(annotation: Any) -> Any:
+    """The type inside Annotated[...]."""
+    while typing.get_origin(annotation) is Annotated:
+        annotation = typing.get_args(annotation)[0]
+    return annotation
+
+
+def members(annotation: Any) -> tuple[Any, ...]:
+    """The alternatives of a union (NoneType among them), or the one type."""
+    annotation = strip(annotation)
+    if typing.get_origin(annotation) in (Union, types.UnionType):
+        return tuple(strip(a) for a in typing.get_args(annotation))
+    return (annotation,)
+
+
+def block_of(annotation: Any) -> type[BaseModel] | None:
+    """The block class of a field that holds one, else None."""
+    for member in members(annotation):
+        if isinstance(member, type) and issubclass(member, BaseModel):
+            return member
+    return None
+
+
+def nested(cls: type, name: str) -> Any:
+    """The resolved annotation of a dataclass field."""
+    return typing.get_type_hints(cls)[name]
+
+
+def block_keys(cls: type[BaseModel], prefix: str = "") -> dict[str, str]:
+    """Dotted key -> description of every leaf."""
+    found: dict[str, str] = {}
+    for name, field in cls.model_fields.items():
+        inner = block_of(field.annotation)
+        if inner is not None:
+            found |= block_keys(inner, f"{prefix}{name}.")
+        else:
+            found[prefix + name] = field.description or ""
+    return found
+
+
+def field_at(cls: type[BaseModel], key: str) -> Any:
+    """The type that stands at a dotted key; None if there is no such key. Keys of a dict field are free."""
+    annotation: Any = cls
+    for part in key.split("."):
+        block = block_of(annotation)
+        if block is not None:
+            if part not in block.model_fields:
+                return None
+            annotation = block.model_fields[part].annotation
+            continue
+        mapping = next((m for m in members(annotation) if typing.get_origin(m) is dict), None)
+        if mapping is None:
+            return None
+        annotation = typing.get_args(mapping)[1]
+    return annotation
+
+
+def set_at(content: dict[str, Any], key: str, value: Any) -> None:
+    """Put a value at a dotted key of nested dicts."""
+    *path, last = key.split(".")
+    for part in path:
+        if not isinstance(content.get(part), dict):
+            content[part] = {}
+        content = content[part]
+    content[last] = value
+
+
+def flatten(cls: type[BaseModel], tables: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested tables as dotted keys, as deep as `cls` has blocks; what it does not know stays as it is."""
+    found: dict[str, Any] = {}
+    for name, value in tables.items():
+        field = cls.model_fields.get(name)
+        inner = block_of(field.annotation) if field is not None else None
+        if inner is not None and isinstance(value, Mapping):
+            found |= flatten(inner, value, f"{prefix}{name}.")
+        elif field is None and isinstance(value, Mapping) and prefix:
+            found |= {f"{prefix}{name}.{k}": v for k, v in value.items()}
+        else:
+            found[prefix + name] = value
+    return found
+
+
+def suggest(key: str, known: Sequence[str]) -> str | None:
+    """The nearest valid key: one that ends in it, or one that is spelt like it."""
+    ends = [k for k in known if k.endswith(f".{key}")]
+    if ends:
+        return ends[0]
+    near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    if near:
+        return near[0]
+    leaf = key.rpartition(".")[2]
+    leaves = {k.rpartition(".")[2]: k for k in known}
+    near = difflib.get_close_matches(leaf, list(leaves), n=1, cutoff=0.75)
+    return leaves[near[0]] if near else None

@@ -1,0 +1,203 @@
+"""The one progress display: a bar with rate, loss, Gaussian count and ETA on a terminal, plain lines elsewhere.
+
+Everything goes to stderr, so that stdout stays clean for results and `--json`.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from typing import TYPE_CHECKING, Any, TextIO
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+REFRESH_SECONDS = 0.1  # a bar is redrawn at most ten times a second
+LINE_SECONDS = 5.0  # a plain line appears at most this often
+RATE_WINDOW_SECONDS = 20.0  # the rate is that of the last seconds: models grow while they train
+
+# Nested displays share the outer one's screen lines.
+_display: ContextVar[Progress | None] = ContextVar("splatwizard_progress", default=None)
+
+
+class Bar:
+    """What `track` hands out. `advance` is cheap: it draws only when enough time has passed.
+
+    label   what is being done
+    total   steps in all; None if unknown
+    start   steps done before (a resumed run); they do not count for the rate
+    """
+
+    def __init__(self, label: str, total: int | None, start: int, *, unit: str, stream: TextIO) -> None:
+        self.label, self.total, self.unit = label, total, unit
+        self.start = self.done = start
+        self._stream = stream
+        self._fields: dict[str, Any] = {}
+        self._began = self._drawn = time.monotonic()
+        self._marks: deque[tuple[float, int]] = deque([(self._began, start)])
+        self._lines = 0
+
+    def advance(self, steps: int = 1, **fields: Any) -> None:
+        """Count `steps` and remember what to show beside them.
+
+        fields  loss=..., gaussians=..., or any name: numbers or one-element tensors, read only when drawn
+        """
+        self.done += steps
+        if fields:
+            self._fields.update(fields)
+        now = time.monotonic()
+        if now - self._drawn >= self._interval:
+            self._drawn = now
+            self._mark(now)
+            self._draw()
+
+    @property
+    def rate(self) -> float | None:
+        """Steps per second over the last seconds, or None before the first step."""
+        (t0, n0), now = self._marks[0], time.monotonic()
+        return (self.done - n0) / (now - t0) if self.done > n0 and now > t0 else None
+
+    @property
+    def seconds_left(self) -> float | None:
+        rate = self.rate
+        return None if self.total is None or not rate else max(self.total - self.done, 0) / rate
+
+    def facts(self) -> str:
+        """Rate and fields: `8.1 it/s · loss 0.0345 · 120,331 Gaussians`."""
+        rate = self.rate
+        shown = (
+            [] if rate is None else [f"{rate:.1f} {self.unit}/s" if rate >= 0.1 else f"{1 / rate:.0f} s/{self.unit}"]
+        )
+        for name, value in self._fields.items():
+            if name == "gaussians":
+                shown.append(f"{int(value):,} Gaussians")
+            elif isinstance(value, str):
+                shown.append(f"{name} {value}")
+            elif isinstance(value, int):
+                shown.append(f"{name} {value:,}")
+            else:
+                shown.append(f"{name} {float(value):.4g}")
+        return " · ".join(shown)
+
+    _interval = LINE_SECONDS
+
+    def _mark(self, now: float) -> None:
+        self._marks.append((now, self.done))
+        while len(self._marks) > 2 and now - self._marks[1][0] > RATE_WINDOW_SECONDS:
+            self._marks.popleft()
+
+    def _draw(self) -> None:
+        count = f"{self.done:,}" if self.total is None else f"{self.done:,}/{self.total:,}"
+        left = self.seconds_left
+        parts = [f"{self.label}: {count}", self.facts(), "" if not left else f"{duration(left)} left"]
+        print(" · ".join(p for p in parts if p), file=self._stream, flush=True)
+        self._lines += 1
+
+    def _finish(self) -> None:
+        seconds = time.monotonic() - self._began
+        if self._lines == 0 and seconds < 1.0:  # a line for each blink of an eye is noise
+            return
+        self._marks = deque([(self._began, self.start)])
+        facts = self.facts()
+        print(
+            f"{self.label}: {self.done:,} in {duration(seconds)}" + (f" · {facts}" if facts else ""),
+            file=self._stream,
+            flush=True,
+        )
+
+
+class _RichBar(Bar):
+    """The same on a terminal."""
+
+    _interval = REFRESH_SECONDS
+
+    def __init__(self, display: Progress, label: str, total: int | None, start: int, *, unit: str) -> None:
+        super().__init__(label, total, start, unit=unit, stream=sys.stderr)
+        self._progress = display
+        self._task: TaskID = display.add_task(label, total=total, completed=start, facts="", left="")
+
+    def _draw(self) -> None:
+        left = self.seconds_left
+        self._progress.update(
+            self._task,
+            completed=self.done,
+            facts=self.facts(),
+            left="" if left is None else f"{duration(left)} left",
+            refresh=True,
+        )
+
+    def _finish(self) -> None:
+        self._marks = deque([(self._began, self.start)])
+        self._progress.update(
+            self._task, completed=self.done, facts=self.facts(), left=f"in {duration(time.monotonic() - self._began)}"
+        )
+        self._progress.refresh()
+
+
+@contextmanager
+def track(
+    label: str, *, total: int | None = None, start: int = 0, unit: str = "it", stream: TextIO | None = None
+) -> Iterator[Bar]:
+    """Show the progress of one long step.
+
+        with track("train 3dgs", total=7000, start=1200) as bar:
+            bar.advance(1, loss=0.03, gaussians=120_331)
+
+    label   what is being done
+    total   steps in all, `start` included; None if unknown
+    start   steps that an earlier run did
+    unit    of the rate: "it", "views"
+    stream  where to (default: stderr)
+    """
+    out = stream or sys.stderr
+    if not out.isatty():
+        bar = Bar(label, total, start, unit=unit, stream=out)
+        yield bar
+        bar._finish()
+        return
+    outer = _display.get()
+    if outer is not None:
+        nested = _RichBar(outer, label, total, start, unit=unit)
+        try:
+            yield nested
+        finally:
+            outer.remove_task(nested._task)
+        return
+    display = _make_display(out)
+    token = _display.set(display)
+    try:
+        with display:
+            bar = _RichBar(display, label, total, start, unit=unit)
+            yield bar
+            bar._finish()
+    finally:
+        _display.reset(token)
+
+
+def _make_display(out: TextIO) -> Progress:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=24),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[facts]}", markup=False),
+        TextColumn("{task.fields[left]}", style="cyan", markup=False),
+        console=Console(file=out),
+        auto_refresh=False,
+    )
+
+
+def duration(seconds: float) -> str:
+    """`12.3 s`, `4 min 05 s`, `2 h 03 min`."""
+    if seconds < 60:
+        return f"{seconds:.1f} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
