@@ -1,1 +1,5 @@
-"""native room."""
+"""Native modules: compiled kernels, found prebuilt, in the cache, or compiled on first use."""
+
+from splatwizard_core.native.loader import BuildRow, NativeModule, build_all, cache_root
+
+__all__ = ["BuildRow", "NativeModule", "build_all", "cache_root"]

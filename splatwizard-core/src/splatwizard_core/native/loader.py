@@ -1,0 +1,428 @@
+"""Native modules: C++ (later CUDA) sources that ship with a package, found prebuilt, cached, or compiled on first use.
+
+A module registers its ops with TORCH_LIBRARY in one thin binding file; after `load()` they are at torch.ops.<name>.
+Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
+SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, MAX_JOBS.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import json
+import logging
+import os
+import platform
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatwizard_core.errors import NativeBuildError
+from splatwizard_core.native import toolchain
+from splatwizard_core.native.build_lock import build_lock
+from splatwizard_core.native.toolchain import Job, Toolchain
+
+if TYPE_CHECKING:
+    from splatwizard_core.plugins.manager import PluginManager
+
+log = logging.getLogger(__name__)
+
+BUILD_TIMEOUT = 600.0
+MARCHES = ("native", "portable")
+CORE_MODULES = ("splatwizard_core.training.native:TRAINING",)
+
+Say = Callable[[str], None]
+
+
+def cache_root() -> Path:
+    """Where this user's caches are: $SPLATWIZARD_CACHE, else the platform's cache folder."""
+    chosen = os.environ.get("SPLATWIZARD_CACHE")
+    if chosen:
+        return Path(chosen).expanduser()
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "splatwizard"
+    if sys.platform == "win32":
+        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "splatwizard"
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatwizard"
+
+
+@dataclass
+class _Session:
+    """What this process knows of a module; a loaded library cannot be unloaded, so it belongs to the process."""
+
+    loaded: Path | None = None
+    error: NativeBuildError | None = None
+    warned: bool = False
+
+
+@dataclass(frozen=True)
+class NativeModule:
+    """One shared library with torch ops, described by its sources.
+
+    name            also the TORCH_LIBRARY namespace: the ops are torch.ops.<name>.*
+    package         import package whose folder the paths below are relative to
+    sources         C++ files compiled once: the binding file
+    kernels         C++ files compiled once per instruction set, in `namespace SW_ARCH` (<splatwizard/dispatch.h>);
+                    they see no torch header
+    headers         every header that the files above include from the package; globs are allowed
+    cuda_sources    .cu files, compiled (with SW_WITH_CUDA defined everywhere) only if torch has CUDA and nvcc is there
+    cflags          more flags for sources and kernels, `cuda_cflags` for cuda_sources, `ldflags` for the linker
+    seconds         about how long it takes to compile, told to the user
+    without         what happens without this module, told to the user when it cannot be built
+    """
+
+    name: str
+    package: str
+    sources: tuple[str, ...]
+    headers: tuple[str, ...] = ()
+    cuda_sources: tuple[str, ...] = ()
+    cflags: tuple[str, ...] = ()
+    kernels: tuple[str, ...] = ()
+    cuda_cflags: tuple[str, ...] = ()
+    ldflags: tuple[str, ...] = ()
+    seconds: int = 30
+    without: str = ""
+    _session: _Session = field(default_factory=_Session, init=False, repr=False, compare=False)
+
+    def load(self, *, say: Say | None = None) -> None:
+        """Make torch.ops.<name> usable: prebuilt, cached, or compiled now with a line of progress through `say`.
+
+        Raises NativeBuildError with the reason and what to do; a second call raises it again without compiling.
+        """
+        if self._session.loaded is not None:
+            return
+        if self._session.error is not None:
+            raise self._session.error
+        try:
+            self._session.loaded = self._load(say or _say)
+        except NativeBuildError as error:
+            self._session.error = error
+            raise
+
+    def try_load(self) -> bool:
+        """Load, and say whether it worked; if not, warn once in this process. For code that has a torch fallback."""
+        try:
+            self.load()
+        except NativeBuildError as error:
+            if not self._session.warned and not _disabled():
+                log.warning("%s", error)
+            self._session.warned = True
+            return False
+        return True
+
+    def available(self) -> str | None:
+        """Why `load` would fail, or None. Compiles nothing: a compiler that is there is taken to work."""
+        if self._session.loaded is not None:
+            return None
+        if self._session.error is not None:
+            return str(self._session.error)
+        if _disabled():
+            return "native code is switched off by SPLATWIZARD_NATIVE=0"
+        try:
+            if next(self._existing(), None) is None:
+                toolchain.find_compiler()
+        except NativeBuildError as error:
+            return str(error)
+        return None
+
+    def state(self) -> dict[str, Any]:
+        """Facts for `sw doctor`: name, state (prebuilt, cached, not built), loaded, path, target (cpu, cuda)."""
+        found = next(self._existing(), None)
+        path = self._session.loaded or found
+        state = "not built"
+        if path is not None:
+            state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
+        return {
+            "name": self.name,
+            "state": state,
+            "loaded": self._session.loaded is not None,
+            "path": None if path is None else str(path),
+            "target": "cuda" if self._with_cuda() else "cpu",
+        }
+
+    def build(
+        self,
+        *,
+        march: str = "native",
+        folder: Path | None = None,
+        force: bool = False,
+        tools: Toolchain | None = None,
+        say: Say | None = None,
+    ) -> Path:
+        """Compile ahead of time and return the library's path; if it is there already and `force` is False, that one.
+
+        march       "native": for this machine's CPU. "portable": for any, with run-time dispatch on x86-64
+        folder      where it goes; None: this user's cache. `prebuilt_folder` ships with the package
+        tools       shares its limit on concurrent compilers between modules
+        Raises NativeBuildError.
+        """
+        folder = self.cache_folder if folder is None else folder
+        library = self._library(folder, march)
+        say = say or _say
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with build_lock(library.with_suffix(".lock"), timeout=_timeout(), say=say):
+                if force or not _intact(library):
+                    self._compile(library, march, tools or Toolchain(), say)
+        except NativeBuildError as error:
+            raise NativeBuildError(self._explain(error)) from error
+        except OSError as error:
+            raise NativeBuildError(
+                self._explain(f"cannot write {folder} ({error.strerror}): set SPLATWIZARD_CACHE to a writable folder")
+            ) from error
+        return library
+
+    @property
+    def prebuilt_folder(self) -> Path:
+        """Where a wheel, or `sw build-kernels --portable`, puts the library."""
+        return self._root() / "prebuilt"
+
+    @property
+    def cache_folder(self) -> Path:
+        return cache_root() / "native"
+
+    def key(self, march: str) -> str:
+        """Digest of all that the binary depends on: torch, CUDA or cpu, ABI, CPU if native, flags, the sources."""
+        import torch
+
+        digest = hashlib.sha256()
+        facts: list[object] = [
+            self.name, str(torch.__version__), toolchain.common_flags(), platform.system(), platform.machine(), march,
+            toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "",
+            self.cflags, self.ldflags,
+        ]  # fmt: skip
+        if self._with_cuda():
+            facts += [torch.version.cuda, toolchain.cuda_architectures(), self.cuda_cflags]
+        digest.update(repr(facts).encode())
+        for path in self._files():
+            try:
+                content = path.read_bytes()
+            except OSError as error:
+                raise NativeBuildError(f"kernel source {path} of '{self.name}' cannot be read: {error}") from error
+            digest.update(f"\0{path.name}\0{len(content)}\0".encode() + content)
+        return digest.hexdigest()[:16]
+
+    def _load(self, say: Say) -> Path:
+        if _disabled():
+            raise NativeBuildError(self._explain("native code is switched off by SPLATWIZARD_NATIVE=0"))
+        for library in self._existing():
+            try:
+                _load_library(library)
+                return library
+            except (OSError, RuntimeError) as error:
+                log.debug("%s does not load: %s", library, error)
+        library = self.build(force=_intact(self._library(self.cache_folder, "native")), say=say)
+        try:
+            _load_library(library)
+        except (OSError, RuntimeError) as error:
+            raise NativeBuildError(self._explain(f"{library} was compiled but does not load: {error}")) from error
+        return library
+
+    def _existing(self) -> Iterator[Path]:
+        """Undamaged libraries for this machine and these sources, best first."""
+        for folder in (self.prebuilt_folder, self.cache_folder):
+            for march in MARCHES:
+                library = self._library(folder, march)
+                if _intact(library):
+                    yield library
+
+    def _library(self, folder: Path, march: str) -> Path:
+        return folder / f"{self.name}-{self.key(march)}.so"
+
+    def _root(self) -> Path:
+        spec = importlib.util.find_spec(self.package)
+        if spec is None or not spec.submodule_search_locations:
+            raise NativeBuildError(f"native module '{self.name}': package '{self.package}' is not a folder on disk")
+        return Path(next(iter(spec.submodule_search_locations)))
+
+    def _files(self) -> list[Path]:
+        """All files that the binary is made from, in a fixed order."""
+        root = self._root()
+        cuda = self.cuda_sources if self._with_cuda() else ()
+        headers = [p for pattern in self.headers for p in (sorted(root.glob(pattern)) or [root / pattern])]
+        shared = sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))
+        return [*(root / s for s in (*self.sources, *self.kernels, *cuda)), *headers, *shared]
+
+    def _with_cuda(self) -> bool:
+        import torch
+
+        return bool(self.cuda_sources) and torch.version.cuda is not None and toolchain.find_nvcc() is not None
+
+    def _jobs(self, march: str, objects: Path) -> list[Job]:
+        root, cuda = self._root(), self._with_cuda()
+        variants = toolchain.arch_variants(march)
+        shared = [*toolchain.common_flags(), *(("-DSW_WITH_CUDA",) if cuda else ())]
+        if "arch_v2" in variants:
+            shared.append("-DSW_PORTABLE_X86")
+        # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
+        lowest = next(iter(variants.values()))
+        binding = (*shared, *lowest, *toolchain.include_flags(torch_headers=True, cuda=cuda), *self.cflags)
+        kernel = (*shared, *toolchain.include_flags(torch_headers=False, cuda=False), *self.cflags)
+        jobs = [Job(root / s, objects / f"{i}.o", binding) for i, s in enumerate(self.sources)]
+        # Lowest level first: of inline functions that several objects emit the linker keeps the first, and that
+        # one must run on every machine.
+        for arch, flags in variants.items():
+            jobs += [
+                Job(root / s, objects / f"{arch}-{i}.o", (*kernel, *flags, f"-DSW_ARCH={arch}"))
+                for i, s in enumerate(self.kernels)
+            ]
+        if cuda:
+            gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in _plain(toolchain.cuda_architectures())]
+            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode)
+            flags = (*flags, *toolchain.include_flags(torch_headers=False, cuda=False), *self.cuda_cflags)
+            jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
+        return jobs
+
+    def _compile(self, library: Path, march: str, tools: Toolchain, say: Say) -> None:
+        say(f"compiling kernels '{self.name}' (once, about {self.seconds} s) ...")
+        started = time.monotonic()
+        build_log = library.with_suffix(".log")
+        build_log.unlink(missing_ok=True)
+        with tempfile.TemporaryDirectory(dir=library.parent, prefix=f".{self.name}-") as scratch:
+            jobs = self._jobs(march, Path(scratch))
+            built = Path(scratch) / library.name
+            try:
+                tools.compile(jobs, build_log)
+                tools.link([j.output for j in jobs], built, build_log, cuda=self._with_cuda(), ldflags=self.ldflags)
+            except NativeBuildError as error:
+                raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
+            self._check_headers(jobs)
+            seconds = round(time.monotonic() - started, 1)
+            facts = {"sha256": _digest(built), "seconds": seconds, "compiler": tools.version(), "march": march}
+            os.replace(built, library)
+            side = Path(scratch) / "facts.json"
+            side.write_text(json.dumps(facts), encoding="utf-8")
+            os.replace(side, library.with_suffix(".json"))
+        say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
+
+    def _check_headers(self, jobs: list[Job]) -> None:
+        """A header of the package that is not declared would let a stale build pass for a fresh one."""
+        root = self._root().resolve()
+        known = {p.resolve() for p in self._files()}
+        for job in jobs:
+            for path in toolchain.read_dependencies(Path(f"{job.output}.d")):
+                resolved = path.resolve()
+                if resolved.is_relative_to(root) and resolved not in known:
+                    raise NativeBuildError(
+                        f"{job.source.name} includes {resolved.relative_to(root)}, which the module does not declare: "
+                        "add it to headers"
+                    )
+
+    def _explain(self, reason: object) -> str:
+        text = f"kernels '{self.name}' are not available: {reason}"
+        return f"{text}\nwithout them: {self.without}" if self.without else text
+
+
+@dataclass(frozen=True)
+class BuildRow:
+    """What `build_all` did with one module. state: built, up to date, or failed; `error` says why."""
+
+    name: str
+    state: str
+    seconds: float
+    path: Path | None
+    error: str | None = None
+
+
+def declared_modules(plugins: PluginManager) -> dict[str, str]:
+    """Target "module:attribute" -> who declares it: the core's own, then every registry entry with `native`."""
+    targets = dict.fromkeys(CORE_MODULES, "splatwizard-core")
+    for registry in plugins.registries.values():
+        for entry in registry:
+            declared = entry.declared.get("native") or ()
+            for target in (declared,) if isinstance(declared, str) else declared:
+                targets.setdefault(target, entry.distribution)
+    return targets
+
+
+def resolve_module(target: str) -> NativeModule:
+    """The NativeModule that "module:attribute" names. Raises NativeBuildError."""
+    module, _, attribute = target.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute)
+    except Exception as error:
+        raise NativeBuildError(f"native module {target} cannot be imported: {type(error).__name__}: {error}") from error
+    if not isinstance(found, NativeModule):
+        raise NativeBuildError(f"{target} is not a NativeModule but {type(found).__name__}")
+    return found
+
+
+def build_all(
+    plugins: PluginManager,
+    *,
+    march: str = "native",
+    into_packages: bool = False,
+    force: bool = False,
+    jobs: int | None = None,
+    say: Say | None = None,
+) -> list[BuildRow]:
+    """Build the core's and all plugins' native modules; one row each, in the order of `declared_modules`.
+
+    march, force    as for `NativeModule.build`
+    into_packages   put the libraries beside their packages' sources instead of into the user's cache
+    jobs            most compilers at once, over all modules; None: the cores
+    A module that fails has its reason in its row and stops no other one.
+    Raises CompilerMissingError if there is no compiler.
+    """
+    tools = Toolchain(jobs)
+
+    def build(target: str) -> BuildRow:
+        started = time.monotonic()
+        try:
+            module = resolve_module(target)
+            folder = module.prebuilt_folder if into_packages else module.cache_folder
+            fresh = not force and _intact(module._library(folder, march))
+            path = module.build(march=march, folder=folder, force=force, tools=tools, say=say)
+        except NativeBuildError as error:
+            return BuildRow(target, "failed", time.monotonic() - started, None, str(error))
+        return BuildRow(module.name, "up to date" if fresh else "built", time.monotonic() - started, path)
+
+    targets = list(declared_modules(plugins))
+    with ThreadPoolExecutor(max_workers=len(targets)) as pool:
+        return list(pool.map(build, targets))
+
+
+def _say(message: str) -> None:
+    """Progress to whoever sits at the terminal; logging would hide it unless configured."""
+    sys.stderr.write(f"{message}\n")
+    sys.stderr.flush()
+
+
+def _load_library(library: Path) -> None:
+    import torch
+
+    torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
+
+
+def _disabled() -> bool:
+    return os.environ.get("SPLATWIZARD_NATIVE", "1").strip().lower() in ("0", "off", "no", "false")
+
+
+def _timeout() -> float:
+    try:
+        return float(os.environ.get("SPLATWIZARD_BUILD_TIMEOUT", BUILD_TIMEOUT))
+    except ValueError:
+        return BUILD_TIMEOUT
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _intact(library: Path) -> bool:
+    """Whether the file is what the build wrote. A truncated library may load and crash the process later."""
+    try:
+        facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
+        return isinstance(facts, dict) and facts.get("sha256") == _digest(library)
+    except (OSError, ValueError):
+        return False
+
+
+def _plain(architectures: list[str]) -> list[str]:
+    return [a.replace(".", "") for a in architectures]

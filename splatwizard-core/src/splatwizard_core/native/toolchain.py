@@ -1,0 +1,214 @@
+"""Drives the compilers: finds them, knows the flags, compiles in parallel, and makes their errors readable.
+
+Not torch.utils.cpp_extension: that gives one set of flags to all files of a module, needs ninja and setuptools,
+and waits for ever on the lock of a dead process. What is left to know is the two lists of paths below.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+import threading
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatwizard_core.errors import NativeBuildError
+
+SHARED_INCLUDE = Path(__file__).parent / "include"
+SHOWN_LINES = 10
+COMPILERS = ("g++", "c++", "clang++")
+
+# namespace of the kernels -> flags, for a binary that runs on any x86-64 of the last fifteen years
+X86_LEVELS = {
+    "arch_v2": ("-march=x86-64-v2",),
+    "arch_v3": ("-march=x86-64-v3",),
+    # 512: GCC otherwise keeps to 256-bit vectors on AVX-512 machines, half the speed on current server cores.
+    "arch_v4": ("-march=x86-64-v4", "-mprefer-vector-width=512"),
+}
+
+
+class CompilerMissingError(NativeBuildError):
+    """There is no compiler on this machine."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One file to compile: command line without compiler, where the object goes."""
+
+    source: Path
+    output: Path
+    flags: tuple[str, ...]
+    cuda: bool = False
+
+
+def cores() -> int:
+    """How many compilers may run at once: $MAX_JOBS, else the cores that this process may use."""
+    limit = os.environ.get("MAX_JOBS", "")
+    if limit.isdigit() and int(limit) > 0:
+        return int(limit)
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def find_compiler() -> list[str]:
+    """The C++ compiler's command: $CXX, else the first of g++, c++, clang++. Raises CompilerMissingError."""
+    chosen = os.environ.get("CXX", "").strip()
+    if chosen:
+        command = shlex.split(chosen)
+        if shutil.which(command[0]) is None:
+            raise CompilerMissingError(f"$CXX is '{chosen}', which is not there: unset CXX or correct it")
+        return command
+    for name in COMPILERS:
+        if shutil.which(name) is not None:
+            return [name]
+    raise CompilerMissingError(
+        "no C++ compiler was found (looked for g++, c++ and clang++): install one, on Debian or Ubuntu with "
+        "`sudo apt install g++`"
+    )
+
+
+def find_nvcc() -> str | None:
+    """The CUDA compiler, from $CUDA_HOME, $CUDA_PATH, the PATH or /usr/local/cuda; None if there is none."""
+    for home in (os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH")):
+        if home and (Path(home) / "bin" / "nvcc").is_file():
+            return str(Path(home) / "bin" / "nvcc")
+    default = Path("/usr/local/cuda/bin/nvcc")
+    return shutil.which("nvcc") or (str(default) if default.is_file() else None)
+
+
+def cuda_architectures() -> list[str]:
+    """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and newer."""
+    import torch
+
+    listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
+    if listed:
+        return sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
+    if torch.cuda.is_available():
+        found = {torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())}
+        return sorted(f"{major}.{minor}" for major, minor in found)
+    return ["8.0"]
+
+
+def cpu_identity() -> str:
+    """What -march=native depends on: the CPU's feature list."""
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        return platform.processor() or platform.machine()
+    # Model too: the compiler tunes for it.
+    wanted = ("flags", "Features", "model name", "CPU part")
+    facts = {}
+    for line in text.split("\n\n", 1)[0].splitlines():
+        key, _, value = line.partition(":")
+        if key.strip() in wanted:
+            facts[key.strip()] = " ".join(sorted(value.split()))
+    return repr(sorted(facts.items()))
+
+
+def common_flags() -> tuple[str, ...]:
+    """C++ flags of every file."""
+    import torch
+
+    flags = ["-std=c++20", "-O3", "-fPIC", f"-D_GLIBCXX_USE_CXX11_ABI={int(torch._C._GLIBCXX_USE_CXX11_ABI)}"]
+    if sys.platform != "darwin":  # Apple's compiler has no OpenMP; at::parallel_for then runs on one thread.
+        flags.append("-fopenmp")
+    return tuple(flags)
+
+
+def include_flags(*, torch_headers: bool, cuda: bool) -> tuple[str, ...]:
+    import torch
+
+    paths = [SHARED_INCLUDE]
+    if torch_headers:
+        base = Path(torch.__file__).parent / "include"
+        paths += [base, base / "torch" / "csrc" / "api" / "include"]
+    nvcc = find_nvcc() if cuda else None
+    if nvcc is not None:
+        paths.append(_cuda_home(nvcc) / "include")
+    return tuple(flag for path in paths for flag in ("-isystem", str(path)))
+
+
+def arch_variants(march: str) -> dict[str, tuple[str, ...]]:
+    """Kernel namespace -> flags, for march "native" (this machine) or "portable" (any machine of this kind)."""
+    if march == "native":
+        wide = ("-mprefer-vector-width=512",) if platform.machine() in ("x86_64", "AMD64") else ()
+        return {"arch_native": ("-march=native", *wide)}
+    if march == "portable":
+        return dict(X86_LEVELS) if platform.machine() in ("x86_64", "AMD64") else {"arch_native": ()}
+    raise ValueError(f"march is '{march}'; it must be 'native' or 'portable'")
+
+
+class Toolchain:
+    """Runs compilers, at most `jobs` at a time over all modules that share this object."""
+
+    def __init__(self, jobs: int | None = None) -> None:
+        self.jobs = jobs or cores()
+        self._slots = threading.Semaphore(self.jobs)
+        self.compiler = find_compiler()
+
+    def version(self) -> str:
+        result = subprocess.run([*self.compiler, "--version"], capture_output=True, text=True, check=False)
+        return result.stdout.partition("\n")[0]
+
+    def compile(self, jobs: Sequence[Job], log: Path) -> None:
+        """Compile all files. Raises NativeBuildError with the first compiler error; everything goes to `log`."""
+        with ThreadPoolExecutor(max_workers=max(1, len(jobs))) as pool:
+            futures = [pool.submit(self._run, self._command(job), log) for job in jobs]
+            errors = [f.exception() for f in futures]
+        for error in errors:
+            if error is not None:
+                raise error
+
+    def _command(self, job: Job) -> list[str]:
+        compiler = [str(find_nvcc())] if job.cuda else self.compiler
+        return [*compiler, *job.flags, "-MD", "-MF", f"{job.output}.d", "-c", str(job.source), "-o", str(job.output)]
+
+    def link(self, objects: Iterable[Path], output: Path, log: Path, *, cuda: bool, ldflags: Sequence[str]) -> None:
+        """Link a shared library against torch's libraries."""
+        import torch
+
+        libraries = ["-L", str(Path(torch.__file__).parent / "lib"), "-ltorch", "-ltorch_cpu", "-lc10"]
+        nvcc = find_nvcc() if cuda else None
+        if nvcc is not None:
+            libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(_cuda_home(nvcc) / "lib64"), "-lcudart"]
+        extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
+        self._run([*self.compiler, "-shared", *map(str, objects), "-o", str(output), *extra, *libraries, *ldflags], log)
+
+    def _run(self, command: list[str], log: Path) -> None:
+        with self._slots:
+            result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
+        text = result.stdout.decode("utf-8", errors="replace")
+        with open(log, "a", encoding="utf-8") as handle:
+            handle.write(f"$ {shlex.join(command)}\n{text}\n")
+        if result.returncode < 0:
+            raise NativeBuildError(
+                f"the compiler was killed by signal {-result.returncode} (out of memory?): try again with MAX_JOBS=1"
+            )
+        if result.returncode != 0:
+            raise NativeBuildError(_excerpt(text))
+
+
+def _excerpt(text: str) -> str:
+    """The part of the compiler's output that says what is wrong: from the first error on, or the last lines."""
+    lines = text.rstrip().splitlines()
+    first = next((i for i, line in enumerate(lines) if re.search(r"\b(error|fatal|undefined)\b", line)), None)
+    shown = lines[first : first + SHOWN_LINES] if first is not None else lines[-SHOWN_LINES:]
+    return "\n".join(f"  {line}" for line in shown)
+
+
+def read_dependencies(path: Path) -> list[Path]:
+    """The files that one compilation read, from the compiler's make rule."""
+    rule = path.read_text(encoding="utf-8").replace("\\\n", " ")
+    return [Path(p.replace("\\ ", " ")) for p in re.split(r"(?<!\\)\s+", rule.partition(": ")[2].strip()) if p]
+
+
+def _cuda_home(nvcc: str) -> Path:
+    return Path(nvcc).resolve().parent.parent
