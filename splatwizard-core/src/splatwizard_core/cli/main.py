@@ -1,0 +1,146 @@
+"""The command `sw`: finds its subcommands lazily and turns errors into one line and an exit status."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from typing import Any
+
+import click
+
+from splatwizard_core.errors import PluginError, SplatwizardError
+
+COMMANDS = {
+    "run": "splatwizard_core.cli.run:run",
+    "train": "splatwizard_core.cli.train:train",
+    "encode": "splatwizard_core.cli.codec:encode",
+    "decode": "splatwizard_core.cli.codec:decode",
+    "eval": "splatwizard_core.cli.evaluate:evaluate",
+    "render": "splatwizard_core.cli.render:render",
+    "export": "splatwizard_core.cli.export:export",
+    "info": "splatwizard_core.cli.info:info",
+    "list-plugins": "splatwizard_core.cli.list_plugins:list_plugins",
+    "schedule": "splatwizard_core.cli.schedule:schedule",
+    "data": "splatwizard_core.cli.data:data",
+    "build-kernels": "splatwizard_core.cli.build_kernels:build_kernels",
+}
+SIGPIPE_STATUS = 141  # what a shell reports of a program whose reader has gone
+
+
+class LazyGroup(click.Group):
+    """A group whose own commands are imported when asked for; plugins add theirs through `register_commands`."""
+
+    _plugins_asked = False
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        self.ask_plugins()
+        return [*COMMANDS, *sorted(self.commands)]
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        target = COMMANDS.get(cmd_name)
+        if target is not None:
+            module, _, attribute = target.partition(":")
+            command: click.Command = getattr(importlib.import_module(module), attribute)
+            return command
+        self.ask_plugins()
+        return super().get_command(ctx, cmd_name)
+
+    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
+        """Called by plugins. Raises PluginError for a name that is taken."""
+        taken = name or cmd.name
+        if taken in COMMANDS or taken in self.commands:
+            raise PluginError(f"command '{taken}' already exists")
+        super().add_command(cmd, name)
+
+    def ask_plugins(self) -> None:
+        """Let every plugin add its commands, once."""
+        if not self._plugins_asked:
+            from splatwizard_core.plugins import load_plugins
+
+            self._plugins_asked = True
+            load_plugins().register_commands(self)
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        import difflib
+
+        try:
+            return super().resolve_command(ctx, args)
+        except click.UsageError as error:
+            near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
+            hint = f"did you mean '{near[0]}'?" if near else "`sw --help` lists all"
+            raise click.UsageError(f"no command '{args[0]}': {hint}", ctx) from error
+
+
+def _version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
+    if value and not ctx.resilient_parsing:
+        import importlib.metadata
+
+        click.echo(importlib.metadata.version("splatwizard-core"))
+        ctx.exit()
+
+
+@click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
+@click.option(
+    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Print the version."
+)
+@click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails (any command).")
+def cli() -> None:
+    """Splatwizard: train, compress, decode and measure 3D Gaussian Splatting scenes, any method, one protocol.
+
+    Methods, rasterizers and codecs come from installed plugins: see `sw list-plugins`.
+    """
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run `sw` and return its exit status: 0, 2 wrong input, 1 failure, 130 interrupted."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    debug = "--debug" in arguments
+    logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
+    for noisy in ("PIL", "torch", "matplotlib"):
+        logging.getLogger(noisy).setLevel(logging.WARNING)
+    try:
+        status = cli.main(args=arguments, prog_name="sw", standalone_mode=False)
+        sys.stdout.flush()
+    except BaseException as error:
+        return _report(error, debug=debug)
+    return status if isinstance(status, int) else 0
+
+
+def _report(error: BaseException, *, debug: bool) -> int:
+    """One or two lines on stderr, and the exit status that the error leads to."""
+    if isinstance(error, BrokenPipeError):
+        # Nobody reads any more; keep the interpreter from complaining when it flushes at its end.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return SIGPIPE_STATUS
+    if debug and not isinstance(error, (click.ClickException, click.Abort, SystemExit)):
+        traceback.print_exception(error)
+    if isinstance(error, SystemExit):
+        return error.code if isinstance(error.code, int) else int(error.code is not None)
+    if isinstance(error, (KeyboardInterrupt, click.Abort)):
+        _say("interrupted; the same command resumes")
+        return 130
+    if isinstance(error, click.ClickException):
+        error.show()
+        return error.exit_code
+    if isinstance(error, SplatwizardError):
+        _say(f"error: {error}")
+        return error.exit_status
+    if not debug:
+        text = " ".join(str(error).split())
+        _say(f"error: {type(error).__name__}: {text:.500} (a traceback: add --debug)")
+    return 1
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
+
+
+def exit_with(status: Any) -> None:
+    """Leave the running command with this status."""
+    click.get_current_context().exit(status)

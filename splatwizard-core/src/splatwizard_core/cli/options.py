@@ -1,0 +1,107 @@
+"""Options that several commands share, and how facts are printed."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+scene_option = click.option(
+    "--scene",
+    default="demo",
+    show_default=True,
+    metavar="SCENE",
+    help="A folder (COLMAP, Blender, ...; the format is detected), `demo`, or `dataset/scene` under $SPLATWIZARD_DATA.",
+)
+images_option = click.option(
+    "--images",
+    metavar="FOLDER",
+    help="Picture folder of a COLMAP scene, such as images_2.  [default: the data set's own]",
+)
+method_option = click.option(
+    "--method",
+    "-m",
+    default=None,
+    metavar="NAME",
+    help="Method, see `sw list-plugins`.  [default: 3dgs, or what --config says]",
+)
+preset_option = click.option(
+    "--preset", metavar="NAME", help="Named values of the method.  [default: paper; quick on the demo scene]"
+)
+rate_option = click.option(
+    "--rate", metavar="NAME", help="Rate point: r1 (smallest file) .. rN, or low, default, high.  [default: default]"
+)
+config_option = click.option(
+    "--config",
+    "config_file",
+    type=click.Path(dir_okay=False),
+    help="TOML file of values; one from a run directory repeats that run.",
+)
+set_option = click.option(
+    "--set", "sets", multiple=True, metavar="KEY=VALUE",
+    help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
+)  # fmt: skip
+device_option = click.option(
+    "--device",
+    type=click.Choice(["auto", "cpu", "cuda"]),
+    help="Where to compute.  [default: auto, CUDA if its kernels can run]",
+)
+seed_option = click.option("--seed", type=click.IntRange(min=0), help="Of every random stream.  [default: 0]")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
+debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")
+resume_option = click.option(
+    "--resume/--fresh", default=True, show_default=True,
+    help="Go on from the last checkpoint and skip finished steps, or discard what --out holds and start over.",
+)  # fmt: skip
+changed_plan_option = click.option(
+    "--allow-changed-plan", is_flag=True,
+    help="Resume although the plan or configuration differs from the checkpoint's; the difference is printed.",
+)  # fmt: skip
+
+
+def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
+    """Several option decorators as one; they appear in `--help` in this order."""
+
+    def apply(function: F) -> F:
+        for decorator in reversed(decorators):
+            function = decorator(function)
+        return function
+
+    return apply
+
+
+def assignments(sets: Sequence[str], **named: Any) -> dict[str, Any]:
+    """The values of --set together with those that have an option of their own (None: not given)."""
+    from splatwizard_core.errors import ConfigError
+    from splatwizard_core.experiments.config import parse_set
+
+    values: dict[str, Any] = dict(parse_set(sets))
+    for key, value in named.items():
+        if value is None:
+            continue
+        if key in values and str(values[key]) != str(value):
+            raise ConfigError(f"--{key} {value} contradicts --set {key}={values[key]}: give one of them", key=key)
+        values[key] = value
+    return values
+
+
+def print_json(content: Any) -> None:
+    """One JSON object on stdout; not-a-number never appears in it."""
+    click.echo(json.dumps(content, indent=2, allow_nan=False))
+
+
+def console() -> Console:
+    """Where tables go; plain text if stdout is no terminal."""
+    import sys
+
+    from rich.console import Console
+
+    # A pipe has no width: 80 columns would break tables that are meant to be searched.
+    return Console(highlight=False, width=None if sys.stdout.isatty() else 160)
