@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
+from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 
@@ -77,6 +77,7 @@ class StageContext:
     model       the model as the stage before left it (or as `Method.create_model` made it)
     scene       the scene
     ppl         run parameters
+    rasterizer  what the trainer renders with; a stage whose loss renders too (a teacher) keeps it
     generator   (stream name) -> an independent seeded torch.Generator: "init", "split", "method", ...
     trained     (method name) -> a frozen, trained model of this scene, from the cache or trained first;
                 for stages that start from, or are taught by, a trained 3DGS scene
@@ -85,6 +86,7 @@ class StageContext:
     model: SplatModel
     scene: Scene
     ppl: PipelineParams
+    rasterizer: Rasterizer
     generator: Callable[[str], torch.Generator]
     trained: Callable[[str], SplatModel]
 
