@@ -71,7 +71,7 @@ def _print(found: dict[str, Any]) -> None:
             by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]))
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if row["error"]:
-            lines.append(f"[red]broken: {escape(row['broken'])}[/red]")
+            lines.append(f"[red]broken: {escape(row['error'])}[/red]")
         table.add_row(escape(row["distribution"]), row["version"], "\n".join(lines) or "-")
     out.print(table)
     for clash in found["clashes"]:
