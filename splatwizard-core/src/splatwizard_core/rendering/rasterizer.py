@@ -9,6 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
 
+from splatwizard_core.errors import CapabilityError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.scene.camera import Camera
 
@@ -309,3 +310,20 @@ def required_features(g: GaussianInputs, opt: RasterOptions) -> Feature:
 def feature_names(features: Feature) -> frozenset[str]:
     """{"BACKWARD", ...} for a set of flags."""
     return frozenset(f.name for f in Feature if f in features and f.name is not None)
+
+
+def check_offered(info: RasterizerInfo, required: Feature) -> None:
+    """Raise CapabilityError unless `info` declares everything in `required`; rasterizers call it first."""
+    wanted = feature_names(required)
+    missing = wanted - info.features
+    if missing:
+        raise CapabilityError(
+            f"rasterizer '{info.name}' does not offer {', '.join(sorted(missing))}; "
+            "`sw list-plugins` shows which one does",
+            missing=missing,
+        )
+    for combo in info.combos_forbidden:
+        if combo <= wanted:
+            raise CapabilityError(
+                f"rasterizer '{info.name}' does not offer {' and '.join(sorted(combo))} together", missing=combo
+            )

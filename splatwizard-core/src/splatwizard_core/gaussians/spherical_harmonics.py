@@ -1,0 +1,90 @@
+"""Real spherical harmonics up to degree 3, in the sign convention of 3DGS."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import ShapeError
+
+C0 = 0.28209479177387814
+C1 = 0.4886025119029199
+C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
+C3 = (
+    -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
+    -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
+)  # fmt: skip
+MAX_DEGREE = 3
+
+
+def num_coefficients(degree: int) -> int:
+    """K = (degree + 1)^2."""
+    return (degree + 1) ** 2
+
+
+def degree_of(num: int) -> int:
+    """The degree that has `num` coefficients. Raises ShapeError if none up to 3 has."""
+    for degree in range(MAX_DEGREE + 1):
+        if num_coefficients(degree) == num:
+            return degree
+    raise ShapeError(f"{num} SH coefficients belong to no degree from 0 to {MAX_DEGREE}; expected 1, 4, 9 or 16")
+
+
+def rgb_to_dc(rgb: Tensor) -> Tensor:
+    """The degree-0 coefficient whose colour is `rgb` from every side; any shape."""
+    return (rgb - 0.5) / C0
+
+
+def dc_to_rgb(dc: Tensor) -> Tensor:
+    """Inverse of `rgb_to_dc`, not clamped."""
+    return dc * C0 + 0.5
+
+
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
+    """Values of the basis functions B_k, [N,3] unit vectors -> [N,(degree+1)^2]. Source: 3DGS (arXiv 2308.04079)."""
+    x, y, z = directions.unbind(-1)
+    basis = [torch.full_like(x, C0)]
+    if degree >= 1:
+        basis += [-C1 * y, C1 * z, -C1 * x]
+    if degree >= 2:
+        xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
+        basis += [C2[0] * xy, C2[1] * yz, C2[2] * (2 * zz - xx - yy), C2[3] * xz, C2[4] * (xx - yy)]
+    if degree >= 3:
+        basis += [
+            C3[0] * y * (3 * xx - yy),
+            C3[1] * xy * z,
+            C3[2] * y * (4 * zz - xx - yy),
+            C3[3] * z * (2 * zz - 3 * xx - 3 * yy),
+            C3[4] * x * (4 * zz - xx - yy),
+            C3[5] * z * (xx - yy),
+            C3[6] * x * (xx - 3 * yy),
+        ]
+    return torch.stack(basis, dim=-1)
+
+
+def eval_sh(sh: Tensor, directions: Tensor, active_degree: int) -> Tensor:
+    """Sum of the active bands, without the 0.5 that makes it a colour; differentiable.
+
+    sh             [N,K,3], K = 1, 4, 9 or 16
+    directions     [N,3] unit vectors, from the camera to the Gaussian
+    active_degree  bands above it are ignored and get exactly zero gradient; capped by what K holds
+
+    Returns [N,3]. Raises ShapeError if K is no square of 1 to 4.
+    """
+    if sh.dim() != 3 or sh.shape[-1] != 3:
+        raise ShapeError(f"sh must be [N,K,3], got {list(sh.shape)}", actual=sh.shape, expected=("N", "K", 3))
+    degree = min(active_degree, degree_of(sh.shape[1]))
+    basis = sh_basis(directions, degree)  # [N, k]
+    return (basis[:, :, None] * sh[:, : basis.shape[1]]).sum(dim=1)
+
+
+def view_colors(sh: Tensor, means: Tensor, center: Tensor, active_degree: int, *, clamp: bool = True) -> Tensor:
+    """Colours as seen from `center`: max(0, 0.5 + SH), [N,3]; differentiable in `sh` and `means`.
+
+    sh      [N,K,3];  means [N,3] world units;  center [3] camera centre, world units, not on a mean
+    clamp   False leaves negative values (sensitivity passes)
+    """
+    directions = torch.nn.functional.normalize(means - center, dim=-1)
+    raw = eval_sh(sh, directions, active_degree) + 0.5
+    # clamp's gradient passes at raw == 0, as the specification wants.
+    return raw.clamp(min=0) if clamp else raw

@@ -1,0 +1,211 @@
+"""The pure-torch rasterizer: the oracle that every kernel is held against, and the fallback where none can be built.
+
+Values follow specs of 3DGS to the letter; gradients come from autograd, not from hand-derived formulas.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import torch
+from torch import Tensor
+
+from splatwizard_core import builtin
+from splatwizard_core.errors import ConfigError, ShapeError
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.gaussians.spherical_harmonics import view_colors
+from splatwizard_core.plugins.registry import Registry
+from splatwizard_core.rendering.compositing import Splats, composite, tile_lists
+from splatwizard_core.rendering.negotiation import info_from_entry
+from splatwizard_core.rendering.projection import CLASSIC_TILE, Projection, project, visible_radii
+from splatwizard_core.rendering.rasterizer import (
+    AccumOutput,
+    GradBuffer,
+    RasterizerInfo,
+    RasterOptions,
+    RasterStats,
+    RenderResult,
+    check_offered,
+    required_features,
+)
+from splatwizard_core.rendering.scores import merge_scores, score_dtype, view_scores
+from splatwizard_core.scene.camera import Camera
+
+PROFILES = ("3dgs", "dgr-exact")
+
+
+def _declared() -> RasterizerInfo:
+    registry = Registry("rasterizer")
+    builtin.register_rasterizers(registry)
+    return info_from_entry(registry.entry("reference"))
+
+
+class ReferenceRasterizer:
+    """Standard 3DGS in pure torch: float32 and float64, CPU and CUDA, bounded memory, slow.
+
+    classic_tiles   also cut each splat at the original's square of 16x16 tiles (3 sigma). The default draws the exact
+                    support, alpha >= 1/255, wherever it reaches. Profile "dgr-exact" implies it, and takes over the
+                    original's gradients through the alpha clamp and the Jacobian clamp.
+    tile            side of the tiles that are blended together, pixels; changes speed only
+
+    In both cases a Gaussian is culled where the original culls it (radii == 0).
+    """
+
+    info: RasterizerInfo = _declared()
+
+    def __init__(self, *, classic_tiles: bool = False, tile: int = 8) -> None:
+        self.classic_tiles = classic_tiles
+        self.tile = tile
+
+    def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
+        """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
+        self._check(g, opt)
+        cam = cam.to(g.means.device, g.means.dtype)
+        quirks = opt.profile == "dgr-exact"
+        classic = self.classic_tiles or quirks
+        p = project(g, cam, opt, dgr_gradient=quirks)
+        order = torch.argsort(p.depth.detach(), stable=True)  # ties by index: rows ascend
+        tile = CLASSIC_TILE if classic else self.tile
+        lists = tile_lists(p, order, cam.width, cam.height, tile, classic=classic)
+
+        u, grad2d, absgrad2d, probe = _watch_screen_gradient(p, g, cam, opt)
+        colors = _colors(g, p.rows, cam, opt)
+        depths = self._depth_channels(p, opt)
+        channels = [colors, *depths.values()]
+        if g.features is not None:
+            channels.append(g.features[p.rows])
+        packed = torch.cat([u, p.conic, p.opacity[:, None], probe, *channels], dim=1)[order]
+        num_features = 0 if g.features is None else g.features.shape[1]
+        splats = Splats(
+            packed,
+            num_channels=packed.shape[1] - 8,
+            detached=num_features if opt.features_detach_geometry else 0,
+            depth=p.depth[order] if "median" in opt.depth else None,
+            pass_clamp=quirks or opt.clamp_grad == "pass",
+            absgrad=opt.absgrad,
+        )
+        drawn = composite(splats, lists, cam.width, cam.height)
+
+        num_colors = colors.shape[1]
+        background = _background(opt, num_colors, cam, g.means)
+        alpha = 1 - drawn.T[None]
+        depth = {name: drawn.channels[num_colors + i][None] for i, name in enumerate(depths)}
+        if "expected" in opt.depth:
+            depth["expected"] = depth["accumulated"] / alpha.clamp(min=1e-10)
+        if drawn.median is not None:
+            depth["median"] = drawn.median[None]
+        scores = {}
+        if opt.scores:
+            per_splat = view_scores(opt.scores, splats, lists, num_colors, background)
+            for spec in opt.scores:
+                full = torch.zeros(len(g), dtype=torch.float64, device=g.means.device)
+                full[p.rows[order]] = per_splat[spec.name]
+                scores[spec.name] = full.to(score_dtype(spec))
+        return RenderResult(
+            image=drawn.channels[:num_colors] + drawn.T * background,
+            radii=p.radii,
+            inputs=g,
+            alpha=alpha if opt.alpha else None,
+            depth={name: depth[name] for name in sorted(opt.depth)},
+            features=drawn.channels[-num_features:] if num_features else None,
+            grad2d=grad2d,
+            absgrad2d=absgrad2d,
+            scores=scores,
+            stats=RasterStats(
+                n_visible=len(p.rows),
+                n_pairs=len(lists.splats),
+                n_evaluated=drawn.n_evaluated,
+                n_blended=drawn.n_blended,
+                n_pixels=cam.width * cam.height,
+                n_invalid=p.n_invalid,
+            ),
+        )
+
+    @torch.no_grad()
+    def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
+        """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
+        g.validate()
+        return visible_radii(g, cam.to(g.means.device, g.means.dtype), RasterOptions())
+
+    @torch.no_grad()
+    def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
+        """Sum the scores over views ("blend_max": their maximum)."""
+        totals = {s.name: torch.zeros(len(g), dtype=score_dtype(s), device=g.means.device) for s in opt.scores}
+        for cam in cams:
+            view = self.render(g, cam, opt).scores
+            for spec in opt.scores:
+                totals[spec.name] = merge_scores(spec, totals[spec.name], view[spec.name])
+        return AccumOutput(totals)
+
+    def _check(self, g: GaussianInputs, opt: RasterOptions) -> None:
+        g.validate()
+        check_offered(self.info, required_features(g, opt))
+        if opt.profile not in PROFILES:
+            raise ConfigError(
+                f"rasterizer 'reference' knows no profile '{opt.profile}'; one of {', '.join(PROFILES)}",
+                key="raster.profile",
+            )
+        if opt.clamp_grad not in ("exact", "pass"):
+            raise ConfigError(f"clamp_grad is '{opt.clamp_grad}', must be 'exact' or 'pass'")
+
+    @staticmethod
+    def _depth_channels(p: Projection, opt: RasterOptions) -> dict[str, Tensor]:
+        """Depth maps that are sums of one value a splat, [V,1] each."""
+        channels = {}
+        if opt.depth & {"accumulated", "expected"}:
+            channels["accumulated"] = p.depth[:, None]
+        if "inverse" in opt.depth:
+            channels["inverse"] = 1 / p.depth[:, None]
+        return channels
+
+
+def _colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) -> Tensor:
+    """[V,C]: precomputed colours as they are, or spherical harmonics seen from the camera."""
+    if g.colors is not None:
+        return g.colors[rows]
+    assert g.sh is not None
+    return view_colors(g.sh.to_dense()[rows], g.means[rows], cam.center, g.sh.active_degree, clamp=opt.clamp_color)
+
+
+def _background(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor:
+    """[C,H,W]."""
+    if opt.background is None:
+        return like.new_zeros(channels, cam.height, cam.width)
+    background = opt.background.to(like)
+    if background.shape == (channels,):
+        return background[:, None, None].expand(channels, cam.height, cam.width)
+    if background.shape == (channels, cam.height, cam.width):
+        return background
+    raise ShapeError(
+        f"background must be [{channels}] or [{channels}, {cam.height}, {cam.width}], got {list(background.shape)}",
+        actual=background.shape,
+        expected=(channels, cam.height, cam.width),
+    )
+
+
+def _watch_screen_gradient(
+    p: Projection, g: GaussianInputs, cam: Camera, opt: RasterOptions
+) -> tuple[Tensor, GradBuffer | None, GradBuffer | None, Tensor]:
+    """(u, buffer of dL/du, buffer of sum |dL/du|, probe [V,2]); the buffers are filled by hooks in NDC units."""
+    u, probe = p.u, torch.zeros_like(p.u)
+    to_ndc = u.new_tensor([cam.width / 2, cam.height / 2])
+
+    def watch(x: Tensor) -> GradBuffer:
+        buffer = GradBuffer()
+
+        def store(gradient: Tensor) -> None:
+            buffer.set(gradient.new_zeros(len(g), 2).index_copy(0, p.rows, gradient * to_ndc))
+
+        x.register_hook(store)
+        return buffer
+
+    grad2d = absgrad2d = None
+    if torch.is_grad_enabled():
+        if opt.grad2d:
+            if not u.requires_grad:
+                u = u.detach().requires_grad_()
+            grad2d = watch(u)
+        if opt.absgrad:
+            probe.requires_grad_()
+            absgrad2d = watch(probe)
+    return u, grad2d, absgrad2d, probe
