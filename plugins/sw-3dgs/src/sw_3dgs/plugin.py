@@ -1,3 +1,25 @@
-"""What this package provides."""
+"""What this package provides: the method 3dgs, and its schedule tasks for any method that wants them."""
 
-from splatwizard_core.plugins import Registry, hookimpl  # noqa: F401
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("3dgs", "sw_3dgs.method:ThreeDGS",
+                 summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised")  # fmt: skip
+
+
+@hookimpl
+def register_tasks(registry: Registry) -> None:
+    registry.add("update-lr", "sw_3dgs.tasks:UpdateLearningRate",
+                 summary="exponential decay of the means' step size, times the scene extent", factory=True)  # fmt: skip
+    registry.add("increase-sh-degree", "sw_3dgs.tasks:increase_sh_degree",
+                 summary="activate one more band of spherical harmonics", factory=False)  # fmt: skip
+    registry.add("collect-gradient-statistics", "sw_3dgs.tasks:collect_gradient_statistics",
+                 summary="add up screen-space gradients (needs grad2d)", factory=False)  # fmt: skip
+    registry.add("collect-absgrad-statistics", "sw_3dgs.tasks:collect_absgrad_statistics",
+                 summary="add up absolute screen-space gradients (needs absgrad)", factory=False)  # fmt: skip
+    registry.add("prune-and-densify", "sw_3dgs.tasks:PruneAndDensify",
+                 summary="clone, split and prune Gaussians by those statistics", factory=True)  # fmt: skip
+    registry.add("reset-opacity", "sw_3dgs.tasks:ResetOpacity",
+                 summary="lower every opacity to at most 0.01", factory=True)  # fmt: skip

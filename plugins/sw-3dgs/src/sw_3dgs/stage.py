@@ -1,0 +1,124 @@
+"""How 3DGS trains: the one stage that other methods start from, extend, or take over whole."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.training.losses import photometric_loss
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+from splatwizard_core.training.stage import LossPack, Stage, StageContext
+
+from sw_3dgs import tasks
+from sw_3dgs.config import ThreeDGSConfig
+
+if TYPE_CHECKING:
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.rendering.rasterizer import RenderResult
+    from splatwizard_core.scene.scene import Scene, View
+    from splatwizard_core.training.params import OptimizationParams, PipelineParams
+    from splatwizard_core.training.scheduler import Scheduler
+    from torch import Tensor
+
+PLAN_STEPS = 30_000
+"""The length of the published plan, which `scale_schedule` scales from."""
+
+
+class ThreeDGSStage(Stage):
+    """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
+
+    name = "3dgs"
+
+    def __init__(self, opt: ThreeDGSConfig) -> None:
+        super().__init__(opt)
+        self.config = opt
+        self.white = False  # known when the stage begins; a plan can be printed without a scene
+
+    def scaled(self, steps: int) -> int:
+        """A plan bound in steps of this run (the same, unless the schedule is scaled with the iterations)."""
+        if not self.config.scale_schedule:
+            return steps
+        return round(steps * self.config.iterations / PLAN_STEPS)
+
+    def scaled_interval(self, steps: int) -> int:
+        """An interval likewise, never below one step."""
+        return max(1, self.scaled(steps))
+
+    def begin(self, context: StageContext) -> SplatModel:
+        self.white = context.scene.protocol.background == "white"
+        model = context.model
+        if hasattr(model, "split_seed"):
+            model.split_seed = context.generator("split").initial_seed()
+        return model
+
+    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        lr = self.config.lr
+        return SplatOptimizer(
+            model,
+            [
+                ParamGroup("means", lr=lr.position_init * scene.extent),
+                ParamGroup("sh_dc", lr=lr.sh_dc),
+                ParamGroup("sh_rest", lr=lr.sh_rest),
+                ParamGroup("opacity_logits", lr=lr.opacity),
+                ParamGroup("log_scales", lr=lr.scales),
+                ParamGroup("quats", lr=lr.quats),
+            ],
+        )
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        lr = self.config.lr
+        max_steps = self.scaled_interval(lr.max_steps)
+        update_lr = tasks.UpdateLearningRate(
+            init=lr.position_init,
+            final=lr.position_final,
+            max_steps=max_steps,
+            delay_steps=self.scaled(lr.position_delay_steps),
+            delay_mult=lr.position_delay_mult,
+        )
+        scheduler.register_task(range(max_steps), update_lr, name="update lr")
+        scheduler.register_task(
+            range(0, max_steps, self.scaled_interval(self.config.sh_interval)),
+            tasks.increase_sh_degree,
+            name="increase SH degree",
+        )
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        densify = self.config.densify
+        stop = self.scaled(densify.stop)
+        reset_interval = self.scaled_interval(densify.reset_interval)
+        scheduler.register_task(
+            range(stop),
+            tasks.collect_absgrad_statistics if densify.absgrad else tasks.collect_gradient_statistics,
+            name="collect gradient statistics",
+        )
+        prune_and_densify = tasks.PruneAndDensify(
+            grad_threshold=densify.grad_threshold,
+            percent_dense=densify.percent_dense,
+            min_opacity=densify.min_opacity,
+            world_prune=densify.world_prune,
+            size_rules_after=reset_interval,
+            prune_screen_px=densify.prune_screen_px,
+            revised_opacity=densify.revised_opacity,
+            reset_interval=reset_interval,
+            pause_after_reset=self.scaled(densify.pause_after_reset),
+        )
+        scheduler.register_task(
+            range(self.scaled(densify.start), stop, self.scaled_interval(densify.interval)),
+            prune_and_densify,
+            name="prune and densify",
+        )
+        reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
+        if self.white and densify.white_reset > 0:
+            # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
+            scheduler.register_task(
+                self.scaled_interval(densify.white_reset), reset_opacity, name="reset opacity (white background)"
+            )
+        scheduler.register_task(range(0, stop, reset_interval), reset_opacity, name="reset opacity")
+
+    def raster_options(self, step: int, background: Tensor) -> RasterOptions:
+        absgrad = self.config.densify.absgrad
+        return RasterOptions(background=background, grad2d=not absgrad, absgrad=absgrad)
+
+    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
+        truth = view.image(background, result.image.device)
+        return photometric_loss(result.image, truth, lambda_dssim=self.config.loss.lambda_dssim)
