@@ -1,0 +1,188 @@
+"""Image quality of a model over views, by the registered metrics."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import BitstreamError, CapabilityError, PluginError, SceneError
+from splatwizard_core.evaluation.image import prepare_render
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.progress import track
+from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
+from splatwizard_core.scene.camera import Camera
+from splatwizard_core.scene.scene import View
+
+Metric = Callable[[Tensor, Tensor], float]
+
+# What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
+RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}
+
+
+@dataclass(frozen=True)
+class MetricResult:
+    """One metric over the views.
+
+    mean        over the views; None if unknown, or infinite
+    per_view    in the order of the views; None where the value is infinite (identical images)
+    direction   "higher" or "lower" is better
+    reason      why there is no mean, else None
+    """
+
+    mean: float | None
+    per_view: list[float | None]
+    direction: str
+    reason: str | None = None
+
+
+@dataclass(frozen=True)
+class EvaluationResult:
+    """Quality over views.
+
+    views               names
+    metrics             by registry name
+    visible_gaussians   mean over the views of the number with radius > 0
+    drawn_gaussians     mean over the views of the number handed to the rasterizer
+    """
+
+    views: list[str]
+    metrics: dict[str, MetricResult]
+    visible_gaussians: float
+    drawn_gaussians: float
+    renders: list[str] = field(default_factory=list)
+
+
+def render_options(raster: Mapping[str, Any], background: Tensor | None) -> RasterOptions:
+    """How a decoded scene is drawn: what its file asks for, on `background` [3].
+
+    Raises BitstreamError if the file asks for it with a value that makes no sense.
+    """
+    asked: dict[str, Any] = {}
+    for key, kind in RASTER_KEYS.items():
+        if key not in raster:
+            continue
+        value = raster[key]
+        if kind is float and type(value) in (int, float) and 0 <= value < math.inf:
+            value = float(value)
+        elif kind is float or type(value) is not kind:
+            raise BitstreamError(f"the file asks for rasterizer option {key} = {value!r:.80}, which makes no sense")
+        asked[key] = value
+    return RasterOptions(background=background, **asked)
+
+
+def raster_header(options: RasterOptions) -> dict[str, Any]:
+    """The inverse of `render_options`: what of `options` belongs into the file, since it changes the picture."""
+    default = RasterOptions()
+    return {key: getattr(options, key) for key in RASTER_KEYS if getattr(options, key) != getattr(default, key)}
+
+
+def render_view(model: SplatModel, camera: Camera, rasterizer: Rasterizer, options: RasterOptions) -> RenderResult:
+    """Draw one view without gradients."""
+    with torch.no_grad():
+        return rasterizer.render(model.gaussians(camera, rasterizer), camera, options)
+
+
+def evaluate(
+    model: SplatModel,
+    views: Sequence[View],
+    rasterizer: Rasterizer,
+    plugins: PluginManager,
+    *,
+    options: RasterOptions,
+    quantize8: bool = True,
+    metrics: Sequence[str] | None = None,
+    save_to: Path | None = None,
+    label: str = "evaluate",
+) -> EvaluationResult:
+    """Draw every view at the size of its picture and compare.
+
+    options     as `render_options` makes them; their background is also that of RGBA pictures
+    quantize8   round renders to 8 bit before comparing
+    metrics     names from the registry; None: every one that is installed
+    save_to     folder for the renders as PNG, named after the views; None: they are not kept
+
+    A metric that cannot be imported or says CapabilityError (weights missing, say) is left unknown, with its reason.
+    Raises SceneError without a view.
+    """
+    if not views:
+        raise SceneError("there is no view to evaluate on")
+    wanted = {name: plugins.metrics.entry(name) for name in (plugins.metrics.names if metrics is None else metrics)}
+    functions: dict[str, Metric] = {}
+    missing: dict[str, str] = {}
+    for name, entry in wanted.items():
+        try:
+            functions[name] = entry.load()
+        except PluginError as error:
+            missing[name] = str(error)
+    values: dict[str, list[float]] = {name: [] for name in wanted}
+    visible = drawn = 0
+    saved: list[str] = []
+    pending: list[Future[None]] = []
+    device = model.device
+    if save_to is not None:
+        save_to.mkdir(parents=True, exist_ok=True)
+    with track(label, total=len(views), unit="views") as bar, ThreadPoolExecutor(1) as writer:
+        for view, file_name in zip(views, png_names([v.name for v in views]), strict=True):
+            result = render_view(model, view.camera.to(device), rasterizer, options)
+            image = prepare_render(result.image, quantize8=quantize8)
+            truth = view.image(options.background, device)
+            for name, function in functions.items():
+                if name in missing:
+                    continue
+                try:
+                    values[name].append(float(function(image, truth)))
+                except CapabilityError as error:
+                    missing[name] = str(error)
+            visible += int(result.visible.sum())
+            drawn += len(result.inputs)
+            if save_to is not None:
+                saved.append(file_name)
+                pending.append(writer.submit(save_png, image.cpu(), save_to / file_name))
+            bar.advance(1, **({"PSNR": values["psnr"][-1]} if values.get("psnr") else {}))
+    for written in pending:
+        written.result()  # a full disk must not pass unseen
+    return EvaluationResult(
+        views=[v.name for v in views],
+        metrics={
+            name: _summary(values[name], str(entry.declared.get("direction", "higher")), missing.get(name))
+            for name, entry in wanted.items()
+        },
+        visible_gaussians=visible / len(views),
+        drawn_gaussians=drawn / len(views),
+        renders=saved,
+    )
+
+
+def _summary(values: list[float], direction: str, missing: str | None) -> MetricResult:
+    if missing is not None:
+        return MetricResult(None, [], direction, missing)
+    finite = [v if math.isfinite(v) else None for v in values]
+    if None in finite:
+        return MetricResult(None, finite, direction, "infinite in at least one view (identical images)")
+    return MetricResult(sum(values) / len(values), finite, direction)
+
+
+def png_names(views: Sequence[str]) -> list[str]:
+    """File names for the renders of views: no folders, and unique also where stems are not."""
+    flat = [name.replace("/", "__").replace(os.sep, "__") for name in views]
+    stems = [name.rsplit(".", 1)[0] for name in flat]
+    return [f"{stem if stems.count(stem) == 1 else name}.png" for name, stem in zip(flat, stems, strict=True)]
+
+
+def save_png(image: Tensor, path: Path) -> None:
+    """Write [3,H,W] in 0..1 as 8-bit PNG, atomically."""
+    from PIL import Image
+
+    pixels = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
+    temporary = path.with_name(f".{path.name}.tmp")
+    Image.fromarray(pixels).save(temporary, format="PNG")
+    os.replace(temporary, path)
