@@ -1,0 +1,61 @@
+"""One Adam step on one tensor: a compiled kernel on the CPU, torch operations everywhere else."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import ShapeError
+from splatwizard_core.training.native import TRAINING
+
+
+@torch.no_grad()
+def adam_step(
+    param: Tensor,
+    grad: Tensor,
+    exp_avg: Tensor,
+    exp_avg_sq: Tensor,
+    *,
+    lr: float,
+    beta1: float,
+    beta2: float,
+    eps: float,
+    step: int,
+) -> None:
+    """Update `param`, `exp_avg` and `exp_avg_sq` in place, densely; the same numbers as torch.optim.Adam to 1e-6.
+
+    param, grad, exp_avg, exp_avg_sq    any shape, alike
+    step                                of this update, from 1
+
+    Raises ShapeError if the shapes differ.
+    Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
+    """
+    for name, tensor in (("grad", grad), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
+        if tensor.shape != param.shape:
+            raise ShapeError(
+                f"{name} is {list(tensor.shape)}, the parameter {list(param.shape)}",
+                actual=tensor.shape,
+                expected=tuple(param.shape),
+            )
+    if step < 1:
+        raise ValueError(f"Adam's step counts from 1, got {step}")
+    if _fused(param, grad, exp_avg, exp_avg_sq):
+        torch.ops.splatwizard_training.adam(param, grad.contiguous(), exp_avg, exp_avg_sq, lr, beta1, beta2, eps, step)
+        # The kernel writes behind autograd's back.
+        for tensor in (param, exp_avg, exp_avg_sq):
+            torch.autograd.graph.increment_version(tensor)
+        return
+    exp_avg.lerp_(grad, 1.0 - beta1)
+    exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
+    denominator = exp_avg_sq.sqrt().div_(math.sqrt(1.0 - beta2**step)).add_(eps)
+    param.addcdiv_(exp_avg, denominator, value=-lr / (1.0 - beta1**step))
+
+
+def _fused(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor) -> bool:
+    return (
+        all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (param, grad, exp_avg, exp_avg_sq))
+        and all(t.is_contiguous() for t in (param, exp_avg, exp_avg_sq))
+        and TRAINING.try_load()
+    )

@@ -1,0 +1,246 @@
+// L1 and SSIM of two images and the gradient of their weighted sum with respect to the first, in one pass.
+//
+// Window w: 11 x 11 Gaussian, sigma 1.5, separable. With u = x + y and v = x - y four blurs give all that SSIM
+// needs (five with x, y, x^2, y^2, xy):
+//   mu = blur(u)   mv = blur(v)   su = blur(u^2) - mu^2   sv = blur(v^2) - mv^2
+//   A = mx^2 + my^2 + C1 = (mu^2 + mv^2)/2 + C1        C = 2 mx my + C1 = (mu^2 - mv^2)/2 + C1
+//   B = sx + sy + C2     = (su + sv)/2 + C2            D = 2 sxy + C2   = (su - sv)/2 + C2
+//   ssim = C D / (A B)
+// and the three partial derivatives are blurred once more (zero padding makes the blur self-adjoint):
+//   p1 = 2 my (D - C)/(A B) - 2 mx ssim (1/A - 1/B)    p2 = -ssim/B    p3 = 2 C/(A B)
+//   d sum(ssim) / dx = blur(p1) + 2 x blur(p2) + y blur(p3)
+//
+// Rows stream through two ring buffers of 11 rows: the horizontal sums of u, v, u^2, v^2, and those of p1, p2, p3.
+// The image is cut into strips of columns, so that both rings stay in the first-level cache and every row of them
+// has a constant stride. A pixel's value depends neither on the strip nor on the rows a thread was given, and row
+// sums are added up by one thread: the result is bit-equal for any number of threads.
+#include "kernels.h"
+
+namespace SW_ARCH {
+namespace {
+
+constexpr int R = 5;              // window radius
+constexpr int TAPS = 2 * R + 1;
+constexpr int STRIP = 128;        // columns of output at a time, at most
+constexpr int P_WIDTH = 144;      // >= STRIP + 2 R: columns where the derivatives are needed, a multiple of 16
+constexpr int X_WIDTH = 160;      // >= P_WIDTH + 2 R
+constexpr float C1 = 0.01f * 0.01f;
+constexpr float C2 = 0.03f * 0.03f;
+// exp(-k^2 / (2 * 1.5^2)), k = -5 .. 5, normalised to sum 1.
+constexpr float W[TAPS] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
+                           0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
+
+struct alignas(64) Workspace {
+  float stats[TAPS][4][P_WIDTH];    // ring: horizontal sums of u, v, u^2, v^2
+  float derivs[TAPS][3][STRIP];     // ring: horizontal sums of p1, p2, p3
+  float zeros[4][P_WIDTH];          // stands for the rows above and below the image
+  float line[4][X_WIDTH];           // u, v, u^2, v^2 of one row, with zeros beside the image
+  float p[3][X_WIDTH];              // p1, p2, p3 of one row
+  float map[P_WIDTH];               // the SSIM of one row
+};
+
+// out[i] = sum_k W[k] in[i + k]
+inline void blur_line(const float* __restrict in, float* __restrict out, int count) {
+  for (int i = 0; i < count; ++i) {
+    float sum = W[0] * in[i];
+    for (int k = 1; k < TAPS; ++k) sum += W[k] * in[i + k];
+    out[i] = sum;
+  }
+}
+
+struct Strip {
+  const splatwizard::PhotometricArgs& args;
+  Workspace& ws;
+  const float* x;      // this plane
+  const float* y;
+  float* grad;
+  int64_t left;        // first column of the strip
+  int count;           // columns of the strip
+  int p_count;         // columns of derivatives, rounded up to whole vectors
+
+  // Horizontal sums of row `row` into its slot of the ring. Column j of the sums is image column left - R + j.
+  void add_row(int64_t row) {
+    const int64_t first = left - 2 * R;
+    const int width = p_count + 2 * R;
+    const int from = static_cast<int>(first < 0 ? -first : 0);
+    const int64_t room = args.width - first;
+    const int to = static_cast<int>(room < width ? room : width);
+    const float* __restrict xr = x + row * args.width + first;
+    const float* __restrict yr = y + row * args.width + first;
+    auto& line = ws.line;
+    for (int s = 0; s < 4; ++s) {
+      for (int i = 0; i < from; ++i) line[s][i] = 0.f;
+      for (int i = to; i < width; ++i) line[s][i] = 0.f;
+    }
+    for (int i = from; i < to; ++i) {
+      const float u = xr[i] + yr[i], v = xr[i] - yr[i];
+      line[0][i] = u;
+      line[1][i] = v;
+      line[2][i] = u * u;
+      line[3][i] = v * v;
+    }
+    for (int s = 0; s < 4; ++s) blur_line(line[s], ws.stats[row % TAPS][s], p_count);
+  }
+
+  // SSIM of row `row` into ws.map, its derivatives into ws.p: columns left - R .. left - R + p_count - 1.
+  template <bool WITH_GRAD>
+  void map_row(int64_t row) {
+    const float* t[TAPS];
+    for (int k = 0; k < TAPS; ++k) {
+      const int64_t r = row - R + k;
+      t[k] = r >= 0 && r < args.height ? &ws.stats[r % TAPS][0][0] : &ws.zeros[0][0];
+    }
+    const float *__restrict t0 = t[0], *__restrict t1 = t[1], *__restrict t2 = t[2], *__restrict t3 = t[3],
+                *__restrict t4 = t[4], *__restrict t5 = t[5], *__restrict t6 = t[6], *__restrict t7 = t[7],
+                *__restrict t8 = t[8], *__restrict t9 = t[9], *__restrict t10 = t[10];
+    float *__restrict map = ws.map, *__restrict p1 = ws.p[0], *__restrict p2 = ws.p[1], *__restrict p3 = ws.p[2];
+    const int n = p_count;
+#pragma omp simd
+    for (int i = 0; i < n; ++i) {
+      auto column = [&](int j) {
+        return W[0] * (t0[j] + t10[j]) + W[1] * (t1[j] + t9[j]) + W[2] * (t2[j] + t8[j]) +
+               W[3] * (t3[j] + t7[j]) + W[4] * (t4[j] + t6[j]) + W[5] * t5[j];
+      };
+      const float mu = column(i), mv = column(i + P_WIDTH);
+      const float mu2 = mu * mu, mv2 = mv * mv;
+      const float su = column(i + 2 * P_WIDTH) - mu2, sv = column(i + 3 * P_WIDTH) - mv2;
+      const float A = 0.5f * (mu2 + mv2) + C1, B = 0.5f * (su + sv) + C2;
+      const float C = 0.5f * (mu2 - mv2) + C1, D = 0.5f * (su - sv) + C2;
+      const float inv = 1.f / (A * B);
+      const float ssim = C * D * inv;
+      map[i] = ssim;
+      if (WITH_GRAD) {
+        const float mx2 = mu + mv, my2 = mu - mv;  // 2 mx, 2 my
+        p1[i] = inv * (my2 * (D - C) - mx2 * ssim * (B - A));
+        p2[i] = -ssim * A * inv;
+        p3[i] = 2.f * C * inv;
+      }
+    }
+  }
+
+  // Columns [from, to) of the derivatives' row where the SSIM map exists.
+  void inside(int64_t row, int& from, int& to) const {
+    const int64_t border = args.valid ? R : 0;
+    const int64_t first = left - R;
+    if (row < border || row >= args.height - border) {
+      from = to = 0;
+      return;
+    }
+    const int64_t a = border - first, b = args.width - border - first;
+    from = static_cast<int>(a > 0 ? a : 0);
+    to = static_cast<int>(b < p_count ? b : p_count);
+    if (to < from) to = from;
+  }
+
+  // The derivatives do not exist outside the map; there the blur of the backward pass sees zero.
+  void add_derivatives(int64_t row) {
+    int from, to;
+    inside(row, from, to);
+    for (auto& line : ws.p) {
+      for (int i = 0; i < from; ++i) line[i] = 0.f;
+      for (int i = to; i < p_count; ++i) line[i] = 0.f;
+    }
+    for (int s = 0; s < 3; ++s) blur_line(ws.p[s], ws.derivs[row % TAPS][s], count);
+  }
+
+  void sum_row(int64_t row, double& l1_sum, double& ssim_sum) const {
+    const float* __restrict xr = x + row * args.width + left;
+    const float* __restrict yr = y + row * args.width + left;
+    float l1 = 0.f, ssim = 0.f;
+#pragma omp simd reduction(+ : l1)
+    for (int i = 0; i < count; ++i) {
+      const float d = xr[i] - yr[i];
+      l1 += d < 0.f ? -d : d;
+    }
+    int from, to;
+    inside(row, from, to);
+    from = from < R ? R : from;
+    to = to > R + count ? R + count : to;
+    const float* __restrict map = ws.map;
+#pragma omp simd reduction(+ : ssim)
+    for (int i = from; i < to; ++i) ssim += map[i];
+    l1_sum += l1;
+    ssim_sum += ssim;
+  }
+
+  void grad_row(int64_t row) const {
+    const float* t[TAPS];
+    for (int k = 0; k < TAPS; ++k) {
+      const int64_t r = row - R + k;
+      t[k] = r >= 0 && r < args.height ? &ws.derivs[r % TAPS][0][0] : &ws.zeros[0][0];
+    }
+    const float *__restrict t0 = t[0], *__restrict t1 = t[1], *__restrict t2 = t[2], *__restrict t3 = t[3],
+                *__restrict t4 = t[4], *__restrict t5 = t[5], *__restrict t6 = t[6], *__restrict t7 = t[7],
+                *__restrict t8 = t[8], *__restrict t9 = t[9], *__restrict t10 = t[10];
+    const float* __restrict xr = x + row * args.width + left;
+    const float* __restrict yr = y + row * args.width + left;
+    float* __restrict out = grad + row * args.width + left;
+    const float l1 = args.l1_weight, g = args.ssim_weight;
+#pragma omp simd
+    for (int i = 0; i < count; ++i) {
+      auto column = [&](int j) {
+        return W[0] * (t0[j] + t10[j]) + W[1] * (t1[j] + t9[j]) + W[2] * (t2[j] + t8[j]) +
+               W[3] * (t3[j] + t7[j]) + W[4] * (t4[j] + t6[j]) + W[5] * t5[j];
+      };
+      const float xi = xr[i], yi = yr[i];
+      const float ssim = column(i) + 2.f * xi * column(i + STRIP) + yi * column(i + 2 * STRIP);
+      const float sign = (xi > yi ? 1.f : 0.f) - (xi < yi ? 1.f : 0.f);
+      out[i] = g * ssim + l1 * sign;
+    }
+  }
+
+  // Rows [begin, end) of the plane: sums, and the gradient if it is wanted.
+  void run(int64_t begin, int64_t end, double* row_l1, double* row_ssim) {
+    const bool with_grad = grad != nullptr;
+    const int64_t reach = with_grad ? R : 0;
+    auto clip = [&](int64_t r) { return r < 0 ? 0 : r > args.height ? args.height : r; };
+    const int64_t first = clip(begin - reach), last = clip(end + reach);
+    int64_t next = clip(first - R);       // next row whose horizontal sums are missing
+    int64_t next_out = begin;
+    for (int64_t row = first; row < last; ++row) {
+      for (; next < clip(row + R + 1); ++next) add_row(next);
+      if (with_grad) {
+        map_row<true>(row);
+      } else {
+        map_row<false>(row);
+      }
+      if (row >= begin && row < end) sum_row(row, row_l1[row], row_ssim[row]);
+      if (with_grad) {
+        add_derivatives(row);
+        // A row of the gradient is complete once the derivatives R rows below it are there.
+        for (; next_out < end && (next_out + R <= row || row == args.height - 1); ++next_out) grad_row(next_out);
+      }
+    }
+  }
+};
+
+}  // namespace
+
+void photometric(const splatwizard::PhotometricArgs& args, const splatwizard::Parallel& parallel) {
+  const int64_t rows = args.planes * args.height;
+  const int64_t strips = (args.width + STRIP - 1) / STRIP;
+  const int64_t width = (args.width + strips - 1) / strips;
+  // 32 rows: below that the 20 rows of overlap with the neighbours cost more than another thread brings.
+  parallel(rows, 32, [&](int64_t begin, int64_t end) {
+    Workspace ws{};
+    while (begin < end) {
+      const int64_t plane = begin / args.height;
+      const int64_t from = begin - plane * args.height;
+      const int64_t to = end - plane * args.height < args.height ? end - plane * args.height : args.height;
+      const int64_t offset = plane * args.height * args.width;
+      double* row_l1 = args.row_l1 + plane * args.height;
+      double* row_ssim = args.row_ssim + plane * args.height;
+      for (int64_t row = from; row < to; ++row) row_l1[row] = row_ssim[row] = 0.;
+      for (int64_t left = 0; left < args.width; left += width) {
+        const int count = static_cast<int>(args.width - left < width ? args.width - left : width);
+        const int p_count = (count + 2 * R + 15) / 16 * 16;
+        float* grad = args.grad == nullptr ? nullptr : args.grad + offset;
+        Strip strip{args, ws, args.x + offset, args.y + offset, grad, left, count, p_count};
+        strip.run(from, to, row_l1, row_ssim);
+      }
+      begin = plane * args.height + to;
+    }
+  });
+}
+
+}  // namespace SW_ARCH

@@ -1,0 +1,18 @@
+"""The training room's native module: fused photometric loss and Adam."""
+
+from __future__ import annotations
+
+from splatwizard_core.native.loader import NativeModule
+
+TRAINING = NativeModule(
+    name="splatwizard_training",
+    package="splatwizard_core.training",
+    sources=("kernels/binding.cpp",),
+    kernels=("kernels/ssim.cpp", "kernels/adam.cpp"),
+    headers=("kernels/*.h",),
+    # Without these two GCC keeps sqrt and division out of vector code. No -ffinite-math-only: a NaN in the image
+    # must reach the loss, where the trainer looks for it.
+    cflags=("-fno-math-errno", "-fno-trapping-math"),
+    seconds=10,
+    without="loss and optimizer run on plain torch operations: same numbers, slower",
+)
