@@ -1,0 +1,1 @@
+"""A two-stage method that holds the core to its contracts."""

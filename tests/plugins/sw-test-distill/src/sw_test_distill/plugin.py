@@ -1,0 +1,8 @@
+"""What this package provides."""
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("test-distill", "sw_test_distill.method:TestDistill", summary="proof of the contracts: two stages")
