@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 from pydantic import Field
+from torch import Tensor
+
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.gaussians.model import GaussianModel
@@ -13,7 +15,6 @@ from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.scheduler import Scheduler
 from splatwizard_core.training.stage import Stage
-from torch import Tensor
 
 TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 
