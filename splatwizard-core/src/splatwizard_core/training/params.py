@@ -4,6 +4,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+FULL_RUN_ITERATIONS = 30_000
+"""The run length that published plans are written for."""
+
 
 class Params(BaseModel):
     """Base of every configuration block: unknown keys and values out of bounds are errors; blocks may nest."""
@@ -21,10 +24,13 @@ class RasterParams(Params):
 class PipelineParams(Params):
     """Parameters of the run that no method owns (`ppl` in the paper's signature)."""
 
-    seed: int = Field(0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it")
+    seed: int = Field(
+        0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it"
+    )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA if its kernels can run, else CPU")
     threads: int = Field(0, ge=0, description="CPU threads; 0: all cores that this process may use")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
+    log_every: int = Field(10, ge=1, description="steps between lines of log.jsonl")
     keep_checkpoints: int = Field(1, ge=1, description="how many of the newest checkpoints stay")
     eval_every: int = Field(0, ge=0, description="steps between evaluations on the test views; 0: only at the end")
     random_background: bool = Field(False, description="a fresh background colour per step in training")
@@ -40,3 +46,12 @@ class OptimizationParams(Params):
     scale_schedule: bool = Field(
         False, description="multiply every plan bound and interval, and lr max_steps, by iterations / 30000"
     )
+
+    @property
+    def schedule_scale(self) -> float:
+        """Factor on plan bounds, intervals and lr max_steps: iterations / 30000 with scale_schedule, else 1.
+
+        A stage applies it to what it registers, `plan.scaled(when, opt.schedule_scale)`, and to what it reads
+        itself (lr max_steps, "not before step 3000" rules).
+        """
+        return self.iterations / FULL_RUN_ITERATIONS if self.scale_schedule else 1.0

@@ -1,4 +1,4 @@
-"""A training stage: what it starts from, its schedule, its loss, its optimizer. The trainer runs it and knows no method."""
+"""A training stage: what it starts from, its schedule, its loss, its optimizer. The trainer knows no method."""
 
 from __future__ import annotations
 
@@ -110,7 +110,10 @@ class Stage:
 
     @property
     def starts_from(self) -> str | None:
-        """Name of a method whose trained scene this stage starts from (the runner supplies it); None: from the stage before."""
+        """Name of a method whose trained scene this stage starts from (the runner supplies it).
+
+        None: it goes on from the stage before.
+        """
         return None
 
     @property
@@ -135,7 +138,10 @@ class Stage:
         return CameraSampler(scene.train, generator)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        """Register what runs before rendering."""
+        """Register what runs before rendering.
+
+        With `opt.scale_schedule` a plan is that of a shorter run: `plan.scaled(when, opt.schedule_scale)`.
+        """
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         """Register what runs between backward and the optimizer step."""

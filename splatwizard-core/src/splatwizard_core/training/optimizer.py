@@ -1,0 +1,254 @@
+"""One Adam over named parameters of a model, whose rows may come and go while it trains."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.errors import ShapeError
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.learning_rate import exponential_lr
+
+__all__ = ["ParamGroup", "SplatOptimizer", "exponential_lr"]
+
+
+@dataclass
+class ParamGroup:
+    """Parameters that share a learning rate.
+
+    name    attribute path of a parameter or of a submodule of the model ("means", "mlp", "mlp.0.weight")
+    lr      learning rate
+    eps     of Adam; 1e-15 as in 3DGS
+    betas   of Adam
+    """
+
+    name: str
+    lr: float
+    eps: float = 1e-15
+    betas: tuple[float, float] = (0.9, 0.999)
+
+
+@dataclass
+class _Moments:
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    step: int = 0
+
+
+class SplatOptimizer:
+    """Adam without weight decay; parameters are found by name at every step, so a model may replace its tensors.
+
+    A parameter without `.grad` is skipped: its moments and its step counter stay. So what a task has just
+    replaced (densify, prune, opacity reset) is not updated in that step, as in the published trainer.
+    """
+
+    def __init__(self, model: SplatModel, groups: Iterable[ParamGroup]) -> None:
+        """Raises ValueError for a group that names nothing, or a parameter that two groups claim."""
+        self.model = model
+        self.groups = {group.name: group for group in groups}
+        self._members: dict[str, list[str]] = {}
+        self._moments: dict[str, _Moments] = {}
+        owner: dict[str, str] = {}
+        known = [name for name, _ in model.named_parameters()]
+        for name in self.groups:
+            members = [k for k in known if k == name or k.startswith(f"{name}.")]
+            if not members:
+                raise ValueError(f"{type(model).__name__} has no parameter or submodule with parameters '{name}'")
+            for member in members:
+                if member in owner:
+                    raise ValueError(f"parameter '{member}' is in the groups '{owner[member]}' and '{name}'")
+                owner[member] = name
+            self._members[name] = members
+
+    def lr(self, name: str) -> float:
+        """Current learning rate of a group."""
+        return self.groups[name].lr
+
+    def set_lr(self, name: str, lr: float) -> None:
+        """Learning rate of a group from the next `step` on."""
+        self.groups[name].lr = lr
+
+    @torch.no_grad()
+    def step(self) -> None:
+        """One Adam update of every parameter that has a gradient."""
+        from splatwizard_core.training.adam import adam_step
+
+        for group_name, group in self.groups.items():
+            beta1, beta2 = group.betas
+            for name in self._members[group_name]:
+                param = self.model.get_parameter(name)
+                if param.grad is None:
+                    continue
+                moments = self._moments.get(name)
+                if moments is None:
+                    # As torch.optim.Adam: moments exist from the first update on.
+                    moments = self._moments[name] = _Moments(_zeros(param), _zeros(param))
+                moments.step += 1
+                adam_step(
+                    param.data,
+                    param.grad,
+                    moments.exp_avg,
+                    moments.exp_avg_sq,
+                    lr=group.lr,
+                    beta1=beta1,
+                    beta2=beta2,
+                    eps=group.eps,
+                    step=moments.step,
+                )
+
+    def zero_grad(self) -> None:
+        """Drop the gradients of all parameters of the model, those in no group included."""
+        for param in self.model.parameters():
+            param.grad = None
+
+    @torch.no_grad()
+    def append_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> None:
+        """Add primitives at the end.
+
+        model   the optimizer's model, or a submodule of it that is a SplatModel
+        rows    attribute of `model.ROWS` -> new rows [n, ...]; every parameter must be there, buffers that are
+                not get zeros
+
+        New rows get zero moments; step counters stay. Raises ShapeError if rows do not fit.
+        """
+        prefix = self._prefix(model)
+        count = self._check_rows(model, rows)
+        for name in model.ROWS:
+            old = _attribute(model, name)
+            new = rows.get(name)
+            new = old.new_zeros(count, *old.shape[1:]) if new is None else new.detach().to(old)
+            self._put(model, name, torch.cat([old.detach(), new]))
+            moments = self._moments.get(prefix + name)
+            if moments is not None:
+                zeros = torch.zeros_like(new)
+                moments.exp_avg = torch.cat([moments.exp_avg, zeros])
+                moments.exp_avg_sq = torch.cat([moments.exp_avg_sq, zeros])
+
+    def _check_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> int:
+        counts = set()
+        for name in rows:
+            if name not in model.ROWS:
+                raise ShapeError(f"append_rows: '{name}' is not among the rows of {type(model).__name__}")
+        for name in model.ROWS:
+            old = _attribute(model, name)
+            new = rows.get(name)
+            if new is None:
+                if isinstance(old, nn.Parameter):
+                    raise ShapeError(f"append_rows: new rows of parameter '{name}' are missing")
+                continue
+            if new.shape[1:] != old.shape[1:] or new.dim() != old.dim():
+                raise ShapeError(
+                    f"append_rows: '{name}' must be [n, {', '.join(map(str, old.shape[1:]))}], got {list(new.shape)}",
+                    actual=new.shape,
+                    expected=("n", *old.shape[1:]),
+                )
+            counts.add(new.shape[0])
+        if len(counts) != 1:
+            raise ShapeError(f"append_rows: all rows need one count, got {sorted(counts)}")
+        return counts.pop()
+
+    @torch.no_grad()
+    def keep_rows(self, model: SplatModel, mask: Tensor, *, carry_grad: bool = False) -> None:
+        """Remove the primitives where `mask` [N] bool is False; moments follow, step counters stay.
+
+        carry_grad  keep the survivors' gradient rows, so that they are updated in this step (Trimming the Fat)
+        """
+        if mask.dtype != torch.bool or mask.shape != (model.num_rows,):
+            raise ShapeError(
+                f"keep_rows needs a bool mask [{model.num_rows}], got {mask.dtype} {list(mask.shape)}",
+                actual=mask.shape,
+                expected=(model.num_rows,),
+            )
+        prefix = self._prefix(model)
+        index = mask.nonzero().squeeze(1)
+        everything = index.numel() == mask.numel()
+
+        def kept(tensor: Tensor) -> Tensor:
+            return tensor if everything else tensor.index_select(0, index)
+
+        for name in model.ROWS:
+            old = _attribute(model, name)
+            grad = old.grad if carry_grad and isinstance(old, nn.Parameter) else None
+            self._put(model, name, kept(old.detach()))
+            if grad is not None:
+                _attribute(model, name).grad = kept(grad)
+            moments = self._moments.get(prefix + name)
+            if moments is not None:
+                moments.exp_avg, moments.exp_avg_sq = kept(moments.exp_avg), kept(moments.exp_avg_sq)
+
+    @torch.no_grad()
+    def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
+        """Give one parameter (or buffer) a new value; its moments become zero, its step counter stays."""
+        old = _attribute(model, name)
+        self._put(model, name, tensor.detach().to(old))
+        moments = self._moments.get(self._prefix(model) + name)
+        if moments is not None:
+            fresh = _attribute(model, name)
+            moments.exp_avg, moments.exp_avg_sq = _zeros(fresh), _zeros(fresh)
+
+    def moments(self, name: str) -> tuple[Tensor, Tensor, int] | None:
+        """(exp_avg, exp_avg_sq, step) of a parameter by its full name; None before its first update."""
+        found = self._moments.get(name)
+        return None if found is None else (found.exp_avg, found.exp_avg_sq, found.step)
+
+    def state_dict(self) -> dict[str, Any]:
+        """{"groups": {name: {lr, eps, betas}}, "moments": {parameter: {exp_avg, exp_avg_sq, step}}}; no copies."""
+        return {
+            "groups": {n: {"lr": g.lr, "eps": g.eps, "betas": list(g.betas)} for n, g in self.groups.items()},
+            "moments": {
+                n: {"exp_avg": m.exp_avg, "exp_avg_sq": m.exp_avg_sq, "step": m.step} for n, m in self._moments.items()
+            },
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Inverse of `state_dict`; the model must have its parameters already.
+
+        Raises ValueError if the groups differ or a moment does not fit its parameter.
+        """
+        if list(state["groups"]) != list(self.groups):
+            raise ValueError(f"optimizer groups differ: {', '.join(state['groups'])} / {', '.join(self.groups)}")
+        members = {member for names in self._members.values() for member in names}
+        loaded = {}
+        for name, m in state["moments"].items():
+            if name not in members:
+                raise ValueError(f"optimizer state of '{name}', which is in no group")
+            param = self.model.get_parameter(name)
+            if m["exp_avg"].shape != param.shape or m["exp_avg_sq"].shape != param.shape:
+                raise ValueError(f"optimizer state of '{name}' is {list(m['exp_avg'].shape)}, not {list(param.shape)}")
+            # Clones: what is loaded must not be changed in place.
+            loaded[name] = _Moments(m["exp_avg"].clone().to(param), m["exp_avg_sq"].clone().to(param), int(m["step"]))
+        for name, g in state["groups"].items():
+            betas = g["betas"]
+            self.groups[name] = ParamGroup(name, float(g["lr"]), float(g["eps"]), (float(betas[0]), float(betas[1])))
+        self._moments = loaded
+
+    def _prefix(self, model: SplatModel) -> str:
+        """Where `model` sits in the optimizer's model: "" for itself, "inner." for a submodule."""
+        for path, module in self.model.named_modules():
+            if module is model:
+                return f"{path}." if path else ""
+        raise ValueError(f"this {type(model).__name__} is not part of the model that is being optimised")
+
+    @staticmethod
+    def _put(model: SplatModel, name: str, tensor: Tensor) -> None:
+        """Set an attribute; a parameter becomes a new one without gradient, so this step skips it."""
+        owner_name, _, leaf = name.rpartition(".")
+        owner = model.get_submodule(owner_name)
+        old = getattr(owner, leaf)
+        if isinstance(old, nn.Parameter):
+            tensor = nn.Parameter(tensor, requires_grad=old.requires_grad)
+        setattr(owner, leaf, tensor)
+
+
+def _attribute(model: SplatModel, name: str) -> Tensor:
+    owner_name, _, leaf = name.rpartition(".")
+    found: Tensor = getattr(model.get_submodule(owner_name), leaf)
+    return found
+
+
+def _zeros(param: Tensor) -> Tensor:
+    return torch.zeros_like(param, memory_format=torch.contiguous_format, requires_grad=False)

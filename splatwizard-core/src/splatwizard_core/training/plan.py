@@ -1,0 +1,229 @@
+"""When tasks run: the forms a plan may take, how they are scaled, printed and compared."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import numbers
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+When = int | range | list[int] | tuple[int, ...] | set[int] | frozenset[int]
+"""One step, every step of a range (end excluded), or each listed step once. Step 0 is legal and never fires."""
+
+LISTED_ENTRIES = 6  # longer lists are abbreviated when printed
+
+
+def check_when(when: Any) -> When:
+    """`when` itself (lists and sets as copies without duplicates), after checking its form.
+
+    Raises TypeError for a bool, a float, or an iterator (it has no known end); ValueError for a negative step.
+    """
+    if isinstance(when, range):
+        if when.step < 0:
+            raise ValueError(f"{when} counts down; a plan's range must count up")
+        if when.start < 0:
+            raise ValueError(f"{when} starts at a negative step; steps are counted from 1 (0 never fires)")
+        return when
+    if isinstance(when, list | tuple):
+        return list(dict.fromkeys(_step(s) for s in when))
+    if isinstance(when, set | frozenset):
+        return frozenset(_step(s) for s in when)
+    return _step(when)
+
+
+def _step(value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+        raise TypeError(
+            f"a plan is an int, a range, or a list, tuple or set of ints; got {value!r} ({type(value).__name__})"
+        )
+    if value < 0:
+        raise ValueError(f"step {value} is negative; steps are counted from 1 (0 never fires)")
+    return int(value)
+
+
+def steps_of(when: When) -> Collection[int]:
+    """The steps of a checked plan, in a form that answers `step in steps` in constant time; nothing is expanded."""
+    if isinstance(when, range):
+        return when
+    return frozenset((when,)) if isinstance(when, int) else frozenset(when)
+
+
+def describe_when(when: When) -> str:
+    """The registered form: `range(500, 15000, 100)` with the fewest arguments that say the same, `7`, `[1, 2]`."""
+    if isinstance(when, range):
+        if when.step != 1:
+            return f"range({when.start}, {when.stop}, {when.step})"
+        return f"range({when.stop})" if when.start == 0 else f"range({when.start}, {when.stop})"
+    if isinstance(when, int):
+        return str(when)
+    steps = sorted(when) if isinstance(when, set | frozenset) else list(when)
+    shown = [str(s) for s in steps[:LISTED_ENTRIES]]
+    return f"[{', '.join([*shown, '...'] if len(steps) > LISTED_ENTRIES else shown)}]"
+
+
+def scaled(when: When, factor: float) -> When:
+    """The plan of a shorter or longer run: every bound and interval times `factor`, rounded to the nearest step.
+
+    Intervals are at least 1; what fired at a step > 0 still does; a range that was not empty stays so.
+    """
+    if factor == 1:
+        return when
+
+    def at(step: int) -> int:
+        return max(1, math.floor(step * factor + 0.5)) if step > 0 else step
+
+    if isinstance(when, int):
+        return at(when)
+    if isinstance(when, range):
+        start, stop = at(when.start), at(when.stop)
+        return range(start, max(stop, start + 1) if when else stop, at(when.step))
+    if isinstance(when, set | frozenset):
+        return frozenset(at(s) for s in when)
+    return list(dict.fromkeys(at(s) for s in when))
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """One registered task.
+
+    stage       "pre" or "post"
+    when        the plan as given (scaled, if the run asks for it)
+    order       how many registrations came before it
+    after       steps up to here are over (registered late); 0 for what stands in the plan
+    """
+
+    stage: str
+    when: When
+    steps: Collection[int]
+    task: Callable[..., Any]
+    name: str
+    priority: int
+    order: int
+    log: bool = False
+    after: int = 0
+
+    def due(self, step: int) -> bool:
+        return step > self.after and step in self.steps
+
+    def fires_in(self, start: int, total: int | None) -> list[int] | range:
+        """The steps s at which it runs, start < s <= total (None: no end), ascending."""
+        low, high = max(start, self.after, 0) + 1, math.inf if total is None else total
+        if isinstance(self.steps, range):
+            steps = self.steps
+            if steps and steps[0] < low:
+                steps = steps[-(-(low - steps.start) // steps.step) :]
+            if total is not None and steps and steps[-1] > total:
+                steps = steps[: max(0, (total - steps.start) // steps.step + 1)]
+            return steps
+        return sorted(s for s in self.steps if low <= s <= high)
+
+
+@dataclass(frozen=True)
+class PlanRow:
+    """One line of a printed plan.
+
+    stage       "Pre" or "Post"
+    overlaps    the same callable stands in this stage once more and both fire at some step: it runs twice there
+    first, last, count      first step, last step and number of executions inside (start, total]; None: never
+    """
+
+    stage: str
+    task: str
+    plan: str
+    priority: int
+    overlaps: bool
+    first: int | None
+    last: int | None
+    count: int
+
+
+def plan_rows(
+    pre: Sequence[Registration], post: Sequence[Registration], *, start: int = 0, total: int | None = None
+) -> list[PlanRow]:
+    """The rows of a plan in stage and order of execution.
+
+    start   steps that are over
+    total   last step T; None: as far as the plans reach
+    """
+    rows = []
+    for title, registrations in (("Pre", pre), ("Post", post)):
+        ordered = sorted(registrations, key=lambda r: (r.priority, r.order))
+        for row in ordered:
+            steps = row.fires_in(start, total)
+            rows.append(
+                PlanRow(
+                    title,
+                    row.name,
+                    describe_when(row.when),
+                    row.priority,
+                    any(_overlap(row, other, start, total) for other in ordered if other is not row),
+                    steps[0] if steps else None,
+                    steps[-1] if steps else None,
+                    len(steps),
+                )
+            )
+    return rows
+
+
+def _overlap(a: Registration, b: Registration, start: int, total: int | None) -> bool:
+    if a.task != b.task:
+        return False
+    few, many = sorted((a.fires_in(start, total), b.fires_in(start, total)), key=len)
+    return not set(few).isdisjoint(many)
+
+
+def format_plan(
+    pre: Any, post: Any, style: str = "table", start: int = 0, total: int | None = None, *, verbose: bool = False
+) -> str:
+    """The plan that will be executed, as text.
+
+    pre, post   the two schedulers of a stage
+    style       "table": Stage | Task | Plan, one row a registration, in stage and order of execution;
+                "json": a list of objects with these and the priority
+    start       steps that are over (a resumed run)
+    total       last step T; None: as far as the plans reach
+    verbose     also first step, last step and number of executions inside (start, total]
+    """
+    rows = plan_rows(pre.registrations, post.registrations, start=start, total=total)
+    if style == "json":
+        return json.dumps([row_facts(row, verbose=verbose) for row in rows], indent=2)
+    if style != "table":
+        raise ValueError(f"a plan is printed as 'table' or 'json', not '{style}'")
+    cells = [["Stage", "Task", "Plan", *(["First", "Last", "Runs"] if verbose else [])]]
+    for row in rows:
+        plan = f"{row.plan} (overlaps)" if row.overlaps else row.plan
+        extra = ["-" if v is None else str(v) for v in (row.first, row.last, row.count)] if verbose else []
+        cells.append([row.stage, row.task, plan, *extra])
+    widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
+    lines = [" | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
+    lines.insert(1, "-+-".join("-" * w for w in widths))
+    return "\n".join(lines)
+
+
+def row_facts(row: PlanRow, *, verbose: bool = False) -> dict[str, Any]:
+    """One row as plain values."""
+    facts: dict[str, Any] = {"stage": row.stage, "task": row.task, "plan": row.plan, "priority": row.priority}
+    if row.overlaps:
+        facts["overlaps"] = True
+    if verbose:
+        facts |= {"first": row.first, "last": row.last, "count": row.count}
+    return facts
+
+
+def plan_lines(pre: Sequence[Registration], post: Sequence[Registration]) -> list[str]:
+    """What identifies a plan: stage, name, every step and the priority of each registration, in order of execution."""
+    lines = []
+    for registrations in (pre, post):
+        for r in sorted(registrations, key=lambda r: (r.priority, r.order)):
+            # describe_when abbreviates lists; what identifies a plan may not.
+            steps = describe_when(r.when) if isinstance(r.when, int | range) else str(sorted(r.when))
+            lines.append(f"{r.stage} | {r.name} | {steps} | priority {r.priority}")
+    return lines
+
+
+def plan_digest(lines: Sequence[str]) -> str:
+    """SHA-256 of `plan_lines`: equal plans, equal text."""
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()

@@ -1,0 +1,152 @@
+"""The schedule of one stage: tasks registered for steps, run in order of priority, supplied by type annotation."""
+
+from __future__ import annotations
+
+import bisect
+import functools
+import inspect
+import logging
+from collections.abc import Callable
+from typing import Any, Final
+
+from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, scaled, steps_of
+from splatwizard_core.training.tasks import POST_ONLY, SOURCES, Binding, TaskContext, bind
+
+__all__ = ["STOP", "PhaseSwitch", "Scheduler", "TaskContext", "format_plan", "plan_lines", "scaled"]
+
+log = logging.getLogger(__name__)
+
+
+class _Stop:
+    def __repr__(self) -> str:
+        return "STOP"
+
+
+STOP: Final = _Stop()
+"""What a task returns to end its training stage cleanly after the current step."""
+
+
+class Scheduler:
+    """The tasks that run before rendering ("pre") or between backward and the optimizer step ("post").
+
+    stage   "pre" or "post"
+    """
+
+    STOP: Final = STOP
+
+    def __init__(self, stage: str) -> None:
+        if stage not in ("pre", "post"):
+            raise ValueError(f"a scheduler's stage is 'pre' or 'post', not '{stage}'")
+        self.stage = stage
+        self.on_log: Callable[[int, str], None] | None = None
+        self._entries: list[tuple[Registration, Binding]] = []
+        self._step: int | None = None  # while a step's tasks run
+
+    def register_task(
+        self,
+        when: When,
+        task: Callable[..., Any],
+        *,
+        priority: int = 0,
+        name: str | None = None,
+        log: bool = False,
+    ) -> None:
+        """Run `task` at the steps of `when`.
+
+        when        one step, a range (end excluded), or a list, tuple or set of steps; step 0 never fires
+        task        its parameters are supplied by their annotations (`tasks.TaskContext` holds what there is);
+                    it may return STOP, other return values are ignored
+        priority    lower runs earlier; equal ones in order of registration
+        name        in plans, logs and errors; default: the function's name with spaces
+        log         write a line each time it runs
+
+        A task may register others while it runs: they fire at later steps only.
+        Raises TypeError or ValueError for a bad `when`, TaskSignatureError for a parameter that cannot be supplied.
+        """
+        plan = check_when(when)
+        name = task_name(task) if name is None else name
+        binding = bind(task, self.stage, name, (*SOURCES, (Scheduler, "scheduler")))
+        entry = Registration(
+            self.stage, plan, steps_of(plan), task, name, priority, len(self._entries), log, self._step or 0
+        )
+        # A new list: exec may be iterating over the old one.
+        entries = list(self._entries)
+        bisect.insort(entries, (entry, binding), key=lambda e: (e[0].priority, e[0].order))
+        self._entries = entries
+
+    @property
+    def registrations(self) -> list[Registration]:
+        """In order of execution."""
+        return [entry for entry, _ in self._entries]
+
+    def check(self, context: TaskContext) -> None:
+        """Raise TaskSignatureError now for what would otherwise fail at the step that first needs it."""
+        for _, binding in self._entries:
+            binding.check(context, skip=(*POST_ONLY, "scheduler"))
+
+    def exec(self, step: int, context: TaskContext) -> bool:
+        """Run what is due at `step`; returns whether a task asked to stop. Past the last plan it does nothing.
+
+        Raises TaskError that names the task, the cause chained.
+        """
+        stop = False
+        for entry, binding in self._entries:
+            if not entry.due(step):
+                continue
+            context.step, context.scheduler, self._step = step, self, step
+            try:
+                result = binding(context)
+            except (EmptyModel, TrainingDiverged, TaskSignatureError):
+                raise
+            except Exception as error:
+                raise TaskError(self.stage, step, entry.name, error) from error
+            finally:
+                self._step = None
+            stop = stop or result is STOP
+            if entry.log:
+                log.info("step %d: %s", step, entry.name)
+                if self.on_log is not None:
+                    self.on_log(step, entry.name)
+        return stop
+
+    def pending_late(self, step: int) -> bool:
+        """Whether something that a task registered is still to run after `step`.
+
+        A checkpoint cannot hold it, so none is written until it has run: a resumed run repeats the registration.
+        """
+        return any(e.after > 0 and e.fires_in(step, None) for e in self.registrations)
+
+    def plan_lines(self) -> list[str]:
+        """What identifies the plan: everything but what tasks registered while they ran."""
+        return plan_lines([e for e in self.registrations if e.after == 0], [])
+
+
+class PhaseSwitch:
+    """Sugar for the common change of mode: `PhaseSwitch(10_000, "entropy").register(scheduler)`.
+
+    At `step` it sets `model.phase = name`, or runs `task` instead if there is one. The plan shows it as
+    "switch to <name>". The model keeps its phase in `state_dict_extra()["phase"]`, so that a resumed run has it.
+    """
+
+    def __init__(self, step: int, name: str, task: Callable[..., Any] | None = None) -> None:
+        self.step, self.name, self.task = step, name, task
+
+    def register(self, scheduler: Scheduler, *, priority: int = 0) -> None:
+        """Register it; the same errors as `register_task`."""
+        scheduler.register_task(self.step, self.task or self._switch, priority=priority, name=f"switch to {self.name}")
+
+    def _switch(self, model: SplatModel) -> None:
+        model.phase = self.name  # type: ignore[assignment]
+        if model.state_dict_extra().get("phase") != self.name:
+            raise TypeError(f"{type(model).__name__}.state_dict_extra() must hold 'phase', or a resumed run loses it")
+
+
+def task_name(task: Callable[..., Any]) -> str:
+    """The name of a function with spaces; of the function inside a partial; of the class of a callable object."""
+    while isinstance(task, functools.partial):
+        task = task.func
+    named = inspect.isroutine(task) or inspect.isclass(task)
+    name: str = getattr(task, "__name__", "") if named else type(task).__name__
+    return name.strip("_").replace("_", " ") or "task"
