@@ -1,0 +1,165 @@
+"""Pictures: finding files, the resolution rule, and decoding to uint8 on first use."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from splatwizard_core.errors import ConfigError, SceneError
+from splatwizard_core.scene.scene import View
+
+SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+
+
+def fitted_size(width: int, height: int, resolution: int) -> tuple[int, int]:
+    """The (width, height) a picture is used at, by the rule of the 3DGS code.
+
+    resolution  1, 2, 4, 8: divide by it and round half to even; -1: at most 1600 px wide (only the width is
+                tested), truncated; any other number: that many px wide, truncated
+
+    Raises ConfigError for 0 and for negative numbers other than -1.
+    """
+    if resolution in (1, 2, 4, 8):
+        fitted = round(width / resolution), round(height / resolution)
+    else:
+        if resolution < -1 or resolution == 0:
+            raise ConfigError(
+                f"resolution {resolution} makes no sense: use -1 (at most 1600 px wide), 1, 2, 4, 8, or a width in px",
+                key="resolution",
+            )
+        target = 1600 if resolution == -1 else resolution
+        factor = width / target if resolution != -1 or width > target else 1.0
+        fitted = int(width / factor), int(height / factor)
+    return max(fitted[0], 1), max(fitted[1], 1)
+
+
+def is_inside(name: str) -> bool:
+    """Whether a relative file name from a stranger's file stays inside the folder it is joined to."""
+    path = PurePosixPath(name.replace("\\", "/"))
+    return bool(path.parts) and not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
+def list_pictures(folder: Path) -> list[str]:
+    """Names of all pictures below `folder`, relative to it with forward slashes, sorted."""
+    found = []
+    for root, _, files in os.walk(folder, followlinks=True):
+        for file in files:
+            if os.path.splitext(file)[1].lower() in SUFFIXES:
+                found.append((Path(root) / file).relative_to(folder).as_posix())
+    return sorted(found)
+
+
+def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
+    """The file of each name: `folder/name`, or the same stem with another picture suffix.
+
+    Raises SceneError that lists the first five missing, and for names that lead out of the folder.
+    """
+    for name in names:
+        if not is_inside(name):
+            raise SceneError(
+                f"image name {name!r} leads out of {folder}; the scene files are damaged", path=str(folder)
+            )
+    by_stem: dict[str, str] | None = None
+    found: list[Path] = []
+    missing: list[str] = []
+    for name in names:
+        path = folder / name
+        if not path.is_file():
+            if by_stem is None:
+                by_stem = {}
+                for other in list_pictures(folder):
+                    by_stem.setdefault(os.path.splitext(other)[0], other)
+            fallback = by_stem.get(os.path.splitext(name)[0])
+            if fallback is None:
+                missing.append(name)
+                continue
+            path = folder / fallback
+        found.append(path)
+    if missing:
+        first = ", ".join(f"'{name}'" for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
+        raise SceneError(f"{folder}: {len(missing)} of {len(names)} images are missing: {first}", path=str(folder))
+    return found
+
+
+def picture_header(path: Path) -> tuple[int, int, bool]:
+    """(width, height, has alpha) of a picture file, from its header alone. Raises SceneError if it is no picture."""
+    try:
+        with _quiet(), Image.open(path) as picture:
+            return picture.width, picture.height, _has_alpha(picture)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path}: not a readable picture ({error})", path=str(path)) from error
+
+
+def load_picture(path: Path, size: tuple[int, int] | None = None, *, alpha: bool = True) -> NDArray[np.uint8]:
+    """uint8 [H,W,3], or [H,W,4] with straight alpha if the file has it and `alpha` is True.
+
+    size    (width, height) to resize to, Pillow's bicubic in 8 bit (premultiplied where there is alpha)
+
+    Grey, palette, CMYK and 16-bit pictures are converted; EXIF rotation is ignored, as COLMAP does.
+    Raises SceneError if the file cannot be decoded.
+    """
+    try:
+        with _quiet(), Image.open(path) as opened:
+            picture = _to_8bit(opened, keep_alpha=alpha)
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path}: the picture cannot be decoded ({error})", path=str(path)) from error
+    if size is not None and picture.size != size:
+        picture = picture.resize(size, Image.Resampling.BICUBIC)
+    return np.asarray(picture)
+
+
+def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
+    """bool [H,W]: True where the mask picture is at least half bright, or half opaque if it has alpha.
+
+    size    (width, height) to resize to, nearest neighbour
+    """
+    try:
+        with _quiet(), Image.open(path) as opened:
+            grey = opened.convert("RGBA").getchannel("A") if _has_alpha(opened) else _to_8bit(opened).convert("L")
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path}: the mask cannot be decoded ({error})", path=str(path)) from error
+    if grey.size != size:
+        grey = grey.resize(size, Image.Resampling.NEAREST)
+    return np.asarray(grey) >= 128
+
+
+def decode_all(views: Iterable[View], *, workers: int | None = None) -> None:
+    """Decode the pictures of all views now, on several threads; afterwards `view.pixels` costs nothing.
+
+    workers     threads; None: one for each core that this process may use, at most 8
+    """
+    pending = [view for view in views if view.load is not None]
+    if workers is None:
+        workers = min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
+        for _ in pool.map(lambda view: view.pixels, pending):
+            pass
+
+
+def _has_alpha(picture: Image.Image) -> bool:
+    return picture.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in picture.info
+
+
+def _to_8bit(picture: Image.Image, *, keep_alpha: bool = False) -> Image.Image:
+    if picture.mode.startswith("I;16"):
+        wide = np.asarray(picture).astype(np.uint16)
+        return Image.fromarray((wide >> 8).astype(np.uint8)).convert("RGB")
+    if picture.mode in ("I", "F"):  # 32-bit containers of 16-bit grey, or floats in 0..1
+        values = np.nan_to_num(np.asarray(picture).astype(np.float64))
+        values = values * 255 if picture.mode == "F" else values / 256
+        return Image.fromarray(np.clip(values, 0, 255).astype(np.uint8)).convert("RGB")
+    return picture.convert("RGBA" if keep_alpha and _has_alpha(picture) else "RGB")
+
+
+def _quiet() -> warnings.catch_warnings[None]:
+    """Large photographs are fine; Pillow still refuses what is absurdly large."""
+    context = warnings.catch_warnings()
+    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
+    return context
