@@ -1,0 +1,121 @@
+"""Quantizer `uniform`: per-channel affine, a range cut into 2^bits equal steps or a given step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import BitstreamError, ShapeError
+
+MAX_BITS = 24
+
+
+class Uniform:
+    """x [N, C] (or [N]) -> indices 0 .. 2^bits - 1 per channel, lattice x^ = low + index * step.
+
+    bits        1..24, one number or one per channel
+    low, high   the range, a number or one per channel; None: the minimum and maximum of what is encoded.
+                Values outside are clamped to it.
+    noise       forward adds uniform noise of one step instead of rounding (for training with a rate term)
+
+    `forward` uses the same lattice, its gradient is 1 inside the range and 0 outside. Arithmetic is float64, results
+    float32. Source: specification of the codec library, quantisers (FakeQuantAffine, SteRound).
+    """
+
+    def __init__(
+        self,
+        bits: int | Sequence[int] = 8,
+        *,
+        low: float | Sequence[float] | None = None,
+        high: float | Sequence[float] | None = None,
+        noise: bool = False,
+    ) -> None:
+        self.bits = np.asarray(bits)
+        if not np.issubdtype(self.bits.dtype, np.integer) or self.bits.min() < 1 or self.bits.max() > MAX_BITS:
+            raise ValueError(f"bits are {bits}, must be integers in 1..{MAX_BITS}")
+        self.low, self.high, self.noise = low, high, noise
+
+    def _lattice(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(low, step, largest index), each [C] float64 on the device of x."""
+        columns = _columns(x)
+        if columns.numel() and not bool(torch.isfinite(columns).all()):
+            raise ValueError("values to quantize must be finite")
+        channels = columns.shape[1]
+        empty = columns.shape[0] == 0
+        ends = []
+        for given, reduce in ((self.low, torch.amin), (self.high, torch.amax)):
+            if given is not None:
+                end = torch.as_tensor(given, dtype=torch.float64, device=x.device).expand(channels)
+            elif empty:
+                end = torch.zeros(channels, dtype=torch.float64, device=x.device)
+            else:
+                end = reduce(columns.detach(), dim=0).to(torch.float64)
+            ends.append(end)
+        # The lattice is stored as float32, so it is computed from what will be read back.
+        low = ends[0].to(torch.float32).to(torch.float64)
+        levels = torch.as_tensor(2.0**self.bits - 1, dtype=torch.float64, device=x.device).expand(channels)
+        step = ((ends[1] - low) / levels).to(torch.float32).to(torch.float64)
+        return low, torch.where(step > 0, step, torch.ones_like(step)), levels
+
+    def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        """x^ of the shape of x; differentiable."""
+        low, step, levels = self._lattice(x)
+        columns = _columns(x)
+        top = low + levels * step
+        with torch.no_grad():
+            if self.noise:
+                noise = torch.rand(columns.shape, generator=generator, device=x.device, dtype=x.dtype)
+                moved = columns + (noise - 0.5) * step.to(x.dtype)
+            else:
+                index = ((columns.to(torch.float64) - low) / step).round()
+                moved = (low + index * step).to(x.dtype)
+            moved = moved.clamp(low.to(x.dtype), top.to(x.dtype))
+        # The clamp carries the gradient: 1 inside the range, 0 outside.
+        inside = columns.clamp(low.to(x.dtype), top.to(x.dtype))
+        return (inside + (moved - inside).detach()).reshape(x.shape)
+
+    __call__ = forward
+
+    def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]:
+        """Indices int64 of the shape of x, and {"low", "step"} float32 [C], {"bits"} uint8 [C] as numpy arrays.
+
+        Raises ValueError for values that are not finite.
+        """
+        low, step, levels = self._lattice(x)
+        index = ((_columns(x).detach().to(torch.float64) - low) / step).round().clamp(torch.zeros_like(levels), levels)
+        channels = index.shape[1]
+        side = {
+            "low": low.cpu().numpy().astype(np.float32),
+            "step": step.cpu().numpy().astype(np.float32),
+            "bits": np.broadcast_to(self.bits, channels).astype(np.uint8),
+        }
+        return index.to(torch.int64).reshape(x.shape), side
+
+    @staticmethod
+    def decode(symbols: Tensor, side: dict[str, Any]) -> Tensor:
+        """x^ float32 of the shape of `symbols`. Raises BitstreamError if the side information does not fit."""
+        index = _columns(symbols)
+        low, step, bits = (np.asarray(side.get(key)) for key in ("low", "step", "bits"))
+        for array in (low, step, bits):
+            if array.shape != (index.shape[1],):
+                raise BitstreamError(f"quantizer side information has shape {array.shape}, must be [{index.shape[1]}]")
+        if not (np.isfinite(low).all() and np.isfinite(step).all() and (step > 0).all()):
+            raise BitstreamError("quantizer side information is not finite, or a step is not positive")
+        if bits.size and not 1 <= bits.min() <= bits.max() <= MAX_BITS:
+            raise BitstreamError(f"quantizer bits are outside 1..{MAX_BITS}")
+        levels = torch.as_tensor(2 ** bits.astype(np.int64) - 1, device=symbols.device)
+        if bool((index < 0).any() or (index > levels).any()):
+            raise BitstreamError("a quantizer index is outside its range")
+        low64, step64 = (torch.as_tensor(a.astype(np.float64), device=symbols.device) for a in (low, step))
+        return (low64 + index.to(torch.float64) * step64).to(torch.float32).reshape(symbols.shape)
+
+
+def _columns(x: Tensor) -> Tensor:
+    """[N] as [N, 1], [N, C] as it is."""
+    if x.ndim not in (1, 2):
+        raise ShapeError(f"a quantizer takes [N] or [N, C], not {list(x.shape)}", actual=x.shape, expected=("N", "C"))
+    return x if x.ndim == 2 else x[:, None]
