@@ -1,0 +1,120 @@
+"""A file and nothing else to a model: choosing the method from the header, and timing it by the protocol."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.errors import BitstreamError, SplatwizardError
+from splatwizard_core.evaluation.memory import MemoryMeter
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.progress import track
+
+REPEATS = 3
+
+
+@dataclass(frozen=True)
+class DecodeReport:
+    """What decoding a file showed.
+
+    digest              of the model; equal models have equal digests
+    decode_s            median of `decode_runs_s`: from opening the file to a model on the device
+    first_decode_s      of the decode before the timed ones, which imports modules and loads kernels
+    peak_bytes          memory growth over the first decode; `memory_kind` says of what
+    """
+
+    method: str
+    method_version: int
+    digest: str
+    counts: dict[str, int]
+    bytes: int
+    sections: dict[str, int]
+    raster: dict[str, Any]
+    decode_s: float
+    decode_runs_s: list[float]
+    first_decode_s: float
+    peak_bytes: int
+    memory_kind: str
+    device: str
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
+    """The decoded model, ready to render on `device`, and the file it came from.
+
+    Raises BitstreamError for a damaged file, PluginError if its method is not installed.
+    """
+    reader = ContainerReader.open(path)
+    method_class = plugins.methods.load(reader.method)
+    if reader.version > method_class.version:
+        raise BitstreamError(
+            f"{reader.name}: version {reader.version} of the layout of '{reader.method}' is newer than "
+            f"{method_class.version}, which is installed: upgrade {plugins.methods.entry(reader.method).distribution}"
+        )
+    with torch.no_grad():
+        model: SplatModel = method_class(plugins, None).decode(reader)
+    model = model.to(device).eval().requires_grad_(False)
+    return model, reader
+
+
+def timed_decode(
+    path: str | Path, plugins: PluginManager, device: torch.device, *, repeats: int = REPEATS
+) -> tuple[SplatModel, DecodeReport]:
+    """Decode once untimed and `repeats` times timed.
+
+    Raises SplatwizardError if two decodes give different models.
+    """
+
+    def once() -> tuple[SplatModel, ContainerReader, float]:
+        _synchronize(device)
+        began = time.perf_counter()
+        model, reader = open_model(path, plugins, device)
+        _synchronize(device)
+        return model, reader, time.perf_counter() - began
+
+    meter = MemoryMeter(device)
+    meter.start()
+    with track(f"decode {Path(path).name}", total=1 + repeats) as bar:
+        model, reader, first = once()
+        peak = meter.peak_bytes()
+        digest = model.digest()
+        bar.advance()
+        runs: list[float] = []
+        for _ in range(repeats):
+            del model
+            model, reader, seconds = once()
+            runs.append(seconds)
+            bar.advance()
+    if model.digest() != digest:
+        raise SplatwizardError(
+            f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
+        )
+    return model, DecodeReport(
+        method=reader.method,
+        method_version=reader.version,
+        digest=digest,
+        counts=model.counts(),
+        bytes=reader.size,
+        sections={"header": reader.header_bytes, **reader.sections},
+        raster=reader.raster,
+        decode_s=statistics.median(runs) if runs else first,
+        decode_runs_s=runs,
+        first_decode_s=first,
+        peak_bytes=peak,
+        memory_kind=meter.kind,
+        device=str(device),
+    )
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

@@ -1,0 +1,61 @@
+"""What a result was made on: packages, device, threads."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+import sys
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.experiments.device import available_cores
+from splatwizard_core.plugins import PluginManager
+
+
+def describe_environment(plugins: PluginManager, device: torch.device, seed: int) -> dict[str, Any]:
+    """Plain values for the record: no machine name, no path, no user."""
+    packages = {p.distribution: p.version for p in plugins.plugins}
+    for name in ("torch", "numpy"):
+        packages[name] = importlib.metadata.version(name)
+    found: dict[str, Any] = {
+        "python": platform.python_version(),
+        "platform": f"{sys.platform}-{platform.machine()}",
+        "packages": packages,
+        "device": str(device),
+        "cpu": cpu_name(),
+        "cores": available_cores(),
+        "threads": torch.get_num_threads(),
+        "seed": seed,
+        "gpu": None,
+    }
+    if device.type == "cuda":
+        properties = torch.cuda.get_device_properties(device)
+        found["gpu"] = {
+            "name": properties.name,
+            "memory_bytes": properties.total_memory,
+            "compute_capability": f"{properties.major}.{properties.minor}",
+            "cuda": torch.version.cuda,
+            "driver": _driver(),
+        }
+    return found
+
+
+def cpu_name() -> str:
+    """Model name of the processor as the system tells it."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()
+
+
+def _driver() -> str | None:
+    try:
+        first = Path("/proc/driver/nvidia/version").read_text().splitlines()[0]
+    except (OSError, IndexError):
+        return None
+    return next((word for word in first.split() if word.count(".") >= 1 and word[0].isdigit()), None)

@@ -1,0 +1,63 @@
+"""Running a step of `sw` in a process of its own, which gets what it is told and nothing else."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.errors import SplatwizardError, UserInputError
+
+
+class FreshProcessError(SplatwizardError):
+    """The other process failed; its own message stands on stderr already."""
+
+
+def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: bool = False) -> dict[str, Any]:
+    """Run `sw ARGUMENTS` in a new interpreter and return the JSON object that it prints.
+
+    cwd         working directory
+    hide_data   take SPLATWIZARD_* (where the data lie) out of its environment
+
+    Its progress and messages go to our stderr. Raises UserInputError or FreshProcessError with its own message if
+    it fails, KeyboardInterrupt if it was interrupted.
+    """
+    environment = {k: v for k, v in os.environ.items() if not (hide_data and k.startswith("SPLATWIZARD_"))}
+    command = [sys.executable, "-m", "splatwizard_core", *arguments]
+    with tempfile.TemporaryFile("w+") as errors:
+        # The display of a terminal must reach it live; anything else is kept for the message.
+        live = sys.stderr.isatty()
+        done = subprocess.run(
+            command, cwd=cwd, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
+            stderr=None if live else errors, text=True, check=False,
+        )  # fmt: skip
+        errors.seek(0)
+        told = errors.read().strip()
+    name = f"sw {arguments[0]}"
+    if done.returncode == 130:
+        raise KeyboardInterrupt
+    if done.returncode != 0:
+        last = told.splitlines()[-1].removeprefix("error: ") if told else "see above"
+        kind = UserInputError if done.returncode == 2 else FreshProcessError
+        raise kind(f"`{name}` in a fresh process failed (status {done.returncode}): {last}")
+    if told:
+        print(told, file=sys.stderr, flush=True)
+    try:
+        content: dict[str, Any] = json.loads(done.stdout)
+    except ValueError as error:
+        raise FreshProcessError(f"`{name}` in a fresh process did not print JSON: {done.stdout[:200]!r}") from error
+    return content
+
+
+def decode_fresh(path: Path, device: str) -> dict[str, Any]:
+    """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight."""
+    with tempfile.TemporaryDirectory(prefix="sw-decode-") as folder:
+        copy = Path(folder) / path.name
+        shutil.copyfile(path, copy)
+        return run_fresh(["decode", copy.name, "--device", device, "--json"], cwd=Path(folder), hide_data=True)

@@ -1,0 +1,121 @@
+"""What is measured of an encoded file: image quality, speed, memory. Meant for a process that did nothing else before."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.evaluation.evaluate import EvaluationResult, evaluate, render_options, render_view
+from splatwizard_core.evaluation.memory import MemoryMeter
+from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
+from splatwizard_core.experiments.environment import describe_environment
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.scene.scene import Scene, View
+from splatwizard_core.training.params import PipelineParams
+
+FEWEST_SPEED_VIEWS = 8
+
+
+def measure(
+    open_model: Callable[[], tuple[SplatModel, dict[str, Any]]],
+    load_scene: Callable[[], Scene],
+    plugins: PluginManager,
+    device: torch.device,
+    ppl: PipelineParams,
+    *,
+    metrics: Sequence[str] | None = None,
+    speed: bool = True,
+    renders: Path | None = None,
+) -> dict[str, Any]:
+    """Open a model, then its scene, and measure the one on the other. Plain values, as `sw eval --json` prints them.
+
+    open_model  () -> the model on `device`, and what it asks of a rasterizer; called first, before any picture is read
+    load_scene  () -> the scene
+    metrics     names; None: all that are installed
+    speed       also measure speed and memory
+    renders     folder for the test views as PNG; None: not kept
+    """
+    meter = MemoryMeter(device)
+    meter.start()
+    model, raster = open_model()
+    decoded_bytes = meter.current_bytes()
+    scene = load_scene()
+    background = scene.background.to(device)
+    options = render_options(raster, background)
+    rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=ppl.raster.prefer, forbid=ppl.raster.forbid)
+    views = scene.test
+
+    meter.start()
+    began = time.perf_counter()
+    with torch.no_grad():
+        model.prepare()
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    prepare_s = time.perf_counter() - began
+    # CUDA's allocator knows all that is held; a resident set only grows by what was measured piece by piece.
+    model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
+
+    report: SpeedReport | None = None
+    speed_views = views if len(views) >= FEWEST_SPEED_VIEWS else _all_views(scene)
+    if speed and speed_views:
+        cameras = [view.camera.to(device) for view in speed_views]
+        report = measure_speed(lambda c: render_view(model, c, rasterizer, options).image, cameras, device)
+    quality = evaluate(
+        model, views, rasterizer, plugins,
+        options=options, quantize8=scene.protocol.quantize8, metrics=metrics, save_to=renders,
+        label=f"evaluate on {scene.name}",
+    )  # fmt: skip
+    found = _describe_scene(scene, quality)
+    found |= {
+        "digest": model.digest(),
+        "counts": model.counts(),
+        "speed": None,
+        "memory": None,
+        "rasterizers": dict(rasterizer.choices),
+        "environment": describe_environment(plugins, device, ppl.seed),
+        "flags": (["fit"] if scene.protocol.split == "all" else []) + (["rss"] if meter.kind == "rss" else []),
+    }
+    if report is not None:
+        facts = asdict(report)
+        first = speed_views[0].camera
+        peak, reserved, kind = (facts.pop(k) for k in ("peak_bytes", "peak_reserved_bytes", "memory_kind"))
+        found["speed"] = {**facts, "prepare_s": prepare_s, "image_size": [first.width, first.height]}
+        found["memory"] = {
+            "kind": kind,
+            "model_bytes": model_bytes,
+            "peak_render_bytes": peak if kind == "cuda" else model_bytes + peak,
+            "peak_reserved_bytes": reserved,
+        }
+    return found
+
+
+def _all_views(scene: Scene) -> list[View]:
+    seen = {view.name for view in scene.test}
+    return [*scene.test, *(view for view in scene.train if view.name not in seen)]
+
+
+def _describe_scene(scene: Scene, quality: EvaluationResult) -> dict[str, Any]:
+    unknown = {f"metrics.{name}.mean": m.reason for name, m in quality.metrics.items() if m.reason is not None}
+    return {
+        "dataset": scene.protocol.dataset,
+        "scene": scene.name,
+        "protocol": {"id": scene.protocol.id, **asdict(scene.protocol)},
+        "train_views": len(scene.train),
+        "test_views": len(scene.test),
+        "views": quality.views,
+        "metrics": {
+            name: {"mean": m.mean, "per_view": m.per_view, "direction": m.direction}
+            for name, m in quality.metrics.items()
+        },
+        "visible_gaussians": quality.visible_gaussians,
+        "drawn_gaussians": quality.drawn_gaussians,
+        "renders": quality.renders,
+        "unknown": unknown,
+    }
