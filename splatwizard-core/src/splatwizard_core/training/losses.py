@@ -99,13 +99,15 @@ class _Photometric(torch.autograd.Function):
 
 def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
     height, width = x.shape[-2:]
-    moments = torch.stack([x, y, x * x, y * y, x * y]).reshape(-1, 1, height, width)
+    moments = torch.stack([x, y, x * x, y * y, x * y]).reshape(1, -1, height, width)  # [1, 5C, H, W]
+    planes = moments.shape[1]
     offsets = torch.arange(-RADIUS, RADIUS + 1, dtype=x.dtype, device=x.device)
     window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
-    window = window / window.sum()
+    window = (window / window.sum()).expand(planes, 1, 1, -1)
     rows, columns = (RADIUS, RADIUS) if padding == "same" else (0, 0)
-    blurred = F.conv2d(moments, window.view(1, 1, 1, -1), padding=(0, columns))
-    blurred = F.conv2d(blurred, window.view(1, 1, -1, 1), padding=(rows, 0))
+    # Grouped: as a batch of one-channel images it would miss the depthwise kernel of torch on the CPU.
+    blurred = F.conv2d(moments, window, padding=(0, columns), groups=planes)
+    blurred = F.conv2d(blurred, window.transpose(2, 3), padding=(rows, 0), groups=planes)
     mx, my, xx, yy, xy = blurred.view(5, -1, *blurred.shape[-2:])
     luminance = (2 * mx * my + C1) / (mx * mx + my * my + C1)
     structure = (2 * (xy - mx * my) + C2) / (xx - mx * mx + yy - my * my + C2)
