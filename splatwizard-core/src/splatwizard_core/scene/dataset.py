@@ -16,9 +16,11 @@ class SceneOptions:
     images          picture folder of a COLMAP scene, such as "images_2"
     resolution      -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
     test_every      every n-th view by name is a test view
-    split           "every8" and the like, "file", "all"
+    split           "every8" and the like, "lod:30", "file", "all"
     background      "black" or "white"
     principal_point "center" or "file"
+    mask_background pictures with alpha are cut out (alpha times colour on the background); False: alpha is a mask only.
+                    Blender scenes are always cut out
     init_points     how many random start points where there is no SfM
     seed            of those points
     """
@@ -29,6 +31,7 @@ class SceneOptions:
     split: str | None = None
     background: str | None = None
     principal_point: str = "center"
+    mask_background: bool = False
     init_points: int = 100_000
     seed: int = 0
 

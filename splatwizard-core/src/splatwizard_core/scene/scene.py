@@ -73,6 +73,7 @@ class Protocol:
     split       "every8", "every<n>", "file", "all"
     background  "black" or "white"
     quantize8   renders are rounded to 8 bit before metrics
+    masked      pictures of a COLMAP scene were cut out by their alpha
     """
 
     dataset: str
@@ -82,6 +83,7 @@ class Protocol:
     background: str = "black"
     principal_point: str = "center"
     quantize8: bool = True
+    masked: bool = False
 
     @property
     def id(self) -> str:
@@ -89,7 +91,7 @@ class Protocol:
         return "/".join(
             (
                 self.dataset, self.images, f"r{self.resolution}", self.split, self.background,
-                f"pp-{self.principal_point}", "q8" if self.quantize8 else "float",
+                f"pp-{self.principal_point}", "q8" if self.quantize8 else "float", *(["masked"] if self.masked else []),
             )
         )  # fmt: skip
 
