@@ -8,20 +8,17 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.training.losses import photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.stage import LossPack, Stage, StageContext
-
 from sw_3dgs import tasks
 from sw_3dgs.config import ThreeDGSConfig
 
 if TYPE_CHECKING:
+    from torch import Tensor
+
     from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.rendering.rasterizer import RenderResult
     from splatwizard_core.scene.scene import Scene, View
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
     from splatwizard_core.training.scheduler import Scheduler
-    from torch import Tensor
-
-PLAN_STEPS = 30_000
-"""The length of the published plan, which `scale_schedule` scales from."""
 
 
 class ThreeDGSStage(Stage):
@@ -35,14 +32,8 @@ class ThreeDGSStage(Stage):
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
     def scaled(self, steps: int) -> int:
-        """A plan bound in steps of this run (the same, unless the schedule is scaled with the iterations)."""
-        if not self.config.scale_schedule:
-            return steps
-        return round(steps * self.config.iterations / PLAN_STEPS)
-
-    def scaled_interval(self, steps: int) -> int:
-        """An interval likewise, never below one step."""
-        return max(1, self.scaled(steps))
+        """A number of steps that a task keeps to itself, in steps of this run; the scheduler scales only plans."""
+        return max(1, round(steps * self.config.schedule_scale)) if steps > 0 else 0
 
     def begin(self, context: StageContext) -> SplatModel:
         self.white = context.scene.protocol.background == "white"
@@ -67,27 +58,22 @@ class ThreeDGSStage(Stage):
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         lr = self.config.lr
-        max_steps = self.scaled_interval(lr.max_steps)
         update_lr = tasks.UpdateLearningRate(
             init=lr.position_init,
             final=lr.position_final,
-            max_steps=max_steps,
+            max_steps=self.scaled(lr.max_steps),
             delay_steps=self.scaled(lr.position_delay_steps),
             delay_mult=lr.position_delay_mult,
         )
-        scheduler.register_task(range(max_steps), update_lr, name="update lr")
+        scheduler.register_task(range(lr.max_steps), update_lr, name="update lr")
         scheduler.register_task(
-            range(0, max_steps, self.scaled_interval(self.config.sh_interval)),
-            tasks.increase_sh_degree,
-            name="increase SH degree",
+            range(0, lr.max_steps, self.config.sh_interval), tasks.increase_sh_degree, name="increase SH degree"
         )
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         densify = self.config.densify
-        stop = self.scaled(densify.stop)
-        reset_interval = self.scaled_interval(densify.reset_interval)
         scheduler.register_task(
-            range(stop),
+            range(densify.stop),
             tasks.collect_absgrad_statistics if densify.absgrad else tasks.collect_gradient_statistics,
             name="collect gradient statistics",
         )
@@ -96,24 +82,20 @@ class ThreeDGSStage(Stage):
             percent_dense=densify.percent_dense,
             min_opacity=densify.min_opacity,
             world_prune=densify.world_prune,
-            size_rules_after=reset_interval,
+            size_rules_after=self.scaled(densify.reset_interval),
             prune_screen_px=densify.prune_screen_px,
             revised_opacity=densify.revised_opacity,
-            reset_interval=reset_interval,
+            reset_interval=self.scaled(densify.reset_interval),
             pause_after_reset=self.scaled(densify.pause_after_reset),
         )
         scheduler.register_task(
-            range(self.scaled(densify.start), stop, self.scaled_interval(densify.interval)),
-            prune_and_densify,
-            name="prune and densify",
+            range(densify.start, densify.stop, densify.interval), prune_and_densify, name="prune and densify"
         )
         reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
         if self.white and densify.white_reset > 0:
             # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
-            scheduler.register_task(
-                self.scaled_interval(densify.white_reset), reset_opacity, name="reset opacity (white background)"
-            )
-        scheduler.register_task(range(0, stop, reset_interval), reset_opacity, name="reset opacity")
+            scheduler.register_task(densify.white_reset, reset_opacity, name="reset opacity (white background)")
+        scheduler.register_task(range(0, densify.stop, densify.reset_interval), reset_opacity, name="reset opacity")
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         absgrad = self.config.densify.absgrad

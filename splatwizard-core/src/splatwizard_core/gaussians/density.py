@@ -6,8 +6,9 @@ Source: 3DGS (arXiv 2308.04079), following the authors' code where it differs fr
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, TypeVar
+from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -16,25 +17,23 @@ from splatwizard_core.errors import EmptyModel
 from splatwizard_core.gaussians.model import GaussianModel, logit
 from splatwizard_core.gaussians.splat_model import SplatModel
 
-ModelT = TypeVar("ModelT", bound=SplatModel, contravariant=True)
-
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN
 """Scales of the children of a split are divided by this."""
 
 
-class RowEditor(Protocol[ModelT]):
+class RowEditor(Protocol):
     """Adds and removes rows of a model together with its optimizer state (`SplatOptimizer`)."""
 
-    def append_rows(self, model: ModelT, rows: dict[str, Tensor]) -> None:
+    def append_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> None:
         """Rows for the names given; zeros for the buffers that are not; Adam moments of new rows are zero."""
         ...
 
-    def keep_rows(self, model: ModelT, mask: Tensor, *, carry_grad: bool = False) -> None:
+    def keep_rows(self, model: SplatModel, mask: Tensor, *, carry_grad: bool = False) -> None:
         """Keep the rows where `mask` [N] bool is True, of parameters, buffers and Adam moments."""
         ...
 
-    def replace(self, model: ModelT, name: str, tensor: Tensor) -> None:
+    def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
         """Replace one parameter; its Adam moments become zero, the step counter stays."""
         ...
 
@@ -68,7 +67,7 @@ def accumulate_statistics(model: GaussianModel, gradients: Tensor, radii: Tensor
 @torch.no_grad()
 def densify_and_prune(
     model: GaussianModel,
-    rows: RowEditor[GaussianModel],
+    rows: RowEditor,
     *,
     step: int,
     extent: float,
@@ -160,7 +159,7 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
 
 
 @torch.no_grad()
-def reset_opacity(model: GaussianModel, rows: RowEditor[GaussianModel], *, ceiling: float = 0.01) -> None:
+def reset_opacity(model: GaussianModel, rows: RowEditor, *, ceiling: float = 0.01) -> None:
     """Lower every opacity to at most `ceiling`; the Adam moments of the opacities become zero, their step stays."""
     rows.replace(model, "opacity_logits", model.opacity_logits.detach().clamp_max(logit(ceiling)))
 

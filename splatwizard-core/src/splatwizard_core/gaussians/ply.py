@@ -96,7 +96,7 @@ def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
         model.means,
         model.means.new_zeros(n, 3),
         model.sh_dc[:, 0, :],
-        model.sh_rest.transpose(1, 2).reshape(n, -1),
+        model.sh_rest.transpose(1, 2).flatten(1),
         model.opacity_logits[:, None],
         model.log_scales,
         model.quats,

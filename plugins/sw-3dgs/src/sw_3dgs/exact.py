@@ -1,0 +1,37 @@
+"""The file in mode `exact`: all six tensors as float32, bit for bit. 236 bytes a Gaussian at SH degree 3."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+from splatwizard_core.gaussians.model import GaussianModel
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+
+TAILS = {"means": (3,), "sh_dc": (1, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
+"""Shape of one row of each tensor, but for sh_rest [K-1,3]."""
+
+
+def encode(model: GaussianModel, writer: ContainerWriter) -> None:
+    """One section a tensor."""
+    writer.raster["sh_degree"] = model.max_sh_degree
+    writer.static["num_gaussians"] = model.num_rows
+    writer.static["max_sh_degree"] = model.max_sh_degree
+    writer.static["active_sh_degree"] = model.active_sh_degree
+    for name in (*TAILS, "sh_rest"):
+        writer.add_array(name, getattr(model, name).detach().cpu().float().numpy())
+
+
+def decode(reader: ContainerReader) -> GaussianModel:
+    """The inverse of `encode`. Raises BitstreamError."""
+    n = reader.integer("num_gaussians", low=1, high=2**32 - 1)
+    degree = reader.integer("max_sh_degree", low=0, high=3)
+    active = reader.integer("active_sh_degree", low=0, high=degree)
+    shapes = {name: (n, *tail) for name, tail in TAILS.items()} | {"sh_rest": (n, (degree + 1) ** 2 - 1, 3)}
+    tensors = {
+        name: torch.from_numpy(reader.array(name, dtype="float32", shape=shape)) for name, shape in shapes.items()
+    }
+    return GaussianModel(**tensors, active_sh_degree=active)

@@ -1,0 +1,27 @@
+"""Named configurations, and the rate points of the file."""
+
+from collections.abc import Mapping
+from typing import Any
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    # The plan of the Splatwizard paper; hyper-parameters of the 3DGS authors' code of 2023.
+    "paper": {},
+    # Exactly the authors' code of 2023: its strict comparison makes 600 the first densification.
+    "inria": {"densify.start": 600},
+    # The authors' code after October 2024; its exposure compensation is off, as it is there by default.
+    "inria2024": {"densify.start": 600, "lr.opacity": 0.025, "clamp_render": True},
+    # AbsGS (arXiv 2404.10484) with the threshold that gsplat suggests.
+    "absgrad": {"densify.absgrad": True, "densify.grad_threshold": 8e-4},
+    # The same plan for a CPU and the demo scene.
+    "quick": {
+        "iterations": 1500,
+        "lr.max_steps": 1500,
+        "sh_interval": 300,
+        "densify.start": 200,
+        "densify.stop": 1000,
+        "densify.interval": 100,
+        "densify.reset_interval": 3000,
+    },
+}
+
+RATES: Mapping[str, Mapping[str, Any]] = {}

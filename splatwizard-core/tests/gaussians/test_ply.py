@@ -1,0 +1,165 @@
+"""3DGS .ply files: every bit comes back, strangers' files are refused in one line."""
+
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from plyfile import PlyData, PlyElement
+
+from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.ply import export_ply, load_ply, property_names, save_ply
+from splatwizard_core.gaussians.splat_model import SplatModel
+
+DATA = Path(os.environ.get("SPLATWIZARD_TEST_DATA", Path(__file__).parents[4] / "shared" / "data")) / "model"
+
+
+def random_model(n: int, degree: int, seed: int) -> GaussianModel:
+    g = torch.Generator().manual_seed(seed)
+    k = (degree + 1) ** 2
+    shapes = [(n, 3), (n, 1, 3), (n, k - 1, 3), (n,), (n, 3), (n, 4)]
+    return GaussianModel(*(torch.randn(s, generator=g) * 3 for s in shapes))
+
+
+def bits(model: GaussianModel) -> dict[str, bytes]:
+    return {name: p.detach().numpy().tobytes() for name, p in model.named_parameters()}
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="no trained .ply at hand")
+def test_a_trained_file_comes_back_bit_for_bit(tmp_path):
+    for source in DATA.glob("*.ply"):
+        model = load_ply(source)
+        save_ply(model, tmp_path / "copy.ply")
+        before, after = source.read_bytes(), (tmp_path / "copy.ply").read_bytes()
+        size = 248 * model.num_rows
+        assert len(after) - after.index(b"end_header\n") - 11 == size
+        assert before[-size:] == after[-size:]
+        assert model.active_sh_degree == model.max_sh_degree == 3
+
+
+@settings(max_examples=25, deadline=None)
+@given(n=st.integers(0, 40), degree=st.integers(0, 3), seed=st.integers(0, 2**31))
+def test_round_trip_of_any_degree(tmp_path_factory, n, degree, seed):
+    path = tmp_path_factory.mktemp("ply") / "model.ply"
+    model = random_model(n, degree, seed)
+    save_ply(model, path)
+    loaded = load_ply(path)
+    assert loaded.max_sh_degree == degree
+    assert bits(loaded) == bits(model)
+
+
+def test_not_a_number_and_infinity_keep_their_bits(tmp_path):
+    model = random_model(3, 1, 0)
+    with torch.no_grad():
+        model.opacity_logits[0] = math.inf
+        model.means[1, 2] = math.nan
+    save_ply(model, tmp_path / "m.ply")
+    assert bits(load_ply(tmp_path / "m.ply")) == bits(model)
+
+
+def test_layout_is_the_one_that_viewers_read(tmp_path):
+    model = random_model(2, 3, 0)
+    save_ply(model, tmp_path / "m.ply")
+    raw = (tmp_path / "m.ply").read_bytes()
+    header, _, rows = raw.partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:3] == ["ply", "format binary_little_endian 1.0", "element vertex 2"]
+    assert lines[3:] == [f"property float {name}" for name in property_names(15)]
+    table = np.frombuffer(rows, "<f4").reshape(2, 62)
+    assert not table[:, 3:6].any()  # normals
+    # Channel-major: all 15 coefficients of red, then green, then blue.
+    assert np.array_equal(table[:, 9:24], model.sh_rest[:, :, 0].detach().numpy())
+    assert np.array_equal(table[:, 39:54], model.sh_rest[:, :, 2].detach().numpy())
+    assert np.array_equal(table[:, 54], model.opacity_logits.detach().numpy())
+    assert np.array_equal(table[:, 58:], model.quats.detach().numpy())
+
+
+def test_ascii_double_and_any_order_are_read(tmp_path):
+    model = random_model(4, 1, 3)
+    save_ply(model, tmp_path / "m.ply")
+    vertex = PlyData.read(tmp_path / "m.ply")["vertex"].data
+    names = [*reversed([n for n in vertex.dtype.names if n not in ("nx", "ny", "nz")]), "red"]
+    rows = np.zeros(4, dtype=[(n, "u1" if n == "red" else "f8") for n in names])
+    for name in names[:-1]:
+        rows[name] = vertex[name]
+    PlyData([PlyElement.describe(rows, "vertex")], text=True).write(str(tmp_path / "ascii.ply"))
+    # plyfile prints doubles with 18 digits, so float32 values survive
+    assert bits(load_ply(tmp_path / "ascii.ply")) == bits(model)
+
+
+@pytest.fixture
+def good(tmp_path) -> bytes:
+    save_ply(random_model(6, 3, 1), tmp_path / "good.ply")
+    return (tmp_path / "good.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda raw: raw[:-1], "truncated"),
+        (lambda raw: raw[:-400], "truncated"),
+        (lambda raw: raw[:40], "no header"),
+        (lambda raw: b"", "no header"),
+        (lambda raw: b"\x89PNG" + raw, "no header"),
+        (lambda raw: raw.replace(b"vertex 6", b"vertex 999999999999"), "claims"),
+        (lambda raw: raw.replace(b"vertex 6", b"vertex -6"), "bad header line"),
+        (lambda raw: raw.replace(b"float opacity", b"list uchar int opacity"), "no place"),
+        (lambda raw: raw.replace(b"binary_little_endian", b"binary_middle_endian"), "not a readable"),
+        (lambda raw: raw.replace(b"element vertex 6", b"element vertex 1\nelement vertex 5"), "bad"),
+    ],
+)
+def test_a_damaged_file_is_refused_in_one_line(tmp_path, good, spoil, message):
+    (tmp_path / "bad.ply").write_bytes(spoil(good))
+    with pytest.raises(BitstreamError, match=message) as caught:
+        load_ply(tmp_path / "bad.ply")
+    assert "bad.ply" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda raw: raw.replace(b"float opacity", b"float opaqueness"), "'opacity' is missing"),
+        (lambda raw: raw.replace(b"float f_rest_44", b"float f_more_44"), "44 f_rest"),
+        (lambda raw: raw.replace(b"element vertex", b"element points"), "no element 'vertex'"),
+    ],
+)
+def test_another_kind_of_ply_is_no_model(tmp_path, good, spoil, message):
+    (tmp_path / "other.ply").write_bytes(spoil(good))
+    with pytest.raises(SceneError, match=message):
+        load_ply(tmp_path / "other.ply")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(SceneError, match="absent"):
+        load_ply(tmp_path / "absent.ply")
+
+
+@settings(max_examples=60, deadline=None)
+@given(position=st.integers(0, 500), value=st.integers(0, 255))
+def test_a_flipped_header_byte_never_ends_in_another_error(tmp_path_factory, position, value):
+    folder = tmp_path_factory.mktemp("flip")
+    save_ply(random_model(2, 0, 1), folder / "m.ply")
+    raw = bytearray((folder / "m.ply").read_bytes())
+    raw[position % len(raw)] = value
+    (folder / "m.ply").write_bytes(raw)
+    try:
+        model = load_ply(folder / "m.ply")
+    except UserInputError:
+        return
+    assert model.num_rows <= 2
+
+
+def test_export_refuses_models_that_depend_on_the_camera(tmp_path):
+    class Anchors(SplatModel):
+        pass
+
+    with pytest.raises(SceneError, match="Anchors"):
+        export_ply(Anchors(), tmp_path / "m.ply")
+    export_ply(random_model(2, 2, 0), tmp_path / "m.ply")
+    assert [p.name for p in tmp_path.iterdir()] == ["m.ply"]
