@@ -172,7 +172,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
 
 
 def read_images(path: Path) -> dict[int, ColmapImage]:
-    """images.bin: u64 count, then (i32 id, 4 f64 q, 3 f64 t, i32 camera id, name NUL, u64 n, n x (2 f64, i64)); or .txt."""
+    """images.bin: u64 count, then (i32 id, 7 f64 q t, i32 camera id, name NUL, u64 n, n x (2 f64, i64)); or .txt."""
     if path.suffix == ".txt":
         return _read_images_text(path)
     images: dict[int, ColmapImage] = {}
