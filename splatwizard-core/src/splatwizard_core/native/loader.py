@@ -221,7 +221,9 @@ class NativeModule:
         try:
             _load_library(library)
         except (OSError, RuntimeError) as error:
-            raise NativeBuildError(self._explain(f"{library} was compiled but does not load: {error}")) from error
+            raise NativeBuildError(
+                self._explain(f"{library} was compiled but does not load: {error.__cause__ or error}")
+            ) from error
         return library
 
     def _existing(self) -> Iterator[Path]:

@@ -27,8 +27,8 @@ constexpr int X_WIDTH = 160;      // >= P_WIDTH + 2 R
 constexpr float C1 = 0.01f * 0.01f;
 constexpr float C2 = 0.03f * 0.03f;
 // exp(-k^2 / (2 * 1.5^2)), k = -5 .. 5, normalised to sum 1.
-constexpr float W[TAPS] = {0.00102838f, 0.00759876f, 0.03600077f, 0.10936069f, 0.21300554f, 0.26601172f,
-                           0.21300554f, 0.10936069f, 0.03600077f, 0.00759876f, 0.00102838f};
+constexpr float W[TAPS] = {0.0010283801f, 0.007598758f, 0.036000773f, 0.10936069f, 0.21300554f, 0.26601171f,
+                           0.21300554f,   0.10936069f,  0.036000773f, 0.007598758f, 0.0010283801f};
 
 struct alignas(64) Workspace {
   float stats[TAPS][4][P_WIDTH];    // ring: horizontal sums of u, v, u^2, v^2

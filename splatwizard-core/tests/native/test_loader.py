@@ -1,0 +1,402 @@
+"""The native loader, on C++ files of a few lines that need no torch header and compile in a moment."""
+
+import ctypes
+import itertools
+import json
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from splatwizard_core.errors import NativeBuildError
+from splatwizard_core.native import loader, toolchain
+from splatwizard_core.native.build_lock import build_lock
+from splatwizard_core.native.loader import NativeModule, build_all, cache_root, declared_modules, resolve_module
+from splatwizard_core.plugins.manager import PluginManager
+
+needs_compiler = pytest.mark.skipif(
+    not any(shutil.which(name) for name in toolchain.COMPILERS), reason="no C++ compiler on this machine"
+)
+packages = itertools.count()
+
+
+class Package:
+    """A package on disk with native sources, and a compiler that counts how often it is called."""
+
+    def __init__(self, folder: Path, calls: Path) -> None:
+        self.folder, self.calls = folder, calls
+        self.write("__init__.py", "")
+        self.write("value.h", "#define VALUE 41\n")
+        self.write("answer.cpp", '#include "value.h"\nextern "C" int answer() { return VALUE + 1; }\n')
+
+    def write(self, name: str, text: str) -> None:
+        (self.folder / name).write_text(text)
+
+    def module(self, **changes) -> NativeModule:
+        """A new object each time, as a new process would have."""
+        fields = {"sources": ("answer.cpp",), "headers": ("*.h",), "without": "answers are guessed"}
+        return NativeModule(name="answer", package=self.folder.name, **{**fields, **changes})
+
+    @property
+    def compilations(self) -> int:
+        return self.calls.read_text().count(" -c ") if self.calls.exists() else 0
+
+
+def call(library: Path | str | None, function: str = "answer") -> int:
+    # A copy: the dynamic linker would hand out the library that is already open under this path.
+    assert library is not None
+    copy = Path(library).with_name(f"copy-{next(packages)}.so")
+    shutil.copy(library, copy)
+    return getattr(ctypes.CDLL(str(copy)), function)()
+
+
+@pytest.fixture
+def package(tmp_path, monkeypatch) -> Package:
+    folder = tmp_path / "src" / f"tiny_native_{next(packages)}"
+    folder.mkdir(parents=True)
+    monkeypatch.syspath_prepend(str(folder.parent))
+    monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "cache"))
+    for name in ("SPLATWIZARD_NATIVE", "SPLATWIZARD_BUILD_TIMEOUT", "CXX", "MAX_JOBS"):
+        monkeypatch.delenv(name, raising=False)
+    calls = tmp_path / "calls"
+    real = next((found for name in toolchain.COMPILERS if (found := shutil.which(name))), None)
+    if real is not None:
+        wrapper = tmp_path / "counting-compiler"
+        wrapper.write_text(f'#!/bin/sh\necho "$@" >> {calls}\nexec {real} "$@"\n')
+        wrapper.chmod(0o755)
+        monkeypatch.setenv("CXX", str(wrapper))
+    return Package(folder, calls)
+
+
+@needs_compiler
+def test_the_first_load_compiles_with_a_line_of_progress_and_the_second_finds_the_cache(package):
+    said: list[str] = []
+    first = package.module(seconds=40)
+    assert first.state()["state"] == "not built"
+    first.load(say=said.append)
+    assert said[0] == "compiling kernels 'answer' (once, about 40 s) ..."
+    assert package.compilations == 1
+    second = package.module()
+    second.load(say=said.append)
+    assert package.compilations == 1
+    assert len(said) == 2
+    assert second.state()["state"] == "cached"
+    assert call(second.state()["path"]) == 42
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", ["answer.cpp", "value.h"])
+def test_a_changed_source_or_header_recompiles(package, name):
+    package.module().build()
+    text = (package.folder / name).read_text()
+    package.write(name, text.replace("41", "50").replace("VALUE + 1", "VALUE + 10"))
+    assert call(package.module().build()) == 51
+    assert package.compilations == 2
+
+
+def test_the_cache_key_names_torch_flags_and_cpu(package, monkeypatch):
+    import torch
+
+    module = package.module()
+    keys = {module.key("native"), module.key("portable"), package.module(cflags=("-DX",)).key("native")}
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "__version__", "99.0")
+        keys.add(module.key("native"))
+    with monkeypatch.context() as patch:
+        patch.setattr(toolchain, "cpu_identity", lambda: "another CPU")
+        keys.add(module.key("native"))
+        assert module.key("portable") in keys
+    assert len(keys) == 5
+    assert module.key("native") in keys
+
+
+@needs_compiler
+def test_a_header_that_is_not_declared_is_an_error_that_names_it(package):
+    with pytest.raises(NativeBuildError, match=r"answer\.cpp includes value\.h.*add it to headers"):
+        package.module(headers=()).build()
+
+
+@needs_compiler
+def test_a_compile_error_shows_the_compilers_line_the_log_and_how_to_go_on(package):
+    package.write("answer.cpp", 'extern "C" int answer() { return nonsense; }\n')
+    module = package.module()
+    with pytest.raises(NativeBuildError) as caught:
+        module.load()
+    text = str(caught.value)
+    assert "answer.cpp:1:34: error:" in text
+    assert "nonsense" in text
+    assert "without them: answers are guessed" in text
+    log = Path(text.partition("full log: ")[2].splitlines()[0])
+    assert "-std=c++20" in log.read_text()
+    assert "nonsense" in log.read_text()
+    with pytest.raises(NativeBuildError):
+        module.load()
+    assert package.compilations == 1
+
+
+@needs_compiler
+def test_a_library_that_was_compiled_but_does_not_load_says_why(package):
+    package.write("answer.cpp", 'int missing();\nextern "C" int answer() { return missing(); }\n')
+    with pytest.raises(NativeBuildError, match=r"does not load: .*undefined symbol.*missing"):
+        package.module(headers=()).load()
+
+
+@needs_compiler
+def test_a_fallback_warns_once(package, caplog):
+    package.write("answer.cpp", "nonsense\n")
+    module = package.module()
+    assert not module.try_load()
+    assert not module.try_load()
+    assert [r.levelname for r in caplog.records if "answer" in r.message] == ["WARNING"]
+    assert module.available() is not None
+
+
+def test_a_missing_compiler_is_named_with_the_package_that_brings_it(package, monkeypatch, tmp_path):
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
+    module = package.module()
+    assert "apt install g++" in str(module.available())
+    with pytest.raises(NativeBuildError, match=r"no C\+\+ compiler was found(.|\n)*answers are guessed"):
+        module.load()
+
+
+def test_a_wrong_cxx_is_named(package, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler -x")
+    assert "no-such-compiler" in str(package.module().available())
+
+
+@needs_compiler
+def test_a_cached_build_needs_no_compiler(package, monkeypatch, tmp_path):
+    package.module().build()
+    monkeypatch.delenv("CXX")
+    monkeypatch.setenv("PATH", str(tmp_path / "empty"))
+    module = package.module()
+    assert module.available() is None
+    module.load()
+    assert module.state()["loaded"]
+
+
+@needs_compiler
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "no facts", "replaced"])
+def test_a_damaged_library_is_rebuilt(package, damage):
+    library = package.module().build()
+    content = library.read_bytes()
+    facts = library.with_suffix(".json")
+    if damage == "truncated":
+        library.write_bytes(content[: len(content) // 2])
+    elif damage == "flipped":
+        library.write_bytes(content[:999] + bytes([content[999] ^ 255]) + content[1000:])
+    elif damage == "no facts":
+        facts.unlink()
+    else:  # the digest fits, and still it is no library
+        library.write_bytes(b"not a library")
+        facts.write_text(json.dumps({"sha256": loader._digest(library)}))
+    module = package.module()
+    module.load()
+    assert package.compilations == 2
+    assert call(module.state()["path"]) == 42
+
+
+@needs_compiler
+def test_available_and_state_compile_nothing(package):
+    module = package.module()
+    assert module.available() is None
+    assert module.state() == {
+        "name": "answer", "state": "not built", "loaded": False, "path": None, "target": "cpu"
+    }  # fmt: skip
+    assert package.compilations == 0
+
+
+def test_native_code_can_be_switched_off(package, monkeypatch, caplog):
+    monkeypatch.setenv("SPLATWIZARD_NATIVE", "0")
+    module = package.module()
+    assert "SPLATWIZARD_NATIVE" in str(module.available())
+    assert not module.try_load()
+    assert not caplog.records  # who switched it off needs no warning
+    assert package.compilations == 0
+
+
+@needs_compiler
+def test_a_cache_that_cannot_be_written_is_named(package, monkeypatch, tmp_path):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "file" / "below"))
+    with pytest.raises(NativeBuildError, match=r"cannot write .*below.*SPLATWIZARD_CACHE"):
+        package.module().load()
+
+
+def test_a_missing_source_is_named(package):
+    with pytest.raises(NativeBuildError, match=r"gone\.cpp"):
+        package.module(sources=("gone.cpp",)).load()
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from splatwizard_core.native.build_lock import build_lock
+with build_lock(Path(sys.argv[1]), timeout=5, say=print):
+    print("held", flush=True)
+    sys.stdin.read()
+"""
+
+
+def hold_lock(path: Path) -> subprocess.Popen:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    holder = subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == "held\n"
+    return holder
+
+
+@needs_compiler
+def test_a_lock_that_is_never_released_times_out_and_names_its_process(package, monkeypatch):
+    monkeypatch.setenv("SPLATWIZARD_BUILD_TIMEOUT", "0.3")
+    module = package.module()
+    said: list[str] = []
+    holder = hold_lock(module._library(module.cache_folder, "native").with_suffix(".lock"))
+    try:
+        with pytest.raises(NativeBuildError, match=rf"process {holder.pid} has held .*SPLATWIZARD_BUILD_TIMEOUT"):
+            module.load(say=said.append)
+    finally:
+        holder.communicate()
+    assert said == [f"waiting for process {holder.pid} that is compiling the same kernels ..."]
+    assert package.compilations == 0
+
+
+@needs_compiler
+def test_a_lock_of_a_killed_process_blocks_nobody(package):
+    module = package.module()
+    lock = module._library(module.cache_folder, "native").with_suffix(".lock")
+    holder = hold_lock(lock)
+    holder.kill()
+    holder.communicate()
+    assert lock.read_text() == str(holder.pid)
+    said: list[str] = []
+    module.load(say=said.append)
+    assert not [line for line in said if "waiting" in line]
+
+
+@needs_compiler
+def test_concurrent_builders_compile_once(package):
+    results: list[Path] = []
+    threads = [threading.Thread(target=lambda: results.append(package.module().build())) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(results) == 4
+    assert len(set(results)) == 1
+    assert package.compilations == 1
+
+
+def test_a_lock_is_released_when_its_block_raises(tmp_path):
+    with pytest.raises(RuntimeError), build_lock(tmp_path / "lock", timeout=1, say=print):
+        raise RuntimeError
+    with build_lock(tmp_path / "lock", timeout=0, say=print):
+        assert (tmp_path / "lock").read_text() == str(os.getpid())
+
+
+LEVEL_H = """
+#include <splatwizard/dispatch.h>
+#define DECLARE(arch) namespace arch { int level(); }
+SW_FOR_EACH_ARCH(DECLARE)
+"""
+LEVEL_CPP = """
+#include "level.h"
+namespace SW_ARCH {
+int level() {
+#if defined(__AVX512VL__)
+  return 4;
+#elif defined(__AVX2__)
+  return 3;
+#else
+  return 2;
+#endif
+}
+}
+"""
+
+
+@needs_compiler
+@pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="the levels are those of x86-64")
+def test_a_portable_build_runs_the_best_kernel_that_this_cpu_has(package):
+    package.write("level.h", LEVEL_H)
+    package.write("level.cpp", LEVEL_CPP)
+    package.write("answer.cpp", '#include "level.h"\nextern "C" int answer() { return SW_SELECT(level)(); }\n')
+    module = package.module(kernels=("level.cpp",))
+    library = module.build(march="portable", folder=module.prebuilt_folder)
+    assert package.compilations == 4
+    with open("/proc/cpuinfo") as handle:
+        flags = next(line for line in handle if line.startswith("flags")).split()
+    expected = 4 if {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"} <= set(flags) else 2
+    if expected == 2 and {"avx2", "fma", "bmi1", "bmi2"} <= set(flags):
+        expected = 3
+    assert call(library) == expected
+    fresh = package.module(kernels=("level.cpp",))
+    fresh.load()
+    assert fresh.state()["state"] == "prebuilt"
+    assert package.compilations == 4
+
+
+@needs_compiler
+def test_kernels_see_their_namespace_and_no_torch_header(package):
+    package.write("level.h", LEVEL_H)
+    package.write("level.cpp", "#if __has_include(<torch/library.h>)\n#error torch\n#endif\n" + LEVEL_CPP)
+    package.write("answer.cpp", '#include "level.h"\nextern "C" int answer() { return SW_SELECT(level)(); }\n')
+    assert call(package.module(kernels=("level.cpp",)).build()) in (2, 3, 4)
+
+
+def test_an_unknown_march_is_refused(package):
+    with pytest.raises(ValueError, match="march is 'fast'"):
+        package.module().build(march="fast")
+
+
+@needs_compiler
+def test_build_all_builds_what_entries_declare_and_reports_what_fails(package, monkeypatch):
+    monkeypatch.setattr(loader, "CORE_MODULES", ())
+    package.write(
+        "native.py",
+        "from splatwizard_core.native import NativeModule\n"
+        f"GOOD = NativeModule('good', '{package.folder.name}', ('answer.cpp',), ('*.h',))\n"
+        f"BAD = NativeModule('bad', '{package.folder.name}', ('bad.cpp',))\n"
+        "NOT_ONE = 3\n",
+    )
+    package.write("bad.cpp", "nonsense\n")
+    plugins = PluginManager([])
+    for kind, name, native in (
+        ("rasterizer", "a", "GOOD"), ("rasterizer", "b", "GOOD"), ("coder", "c", "BAD"), ("coder", "d", "NOT_ONE"),
+    ):  # fmt: skip
+        plugins.registries[kind].add(name, "nowhere:Thing", summary="", native=f"{package.folder.name}.native:{native}")
+    plugins.registries["method"].add("e", "nowhere:Thing", summary="", native=["no.such.module:X"])
+    rows = {row.name.partition(":")[2] or row.name: row for row in build_all(plugins, jobs=1)}
+    assert {name: row.state for name, row in rows.items()} == {
+        "good": "built", "BAD": "failed", "NOT_ONE": "failed", "X": "failed"
+    }  # fmt: skip
+    assert "bad.cpp:1:1: error" in str(rows["BAD"].error)
+    assert "not a NativeModule but int" in str(rows["NOT_ONE"].error)
+    assert "no.such.module" in str(rows["X"].error)
+    assert call(rows["good"].path) == 42
+    again = {row.name: row.state for row in build_all(plugins)}
+    assert again["good"] == "up to date"
+    into = {row.name: row for row in build_all(plugins, into_packages=True)}["good"]
+    assert into.path is not None
+    assert into.path.parent == package.folder / "prebuilt"
+
+
+def test_every_native_module_of_the_core_exists():
+    assert all(isinstance(resolve_module(target), NativeModule) for target in declared_modules(PluginManager([])))
+
+
+def test_the_cache_follows_the_platforms_convention(monkeypatch, tmp_path):
+    monkeypatch.delenv("SPLATWIZARD_CACHE", raising=False)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert cache_root() == tmp_path / "splatwizard"
+    monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "mine"))
+    assert cache_root() == tmp_path / "mine"
