@@ -1,0 +1,74 @@
+"""Peak memory: of the GPU's allocator, or of the resident set of this process (flagged `rss`)."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from pathlib import Path
+
+import psutil
+import torch
+
+_STATUS = Path("/proc/self/status")
+_CLEAR = Path("/proc/self/clear_refs")
+
+
+def rss_bytes() -> int:
+    """Resident set of this process now, bytes."""
+    return int(psutil.Process().memory_info().rss)
+
+
+def peak_rss_bytes() -> int:
+    """Largest resident set since the last `reset_peak_rss` (or since the process began), bytes."""
+    try:
+        for line in _STATUS.read_text().splitlines():
+            if line.startswith("VmHWM:"):
+                return int(line.split()[1]) * 1024
+    except OSError:
+        pass
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024
+
+
+def reset_peak_rss() -> bool:
+    """Let the peak start again from now; False where the system cannot (the peak then is the process's)."""
+    try:
+        _CLEAR.write_text("5")  # Linux: reset the high-water mark of the resident set
+    except OSError:
+        return False
+    return True
+
+
+class MemoryMeter:
+    """Peak memory between `start` and `peak_bytes`, above what was there at `start`.
+
+    kind    "cuda": bytes of torch's allocator, absolute; "rss": growth of the resident set
+    """
+
+    def __init__(self, device: torch.device | str) -> None:
+        self.device = torch.device(device)
+        self.kind = "cuda" if self.device.type == "cuda" else "rss"
+        self._before = 0
+
+    def start(self) -> None:
+        if self.kind == "cuda":
+            torch.cuda.synchronize(self.device)
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            reset_peak_rss()
+            self._before = rss_bytes()
+
+    def peak_bytes(self) -> int:
+        if self.kind == "cuda":
+            return int(torch.cuda.max_memory_allocated(self.device))
+        return max(peak_rss_bytes() - self._before, 0)
+
+    def current_bytes(self) -> int:
+        """What is held now, above what was there at `start` (CUDA: all that is allocated)."""
+        if self.kind == "cuda":
+            return int(torch.cuda.memory_allocated(self.device))
+        return max(rss_bytes() - self._before, 0)
+
+    def peak_reserved_bytes(self) -> int | None:
+        """CUDA: peak of the allocator's reserved pool; None on a CPU."""
+        return int(torch.cuda.max_memory_reserved(self.device)) if self.kind == "cuda" else None
