@@ -1,0 +1,1 @@
+"""Checks that any plugin can run against its own parts; importable without pytest."""
