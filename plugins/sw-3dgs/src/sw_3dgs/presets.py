@@ -24,4 +24,24 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
-RATES: Mapping[str, Mapping[str, Any]] = {}
+
+def _quantized(bits: int, dc: float, rest: float, opacity: float, scale: float, quat: float) -> dict[str, Any]:
+    return {
+        "codec.mode": "quantized",
+        "codec.position_bits": bits,
+        "codec.dc_step": dc,
+        "codec.rest_step": rest,
+        "codec.opacity_step": opacity,
+        "codec.scale_step": scale,
+        "codec.quat_step": quat,
+    }
+
+
+RATES: Mapping[str, Mapping[str, Any]] = {
+    "r1": _quantized(14, 0.16, 0.24, 0.5, 0.25, 0.06),
+    "r2": _quantized(15, 0.08, 0.12, 0.25, 0.14, 0.03),
+    "r3": _quantized(16, 0.05, 0.06, 0.15, 0.08, 0.02),
+    "r4": _quantized(17, 0.03, 0.03, 0.1, 0.05, 0.012),
+    "r5": _quantized(18, 0.02, 0.015, 0.06, 0.03, 0.008),
+    "r6": {"codec.mode": "exact"},
+}

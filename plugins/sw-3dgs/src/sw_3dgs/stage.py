@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.training.losses import photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+from splatwizard_core.training.plan import When, scaled
 from splatwizard_core.training.stage import LossPack, Stage, StageContext
 from sw_3dgs import tasks
 from sw_3dgs.config import ThreeDGSConfig
@@ -31,8 +32,12 @@ class ThreeDGSStage(Stage):
         self.config = opt
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
-    def scaled(self, steps: int) -> int:
-        """A number of steps that a task keeps to itself, in steps of this run; the scheduler scales only plans."""
+    def when(self, when: When) -> When:
+        """A plan of the full run, in steps of this one."""
+        return scaled(when, self.config.schedule_scale)
+
+    def steps(self, steps: int) -> int:
+        """A number of steps likewise, which a task keeps to itself."""
         return max(1, round(steps * self.config.schedule_scale)) if steps > 0 else 0
 
     def begin(self, context: StageContext) -> SplatModel:
@@ -61,19 +66,21 @@ class ThreeDGSStage(Stage):
         update_lr = tasks.UpdateLearningRate(
             init=lr.position_init,
             final=lr.position_final,
-            max_steps=self.scaled(lr.max_steps),
-            delay_steps=self.scaled(lr.position_delay_steps),
+            max_steps=self.steps(lr.max_steps),
+            delay_steps=self.steps(lr.position_delay_steps),
             delay_mult=lr.position_delay_mult,
         )
-        scheduler.register_task(range(lr.max_steps), update_lr, name="update lr")
+        scheduler.register_task(self.when(range(lr.max_steps)), update_lr, name="update lr")
         scheduler.register_task(
-            range(0, lr.max_steps, self.config.sh_interval), tasks.increase_sh_degree, name="increase SH degree"
+            self.when(range(0, lr.max_steps, self.config.sh_interval)),
+            tasks.increase_sh_degree,
+            name="increase SH degree",
         )
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         densify = self.config.densify
         scheduler.register_task(
-            range(densify.stop),
+            self.when(range(densify.stop)),
             tasks.collect_absgrad_statistics if densify.absgrad else tasks.collect_gradient_statistics,
             name="collect gradient statistics",
         )
@@ -82,20 +89,26 @@ class ThreeDGSStage(Stage):
             percent_dense=densify.percent_dense,
             min_opacity=densify.min_opacity,
             world_prune=densify.world_prune,
-            size_rules_after=self.scaled(densify.reset_interval),
+            size_rules_after=self.steps(densify.reset_interval),
             prune_screen_px=densify.prune_screen_px,
             revised_opacity=densify.revised_opacity,
-            reset_interval=self.scaled(densify.reset_interval),
-            pause_after_reset=self.scaled(densify.pause_after_reset),
+            reset_interval=self.steps(densify.reset_interval),
+            pause_after_reset=self.steps(densify.pause_after_reset),
         )
         scheduler.register_task(
-            range(densify.start, densify.stop, densify.interval), prune_and_densify, name="prune and densify"
+            self.when(range(densify.start, densify.stop, densify.interval)),
+            prune_and_densify,
+            name="prune and densify",
         )
         reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
         if self.white and densify.white_reset > 0:
             # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
-            scheduler.register_task(densify.white_reset, reset_opacity, name="reset opacity (white background)")
-        scheduler.register_task(range(0, densify.stop, densify.reset_interval), reset_opacity, name="reset opacity")
+            scheduler.register_task(
+                self.when(densify.white_reset), reset_opacity, name="reset opacity (white background)"
+            )
+        scheduler.register_task(
+            self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
+        )
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         absgrad = self.config.densify.absgrad
