@@ -48,7 +48,7 @@ class ChunkedCoder:
         return b"".join(parts)
 
     def decode(self, data: bytes, n: int, model: ModelSpec) -> np.ndarray:
-        """[n] int32. Raises BitstreamError unless `data` is exactly what `encode` wrote for n symbols and this model."""
+        """[n] int32. Raises BitstreamError unless `data` is what `encode` wrote for n symbols and this model."""
         check_length(model, n)
         low, high = domain(model)
         reader = ByteReader(data)

@@ -53,8 +53,13 @@ def pack_tables(tables: Sequence[np.ndarray]) -> bytes:
     writer.put(symbols, Table(code_counts(meta)))
     coded = writer.finish()
     return b"".join(
-        [write_varint(len(meta)), meta.astype(np.uint8).tobytes(), write_varint(len(coded)), coded]
-        + [writer.crc.to_bytes(4, "little")]
+        [
+            write_varint(len(meta)),
+            meta.astype(np.uint8).tobytes(),
+            write_varint(len(coded)),
+            coded,
+            writer.crc.to_bytes(4, "little"),
+        ]
     )
 
 

@@ -1,13 +1,13 @@
 """Position codec `octree`: integer points as the occupancy of an octree, breadth first, range coded.
 
 Each inner node is a byte with a bit for every child that holds a point. It is coded with a count table selected by the
-level and by how many children the node's parent has (1, 2, 3, 4 or more); a level may reuse the latest table. Once every node holds a single point the
-remaining bits of the points go raw. Points come out in Morton order. Source: specification of the codec library,
-point positions.
+level and by how many children the node's parent has (1, 2, 3, 4 or more); a level may reuse the latest table. Once
+every node holds a single point the remaining bits of the points go raw. Points come out in Morton order.
+Source: specification of the codec library, point positions.
 
 Layout (docs/bitstream.md): u8 version, u8 bits, varint points, varint distinct points, u8 levels that are coded,
-u8 actions for each of them, tables, varint length and range-coded words, u32 CRC-32 of the occupancies, raw suffixes, duplicates (`columns`),
-u32 CRC-32 of the points.
+u8 actions for each of them, tables, varint length and range-coded words, u32 CRC-32 of the occupancies, raw suffixes,
+duplicates (`columns`), u32 CRC-32 of the points.
 """
 
 from __future__ import annotations

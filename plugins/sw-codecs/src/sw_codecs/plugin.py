@@ -5,19 +5,39 @@ from splatwizard_core.plugins import Registry, hookimpl
 
 @hookimpl
 def register_quantizers(registry: Registry) -> None:
-    registry.add(
-        "uniform", "sw_codecs.uniform:Uniform", summary="affine, bits and range per channel; noise or rounding"
-    )
+    registry.add("uniform", "sw_codecs.uniform:Uniform",
+                 summary="affine, bits and range per channel; rounding or noise")  # fmt: skip
+    registry.add("ste-round", "sw_codecs.rounding:SteRound", summary="multiples of a step, straight-through gradient")
+    registry.add("uniform-noise", "sw_codecs.rounding:UniformNoise", summary="noise of one step in training")
+    registry.add("ste-binary", "sw_codecs.rounding:SteBinary", summary="the sign, +1 or -1")
+    registry.add("ste-mask", "sw_codecs.rounding:SteMask", summary="a learned mask with a threshold")
+    registry.add("vq", "sw_codecs.vector_quantizer:VectorQuantizer",
+                 summary="nearest codebook entry; k-means or EMA, bounded memory")  # fmt: skip
 
 
 @hookimpl
 def register_entropy_models(registry: Registry) -> None:
     registry.add("columns", "sw_codecs.columns:Columns",
                  summary="integer matrix, stored statistics per column, any alphabet")  # fmt: skip
+    registry.add("categorical", "sw_codecs.categorical:Categorical", summary="stored counts, one table per context")
+    registry.add("bernoulli", "sw_codecs.bernoulli:Bernoulli", summary="masks, stored share of ones")
+    registry.add("gaussian-exact", "sw_codecs.gaussian_exact:GaussianExact",
+                 summary="mean and scale per symbol, integers only: decodes on any machine")  # fmt: skip
+    registry.add("laplace-exact", "sw_codecs.gaussian_exact:LaplaceExact",
+                 summary="as gaussian-exact, Laplacian")  # fmt: skip
+
+
+@hookimpl
+def register_context_models(registry: Registry) -> None:
+    registry.add("integer-mlp", "sw_codecs.integer_mlp:IntegerMlp",
+                 summary="ReLU network evaluated in exact integer arithmetic")  # fmt: skip
 
 
 @hookimpl
 def register_coders(registry: Registry) -> None:
     registry.add("range", "sw_codecs.coders:RangeCoder", summary="arithmetic coding under a ModelSpec")
     registry.add("rans", "sw_codecs.coders:RansCoder", summary="rANS under a ModelSpec")
+    registry.add("huffman", "sw_codecs.huffman_coder:HuffmanCoder", summary="Huffman codes from count tables")
     registry.add("octree", "sw_codecs.octree:Octree", summary="point positions as octree occupancy")
+    registry.add("morton-delta", "sw_codecs.position_codecs:MortonDelta", summary="point positions as Morton steps")
+    registry.add("raw", "sw_codecs.position_codecs:RawPositions", summary="point positions as they are, zstd")

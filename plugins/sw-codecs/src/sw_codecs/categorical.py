@@ -1,0 +1,96 @@
+"""Entropy model `categorical`: symbols 0..K-1 under stored counts, one table or one for each value of a context."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import BitstreamError
+from sw_codecs.bits import ByteReader
+from sw_codecs.coders import RangeCoder
+from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables
+from sw_codecs.model_spec import Tables
+
+VERSION = 1
+MAX_ENTRIES = 1 << 24
+
+
+@dataclass(frozen=True)
+class CategoricalContext:
+    """size: how many symbols there are. index [n]: which table codes each symbol, in 0..tables-1; decoded before.
+
+    `decode` needs n: from the index, or given.
+    """
+
+    size: int
+    n: int | None = None
+    index: np.ndarray | None = None
+    tables: int = 1
+
+    def __post_init__(self) -> None:
+        if self.size < 1 or self.tables < 1 or self.size * self.tables > MAX_ENTRIES:
+            raise ValueError(f"{self.tables} tables of {self.size} symbols are none or too many")
+
+    def rows(self, n: int) -> np.ndarray:
+        """The table of each of n symbols."""
+        index = np.zeros(n, np.int64) if self.index is None else np.asarray(self.index)
+        if index.shape != (n,) or (n and not 0 <= index.min() <= index.max() < self.tables):
+            raise ValueError(f"the context must be {n} integers in 0..{self.tables - 1}")
+        return index
+
+
+class Categorical:
+    """Counts are gathered by the encoder and stored; nothing is trained."""
+
+    def bits(self, symbols: Tensor, context: CategoricalContext) -> Tensor:
+        """Bits per symbol under the counts of `symbols` itself, float64, shape of `symbols`; no gradient."""
+        flat = symbols.detach().cpu().numpy().reshape(-1)
+        index, tables = _histograms(flat, context)
+        stored = np.stack([rounded_counts(t) for t in tables])
+        found = np.log2(np.maximum(stored.sum(1), 1)[index] / stored[index, flat])
+        return torch.from_numpy(found.reshape(symbols.shape)).to(symbols.device)
+
+    def encode(self, symbols: np.ndarray, context: CategoricalContext) -> bytes:
+        """u8 version, the count tables, chunks of the `range` coder. Raises ValueError for symbols out of range."""
+        symbols = np.asarray(symbols)
+        index, tables = _histograms(symbols, context)
+        head = bytes([VERSION])
+        if len(symbols) == 0:
+            return head
+        return head + pack_tables(tables) + RangeCoder().encode(symbols, _spec(list(tables), index))
+
+    def decode(self, data: bytes, context: CategoricalContext) -> np.ndarray:
+        """int32 [n]. Raises BitstreamError for damage or another context."""
+        n = context.n if context.n is not None else len(np.asarray(context.index if context.index is not None else ()))
+        reader = ByteReader(data)
+        version = reader.integer(1)
+        if version != VERSION:
+            raise BitstreamError(f"categorical data of version {version} is not known: upgrade sw-codecs")
+        if n == 0:
+            reader.finish()
+            return np.empty(0, np.int32)
+        tables = unpack_tables(reader, [context.size] * context.tables)
+        if sum(int(t.sum()) for t in tables) == 0:
+            raise BitstreamError("the count tables are empty")
+        return RangeCoder().decode(bytes(reader.take(reader.left)), n, _spec(tables, context.rows(n), stored=True))
+
+
+def _histograms(symbols: np.ndarray, context: CategoricalContext) -> tuple[np.ndarray, np.ndarray]:
+    """The table of each symbol, and the counts [tables, size]."""
+    if symbols.ndim != 1 or not np.issubdtype(symbols.dtype, np.integer):
+        raise ValueError(f"symbols must be a list of integers, not {symbols.dtype} of shape {list(symbols.shape)}")
+    if symbols.size and not 0 <= symbols.min() <= symbols.max() < context.size:
+        raise ValueError(f"symbols {symbols.min()}..{symbols.max()} leave 0..{context.size - 1}")
+    index = context.rows(len(symbols))
+    counts = np.bincount(index.astype(np.int64) * context.size + symbols, minlength=context.tables * context.size)
+    return index, counts.reshape(context.tables, context.size)
+
+
+def _spec(tables: list[np.ndarray], index: np.ndarray, *, stored: bool = False) -> Tables:
+    """Tables that never occur get equal counts, so that every table is a distribution."""
+    counts = np.stack(tables if stored else [rounded_counts(t) for t in tables])
+    counts[counts.sum(1) == 0] = 1
+    return Tables(counts, index)

@@ -1,0 +1,113 @@
+"""Context model `integer-mlp`: a small ReLU network evaluated exactly, in integers held by float64 tensors.
+
+Any sum of products of integers below 2^53 is exact in float64 whatever the order of summation, with or without fused
+multiply-add, on CPU and CUDA, for any batch size. So the probabilities that a decoder derives from the outputs are the
+encoder's, to the bit. Source: specification of the codec library, exact mode, rule 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.errors import BitstreamError
+
+FRACTION = 12
+ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1
+WEIGHT_LIMIT = 1 << 24  # 4096 in units of 1
+
+
+class IntegerMlp:
+    """Linear layers with ReLU between them.
+
+    weights         [(W [out, in], b [out])] float32, as they stand in the file
+    output_scale    a number or one per output of the last layer: outputs come in units of 1 / output_scale (for
+                    HAC: 1 / base step); exact in float64
+
+    Raises ValueError if a weight exceeds 4096 or a sum could reach 2^53.
+    """
+
+    def __init__(
+        self,
+        weights: Sequence[tuple[np.ndarray, np.ndarray]],
+        *,
+        output_scale: float | np.ndarray = 1.0,
+        device: torch.device | str = "cpu",
+    ) -> None:
+        self.weights = [(np.asarray(w, np.float32), np.asarray(b, np.float32)) for w, b in weights]
+        if not self.weights:
+            raise ValueError("a network needs at least one layer")
+        self._layers: list[tuple[Tensor, Tensor]] = []
+        width = self.weights[0][0].shape[-1]
+        for i, (w, b) in enumerate(self.weights):
+            if w.ndim != 2 or b.shape != w.shape[:1] or w.shape[1] != width:
+                raise ValueError(
+                    f"layer {i}: weight {list(w.shape)} and bias {list(b.shape)} do not fit {width} inputs"
+                )
+            width = w.shape[0]
+            scale = np.asarray(output_scale if i == len(self.weights) - 1 else 1.0, np.float64)
+            scale = np.broadcast_to(scale, (width,))
+            wq = np.rint(w.astype(np.float64) * scale[:, None] * 2.0**FRACTION)
+            bq = np.rint(b.astype(np.float64) * scale * 2.0 ** (2 * FRACTION))
+            if not (np.isfinite(wq).all() and np.isfinite(bq).all()) or np.abs(wq).max(initial=0) > WEIGHT_LIMIT:
+                raise ValueError(f"layer {i}: a weight is not finite or exceeds {WEIGHT_LIMIT >> FRACTION}")
+            if (np.abs(wq).sum(1) * ACTIVATION_LIMIT + np.abs(bq)).max(initial=0) >= 2.0**53:
+                raise ValueError(f"layer {i}: sums could reach 2^53 and would not be exact")
+            self._layers.append((torch.from_numpy(wq).to(device), torch.from_numpy(bq).to(device)))
+
+    @classmethod
+    def from_module(cls, module: nn.Module, *, output_scale: float | np.ndarray = 1.0) -> IntegerMlp:
+        """From nn.Sequential of Linear and ReLU in turn. Raises ValueError for anything else."""
+        weights, parts = [], list(module.children())
+        for i, part in enumerate(parts):
+            if i % 2 == 0 and isinstance(part, nn.Linear) and part.bias is not None:
+                weights.append((part.weight.detach().cpu().numpy(), part.bias.detach().cpu().numpy()))
+            elif not (i % 2 == 1 and isinstance(part, nn.ReLU) and i < len(parts) - 1):
+                raise ValueError(f"part {i} is {type(part).__name__}: Linear and ReLU must take turns, Linear last")
+        device = next(module.parameters()).device if weights else "cpu"
+        return cls(weights, output_scale=output_scale, device=device)
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The float32 arrays that go into the file: weight0, bias0, weight1, ..."""
+        found = {}
+        for i, (w, b) in enumerate(self.weights):
+            found[f"weight{i}"], found[f"bias{i}"] = w, b
+        return found
+
+    @classmethod
+    def from_state(cls, state: Mapping[str, np.ndarray], *, output_scale: float | np.ndarray = 1.0) -> IntegerMlp:
+        """From what `state` gave. Raises BitstreamError if the arrays make no exact network."""
+        try:
+            weights = [(state[f"weight{i}"], state[f"bias{i}"]) for i in range(len(state) // 2)]
+            return cls(weights, output_scale=output_scale)
+        except (KeyError, ValueError) as error:
+            raise BitstreamError(f"the context network cannot be used: {error}") from error
+
+    def __call__(self, inputs: Tensor, *, rows: int = 1 << 16) -> Tensor:
+        """int64 [n, out] with 12 fractional bits, in units of 1 / output_scale.
+
+        inputs  [n, in] integers with 12 fractional bits, clamped to +-2^20 (that is 256)
+        rows    how many are evaluated at once; the result does not depend on it
+        """
+        if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
+            raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
+        blocks = [self._evaluate(block) for block in inputs.split(max(rows, 1))]
+        return torch.cat(blocks) if blocks else inputs.new_zeros(0, self._layers[-1][0].shape[0])
+
+    def _evaluate(self, inputs: Tensor) -> Tensor:
+        device = self._layers[0][0].device
+        a = inputs.to(device).clamp(-ACTIVATION_LIMIT, ACTIVATION_LIMIT).to(torch.float64)
+        for i, (w, b) in enumerate(self._layers):
+            a = ((a @ w.T + b) / 2.0**FRACTION).floor()
+            if i < len(self._layers) - 1:
+                a = a.clamp(0, ACTIVATION_LIMIT)
+        return a.to(torch.int64).to(inputs.device)
+
+
+def to_fixed(values: np.ndarray) -> np.ndarray:
+    """Floats as int64 with 12 fractional bits. For values both sides hold bit for bit (decoded ones), never for
+    outputs of a float network."""
+    return np.rint(np.asarray(values, np.float64) * 2.0**FRACTION).astype(np.int64)
