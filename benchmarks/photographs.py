@@ -64,7 +64,8 @@ def report(scene: str, out: Path, bar: float | None) -> None:
     train = exact["train"]
     console.print(
         f"{exact['counts']['num_gaussians']:,} Gaussians; {train['steps']} steps in {train['train_s']:.0f} s: "
-        f"{train['steps'] / train['train_s']:.2f} it/s; peak {train['peak_bytes'] / 1e9:.2f} GB ({train['memory_kind']})"
+        f"{train['steps'] / train['train_s']:.2f} it/s; "
+        f"peak {train['peak_bytes'] / 1e9:.2f} GB ({train['memory_kind']})"
     )
     for part, seconds in (train["breakdown_s"] or {}).items():
         console.print(f"  {part:<12}{seconds:9.1f} s  {seconds / train['train_s']:6.1%}")

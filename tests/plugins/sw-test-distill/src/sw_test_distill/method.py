@@ -115,7 +115,8 @@ class TestDistill(Method):
     def encode(self, model: MaskedStudent, writer: ContainerWriter) -> None:
         rest = model.sh_rest.detach() * (model.mask_logits.detach() > 0)[:, None, None]
         colors = torch.cat([model.sh_dc.detach(), rest], dim=1).flatten(1)
-        quantizer = self.plugins.quantizers.load("vq")(entries=min(self.config.codebook, len(colors)), seed=0)
+        quantizer = self.plugins.quantizers.load("vq")(self.config.codebook)
+        quantizer.fit(colors, generator=torch.Generator(colors.device).manual_seed(0))
         codes, side = quantizer.encode(colors)
         writer.add_array("codes", codes.cpu().numpy().astype("<u2"))
         writer.add_array("codebook", np.asarray(side["codebook"], dtype="<f4"))
@@ -123,8 +124,8 @@ class TestDistill(Method):
             writer.add_array(name, getattr(model, name).detach().cpu().numpy().astype("<f4"))
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
-        codebook = torch.from_numpy(reader.array("codebook", dtype="<f4", ndim=2).copy())
         codes = torch.from_numpy(reader.array("codes", dtype="<u2", ndim=1).astype(np.int64))
-        colors = codebook[codes].reshape(len(codes), -1, 3)
+        side = {"codebook": reader.array("codebook", dtype="<f4", ndim=2)}
+        colors = self.plugins.quantizers.load("vq").decode(codes, side).reshape(len(codes), -1, 3)
         own = {name: torch.from_numpy(reader.array(name, dtype="<f4").copy()) for name in OWN}
         return GaussianModel.from_tensors(sh_dc=colors[:, :1], sh_rest=colors[:, 1:], **own)
