@@ -14,23 +14,16 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 scene_option = click.option(
-    "--scene",
-    default="demo",
-    show_default=True,
-    metavar="SCENE",
-    help="A folder (COLMAP, Blender, ...; the format is detected), `demo`, or `dataset/scene` under $SPLATWIZARD_DATA.",
-)
+    "--scene", metavar="SCENE",
+    help="A folder (COLMAP, Blender, ...; the format is detected), `demo`, or `dataset/scene` under "
+    "$SPLATWIZARD_DATA.  [default: demo]",
+)  # fmt: skip
 images_option = click.option(
-    "--images",
-    metavar="FOLDER",
+    "--images", metavar="FOLDER",
     help="Picture folder of a COLMAP scene, such as images_2.  [default: the data set's own]",
-)
+)  # fmt: skip
 method_option = click.option(
-    "--method",
-    "-m",
-    default=None,
-    metavar="NAME",
-    help="Method, see `sw list-plugins`.  [default: 3dgs, or what --config says]",
+    "--method", "-m", metavar="NAME", help="Method, see `sw list-plugins`.  [default: 3dgs, or what --config says]"
 )
 preset_option = click.option(
     "--preset", metavar="NAME", help="Named values of the method.  [default: paper; quick on the demo scene]"
@@ -39,20 +32,17 @@ rate_option = click.option(
     "--rate", metavar="NAME", help="Rate point: r1 (smallest file) .. rN, or low, default, high.  [default: default]"
 )
 config_option = click.option(
-    "--config",
-    "config_file",
-    type=click.Path(dir_okay=False),
-    help="TOML file of values; one from a run directory repeats that run.",
-)
+    "--config", "config_file", type=click.Path(dir_okay=False), metavar="FILE",
+    help="TOML file of values; config.toml of a run directory repeats that run.",
+)  # fmt: skip
 set_option = click.option(
     "--set", "sets", multiple=True, metavar="KEY=VALUE",
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
 )  # fmt: skip
 device_option = click.option(
-    "--device",
-    type=click.Choice(["auto", "cpu", "cuda"]),
-    help="Where to compute.  [default: auto, CUDA if its kernels can run]",
-)
+    "--device", type=click.Choice(["auto", "cpu", "cuda"]),
+    help="Where to compute.  [default: auto, which is CUDA if its kernels can run]",
+)  # fmt: skip
 seed_option = click.option("--seed", type=click.IntRange(min=0), help="Of every random stream.  [default: 0]")
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")

@@ -18,7 +18,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from splatwizard_core.evaluation.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter
 
 WARMUP_FRAMES = 10
 CUDA_FRAMES = 100

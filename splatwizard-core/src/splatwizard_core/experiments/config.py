@@ -29,7 +29,7 @@ else:
 
 ParamsT = TypeVar("ParamsT", bound=Params)
 
-RESERVED = ("method", "preset", "rate")
+RESERVED = ("method", "preset", "rate", "scene")
 SCENE_KEYS = ("images", "resolution", "test_every", "background", "principal_point", "split", "init_points")
 RATE_ALIASES = ("low", "default", "high", "all")
 
@@ -92,6 +92,7 @@ class ResolvedConfig:
     """What one run is made with, every value decided.
 
     method, preset, rate    names
+    scene_spec              "demo", a folder, or dataset/scene
     config                  the method's hyper-parameters
     ppl                     run parameters
     scene                   how the scene is read
@@ -101,6 +102,7 @@ class ResolvedConfig:
     method: str
     preset: str
     rate: str
+    scene_spec: str
     config: OptimizationParams
     ppl: PipelineParams
     scene: SceneOptions
@@ -123,6 +125,7 @@ class ResolvedConfig:
         import tomli_w
 
         content: dict[str, Any] = {"method": self.method, "preset": self.preset, "rate": self.rate}
+        content["scene"] = absolute_spec(self.scene_spec)
         # The blocks are merged upwards: first come keys of the method, where both have one.
         content |= {key: getattr(self.scene, key) for key in SCENE_KEYS}
         content |= self.ppl.model_dump(mode="json")
@@ -146,6 +149,16 @@ class ResolvedConfig:
         content = self.as_dict()
         del content["provenance"]
         return content_hash(content)
+
+
+def is_demo(scene_spec: str) -> bool:
+    """Whether a scene is the procedural one."""
+    return scene_spec == "demo" or scene_spec.startswith("demo:")
+
+
+def absolute_spec(scene_spec: str) -> str:
+    """A scene as another process, with another working directory, can find it."""
+    return str(Path(scene_spec).resolve()) if not is_demo(scene_spec) and Path(scene_spec).exists() else scene_spec
 
 
 def content_hash(content: Any) -> str:
@@ -212,13 +225,15 @@ def resolve(
     config_file: str | Path | None = None,
     sets: Mapping[str, Any] | None = None,
     *,
-    default_preset: str = "paper",
+    scene: str | None = None,
 ) -> ResolvedConfig:
     """Every value of a run of `method`: defaults -> preset -> rate point -> file -> sets, the later wins.
 
-    preset, rate    names; None: what the file says, else `default_preset` and the method's DEFAULT_RATE
-    config_file     TOML; keys as in `sets`, tables for blocks, besides the reserved `method`, `preset`, `rate`
+    preset, rate    names; None: what the file says, else "quick" on the demo scene and "paper" elsewhere, and the
+                    method's DEFAULT_RATE
+    config_file     TOML; keys as in `sets`, tables for blocks, besides the reserved `method`, `preset`, `rate`, `scene`
     sets            by dotted key: a key of the method's config, else of PipelineParams, else a scene option
+    scene           "demo", a folder, or dataset/scene; None: what the file says, else "demo"
 
     Raises ConfigError.
     """
@@ -231,7 +246,8 @@ def resolve(
                 f"leave out --{name}, or take the key '{name}' and the values that follow from it out of the file",
                 key=name,
             )
-    preset = preset or said.get("preset") or default_preset
+    scene_spec = scene or str(said.get("scene", "demo"))
+    preset = preset or said.get("preset") or ("quick" if is_demo(scene_spec) else "paper")
     rate = rate or said.get("rate") or method.DEFAULT_RATE
     if preset not in method.PRESETS:
         raise ConfigError(
@@ -249,7 +265,7 @@ def resolve(
         ("--set", sets or {}),
     ]
     config: OptimizationParams = method.Config()
-    ppl, scene = PipelineParams(), SceneOptions()
+    ppl, scene_options = PipelineParams(), SceneOptions()
     known = {**dict.fromkeys(SCENE_KEYS, ""), **block_keys(PipelineParams), **block_keys(method.Config)}
     provenance: dict[str, str] = {}
     for source, values in layers:
@@ -266,9 +282,9 @@ def resolve(
             provenance[key] = source
         config = apply_overrides(config, parts[0], source=source)
         ppl = apply_overrides(ppl, parts[1], source=source)
-        scene = _scene_options(scene, parts[2], source)
-    scene = dataclasses.replace(scene, seed=ppl.seed)
-    return ResolvedConfig(method.name, preset, rate, config, ppl, scene, provenance)
+        scene_options = _scene_options(scene_options, parts[2], source)
+    scene_options = dataclasses.replace(scene_options, seed=ppl.seed)
+    return ResolvedConfig(method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance)
 
 
 def _scene_options(options: SceneOptions, values: Mapping[str, Any], source: str) -> SceneOptions:

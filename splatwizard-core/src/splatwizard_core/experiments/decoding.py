@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import os
 import statistics
 import time
 from dataclasses import asdict, dataclass
@@ -11,9 +13,9 @@ from typing import Any
 import torch
 
 from splatwizard_core.coding.container import ContainerReader
-from splatwizard_core.errors import BitstreamError, SplatwizardError
-from splatwizard_core.evaluation.memory import MemoryMeter
+from splatwizard_core.errors import BitstreamError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import MemoryMeter
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
 
@@ -113,6 +115,40 @@ def timed_decode(
         memory_kind=meter.kind,
         device=str(device),
     )
+
+
+def save_decoded(model: SplatModel, report: DecodeReport, path: Path, plugins: PluginManager) -> None:
+    """Keep a decoded model: `.safetensors` holds its tensors and says what they are, any other suffix is an exporter's.
+
+    Raises UserInputError if no exporter writes such files.
+    """
+    if path.suffix != ".safetensors":
+        export_model(model, path, plugins)
+        return
+    from safetensors.torch import save_file
+
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    told = {"method": report.method, "digest": report.digest, "extra": json.dumps(model.state_dict_extra())}
+    temporary = path.with_name(f".{path.name}.tmp")
+    save_file(tensors, temporary, metadata=told)
+    os.replace(temporary, path)
+
+
+def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: str | None = None) -> str:
+    """Write an interchange format; returns the name of the exporter.
+
+    name    of the exporter; None: the one whose declared suffix `path` has
+
+    Raises UserInputError if there is none, or if the model has no such form.
+    """
+    if name is None:
+        suffixes = {str(e.declared.get("suffix", "")): e.name for e in plugins.exporters}
+        name = suffixes.get(path.suffix)
+        if name is None:
+            known = ", ".join(f"{suffix} ({exporter})" for suffix, exporter in sorted(suffixes.items()) if suffix)
+            raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
+    plugins.exporters.load(name)(model, path)
+    return name
 
 
 def _synchronize(device: torch.device) -> None:

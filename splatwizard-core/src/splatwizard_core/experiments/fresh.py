@@ -14,6 +14,8 @@ from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
 
+HIDDEN = ("SPLATWIZARD_DATA", "SPLATWIZARD_TEST_DATA")
+
 
 class FreshProcessError(SplatwizardError):
     """The other process failed; its own message stands on stderr already."""
@@ -23,12 +25,12 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     """Run `sw ARGUMENTS` in a new interpreter and return the JSON object that it prints.
 
     cwd         working directory
-    hide_data   take SPLATWIZARD_* (where the data lie) out of its environment
+    hide_data   take SPLATWIZARD_DATA (where the scenes lie) out of its environment
 
     Its progress and messages go to our stderr. Raises UserInputError or FreshProcessError with its own message if
     it fails, KeyboardInterrupt if it was interrupted.
     """
-    environment = {k: v for k, v in os.environ.items() if not (hide_data and k.startswith("SPLATWIZARD_"))}
+    environment = {k: v for k, v in os.environ.items() if not (hide_data and k in HIDDEN)}
     command = [sys.executable, "-m", "splatwizard_core", *arguments]
     with tempfile.TemporaryFile("w+") as errors:
         # The display of a terminal must reach it live; anything else is kept for the message.

@@ -1,4 +1,4 @@
-"""What is measured of an encoded file: image quality, speed, memory. Meant for a process that did nothing else before."""
+"""What is measured of an encoded file: quality, speed, memory. Meant for a process that did nothing else before."""
 
 from __future__ import annotations
 
@@ -10,12 +10,21 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.evaluation.evaluate import EvaluationResult, evaluate, render_options, render_view
-from splatwizard_core.evaluation.memory import MemoryMeter
+from splatwizard_core.evaluation.evaluate import (
+    EvaluationResult,
+    evaluate,
+    png_names,
+    render_options,
+    render_view,
+    save_png,
+)
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
+from splatwizard_core.experiments.decoding import open_model
 from splatwizard_core.experiments.environment import describe_environment
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import MemoryMeter
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.params import PipelineParams
@@ -119,3 +128,40 @@ def _describe_scene(scene: Scene, quality: EvaluationResult) -> dict[str, Any]:
         "renders": quality.renders,
         "unknown": unknown,
     }
+
+
+def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable[[], tuple[SplatModel, dict[str, Any]]]:
+    """() -> the model of a .swz or .ply on `device`, and what the file asks of a rasterizer."""
+
+    def open_file() -> tuple[SplatModel, dict[str, Any]]:
+        if path.suffix == ".ply":
+            from splatwizard_core.gaussians.ply import load_ply
+
+            return load_ply(path).to(device).eval().requires_grad_(False), {}
+        model, reader = open_model(path, plugins, device)
+        return model, reader.raster
+
+    return open_file
+
+
+def render_views(
+    model: SplatModel,
+    raster: dict[str, Any],
+    views: Sequence[View],
+    background: torch.Tensor,
+    plugins: PluginManager,
+    device: torch.device,
+    ppl: PipelineParams,
+    folder: Path,
+) -> list[str]:
+    """Draw views as PNG into `folder`; the file names."""
+    options = render_options(raster, background.to(device))
+    rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=ppl.raster.prefer, forbid=ppl.raster.forbid)
+    folder.mkdir(parents=True, exist_ok=True)
+    names = png_names([view.name for view in views])
+    model.prepare()
+    with track("render", total=len(views), unit="views") as bar:
+        for view, name in zip(views, names, strict=True):
+            save_png(render_view(model, view.camera.to(device), rasterizer, options).image.cpu(), folder / name)
+            bar.advance()
+    return names

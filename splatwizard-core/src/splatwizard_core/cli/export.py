@@ -1,0 +1,39 @@
+"""`sw export`: a decoded scene in an interchange format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from splatwizard_core.cli.options import assignments, debug_option, device_option, json_option, options, print_json
+from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
+
+
+@click.command()
+@click.argument("file", metavar="FILE")
+@click.argument("out", metavar="OUT")
+@options(
+    click.option(
+        "--format", "exporter", metavar="NAME", help="Exporter, see `sw list-plugins`.  [default: by the suffix of OUT]"
+    ),
+    device_option, json_option, debug_option,
+)  # fmt: skip
+def export(file: str, out: str, exporter: str | None, device: str | None, as_json: bool) -> None:
+    """Decode FILE (.swz or .ply) and write it to OUT in another format, such as .ply."""
+    from splatwizard_core.experiments.decoding import export_model
+    from splatwizard_core.experiments.measuring import opener
+    from splatwizard_core.plugins import load_plugins
+
+    path = existing(file)
+    plugins = load_plugins()
+    ppl, _, _ = resolve_run_options(None, assignments((), device=device))
+    session = open_session(ppl, plugins)
+    model, _ = opener(path, plugins, session.device)()
+    target = Path(out)
+    name = export_model(model, target, plugins, exporter)
+    facts = {"file": out, "format": name, "bytes": target.stat().st_size, "counts": model.counts()}
+    if as_json:
+        print_json(facts)
+    else:
+        click.echo(f"{facts['bytes']:,} bytes ({name}): {out}")

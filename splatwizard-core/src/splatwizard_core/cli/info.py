@@ -1,0 +1,122 @@
+"""`sw info`: what is in a file or a scene."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from splatwizard_core.cli.options import (
+    assignments,
+    console,
+    debug_option,
+    images_option,
+    json_option,
+    options,
+    print_json,
+    set_option,
+)
+
+
+@click.command()
+@click.argument("path", metavar="PATH")
+@options(images_option, set_option, json_option, debug_option)
+def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) -> None:
+    """What is in PATH: a .swz file (bytes by section), a .ply, or a scene (folder, `demo`, dataset/scene)."""
+    where = Path(path)
+    if where.suffix == ".swz" or (where.is_file() and _starts_with(where, b"SPWZ")):
+        facts = {"kind": "file", **file_facts(where)}
+    elif where.suffix == ".ply":
+        facts = {"kind": "ply", **_ply_facts(where)}
+    else:
+        facts = {"kind": "scene", **_scene_facts(path, images, sets)}
+    if as_json:
+        print_json(facts)
+    else:
+        {"file": _print_file, "ply": _print_plain, "scene": _print_plain}[facts["kind"]](facts)
+
+
+def _starts_with(path: Path, magic: bytes) -> bool:
+    with path.open("rb") as file:
+        return file.read(len(magic)) == magic
+
+
+def file_facts(path: Path) -> dict[str, Any]:
+    """Header and bytes by section of a .swz; the bytes sum to its size."""
+    from splatwizard_core.coding.container import ContainerReader
+
+    return {"path": str(path), **ContainerReader.open(path).summary()}
+
+
+def _ply_facts(path: Path) -> dict[str, Any]:
+    from splatwizard_core.cli.setup import existing
+    from splatwizard_core.gaussians.ply import load_ply
+
+    model = load_ply(existing(str(path)))
+    means, scales = model.means.detach(), model.scales.detach()
+    low, high = means.amin(0).tolist(), means.amax(0).tolist()
+    return {
+        "path": str(path),
+        "size": path.stat().st_size,
+        **model.counts(),
+        "sh_degree": model.max_sh_degree,
+        "box": {"min": low, "max": high},
+        "median_scale": float(scales.median()),
+        "median_opacity": float(model.opacities.detach().median()),
+    }
+
+
+def _scene_facts(spec: str, images: str | None, sets: tuple[str, ...]) -> dict[str, Any]:
+    from splatwizard_core.cli.setup import resolve_run_options
+    from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.scene.describe import describe
+    from splatwizard_core.scene.loaders import load_scene
+
+    _, options_, _ = resolve_run_options(None, assignments(sets, images=images))
+    return describe(load_scene(spec, options_, load_plugins()))
+
+
+def _print_file(facts: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    out = console()
+    out.print(escape(f"{facts['path']}: {facts['method']} (layout version {facts['method_version']})"), soft_wrap=True)
+    for name in ("raster", "static"):
+        if facts[name]:
+            out.print(escape(f"{name}: {_shown(facts[name])}"), soft_wrap=True)
+    table = Table()
+    table.add_column("section")
+    table.add_column("bytes", justify="right")
+    table.add_column("share", justify="right")
+    for name, size in facts["bytes"].items():
+        table.add_row(escape(name), f"{size:,}", f"{size / facts['size']:.1%}")
+    table.add_section()
+    table.add_row("file", f"{facts['size']:,}", "100.0%")
+    out.print(table)
+
+
+def _print_plain(facts: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(show_header=False)
+    for name, value in facts.items():
+        if name != "kind" and value not in (None, [], {}):
+            table.add_row(name.replace("_", " "), escape(_shown(value)))
+    console().print(table)
+
+
+def _shown(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    if isinstance(value, int):
+        return f"{value:,}"
+    if isinstance(value, dict):
+        return ", ".join(f"{k} {_shown(v)}" for k, v in value.items())
+    if isinstance(value, (list, tuple)):
+        return "; ".join(map(_shown, value)) if value and isinstance(value[0], dict) else ", ".join(map(_shown, value))
+    return str(value)

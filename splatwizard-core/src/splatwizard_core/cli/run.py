@@ -1,0 +1,144 @@
+"""`sw run`: train, encode, decode, evaluate, report."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from splatwizard_core.cli.options import (
+    assignments,
+    changed_plan_option,
+    config_option,
+    console,
+    debug_option,
+    device_option,
+    images_option,
+    json_option,
+    options,
+    preset_option,
+    print_json,
+    resume_option,
+    scene_option,
+    seed_option,
+    set_option,
+)
+from splatwizard_core.cli.setup import method_names, open_session, resolve_all, say
+
+if TYPE_CHECKING:
+    from splatwizard_core.experiments.record import Record
+
+
+@click.command()
+@options(
+    click.option(
+        "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]",
+        help="One or more methods; repeatable.  [default: 3dgs, or what --config says]",
+    ),
+    scene_option, images_option,
+    click.option(
+        "--rate", "rates", metavar="NAME[,NAME]",
+        help="Rate points: r1 (smallest file) .. rN, or low, default, high, all.  [default: default]",
+    ),
+    preset_option, config_option, set_option,
+    click.option(
+        "--out", default="out", show_default=True, metavar="DIR",
+        help="Root of the run directories, DIR/<scene>/<method>/<rate>.",
+    ),
+    device_option, seed_option, resume_option, changed_plan_option, json_option, debug_option,
+)  # fmt: skip
+def run(
+    methods: tuple[str, ...],
+    scene: str | None,
+    images: str | None,
+    rates: str | None,
+    preset: str | None,
+    config_file: str | None,
+    sets: tuple[str, ...],
+    out: str,
+    device: str | None,
+    seed: int | None,
+    resume: bool,
+    allow_changed_plan: bool,
+    as_json: bool,
+) -> None:
+    """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
+
+    Finished steps are not done again; an interrupted run goes on from its last checkpoint.
+    """
+    from splatwizard_core.experiments.config import is_demo
+    from splatwizard_core.experiments.run import RunRequest
+    from splatwizard_core.experiments.run import run as run_one
+    from splatwizard_core.plugins import load_plugins
+
+    plugins = load_plugins()
+    values = assignments(sets, images=images, device=device, seed=seed)
+    resolved = resolve_all(
+        plugins, method_names(methods, config_file), rates,
+        preset=preset, config_file=config_file, values=values, scene=scene,
+    )  # fmt: skip
+    session = open_session(resolved[0].ppl, plugins)
+    if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
+        say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
+    done: list[tuple[Record, Path]] = []
+    for each in resolved:
+        request = RunRequest(each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan)
+        done.append(run_one(session, request))
+    if as_json:
+        print_json({"runs": [{"directory": str(d), "record": r.model_dump(mode="json")} for r, d in done]})
+    else:
+        print_results(done)
+
+
+def print_results(done: list[tuple[Record, Path]]) -> None:
+    """One row a run, on stdout."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    out = console()
+    first = done[0][0]
+    names = list(dict.fromkeys(name for record, _ in done for name in record.metrics))
+    names.sort(key=lambda n: (("psnr", "ssim", "l1").index(n) if n in ("psnr", "ssim", "l1") else 3, n))
+    table = Table(
+        title=f"{escape(first.scene)}: {first.test_views} test views, protocol {escape(first.protocol.id)}",
+        title_justify="left",
+    )
+    table.add_column("method")
+    table.add_column("rate")
+    for column in (*(_heading(n) for n in names), "MB", "primitives", "train s", "encode s", "decode s", "FPS"):
+        table.add_column(column, justify="right")
+    for record, _ in done:
+        means = [record.metrics[n].mean if n in record.metrics else None for n in names]
+        table.add_row(
+            escape(record.method),
+            escape(record.rate or "-"),
+            *(_number(n, value) for n, value in zip(names, means, strict=True)),
+            f"{record.file.bytes / 1e6:.3f}",
+            " / ".join(f"{n:,}" for n in record.counts.values()),
+            _seconds(record.train.train_s),
+            _seconds(record.codec.encode_s),
+            _seconds(record.codec.decode_s),
+            f"{record.speed.fps:.1f}",
+        )
+    out.print(table)
+    for reason in dict.fromkeys(
+        f"{key.split('.')[1]}: {why}" for r, _ in done for key, why in r.unknown.items() if key.startswith("metrics.")
+    ):
+        out.print(escape(reason))
+    for _, directory in done:
+        out.print(f"{escape(str(directory))}/metrics.json", soft_wrap=True)
+
+
+def _heading(metric: str) -> str:
+    return {"psnr": "PSNR dB", "ssim": "SSIM", "l1": "L1"}.get(metric, metric)
+
+
+def _number(metric: str, value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.3f}" if metric == "psnr" else f"{value:.4f}"
+
+
+def _seconds(value: float | None) -> str:
+    return "-" if value is None else f"{value:.1f}" if value >= 10 else f"{value:.2f}"

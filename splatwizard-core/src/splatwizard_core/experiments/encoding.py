@@ -1,0 +1,79 @@
+"""A trained model to one file: from a run directory, or from a .ply."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.coding.container import ContainerWriter
+from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.evaluation.evaluate import raster_header
+from splatwizard_core.experiments.config import ResolvedConfig
+from splatwizard_core.experiments.files import file_sha256
+from splatwizard_core.experiments.lock import directory_lock
+from splatwizard_core.experiments.method import Method
+from splatwizard_core.experiments.session import Session, TrainedModel
+from splatwizard_core.experiments.training_run import finished_directory, make_method, train, training_key
+from splatwizard_core.gaussians.splat_model import SplatModel
+
+
+def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Write one file; {"encode_s", "bytes", "sha256"}.
+
+    raster  what the header asks of a rasterizer
+
+    The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
+    """
+    before = model.digest()
+    _synchronize(model)
+    began = time.perf_counter()
+    writer = ContainerWriter(method.name, method.version, raster=raster)
+    with torch.no_grad():
+        method.encode(model, writer)
+    size = writer.write(path)
+    _synchronize(model)
+    seconds = time.perf_counter() - began
+    if model.digest() != before:
+        raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
+    return {"encode_s": seconds, "bytes": size, "sha256": file_sha256(path)}
+
+
+def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
+    """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
+    key = training_key(session, resolved)
+    with directory_lock(directory):
+        if finished_directory(directory, key) is None:
+            raise UserInputError(
+                f"{directory} holds no finished training of this configuration: "
+                f"`sw train --config {directory}/config.toml` makes it (only `codec` keys may differ)"
+            )
+        trained = train(session, resolved, directory, trained=_nothing_to_start_from)
+        return encode(make_method(session, resolved), trained.model, trained.facts["raster"], target)
+
+
+def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
+    """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
+    from splatwizard_core.gaussians.ply import load_ply
+
+    if path.suffix != ".ply":
+        raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
+    model = load_ply(path).to(session.device).eval().requires_grad_(False)
+    method = make_method(session, resolved)
+    last = list(method.stages())[-1]
+    raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))
+    try:
+        return encode(method, model, raster, target)
+    except (TypeError, AttributeError) as error:
+        raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error
+
+
+def _nothing_to_start_from(name: str) -> TrainedModel:
+    raise SplatwizardError(f"a finished training asked for a trained '{name}' scene")
+
+
+def _synchronize(model: SplatModel) -> None:
+    if model.device.type == "cuda":
+        torch.cuda.synchronize(model.device)

@@ -1,0 +1,260 @@
+"""One run: train -> encode -> decode in a fresh process -> evaluate in another -> metrics.json.
+
+Every finished step is remembered with what it was made from, so a run that was interrupted goes on where it was and
+a finished one is not done again.
+"""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.experiments.cache import trained_scene
+from splatwizard_core.experiments.config import SCENE_KEYS, ResolvedConfig, absolute_spec, content_hash
+from splatwizard_core.experiments.encoding import encode
+from splatwizard_core.experiments.files import file_sha256, write_atomic
+from splatwizard_core.experiments.fresh import decode_fresh, run_fresh
+from splatwizard_core.experiments.lock import directory_lock
+from splatwizard_core.experiments.record import FILE_NAME, Record, missing_reasons, read_record
+from splatwizard_core.experiments.session import Session, TrainedModel
+from splatwizard_core.experiments.steps import StepLog
+from splatwizard_core.experiments.training_run import make_method, train, training_key
+
+ENCODED = "scene.swz"
+CONFIG = "config.toml"
+RENDERS = "renders"
+OWN_FILES = (CONFIG, "log.jsonl", "checkpoints", ENCODED, FILE_NAME, RENDERS, "steps.json")
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What to run.
+
+    out         root of all run directories
+    resume      use what is there; False: discard it
+    """
+
+    resolved: ResolvedConfig
+    out: Path
+    resume: bool = True
+    allow_changed_plan: bool = False
+
+
+def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
+    """The whole chain for one scene, method and rate point; the record and the run directory.
+
+    Raises RunLockedError if another process writes there, and whatever a step raises.
+    """
+    resolved = request.resolved
+    directory = run_directory(request)
+    with directory_lock(directory):
+        _begin(directory, request)
+        steps = StepLog(directory)
+        finished = _finished_record(session, directory, steps, request)
+        if finished is not None:
+            session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
+            return finished, directory
+        train_key = training_key(session, resolved)
+        encoded = directory / ENCODED
+        encode_key = _encode_key(train_key, resolved)
+        facts = steps.done("encode", encode_key)
+        if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+            trained = train_in(session, request, directory)
+            facts = encode(make_method(session, resolved), trained.model, trained.facts["raster"], encoded)
+            session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
+            steps.finish("encode", encode_key, facts)
+        training = steps.done("train", train_key)
+        if training is None:
+            raise SplatwizardError(f"{directory}/steps.json changed while the run went on")
+        decoded = _decode_step(session, steps, encoded, facts["sha256"])
+        measured = _evaluate_step(session, steps, request, directory, facts["sha256"])
+        if decoded["digest"] != measured["digest"]:
+            raise SplatwizardError(
+                f"{encoded}: the decoding and the evaluating process got different models from the same file; "
+                f"method '{resolved.method}' does not decode deterministically"
+            )
+        record = _assemble(session, resolved, training, facts, decoded, measured)
+        record.write(directory / FILE_NAME)
+        steps.finish("record", _record_key(session, request), {"sha256": facts["sha256"]})
+    return record, directory
+
+
+def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:
+    """The training step of a run; `run` with the same request goes on from there."""
+    directory = run_directory(request)
+    with directory_lock(directory):
+        _begin(directory, request)
+        return train_in(session, request, directory), directory
+
+
+def run_directory(request: RunRequest) -> Path:
+    """out/<scene>/<method>/<rate>."""
+    resolved = request.resolved
+    name = Path(absolute_spec(resolved.scene_spec)).name.replace(":", "-")
+    return request.out / name / resolved.method / resolved.rate
+
+
+def train_in(session: Session, request: RunRequest, directory: Path, *, stop_after: int | None = None) -> TrainedModel:
+    """The training step alone, in a directory that the caller holds."""
+
+    def start(name: str) -> TrainedModel:
+        return trained_scene(session, name, request.resolved, request.out)
+
+    return train(
+        session, request.resolved, directory,
+        trained=start, resume=request.resume, allow_changed_plan=request.allow_changed_plan, stop_after=stop_after,
+    )  # fmt: skip
+
+
+def _begin(directory: Path, request: RunRequest) -> None:
+    if not request.resume:
+        discard(directory)
+    write_atomic(directory / CONFIG, request.resolved.toml())
+
+
+def discard(directory: Path) -> None:
+    """Remove what a run wrote; anything else in the directory stays."""
+    for name in OWN_FILES:
+        path = directory / name
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path)
+        else:
+            path.unlink(missing_ok=True)
+
+
+def _record_key(session: Session, request: RunRequest) -> str:
+    entry = session.plugins.methods.entry(request.resolved.method)
+    return content_hash(
+        [
+            absolute_spec(request.resolved.scene_spec), request.resolved.config_hash(), str(session.device),
+            entry.distribution, entry.version, session.plugins.metrics.names,
+        ]
+    )  # fmt: skip
+
+
+def _finished_record(session: Session, directory: Path, steps: StepLog, request: RunRequest) -> Record | None:
+    """The record of a run that was finished from the same inputs and still is as it was written."""
+    facts = steps.done("record", _record_key(session, request))
+    encoded = directory / ENCODED
+    if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+        return None
+    try:
+        record = read_record(directory / FILE_NAME)
+    except UserInputError:
+        return None  # it is written again
+    return record if record.file.sha256 == facts["sha256"] else None
+
+
+def _encode_key(train_key: str, resolved: ResolvedConfig) -> str:
+    return content_hash([train_key, resolved.config.model_dump(mode="json")])
+
+
+def _decode_step(session: Session, steps: StepLog, encoded: Path, sha256: str) -> dict[str, Any]:
+    key = content_hash([sha256, str(session.device)])
+    facts = steps.done("decode", key)
+    if facts is None:
+        facts = decode_fresh(encoded, str(session.device))
+        session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {_counted(facts['counts'])}")
+        steps.finish("decode", key, facts)
+    return facts
+
+
+def _counted(counts: dict[str, int]) -> str:
+    return ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in counts.items())
+
+
+def _evaluate_step(
+    session: Session, steps: StepLog, request: RunRequest, directory: Path, sha256: str
+) -> dict[str, Any]:
+    resolved = request.resolved
+    digest = session.scene_digest(resolved)
+    raster = resolved.ppl.raster.model_dump(mode="json")
+    key = content_hash([sha256, digest, str(session.device), raster, session.plugins.metrics.names])
+    facts = steps.done("evaluate", key)
+    if facts is None:
+        arguments = ["eval", str(directory / ENCODED), "--scene", absolute_spec(request.resolved.scene_spec)]
+        arguments += eval_options(resolved, str(session.device))
+        facts = run_fresh([*arguments, "--renders", str(directory / RENDERS), "--json"])
+        steps.finish("evaluate", key, facts)
+    return facts
+
+
+def eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
+    """The options that make `sw eval` see the scene as this run does."""
+    found = ["--device", device, "--set", f"seed={resolved.ppl.seed}", "--set", f"threads={resolved.ppl.threads}"]
+    for key in SCENE_KEYS:
+        value = getattr(resolved.scene, key)
+        found += ["--set", f"{key}={'none' if value is None else value}"]
+    for key in ("prefer", "forbid"):
+        names = getattr(resolved.ppl.raster, key)
+        found += ["--set", f"raster.{key}={','.join(names)}"] if names else []
+    return found
+
+
+def _assemble(
+    session: Session,
+    resolved: ResolvedConfig,
+    training: dict[str, Any],
+    encoding: dict[str, Any],
+    decoded: dict[str, Any],
+    measured: dict[str, Any],
+) -> Record:
+    """The record from what the steps reported."""
+    entry = session.plugins.methods.entry(resolved.method)
+    unknown = dict(measured["unknown"])
+    unknown["geometry"] = "not asked for"
+    if training["breakdown_s"] is None:
+        unknown["train.breakdown_s"] = "not profiled (--set profile=stages)"
+    if training["peak_bytes"] is None:
+        unknown["train.peak_bytes"] = "not measured"
+    if measured["memory"]["peak_reserved_bytes"] is None:
+        unknown["memory.peak_reserved_bytes"] = "a CPU has no such pool"
+    record = Record(
+        method=resolved.method,
+        method_version=decoded["method_version"],
+        distribution=f"{entry.distribution} {entry.version}",
+        preset=resolved.preset,
+        rate=resolved.rate,
+        config=resolved.as_dict(),
+        config_hash=resolved.config_hash(),
+        **{k: measured[k] for k in _FROM_EVALUATION},
+        file={
+            "bytes": encoding["bytes"],
+            "sha256": encoding["sha256"],
+            "sections": decoded["sections"],
+            "digest": decoded["digest"],
+        },
+        counts=decoded["counts"],
+        codec={
+            "encode_s": encoding["encode_s"],
+            "decode_s": decoded["decode_s"],
+            "decode_runs_s": decoded["decode_runs_s"],
+            "first_decode_s": decoded["first_decode_s"],
+            "peak_decode_bytes": decoded["peak_bytes"],
+            "memory_kind": decoded["memory_kind"],
+        },
+        train={
+            **{k: training[k] for k in _FROM_TRAINING},
+            "with_pretraining_s": training["train_s"] + sum(training["pretraining_s"].values()),
+        },
+        plan=training["plan"],
+        rasterizers={"train": training["rasterizers"], "render": measured["rasterizers"]},
+        environment=measured["environment"],
+        unknown=unknown,
+        date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+    )
+    without = missing_reasons(record)
+    if without:
+        raise SplatwizardError(f"the record has null without a reason: {', '.join(without)}")
+    return record
+
+
+_FROM_EVALUATION = (
+    "dataset", "scene", "protocol", "train_views", "test_views", "views", "metrics", "visible_gaussians",
+    "speed", "memory", "flags",
+)  # fmt: skip
+_FROM_TRAINING = ("train_s", "stages", "steps", "peak_bytes", "memory_kind", "breakdown_s", "trained_in")

@@ -1,0 +1,68 @@
+"""What several runs of one command share: plugins, device, loaded scenes and trained models."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+
+from splatwizard_core.experiments.config import ResolvedConfig
+from splatwizard_core.experiments.identity import scene_digest
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.scene import Scene
+
+
+@dataclass
+class TrainedModel:
+    """A finished training: the model, what it was made from, and what is reported of it."""
+
+    model: SplatModel
+    key: str
+    facts: dict[str, Any]
+
+
+@dataclass
+class Session:
+    """One invocation of `sw`.
+
+    device  where models live
+    say     takes one-line messages for the user
+    """
+
+    plugins: PluginManager
+    device: torch.device
+    say: Callable[[str], None]
+    _scenes: dict[tuple[str, SceneOptions], Scene] = field(default_factory=dict)
+    _digests: dict[tuple[str, SceneOptions], str] = field(default_factory=dict)
+    _last_trained: TrainedModel | None = None
+
+    def scene(self, resolved: ResolvedConfig) -> Scene:
+        """The scene of a run, loaded once; its warnings are told once."""
+        from splatwizard_core.scene.loaders import load_scene
+
+        key = (resolved.scene_spec, resolved.scene)
+        if key not in self._scenes:
+            scene = load_scene(resolved.scene_spec, resolved.scene, self.plugins)
+            for warning in scene.warnings:
+                self.say(f"scene {scene.name}: {warning}")
+            self._scenes[key] = scene
+        return self._scenes[key]
+
+    def scene_digest(self, resolved: ResolvedConfig) -> str:
+        """What identifies the scene's content, computed once."""
+        key = (resolved.scene_spec, resolved.scene)
+        if key not in self._digests:
+            self._digests[key] = scene_digest(self.scene(resolved))
+        return self._digests[key]
+
+    def remember(self, trained: TrainedModel) -> None:
+        """Keep the last trained model: the next rate point often starts from it."""
+        self._last_trained = trained
+
+    def trained(self, key: str) -> TrainedModel | None:
+        """The last trained model, if it is the one asked for."""
+        return self._last_trained if self._last_trained is not None and self._last_trained.key == key else None

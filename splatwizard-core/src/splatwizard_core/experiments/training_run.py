@@ -1,0 +1,158 @@
+"""Training inside a run directory: resumed, shared between rate points, and starting from trained scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.evaluation.evaluate import raster_header
+from splatwizard_core.experiments.config import ResolvedConfig, content_hash
+from splatwizard_core.experiments.method import Method
+from splatwizard_core.experiments.session import Session, TrainedModel
+from splatwizard_core.experiments.steps import StepLog
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.streams import stream
+from splatwizard_core.training.pipeline import train_stages
+
+CHECKPOINTS = "checkpoints"
+STEP = "train"
+
+
+def make_method(session: Session, resolved: ResolvedConfig) -> Method:
+    """The configured method."""
+    method: Method = session.plugins.methods.load(resolved.method)(session.plugins, resolved.config)
+    return method
+
+
+def training_key(session: Session, resolved: ResolvedConfig) -> str:
+    """What a training was made from: equal keys mean an interchangeable model."""
+    cls = session.plugins.methods.load(resolved.method)
+    return content_hash([resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version])
+
+
+def train(
+    session: Session,
+    resolved: ResolvedConfig,
+    directory: Path,
+    *,
+    trained: Callable[[str], TrainedModel],
+    resume: bool = True,
+    allow_changed_plan: bool = False,
+    stop_after: int | None = None,
+) -> TrainedModel:
+    """The trained model of this configuration on this scene, from wherever it already exists.
+
+    directory   run directory, held by the caller; another rate point's beside it is used if it was trained equally
+    trained     (method name) -> the trained scene that a stage starts from
+    stop_after  end the process's part of the training after this many steps (raises KeyboardInterrupt then)
+    """
+    key = training_key(session, resolved)
+    in_memory = session.trained(key)
+    if in_memory is not None:
+        return _share(session, in_memory, directory, resolved)
+    home = finished_directory(directory, key) or directory
+    scene = session.scene(resolved)
+    steps = StepLog(home)
+    done = steps.done(STEP, key)
+    if done is None:
+        session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
+    outcome_model, facts = run_stages(
+        session, resolved, scene, home, key,
+        trained=trained, resume=resume or done is not None, allow_changed_plan=allow_changed_plan,
+        stop_after=stop_after,
+    )  # fmt: skip
+    if done is None:
+        facts["trained_in"] = resolved.rate
+        steps.finish(STEP, key, facts)
+    else:
+        facts = done  # what was measured when it was trained, not when it was loaded
+    found = TrainedModel(outcome_model, key, facts)
+    session.remember(found)
+    return _share(session, found, directory, resolved) if home != directory else found
+
+
+def _share(session: Session, found: TrainedModel, directory: Path, resolved: ResolvedConfig) -> TrainedModel:
+    """Note in this rate point's directory whose training it uses."""
+    steps = StepLog(directory)
+    if steps.done(STEP, found.key) is None:
+        session.say(f"rate point {resolved.rate} shares the training of {found.facts.get('trained_in')}")
+        steps.finish(STEP, found.key, {**found.facts, "checkpoints": "elsewhere"})
+    return found
+
+
+def finished_directory(directory: Path, key: str) -> Path | None:
+    """The run directory (this, or that of another rate point beside it) that holds this very training, finished."""
+    candidates = [directory]
+    if directory.parent.is_dir():
+        candidates += sorted(p for p in directory.parent.iterdir() if p.is_dir() and p != directory)
+    for candidate in candidates:
+        if holds_training(candidate, key):
+            return candidate
+    return None
+
+
+def holds_training(directory: Path, key: str) -> bool:
+    """Whether a run directory holds this training, finished, with its own checkpoints."""
+    facts = StepLog(directory).done(STEP, key)
+    return facts is not None and "checkpoints" not in facts and (directory / CHECKPOINTS).is_dir()
+
+
+def run_stages(
+    session: Session,
+    resolved: ResolvedConfig,
+    scene: Scene,
+    directory: Path,
+    key: str,
+    *,
+    trained: Callable[[str], TrainedModel],
+    resume: bool,
+    allow_changed_plan: bool,
+    stop_after: int | None,
+) -> tuple[SplatModel, dict[str, Any]]:
+    """Train (or load, where the checkpoints say it is finished); the model and what is reported of the training."""
+    method = make_method(session, resolved)
+    stages = list(method.stages())
+    ppl = resolved.ppl
+    prefer = [*ppl.raster.prefer, *dict.fromkeys(name for stage in stages for name in stage.prefer)]
+    rasterizer = NegotiatedRasterizer(session.plugins, device=session.device, prefer=prefer, forbid=ppl.raster.forbid)
+    before: dict[str, float] = {}
+
+    def frozen(name: str) -> SplatModel:
+        source = trained(name)
+        before[name] = source.facts["train_s"]
+        return source.model
+
+    def create_model() -> SplatModel:
+        return method.create_model(scene, stream(ppl.seed, "init")).to(session.device)
+
+    outcome = train_stages(
+        stages,
+        create_model,
+        scene,
+        ppl,
+        rasterizer,
+        directory=directory / CHECKPOINTS,
+        identity={"method": method.name, "method_version": method.version, "key": key},
+        trained=frozen,
+        stop_after=stop_after,
+        resume=resume,
+        allow_changed_plan=allow_changed_plan,
+    )
+    background = scene.background
+    last = stages[-1]
+    facts = {
+        "train_s": outcome.train_s,
+        "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
+        "pretraining_s": before,
+        "steps": outcome.steps,
+        "peak_bytes": outcome.peak_memory,
+        "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
+        "breakdown_s": outcome.stage_breakdown,
+        "plan": outcome.plan,
+        "rasterizers": dict(rasterizer.choices),
+        "raster": raster_header(last.raster_options(last.iterations, background)),
+    }
+    return outcome.model, facts
