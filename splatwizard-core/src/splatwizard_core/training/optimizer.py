@@ -209,7 +209,7 @@ class SplatOptimizer:
 
         Raises ValueError if the groups differ or a moment does not fit its parameter.
         """
-        if list(state["groups"]) != list(self.groups):
+        if set(state["groups"]) != set(self.groups):
             raise ValueError(f"optimizer groups differ: {', '.join(state['groups'])} / {', '.join(self.groups)}")
         members = {member for names in self._members.values() for member in names}
         loaded = {}

@@ -11,10 +11,12 @@ from typing import Any, Final
 
 from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, scaled, steps_of
+from splatwizard_core.training.stage import Stage
 from splatwizard_core.training.tasks import POST_ONLY, SOURCES, Binding, TaskContext, bind
 
-__all__ = ["STOP", "PhaseSwitch", "Scheduler", "TaskContext", "format_plan", "plan_lines", "scaled"]
+__all__ = ["STOP", "PhaseSwitch", "Scheduler", "TaskContext", "build_schedulers", "format_plan", "plan_lines", "scaled"]
 
 log = logging.getLogger(__name__)
 
@@ -141,6 +143,14 @@ class PhaseSwitch:
         model.phase = self.name  # type: ignore[assignment]
         if model.state_dict_extra().get("phase") != self.name:
             raise TypeError(f"{type(model).__name__}.state_dict_extra() must hold 'phase', or a resumed run loses it")
+
+
+def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Scheduler]:
+    """The plan of a stage, (pre, post), without scene, model or device: what is printed is what is run."""
+    pre, post = Scheduler("pre"), Scheduler("post")
+    stage.register_pre_task(pre, ppl, stage.opt)
+    stage.register_post_task(post, ppl, stage.opt)
+    return pre, post
 
 
 def task_name(task: Callable[..., Any]) -> str:

@@ -1,0 +1,268 @@
+"""Checkpoints: a safetensors file of all tensors and a JSON file of everything else, written as a pair. No pickle.
+
+`00-0001000.safetensors` + `00-0001000.json`: stage 0 after step 1000. Both carry the same random pair id; the JSON
+file, renamed into place last, makes the pair valid and holds a CRC-32 of itself and of every tensor.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import difflib
+import json
+import logging
+import os
+import re
+import secrets
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from splatwizard_core.errors import CheckpointError
+from splatwizard_core.training.plan import plan_digest
+
+log = logging.getLogger(__name__)
+
+FORMAT = 1
+TENSOR_KEY = "$tensor"
+_NAME = re.compile(r"(\d{2})-(\d{7})\.json")
+_OURS = re.compile(r"\.?\d{2}-\d{7}\.(json|safetensors)(\.tmp|\.damaged)?")
+
+
+class DamagedCheckpointError(CheckpointError):
+    """The pair of files is not what was written; an older one may be."""
+
+
+@dataclass
+class Checkpoint:
+    """A run after a step.
+
+    stage, stage_name, step     where it stands; steps count from 1 in each stage
+    finished    the stage is over (its last step, or a task stopped it)
+    identity    what the result depends on besides the plan: method, version, resolved configuration (JSON-able)
+    plan        `plan_lines` of the stage's tasks
+    extent      scene extent E, world units
+    progress    what the record of the run accumulates: seconds, steps of earlier stages, peak memory
+    state       nested dicts and lists of tensors and JSON-able values
+    """
+
+    stage: int
+    stage_name: str
+    step: int
+    finished: bool
+    identity: dict[str, Any]
+    plan: list[str]
+    extent: float
+    progress: dict[str, Any]
+    state: dict[str, Any]
+
+
+class CheckpointStore:
+    """The checkpoints of one run in one directory.
+
+    keep    how many of the newest of a stage stay; the last one of each finished stage stays too, since a later
+            stage is resumed on top of it
+    """
+
+    def __init__(self, directory: Path, keep: int = 1) -> None:
+        self.directory, self.keep = directory, keep
+
+    def write(self, checkpoint: Checkpoint) -> Path:
+        """Write the pair atomically, then remove those that are no longer kept; returns the JSON file's path."""
+        self.directory.mkdir(parents=True, exist_ok=True)
+        tensors: dict[str, Tensor] = {}
+        content = {
+            **{f.name: getattr(checkpoint, f.name) for f in fields(Checkpoint) if f.name != "state"},
+            "format": FORMAT,
+            "pair": secrets.token_hex(16),
+            "plan_digest": plan_digest(checkpoint.plan),
+            "state": split_tensors(checkpoint.state, tensors),
+            "tensors": {name: _crc(tensor) for name, tensor in tensors.items()},
+        }
+        path = self.directory / f"{checkpoint.stage:02d}-{checkpoint.step:07d}.json"
+        tensor_path = path.with_suffix(".safetensors")
+        body = json.dumps(content)
+        text = json.dumps({"crc": zlib.crc32(body.encode()), "content": content})
+        temporary = [p.with_name(f".{p.name}.tmp") for p in (tensor_path, path)]
+        try:
+            save_file(tensors, temporary[0], {"pair": content["pair"]})
+            temporary[1].write_text(text)
+            os.replace(temporary[0], tensor_path)
+            os.replace(temporary[1], path)
+        except BaseException:
+            for leftover in temporary:
+                with contextlib.suppress(OSError):
+                    leftover.unlink()
+            raise
+        self._prune(checkpoint.stage)
+        return path
+
+    def paths(self) -> list[Path]:
+        """The JSON files, newest first."""
+        found = self.directory.iterdir() if self.directory.is_dir() else ()
+        return sorted((p for p in found if _NAME.fullmatch(p.name)), key=lambda p: p.name, reverse=True)
+
+    def newest(self) -> Checkpoint | None:
+        """The newest checkpoint that can be read, or None if there is none.
+
+        A damaged one is set aside with a warning; raises CheckpointError if all of them are damaged.
+        """
+        problem: CheckpointError | None = None
+        for path in self.paths():
+            try:
+                found = read_checkpoint(path)
+            except DamagedCheckpointError as error:
+                problem = problem or error
+                log.warning("%s; trying the one before", error)
+                for each in (path, path.with_suffix(".safetensors")):
+                    with contextlib.suppress(OSError):
+                        os.replace(each, each.with_name(f"{each.name}.damaged"))
+                continue
+            if problem is not None:
+                log.warning("resuming from %s instead, step %d", path.name, found.step)
+            return found
+        if problem is not None:
+            raise CheckpointError(f"{problem}; no earlier checkpoint is left, so start again without resuming")
+        return None
+
+    def last_of(self, stage: int) -> Checkpoint:
+        """The checkpoint that finished a stage. Raises CheckpointError."""
+        for path in self.paths():
+            if path.name.startswith(f"{stage:02d}-"):
+                found = read_checkpoint(path)
+                if found.finished:
+                    return found
+        raise CheckpointError(
+            f"{self.directory}: the last checkpoint of stage {stage} is missing; start again without resuming"
+        )
+
+    def clear(self) -> None:
+        """Remove every checkpoint file of the directory."""
+        if self.directory.is_dir():
+            for path in self.directory.iterdir():
+                if _OURS.fullmatch(path.name):
+                    path.unlink()
+
+    def _prune(self, stage: int) -> None:
+        by_stage: dict[int, list[Path]] = {}
+        for path in self.paths():
+            by_stage.setdefault(int(path.name[:2]), []).append(path)
+        kept = {
+            path.stem for number, paths in by_stage.items() for path in paths[: self.keep if number == stage else 1]
+        }
+        for path in self.directory.iterdir():
+            if re.fullmatch(r"\d{2}-\d{7}\.(json|safetensors)", path.name) and path.stem not in kept:
+                path.unlink()
+
+
+def read_checkpoint(path: Path) -> Checkpoint:
+    """Read and verify a pair by the path of its JSON file; tensors are on the CPU.
+
+    Raises DamagedCheckpointError that says what is wrong, CheckpointError for a format of another version.
+    """
+    tensor_path = path.with_suffix(".safetensors")
+    try:
+        outer = json.loads(path.read_text())
+        content = outer["content"]
+        if outer["crc"] != zlib.crc32(json.dumps(content).encode()):
+            raise DamagedCheckpointError(f"checkpoint {path} is damaged: its checksum does not fit")
+        if content["format"] != FORMAT:
+            raise CheckpointError(
+                f"checkpoint {path} has format {content['format']}, this version reads {FORMAT}: start again"
+            )
+        with safe_open(tensor_path, framework="pt") as file:
+            if (file.metadata() or {}).get("pair") != content["pair"]:
+                raise DamagedCheckpointError(f"checkpoint {path} and {tensor_path.name} do not belong together")
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+        if tensors.keys() != content["tensors"].keys():
+            raise DamagedCheckpointError(f"checkpoint {tensor_path} does not hold the tensors that {path.name} lists")
+        for name, tensor in tensors.items():
+            if _crc(tensor) != content["tensors"][name]:
+                raise DamagedCheckpointError(f"checkpoint {tensor_path} is damaged: tensor '{name}' has changed")
+        values = {f.name: content[f.name] for f in fields(Checkpoint) if f.name != "state"}
+        return Checkpoint(**values, state=join_tensors(content["state"], tensors))
+    except FileNotFoundError as error:
+        raise DamagedCheckpointError(f"checkpoint {error.filename or tensor_path} is missing") from error
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DamagedCheckpointError(f"checkpoint {path} cannot be read: {type(error).__name__}: {error}") from error
+
+
+def split_tensors(value: Any, tensors: dict[str, Tensor], path: str = "") -> Any:
+    """`value` as JSON, its tensors put into `tensors` (CPU, contiguous, no shared memory) by their path.
+
+    Raises TypeError for what is neither a tensor nor JSON-able: it would come back as something else.
+    """
+    if isinstance(value, Tensor):
+        if path in tensors:
+            raise ValueError(f"two tensors of a checkpoint are called '{path}'")
+        tensor = value.detach().cpu().contiguous()
+        # safetensors refuses tensors that share memory (tied weights).
+        used = {t.untyped_storage().data_ptr() for t in tensors.values() if t.numel()}
+        if tensor.numel() and tensor.untyped_storage().data_ptr() in used:
+            tensor = tensor.clone()
+        tensors[path] = tensor
+        return {TENSOR_KEY: path}
+    if isinstance(value, Mapping):
+        if TENSOR_KEY in value or not all(isinstance(k, str) for k in value):
+            raise TypeError(f"checkpoint state at '{path}': keys must be strings other than '{TENSOR_KEY}'")
+        return {k: split_tensors(v, tensors, f"{path}/{k}" if path else k) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [split_tensors(v, tensors, f"{path}/{i}") for i, v in enumerate(value)]
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    raise TypeError(f"checkpoint state at '{path}': {type(value).__name__} is neither a tensor nor JSON-able")
+
+
+def join_tensors(value: Any, tensors: Mapping[str, Tensor]) -> Any:
+    """Inverse of `split_tensors` (tuples come back as lists)."""
+    if isinstance(value, dict):
+        if TENSOR_KEY in value:
+            return tensors[value[TENSOR_KEY]]
+        return {k: join_tensors(v, tensors) for k, v in value.items()}
+    if isinstance(value, list):
+        return [join_tensors(v, tensors) for v in value]
+    return value
+
+
+def _crc(tensor: Tensor) -> int:
+    """CRC-32 of shape, dtype and bytes."""
+    head = zlib.crc32(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
+    if not tensor.numel():
+        return head
+    content: Any = tensor.reshape(-1).view(torch.uint8).numpy()  # a buffer, which numpy's types do not say
+    return zlib.crc32(content, head)
+
+
+def normalised(identity: Mapping[str, Any]) -> dict[str, Any]:
+    """The identity as it comes back from JSON, so that a fresh one and a stored one can be compared."""
+    found: dict[str, Any] = json.loads(json.dumps(identity, default=str, sort_keys=True))
+    return found
+
+
+def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Sequence[str], extent: float) -> list[str]:
+    """What a checkpoint was made with and this run is not, one line each; empty if nothing differs."""
+    old, new = _flat(checkpoint.identity), _flat(normalised(identity))
+    lines = [f"{k}: {old.get(k, 'absent')} -> {new.get(k, 'absent')}" for k in sorted(old.keys() | new.keys())
+             if old.get(k, "absent") != new.get(k, "absent")]  # fmt: skip
+    if abs(checkpoint.extent - extent) > 1e-6 * max(abs(extent), 1e-12):
+        lines.append(f"scene extent: {checkpoint.extent:.6g} -> {extent:.6g}")
+    if plan_digest(checkpoint.plan) != plan_digest(plan):
+        changed = (d for d in difflib.ndiff(checkpoint.plan, list(plan)) if d[0] in "+-")
+        lines += [f"plan {line}" for line in changed]
+    return lines
+
+
+def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, item in value.items():
+        if isinstance(item, dict) and item:
+            found |= _flat(item, f"{prefix}{key}.")
+        else:
+            found[prefix + key] = item
+    return found

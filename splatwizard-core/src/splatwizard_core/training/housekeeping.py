@@ -1,0 +1,182 @@
+"""What happens between the steps of a stage and is no part of it: log, progress, evaluation, checkpoints, Ctrl-C."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import asdict, dataclass, field
+from types import TracebackType
+from typing import Any
+
+import torch
+
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.progress import track
+from splatwizard_core.training import rng
+from splatwizard_core.training.interrupt import InterruptGuard
+from splatwizard_core.training.run_log import RunLog
+from splatwizard_core.training.timing import LoopClock, synchronize
+from splatwizard_core.training.trainer import StepRecord, Trainer
+
+log = logging.getLogger(__name__)
+
+Evaluate = Callable[[SplatModel, int], Mapping[str, Any] | None]
+
+UNREAD_LINES = 8  # log lines whose losses stay on a GPU until they are read together: each reading waits for it
+
+
+@dataclass
+class Progress:
+    """What a run accumulates over processes; part of every checkpoint.
+
+    stage_seconds   stage name -> wall clock of its loop without housekeeping
+    stage_steps     stage name -> steps done
+    breakdown       stage name -> seconds per stage of a step, where they are timed
+    peak_memory     bytes
+    """
+
+    stage_seconds: dict[str, float] = field(default_factory=dict)
+    stage_steps: dict[str, int] = field(default_factory=dict)
+    breakdown: dict[str, dict[str, float]] = field(default_factory=dict)
+    peak_memory: int = 0
+
+    @property
+    def steps(self) -> int:
+        return sum(self.stage_steps.values())
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+class Housekeeping:
+    """The work between the steps of one stage. Used as a context around `Trainer.run`; `after_step` is its callback.
+
+    name        of the stage in records (unique in the run)
+    save        (finished) -> writes a checkpoint of the trainer as it is
+    """
+
+    def __init__(
+        self,
+        trainer: Trainer,
+        name: str,
+        progress: Progress,
+        run_log: RunLog,
+        save: Callable[[bool], None],
+        meter: MemoryMeter,
+        *,
+        label: str,
+        on_step: Callable[[StepRecord], None] | None = None,
+        evaluate: Evaluate | None = None,
+    ) -> None:
+        self.trainer, self.name, self.progress, self.run_log = trainer, name, progress, run_log
+        self.on_step, self.evaluate, self.meter = on_step, evaluate, meter
+        self.guard = InterruptGuard()
+        self.clock = LoopClock(progress.stage_seconds.get(name, 0.0))
+        self._save, self._label = save, label
+        self._rows_are = "anchors" if "num_anchors" in trainer.model.counts() else "gaussians"
+        self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
+        self._saved_at = -1
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Housekeeping:
+        trainer = self.trainer
+        for scheduler in (trainer.pre, trainer.post):
+            scheduler.on_log = self._log_task
+        self._stack.enter_context(self.guard)
+        iterations = trainer.stage.iterations
+        self._bar = self._stack.enter_context(track(self._label, total=iterations, start=trainer.step))
+        self._stack.enter_context(self.clock.running(trainer.device))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            self._write_lines()
+        finally:
+            self._stack.__exit__(kind, error, trace)
+        self._account()
+
+    def after_step(self, record: StepRecord) -> None:
+        """Everything that is due after this step."""
+        with self.clock.paused():
+            try:
+                self._bar.advance(1, loss=record.total, **{self._rows_are: record.num_rows})
+                if self.on_step is not None:
+                    self.on_step(record)
+                self._log_step(record)
+                every = self.trainer.ppl.eval_every
+                if self.evaluate is not None and every and record.step % every == 0:
+                    self._evaluate(self.evaluate, record.step)
+                last = record.step == self.trainer.stage.iterations or self.trainer.stopped
+                if not last and record.step % self.trainer.ppl.checkpoint_every == 0:
+                    self.save()
+                if self.guard.pending:
+                    raise KeyboardInterrupt
+            except KeyboardInterrupt:
+                # Between steps the state is whole, so nothing that is done is lost.
+                self.save()
+                raise
+
+    def save(self, *, finished: bool = False) -> None:
+        """Write a checkpoint of the last step, unless it is there or a task that it cannot hold is still to run."""
+        trainer = self.trainer
+        if self._saved_at == trainer.step and not finished:
+            return
+        if not finished and (trainer.pre.pending_late(trainer.step) or trainer.post.pending_late(trainer.step)):
+            log.warning(
+                "no checkpoint at step %d: a task that was registered while training is still to run", trainer.step
+            )
+            return
+        trainer.check_losses()
+        self._write_lines()
+        self._account()
+        self._save(finished)
+        self._saved_at = trainer.step
+
+    def _account(self) -> None:
+        """Bring the accumulated figures up to date."""
+        self.progress.stage_seconds[self.name] = self.clock.seconds
+        self.progress.stage_steps[self.name] = self.trainer.step
+        self.progress.peak_memory = max(self.progress.peak_memory, self.meter.peak_bytes())
+        if self.trainer.stage_clock is not None:
+            self.progress.breakdown[self.name] = dict(self.trainer.stage_clock.totals)
+
+    def _evaluate(self, evaluate: Evaluate, step: int) -> None:
+        model = self.trainer.model
+        synchronize(self.trainer.device)
+        # An evaluation measures memory of its own.
+        self.progress.peak_memory = max(self.progress.peak_memory, self.meter.peak_bytes())
+        modes = {module: module.training for module in model.modules()}
+        with rng.preserved(), torch.no_grad():
+            model.eval()
+            try:
+                metrics = evaluate(model, step)
+            finally:
+                for module, mode in modes.items():
+                    module.training = mode
+        if metrics:
+            self.run_log.write(self.trainer.index, step, metrics=dict(metrics))
+
+    def _log_task(self, step: int, name: str) -> None:
+        self.run_log.write(self.trainer.index, step, task=name)
+
+    def _log_step(self, record: StepRecord) -> None:
+        if record.step not in (1, record.iterations) and record.step % self.trainer.ppl.log_every:
+            return
+        groups = self.trainer.optimizer.groups.values()
+        facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
+        self._unread.append((record, facts))
+        if self.trainer.device.type == "cpu" or len(self._unread) >= UNREAD_LINES:
+            self._write_lines()
+
+    def _write_lines(self) -> None:
+        for record, facts in self._unread:
+            line: dict[str, Any] = {"view": record.view, "loss": record.total.item()}
+            line["parts"] = {name: part.item() for name, part in record.parts.items()}
+            if record.seconds:
+                line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
+            self.run_log.write(record.stage, record.step, **line, **facts)
+        self._unread.clear()

@@ -1,0 +1,83 @@
+"""Where the time of a training loop goes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
+"""The five stages of a step, the third in its two halves."""
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait for the device; nothing to wait for on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+class LoopClock:
+    """Wall clock of the loop minus housekeeping: evaluation, checkpoints, logs.
+
+    seconds     of the loop so far; starts at what an interrupted run had used
+    """
+
+    def __init__(self, seconds: float = 0.0) -> None:
+        self._seconds = seconds
+        self._since: float | None = None
+
+    @property
+    def seconds(self) -> float:
+        return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
+
+    @contextmanager
+    def running(self, device: torch.device) -> Iterator[None]:
+        """The loop; waits for the device at its end."""
+        self._since = time.perf_counter()
+        try:
+            yield
+            synchronize(device)
+        finally:
+            self._seconds = self.seconds
+            self._since = None
+
+    @contextmanager
+    def paused(self) -> Iterator[None]:
+        """Housekeeping inside the loop."""
+        self._seconds = self.seconds
+        self._since = None
+        try:
+            yield
+        finally:
+            self._since = time.perf_counter()
+
+
+class StageClock:
+    """Seconds per stage of a step; synchronises the device at every mark, which is why it is opt-in."""
+
+    def __init__(self, device: torch.device, totals: dict[str, float] | None = None) -> None:
+        self.device = device
+        self.totals = dict.fromkeys(STAGES, 0.0) | (totals or {})
+        self._last: dict[str, float] = {}
+        self._since = 0.0
+
+    def start(self) -> None:
+        """A step begins."""
+        self._last = {}
+        synchronize(self.device)
+        self._since = time.perf_counter()
+
+    def mark(self, stage: str) -> None:
+        """This stage ends here."""
+        synchronize(self.device)
+        now = time.perf_counter()
+        self._last[stage] = now - self._since
+        self.totals[stage] += now - self._since
+        self._since = now
+
+    @property
+    def last_step(self) -> dict[str, float]:
+        """Seconds per stage of the last step."""
+        return self._last

@@ -1,0 +1,236 @@
+"""The loop of one training stage: pre tasks, render, loss, post tasks, optimizer. It knows no method.
+
+What published numbers depend on: post tasks run between backward and the optimizer step; a parameter that a task
+has replaced has no gradient and is skipped; the last step makes no update.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+from weakref import WeakKeyDictionary
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import EmptyModel, NothingToDo, TrainingDiverged
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.camera import Camera
+from splatwizard_core.scene.scene import Scene, View
+from splatwizard_core.training.interrupt import InterruptGuard
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.rng import Streams
+from splatwizard_core.training.scheduler import build_schedulers
+from splatwizard_core.training.stage import CameraIterator, LossPack, Stage
+from splatwizard_core.training.tasks import TaskContext
+from splatwizard_core.training.timing import StageClock
+
+CHECK_EVERY = 32  # steps between looks at the losses on a GPU: each look waits for the device
+
+
+@dataclass
+class StepRecord:
+    """One finished step, as cheap as it can be: tensors are read (and the device waited for) only by who needs them.
+
+    step        1-based, of this stage
+    total, parts    the loss, detached scalars
+    num_rows    primitives after the step
+    seconds     per stage; empty unless stages are timed
+    """
+
+    stage: int
+    stage_name: str
+    step: int
+    iterations: int
+    view: str
+    total: Tensor
+    parts: dict[str, Tensor] = field(default_factory=dict)
+    num_rows: int = 0
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+class Trainer:
+    """Runs the steps of one stage on a model.
+
+    index       position of the stage in the run
+    streams     the stage's random streams
+    stage_clock times every stage of a step (waiting for the device); None: no such timing
+    step        the last finished step
+    stopped     a task asked to end the stage
+    """
+
+    def __init__(
+        self,
+        stage: Stage,
+        model: SplatModel,
+        scene: Scene,
+        ppl: PipelineParams,
+        rasterizer: Rasterizer,
+        streams: Streams,
+        *,
+        index: int = 0,
+        stage_clock: StageClock | None = None,
+    ) -> None:
+        self.stage, self.model, self.scene, self.ppl = stage, model, scene, ppl
+        self.rasterizer, self.streams, self.index = rasterizer, streams, index
+        self.stage_clock = stage_clock
+        self.device = model.device
+        self.optimizer = stage.create_optimizer(model, scene)
+        self.sampler = stage.create_sampler(scene, streams("sampler"))
+        self.pre, self.post = build_schedulers(stage, ppl)
+        self.context = TaskContext(
+            ppl, stage.opt, model, scene, self.optimizer, CameraIterator(scene.train), rasterizer
+        )
+        self.pre.check(self.context)
+        self.post.check(self.context)
+        self.step = 0
+        self.stopped = False
+        self._background = scene.background.to(self.device)
+        self._cameras: WeakKeyDictionary[View, Camera] = WeakKeyDictionary()
+        self._unchecked: list[StepRecord] = []
+
+    def run(self, until: int, after_step: Callable[[StepRecord], None], guard: InterruptGuard | None = None) -> None:
+        """Run the steps after `self.step` up to `until`, or to the one after which a task wants to stop.
+
+        after_step  housekeeping, called between steps, when the state is whole
+
+        Raises NothingToDo, TrainingDiverged, EmptyModel, TaskError.
+        """
+        if self.step >= self.stage.iterations:
+            raise NothingToDo(
+                f"stage '{self.stage.name}' ends at step {self.stage.iterations}, and {self.step} steps are done: "
+                "raise `iterations` to train on"
+            )
+        guard = guard or InterruptGuard()
+        self.model.train()
+        while self.step < min(until, self.stage.iterations) and not self.stopped:
+            with guard.step():
+                record = self._run_step(self.step + 1)
+                self.step += 1
+            after_step(record)
+        self.check_losses()
+
+    def _run_step(self, step: int) -> StepRecord:
+        clock, context = self.stage_clock, self.context
+        if clock:
+            clock.start()
+        context.result = context.loss = None
+        with torch.no_grad():
+            stop = self.pre.exec(step, context)
+        self._check_rows(step)
+        if clock:
+            clock.mark("pre")
+
+        view = self.sampler.next(step)
+        background = self._next_background()
+        camera = self._camera(view)
+        inputs = self.model.gaussians(camera, self.rasterizer)
+        result = self.rasterizer.render(inputs, camera, self.stage.raster_options(step, background))
+        if self.ppl.clamp_render:
+            result.image = result.image.clamp(0, 1)
+        if clock:
+            clock.mark("render")
+
+        loss = self.stage.loss(self.model, view, result, background, step)
+        record = self._record(step, view, loss)
+        if clock:
+            clock.mark("loss")
+        loss.total.backward()  # type: ignore[no-untyped-call]
+        if clock:
+            clock.mark("backward")
+
+        context.result, context.loss = result, loss
+        with torch.no_grad():
+            stop = self.post.exec(step, context) or stop
+        self._check_rows(step)
+        if clock:
+            clock.mark("post")
+
+        if step < self.stage.iterations:
+            self.optimizer.step()
+        self.optimizer.zero_grad()
+        if clock:
+            clock.mark("optimize")
+            record.seconds = clock.last_step
+        # The graph and its buffers end with the step, not with the next one's render.
+        context.result = context.loss = None
+        self.stopped = stop
+        record.num_rows = self._num_rows()
+        return record
+
+    def _record(self, step: int, view: View, loss: LossPack) -> StepRecord:
+        record = StepRecord(
+            self.index,
+            self.stage.name,
+            step,
+            self.stage.iterations,
+            view.name,
+            loss.total.detach(),
+            {name: part.detach() for name, part in loss.parts.items()},
+        )
+        self._unchecked.append(record)
+        # On a CPU a look costs a microsecond, so it happens before a bad gradient can spread.
+        if self.device.type == "cpu" or len(self._unchecked) >= CHECK_EVERY:
+            self.check_losses()
+        return record
+
+    def check_losses(self) -> None:
+        """Raise TrainingDiverged if a loss since the last look is not finite. Waits for the device."""
+        records, self._unchecked = self._unchecked, []
+        if not records:
+            return
+        if len(records) == 1:
+            fine = math.isfinite(records[0].total.item())
+        else:
+            fine = bool(torch.stack([r.total for r in records]).isfinite().all())
+        if fine:
+            return
+        for record in records:
+            if math.isfinite(record.total.item()):
+                continue
+            values = {name: part.item() for name, part in record.parts.items()}
+            values["total"] = record.total.item()
+            part = next(name for name, value in values.items() if not math.isfinite(value))
+            raise TrainingDiverged(record.step, record.view, part, values[part])
+
+    def _num_rows(self) -> int:
+        return self.model.num_rows if self.model.ROWS else 0
+
+    def _check_rows(self, step: int) -> None:
+        if self.model.ROWS and self.model.num_rows == 0:
+            raise EmptyModel(step)
+
+    def _next_background(self) -> Tensor:
+        if self.ppl.random_background:
+            return torch.rand(3, generator=self.streams("background")).to(self.device)
+        return self._background
+
+    def _camera(self, view: View) -> Camera:
+        """The view's camera on the model's device, moved once."""
+        camera = self._cameras.get(view)
+        if camera is None:
+            camera = self._cameras[view] = view.camera.to(self.device)
+        return camera
+
+    def state_dict(self) -> dict[str, Any]:
+        """All that the next step depends on, tensors and JSON-able values in nested dicts; no copies."""
+        return {
+            "model": self.model.state_dict(),
+            "extra": self.model.state_dict_extra(),
+            "optimizer": self.optimizer.state_dict(),
+            "sampler": self.sampler.state_dict(),
+            "streams": self.streams.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any], step: int) -> None:
+        """Continue after `step`. Raises the errors of whoever finds that its part does not fit."""
+        self.model.load_resized(state["model"])
+        self.model.load_state_dict_extra(state["extra"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        # The sampler's generator is one of the streams: both hold the same state.
+        self.streams.load_state_dict(state["streams"])
+        self.sampler.load_state_dict(state["sampler"])
+        self.step = step
