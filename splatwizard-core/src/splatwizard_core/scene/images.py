@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
@@ -91,7 +90,7 @@ def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
 def picture_header(path: Path) -> tuple[int, int, bool]:
     """(width, height, has alpha) of a picture file, from its header alone. Raises SceneError if it is no picture."""
     try:
-        with _quiet(), Image.open(path) as picture:
+        with Image.open(path) as picture:
             return picture.width, picture.height, _has_alpha(picture)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{path}: not a readable picture ({error})", path=str(path)) from error
@@ -106,7 +105,7 @@ def load_picture(path: Path, size: tuple[int, int] | None = None, *, alpha: bool
     Raises SceneError if the file cannot be decoded.
     """
     try:
-        with _quiet(), Image.open(path) as opened:
+        with Image.open(path) as opened:
             picture = _to_8bit(opened, keep_alpha=alpha)
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{path}: the picture cannot be decoded ({error})", path=str(path)) from error
@@ -121,7 +120,7 @@ def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     size    (width, height) to resize to, nearest neighbour
     """
     try:
-        with _quiet(), Image.open(path) as opened:
+        with Image.open(path) as opened:
             grey = opened.convert("RGBA").getchannel("A") if _has_alpha(opened) else _to_8bit(opened).convert("L")
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{path}: the mask cannot be decoded ({error})", path=str(path)) from error
@@ -156,10 +155,3 @@ def _to_8bit(picture: Image.Image, *, keep_alpha: bool = False) -> Image.Image:
         values = values * 255 if picture.mode == "F" else values / 256
         return Image.fromarray(np.clip(values, 0, 255).astype(np.uint8)).convert("RGB")
     return picture.convert("RGBA" if keep_alpha and _has_alpha(picture) else "RGB")
-
-
-def _quiet() -> warnings.catch_warnings[None]:
-    """Large photographs are fine; Pillow still refuses what is absurdly large."""
-    context = warnings.catch_warnings()
-    warnings.filterwarnings("ignore", category=Image.DecompressionBombWarning)
-    return context

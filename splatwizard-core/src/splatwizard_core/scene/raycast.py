@@ -19,10 +19,11 @@ OFFSET = 1e-5
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape and what it is made of."""
+    """A shape and what it is made of; the stage casts no shadow on anything above it, which saves asking."""
 
     shape: Shape
     material: Material
+    casts_shadow: bool = True
 
 
 @dataclass(frozen=True)
@@ -70,8 +71,9 @@ class World:
         """[n]: whether rays from one point [3,1] along unit directions [3,n] meet something nearer than far [n]."""
         dark = np.zeros(d.shape[1], dtype=bool)
         for solid in self.solids:
-            # From one common point the test that rejects most rays needs a single dot product.
-            dark |= solid.shape.intersect(lamp, d) < far
+            if solid.casts_shadow:
+                # From one common point the test that rejects most rays needs a single dot product.
+                dark |= solid.shape.intersect(lamp, d) < far
         return dark
 
     def normals(self, p: Vec, which: NDArray[np.int64]) -> Vec:

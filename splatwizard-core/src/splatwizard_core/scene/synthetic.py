@@ -63,7 +63,7 @@ def build_world(seed: int = 0) -> World:
     floor = Cylinder((0.0, 0.0, -0.06), r=FLOOR_RADIUS, half_height=0.06)
     ring_tube, ring = 0.13, 0.40
     solids = [
-        Solid(floor, Material(planks((0.62, 0.42, 0.24), (0.30, 0.17, 0.08), width=0.23, seed=first))),
+        Solid(floor, Material(planks((0.62, 0.42, 0.24), (0.30, 0.17, 0.08), width=0.23, seed=first)), casts_shadow=False),
         Solid(
             Sphere(place(-0.05, 0.05, 0.52), turn(), r=0.52),
             Material(marble((0.85, 0.83, 0.78), (0.05, 0.22, 0.30), scale=1.5, seed=first + 10), 0.55, 6, 0.06),
