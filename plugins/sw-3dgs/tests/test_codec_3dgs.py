@@ -201,8 +201,7 @@ def test_a_section_forged_with_a_right_checksum_gives_a_model_or_a_bitstream_err
 
     try:
         model = decoded(rebuilt(data, sections={name: forge}))
-    except BitstreamError as error:
-        assert "\n" not in str(error)
+    except BitstreamError:
         return
     assert model.num_rows == 30
 
