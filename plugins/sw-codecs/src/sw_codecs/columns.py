@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.bits import ByteReader, class_bits, pack_fixed, packed_size, unpack_fixed, write_varint
-from sw_codecs.column_plan import BINS, CONSTANT, MAX_VALUE, ColumnPlan, choose_plan
+from sw_codecs.column_plan import CONSTANT, MAGNITUDES, MAX_VALUE, ColumnPlan, choose_plan
 from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables
 from sw_codecs.model_spec import Table
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
@@ -169,7 +169,7 @@ def _pack_raw(codes: np.ndarray, extra: np.ndarray | None, width: int) -> bytes:
 
 def _unpack_raw(reader: ByteReader, classes: np.ndarray, plan: ColumnPlan) -> np.ndarray:
     """Inverse of `_pack_raw`: uint64 [N]."""
-    if plan.kind == BINS:
+    if plan.kind != MAGNITUDES:
         return unpack_fixed(reader.take(packed_size(len(classes), plan.parameter)), len(classes), plan.parameter)
     extra = class_bits(classes, plan.parameter)
     raw = np.zeros(len(classes), np.uint64)
