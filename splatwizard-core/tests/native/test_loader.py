@@ -14,9 +14,10 @@ from pathlib import Path
 import pytest
 
 from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.native import loader, toolchain
+from splatwizard_core.native import build, loader, toolchain
+from splatwizard_core.native.build import build_all, declared_modules, resolve_module
 from splatwizard_core.native.build_lock import build_lock
-from splatwizard_core.native.loader import NativeModule, build_all, cache_root, declared_modules, resolve_module
+from splatwizard_core.native.loader import NativeModule, cache_root
 from splatwizard_core.plugins.manager import PluginManager
 
 needs_compiler = pytest.mark.skipif(
@@ -359,7 +360,7 @@ def test_an_unknown_march_is_refused(package):
 
 @needs_compiler
 def test_build_all_builds_what_entries_declare_and_reports_what_fails(package, monkeypatch):
-    monkeypatch.setattr(loader, "CORE_MODULES", ())
+    monkeypatch.setattr(build, "CORE_MODULES", ())
     package.write(
         "native.py",
         "from splatwizard_core.native import NativeModule\n"

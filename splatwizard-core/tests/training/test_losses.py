@@ -94,11 +94,10 @@ def test_the_gradient_of_the_torch_ssim_is_its_derivative(padding):
     )
 
 
-@pytest.mark.parametrize("padding", ["same", "valid"])
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("size", "padding"), [(s, p) for s in SIZES for p in ("same", "valid") if p == "same" or min(s) >= 11]
+)
 def test_compiled_and_torch_ssim_agree(kernels, size, padding):
-    if padding == "valid" and min(size) < 11:
-        pytest.skip("the window does not fit")
     x, y = images(*size)
     value, gradient = value_and_gradient(x, y, padding=padding)
     expected, expected_gradient = value_and_gradient(x.double(), y.double(), padding=padding)

@@ -8,7 +8,6 @@ SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CU
 from __future__ import annotations
 
 import hashlib
-import importlib
 import importlib.util
 import json
 import logging
@@ -18,24 +17,19 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatwizard_core.errors import NativeBuildError
 from splatwizard_core.native import toolchain
 from splatwizard_core.native.build_lock import build_lock
 from splatwizard_core.native.toolchain import Job, Toolchain
 
-if TYPE_CHECKING:
-    from splatwizard_core.plugins.manager import PluginManager
-
 log = logging.getLogger(__name__)
 
 BUILD_TIMEOUT = 600.0
 MARCHES = ("native", "portable")
-CORE_MODULES = ("splatwizard_core.training.native:TRAINING",)
 
 Say = Callable[[str], None]
 
@@ -145,6 +139,10 @@ class NativeModule:
             "path": None if path is None else str(path),
             "target": "cuda" if self._with_cuda() else "cpu",
         }
+
+    def is_built(self, march: str, folder: Path | None = None) -> bool:
+        """Whether `build` with these arguments would find the library there and undamaged."""
+        return _intact(self._library(self.cache_folder if folder is None else folder, march))
 
     def build(
         self,
@@ -319,75 +317,6 @@ class NativeModule:
     def _explain(self, reason: object) -> str:
         text = f"kernels '{self.name}' are not available: {reason}"
         return f"{text}\nwithout them: {self.without}" if self.without else text
-
-
-@dataclass(frozen=True)
-class BuildRow:
-    """What `build_all` did with one module. state: built, up to date, or failed; `error` says why."""
-
-    name: str
-    state: str
-    seconds: float
-    path: Path | None
-    error: str | None = None
-
-
-def declared_modules(plugins: PluginManager) -> dict[str, str]:
-    """Target "module:attribute" -> who declares it: the core's own, then every registry entry with `native`."""
-    targets = dict.fromkeys(CORE_MODULES, "splatwizard-core")
-    for registry in plugins.registries.values():
-        for entry in registry:
-            declared = entry.declared.get("native") or ()
-            for target in (declared,) if isinstance(declared, str) else declared:
-                targets.setdefault(target, entry.distribution)
-    return targets
-
-
-def resolve_module(target: str) -> NativeModule:
-    """The NativeModule that "module:attribute" names. Raises NativeBuildError."""
-    module, _, attribute = target.partition(":")
-    try:
-        found = getattr(importlib.import_module(module), attribute)
-    except Exception as error:
-        raise NativeBuildError(f"native module {target} cannot be imported: {type(error).__name__}: {error}") from error
-    if not isinstance(found, NativeModule):
-        raise NativeBuildError(f"{target} is not a NativeModule but {type(found).__name__}")
-    return found
-
-
-def build_all(
-    plugins: PluginManager,
-    *,
-    march: str = "native",
-    into_packages: bool = False,
-    force: bool = False,
-    jobs: int | None = None,
-    say: Say | None = None,
-) -> list[BuildRow]:
-    """Build the core's and all plugins' native modules; one row each, in the order of `declared_modules`.
-
-    march, force    as for `NativeModule.build`
-    into_packages   put the libraries beside their packages' sources instead of into the user's cache
-    jobs            most compilers at once, over all modules; None: the cores
-    A module that fails has its reason in its row and stops no other one.
-    Raises CompilerMissingError if there is no compiler.
-    """
-    tools = Toolchain(jobs)
-
-    def build(target: str) -> BuildRow:
-        started = time.monotonic()
-        try:
-            module = resolve_module(target)
-            folder = module.prebuilt_folder if into_packages else module.cache_folder
-            fresh = not force and _intact(module._library(folder, march))
-            path = module.build(march=march, folder=folder, force=force, tools=tools, say=say)
-        except NativeBuildError as error:
-            return BuildRow(target, "failed", time.monotonic() - started, None, str(error))
-        return BuildRow(module.name, "up to date" if fresh else "built", time.monotonic() - started, path)
-
-    targets = list(declared_modules(plugins))
-    with ThreadPoolExecutor(max_workers=len(targets)) as pool:
-        return list(pool.map(build, targets))
 
 
 def _say(message: str) -> None:

@@ -1,4 +1,4 @@
-"""One Adam step on one tensor: a compiled kernel on the CPU, torch operations everywhere else."""
+"""One Adam step on one tensor: a compiled kernel on the CPU, torch's fused one everywhere else."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor
+from torch.optim.adam import adam
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.training.native import TRAINING
@@ -41,21 +42,22 @@ def adam_step(
             )
     if step < 1:
         raise ValueError(f"Adam's step counts from 1, got {step}")
-    if _fused(param, grad, exp_avg, exp_avg_sq):
-        torch.ops.splatwizard_training.adam(param, grad.contiguous(), exp_avg, exp_avg_sq, lr, beta1, beta2, eps, step)
-        # The kernel writes behind autograd's back.
-        for tensor in (param, exp_avg, exp_avg_sq):
-            torch.autograd.graph.increment_version(tensor)
+    grad = grad.contiguous()
+    tensors = (param, grad, exp_avg, exp_avg_sq)
+    if not all(t.is_contiguous() for t in tensors):
+        exp_avg.lerp_(grad, 1.0 - beta1)
+        exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
+        denominator = exp_avg_sq.sqrt().div_(math.sqrt(1.0 - beta2**step)).add_(eps)
+        param.addcdiv_(exp_avg, denominator, value=-lr / (1.0 - beta1**step))
         return
-    exp_avg.lerp_(grad, 1.0 - beta1)
-    exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
-    denominator = exp_avg_sq.sqrt().div_(math.sqrt(1.0 - beta2**step)).add_(eps)
-    param.addcdiv_(exp_avg, denominator, value=-lr / (1.0 - beta1**step))
-
-
-def _fused(param: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tensor) -> bool:
-    return (
-        all(t.device.type == "cpu" and t.dtype == torch.float32 for t in (param, grad, exp_avg, exp_avg_sq))
-        and all(t.is_contiguous() for t in (param, exp_avg, exp_avg_sq))
-        and TRAINING.try_load()
-    )
+    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and TRAINING.try_load():
+        torch.ops.splatwizard_training.adam(*tensors, lr, beta1, beta2, eps, step)
+    else:
+        count = torch.tensor(float(step - 1), device=param.device)  # steps done; torch counts this one itself
+        adam(
+            [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=True, amsgrad=False, maximize=False,
+            weight_decay=0.0, lr=lr, beta1=beta1, beta2=beta2, eps=eps,
+        )  # fmt: skip
+    # Both write behind autograd's back.
+    for tensor in (param, exp_avg, exp_avg_sq):
+        torch.autograd.graph.increment_version(tensor)

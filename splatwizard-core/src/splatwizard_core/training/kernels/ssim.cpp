@@ -39,12 +39,90 @@ struct alignas(64) Workspace {
   float map[P_WIDTH];               // the SSIM of one row
 };
 
+// The loops are functions of their own on purpose: inlined into each other GCC 12 runs out of registers for the row
+// pointers and gives up on the reductions, silently.
+#define SW_LOOP __attribute__((noinline)) void
+
 // out[i] = sum_k W[k] in[i + k]
-inline void blur_line(const float* __restrict in, float* __restrict out, int count) {
+SW_LOOP blur_line(const float* __restrict in, float* __restrict out, int count) {
   for (int i = 0; i < count; ++i) {
     float sum = W[0] * in[i];
     for (int k = 1; k < TAPS; ++k) sum += W[k] * in[i + k];
     out[i] = sum;
+  }
+}
+
+// u, v, u^2, v^2 of one row
+SW_LOOP mix_row(const float* __restrict x, const float* __restrict y, float* __restrict line, int from, int to) {
+  for (int i = from; i < to; ++i) {
+    const float u = x[i] + y[i], v = x[i] - y[i];
+    line[i] = u;
+    line[i + X_WIDTH] = v;
+    line[i + 2 * X_WIDTH] = u * u;
+    line[i + 3 * X_WIDTH] = v * v;
+  }
+}
+
+SW_LOOP add_absolute_difference(const float* __restrict x, const float* __restrict y, int count, double& total) {
+  float sum = 0.f;
+#pragma omp simd reduction(+ : sum)
+  for (int i = 0; i < count; ++i) sum += __builtin_fabsf(x[i] - y[i]);
+  total += sum;
+}
+
+SW_LOOP add_line(const float* __restrict line, int count, double& total) {
+  float sum = 0.f;
+#pragma omp simd reduction(+ : sum)
+  for (int i = 0; i < count; ++i) sum += line[i];
+  total += sum;
+}
+
+// The vertical blur of column j; t[k] is the row k - R below the middle one.
+struct Rows {
+  const float* t[TAPS];
+};
+
+#define SW_COLUMN(j)                                                                                              \
+  (W[0] * (t0[j] + t10[j]) + W[1] * (t1[j] + t9[j]) + W[2] * (t2[j] + t8[j]) + W[3] * (t3[j] + t7[j]) +           \
+   W[4] * (t4[j] + t6[j]) + W[5] * t5[j])
+#define SW_UNPACK_ROWS(rows)                                                                                      \
+  const float *__restrict t0 = rows.t[0], *__restrict t1 = rows.t[1], *__restrict t2 = rows.t[2],                 \
+              *__restrict t3 = rows.t[3], *__restrict t4 = rows.t[4], *__restrict t5 = rows.t[5],                 \
+              *__restrict t6 = rows.t[6], *__restrict t7 = rows.t[7], *__restrict t8 = rows.t[8],                 \
+              *__restrict t9 = rows.t[9], *__restrict t10 = rows.t[10]
+
+// SSIM of one row, and its derivatives p1, p2, p3 (X_WIDTH apart).
+template <bool WITH_GRAD>
+SW_LOOP map_line(const Rows& rows, float* __restrict map, float* __restrict p, int count) {
+  SW_UNPACK_ROWS(rows);
+#pragma omp simd
+  for (int i = 0; i < count; ++i) {
+    const float mu = SW_COLUMN(i), mv = SW_COLUMN(i + P_WIDTH);
+    const float mu2 = mu * mu, mv2 = mv * mv;
+    const float su = SW_COLUMN(i + 2 * P_WIDTH) - mu2, sv = SW_COLUMN(i + 3 * P_WIDTH) - mv2;
+    const float A = 0.5f * (mu2 + mv2) + C1, B = 0.5f * (su + sv) + C2;
+    const float C = 0.5f * (mu2 - mv2) + C1, D = 0.5f * (su - sv) + C2;
+    const float inv = 1.f / (A * B);
+    const float ssim = C * D * inv;
+    map[i] = ssim;
+    if (WITH_GRAD) {
+      const float mx2 = mu + mv, my2 = mu - mv;  // 2 mx, 2 my
+      p[i] = inv * (my2 * (D - C) - mx2 * ssim * (B - A));
+      p[i + X_WIDTH] = -ssim * A * inv;
+      p[i + 2 * X_WIDTH] = 2.f * C * inv;
+    }
+  }
+}
+
+SW_LOOP grad_line(const Rows& rows, const float* __restrict x, const float* __restrict y, float* __restrict out,
+                  int count, float l1, float g) {
+  SW_UNPACK_ROWS(rows);
+#pragma omp simd
+  for (int i = 0; i < count; ++i) {
+    const float xi = x[i], yi = y[i];
+    const float ssim = SW_COLUMN(i) + 2.f * xi * SW_COLUMN(i + STRIP) + yi * SW_COLUMN(i + 2 * STRIP);
+    const float sign = (xi > yi ? 1.f : 0.f) - (xi < yi ? 1.f : 0.f);
+    out[i] = g * ssim + l1 * sign;
   }
 }
 
@@ -65,56 +143,34 @@ struct Strip {
     const int from = static_cast<int>(first < 0 ? -first : 0);
     const int64_t room = args.width - first;
     const int to = static_cast<int>(room < width ? room : width);
-    const float* __restrict xr = x + row * args.width + first;
-    const float* __restrict yr = y + row * args.width + first;
     auto& line = ws.line;
     for (int s = 0; s < 4; ++s) {
       for (int i = 0; i < from; ++i) line[s][i] = 0.f;
       for (int i = to; i < width; ++i) line[s][i] = 0.f;
     }
-    for (int i = from; i < to; ++i) {
-      const float u = xr[i] + yr[i], v = xr[i] - yr[i];
-      line[0][i] = u;
-      line[1][i] = v;
-      line[2][i] = u * u;
-      line[3][i] = v * v;
-    }
+    const int64_t offset = row * args.width + first;
+    mix_row(x + offset, y + offset, &line[0][0], from, to);
     for (int s = 0; s < 4; ++s) blur_line(line[s], ws.stats[row % TAPS][s], p_count);
   }
 
-  // SSIM of row `row` into ws.map, its derivatives into ws.p: columns left - R .. left - R + p_count - 1.
-  template <bool WITH_GRAD>
-  void map_row(int64_t row) {
-    const float* t[TAPS];
+  // The rows of a ring around `row`; zeros above and below the image.
+  template <int SLOT>
+  Rows around(const float* ring, int64_t row) const {
+    Rows rows;
     for (int k = 0; k < TAPS; ++k) {
       const int64_t r = row - R + k;
-      t[k] = r >= 0 && r < args.height ? &ws.stats[r % TAPS][0][0] : &ws.zeros[0][0];
+      rows.t[k] = r >= 0 && r < args.height ? ring + (r % TAPS) * SLOT : &ws.zeros[0][0];
     }
-    const float *__restrict t0 = t[0], *__restrict t1 = t[1], *__restrict t2 = t[2], *__restrict t3 = t[3],
-                *__restrict t4 = t[4], *__restrict t5 = t[5], *__restrict t6 = t[6], *__restrict t7 = t[7],
-                *__restrict t8 = t[8], *__restrict t9 = t[9], *__restrict t10 = t[10];
-    float *__restrict map = ws.map, *__restrict p1 = ws.p[0], *__restrict p2 = ws.p[1], *__restrict p3 = ws.p[2];
-    const int n = p_count;
-#pragma omp simd
-    for (int i = 0; i < n; ++i) {
-      auto column = [&](int j) {
-        return W[0] * (t0[j] + t10[j]) + W[1] * (t1[j] + t9[j]) + W[2] * (t2[j] + t8[j]) +
-               W[3] * (t3[j] + t7[j]) + W[4] * (t4[j] + t6[j]) + W[5] * t5[j];
-      };
-      const float mu = column(i), mv = column(i + P_WIDTH);
-      const float mu2 = mu * mu, mv2 = mv * mv;
-      const float su = column(i + 2 * P_WIDTH) - mu2, sv = column(i + 3 * P_WIDTH) - mv2;
-      const float A = 0.5f * (mu2 + mv2) + C1, B = 0.5f * (su + sv) + C2;
-      const float C = 0.5f * (mu2 - mv2) + C1, D = 0.5f * (su - sv) + C2;
-      const float inv = 1.f / (A * B);
-      const float ssim = C * D * inv;
-      map[i] = ssim;
-      if (WITH_GRAD) {
-        const float mx2 = mu + mv, my2 = mu - mv;  // 2 mx, 2 my
-        p1[i] = inv * (my2 * (D - C) - mx2 * ssim * (B - A));
-        p2[i] = -ssim * A * inv;
-        p3[i] = 2.f * C * inv;
-      }
+    return rows;
+  }
+
+  // SSIM of row `row` into ws.map, its derivatives into ws.p: columns left - R .. left - R + p_count - 1.
+  void map_row(int64_t row) {
+    const Rows rows = around<4 * P_WIDTH>(&ws.stats[0][0][0], row);
+    if (grad != nullptr) {
+      map_line<true>(rows, ws.map, &ws.p[0][0], p_count);
+    } else {
+      map_line<false>(rows, ws.map, &ws.p[0][0], p_count);
     }
   }
 
@@ -140,53 +196,24 @@ struct Strip {
       for (int i = 0; i < from; ++i) line[i] = 0.f;
       for (int i = to; i < p_count; ++i) line[i] = 0.f;
     }
-    for (int s = 0; s < 3; ++s) blur_line(ws.p[s], ws.derivs[row % TAPS][s], count);
+    const int whole = (count + 15) / 16 * 16;
+    for (int s = 0; s < 3; ++s) blur_line(ws.p[s], ws.derivs[row % TAPS][s], whole);
   }
 
   void sum_row(int64_t row, double& l1_sum, double& ssim_sum) const {
-    const float* __restrict xr = x + row * args.width + left;
-    const float* __restrict yr = y + row * args.width + left;
-    float l1 = 0.f, ssim = 0.f;
-#pragma omp simd reduction(+ : l1)
-    for (int i = 0; i < count; ++i) {
-      const float d = xr[i] - yr[i];
-      l1 += d < 0.f ? -d : d;
-    }
+    const int64_t offset = row * args.width + left;
+    add_absolute_difference(x + offset, y + offset, count, l1_sum);
     int from, to;
     inside(row, from, to);
     from = from < R ? R : from;
     to = to > R + count ? R + count : to;
-    const float* __restrict map = ws.map;
-#pragma omp simd reduction(+ : ssim)
-    for (int i = from; i < to; ++i) ssim += map[i];
-    l1_sum += l1;
-    ssim_sum += ssim;
+    add_line(ws.map + from, to - from, ssim_sum);
   }
 
   void grad_row(int64_t row) const {
-    const float* t[TAPS];
-    for (int k = 0; k < TAPS; ++k) {
-      const int64_t r = row - R + k;
-      t[k] = r >= 0 && r < args.height ? &ws.derivs[r % TAPS][0][0] : &ws.zeros[0][0];
-    }
-    const float *__restrict t0 = t[0], *__restrict t1 = t[1], *__restrict t2 = t[2], *__restrict t3 = t[3],
-                *__restrict t4 = t[4], *__restrict t5 = t[5], *__restrict t6 = t[6], *__restrict t7 = t[7],
-                *__restrict t8 = t[8], *__restrict t9 = t[9], *__restrict t10 = t[10];
-    const float* __restrict xr = x + row * args.width + left;
-    const float* __restrict yr = y + row * args.width + left;
-    float* __restrict out = grad + row * args.width + left;
-    const float l1 = args.l1_weight, g = args.ssim_weight;
-#pragma omp simd
-    for (int i = 0; i < count; ++i) {
-      auto column = [&](int j) {
-        return W[0] * (t0[j] + t10[j]) + W[1] * (t1[j] + t9[j]) + W[2] * (t2[j] + t8[j]) +
-               W[3] * (t3[j] + t7[j]) + W[4] * (t4[j] + t6[j]) + W[5] * t5[j];
-      };
-      const float xi = xr[i], yi = yr[i];
-      const float ssim = column(i) + 2.f * xi * column(i + STRIP) + yi * column(i + 2 * STRIP);
-      const float sign = (xi > yi ? 1.f : 0.f) - (xi < yi ? 1.f : 0.f);
-      out[i] = g * ssim + l1 * sign;
-    }
+    const int64_t offset = row * args.width + left;
+    grad_line(around<3 * STRIP>(&ws.derivs[0][0][0], row), x + offset, y + offset, grad + offset, count,
+              args.l1_weight, args.ssim_weight);
   }
 
   // Rows [begin, end) of the plane: sums, and the gradient if it is wanted.
@@ -199,11 +226,7 @@ struct Strip {
     int64_t next_out = begin;
     for (int64_t row = first; row < last; ++row) {
       for (; next < clip(row + R + 1); ++next) add_row(next);
-      if (with_grad) {
-        map_row<true>(row);
-      } else {
-        map_row<false>(row);
-      }
+      map_row(row);
       if (row >= begin && row < end) sum_row(row, row_l1[row], row_ssim[row]);
       if (with_grad) {
         add_derivatives(row);
@@ -219,7 +242,7 @@ struct Strip {
 void photometric(const splatwizard::PhotometricArgs& args, const splatwizard::Parallel& parallel) {
   const int64_t rows = args.planes * args.height;
   const int64_t strips = (args.width + STRIP - 1) / STRIP;
-  const int64_t width = (args.width + strips - 1) / strips;
+  const int64_t width = ((args.width + strips - 1) / strips + 15) / 16 * 16;  // whole vectors
   // 32 rows: below that the 20 rows of overlap with the neighbours cost more than another thread brings.
   parallel(rows, 32, [&](int64_t begin, int64_t end) {
     Workspace ws{};
