@@ -80,7 +80,8 @@ def test_default_is_the_exact_mode():
 @pytest.mark.parametrize(("n", "degree", "active"), [(700, 3, 3), (40, 2, 1), (3, 0, 0), (1, 3, 0)])
 def test_the_decoder_rebuilds_what_the_encoder_reconstructs(rate, n, degree, active):
     model = random_model(n, degree, active)
-    layout, cells, symbols = lattice(model, method(rate).config.codec)
+    sort = load_plugins().coders.load("octree").sort
+    layout, cells, symbols = lattice(model, method(rate).config.codec, sort)
     expected = reconstruct(layout, cells, symbols)
     found = decoded(encoded(model, rate))
     assert bits(found) == bits(expected)

@@ -7,14 +7,14 @@ is not finite) are left out. The decoder needs integers and exact arithmetic onl
 from __future__ import annotations
 
 import logging
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
-from splatwizard_core.coding.morton import morton_order
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.model import GaussianModel, logit
 from splatwizard_core.training.params import Params
@@ -33,10 +33,6 @@ FAINTEST = logit(1 / 255)
 
 SECTIONS = {"color": (0, 3), "opacity": (3, 4), "scales": (4, 7), "quats": (7, 10)}
 """Columns of the attribute matrix by section; SH bands 1 to 3 have one section each."""
-
-
-def _triple(low: float, high: float) -> Any:
-    return Field(min_length=3, max_length=3)
 
 
 class Layout(Params):
@@ -66,10 +62,11 @@ class Layout(Params):
 
 def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> None:
     """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
-    layout, cells, symbols = lattice(model, codec)
+    octree = plugins.coders.load("octree")()
+    layout, cells, symbols = lattice(model, codec, octree.sort)
     writer.raster["sh_degree"] = layout.max_sh_degree
     writer.static.update(layout.model_dump(mode="json"))
-    writer.add("positions", plugins.coders.load("octree")().encode(cells, layout.position_bits))
+    writer.add("positions", octree.encode(cells, layout.position_bits))
     columns = plugins.entropy_models.load("columns")()
     for name, (start, stop) in _sections(layout.active_sh_degree).items():
         writer.add(name, columns.encode(symbols[:, start:stop], None))
@@ -97,8 +94,10 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     return model
 
 
-def lattice(model: GaussianModel, codec: Codec) -> tuple[Layout, NDArray[np.int64], NDArray[np.int64]]:
-    """What is coded: the header, grid cells [N,3] in Morton order, and the attribute integers [N,C] in that order."""
+def lattice(
+    model: GaussianModel, codec: Codec, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+) -> tuple[Layout, NDArray[np.int64], NDArray[np.int64]]:
+    """What is coded: the header, grid cells [N,3] in the order of `sort`, and the attribute integers [N,C] likewise."""
     arrays = {
         name: getattr(model, name).detach().cpu().numpy()
         for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
@@ -113,7 +112,7 @@ def lattice(model: GaussianModel, codec: Codec) -> tuple[Layout, NDArray[np.int6
     arrays = {name: array[keep] for name, array in arrays.items()}
     grid = PositionGrid.fit(arrays["means"], codec.position_bits)
     cells = grid.quantize(arrays["means"])
-    order = morton_order(cells)
+    order = sort(cells)
     active = (model.active_sh_degree + 1) ** 2 - 1
     values = Values(
         dc=arrays["sh_dc"][order, 0],
