@@ -1,3 +1,25 @@
 """What this package provides."""
 
-from splatwizard_core.plugins import Registry, hookimpl  # noqa: F401
+from splatwizard_core.plugins import Registry, hookimpl
+
+STANDARD_FEATURES = [
+    "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",
+    "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "TIGHT_TILES",
+    "FLOAT64", "DETERMINISTIC",
+]  # fmt: skip
+
+
+@hookimpl
+def register_rasterizers(registry: Registry) -> None:
+    registry.add(
+        "standard",
+        "sw_rasterizers.standard:StandardRasterizer",
+        summary="compiled 3DGS rasterizer, CPU, vectorised and multi-threaded",
+        devices=["cpu"],
+        dtypes=["float32", "float64"],
+        features=STANDARD_FEATURES,
+        available="sw_rasterizers.native:unavailable",
+        exactness="exact",
+        speed=50,
+        native="sw_rasterizers.native:MODULE",
+    )

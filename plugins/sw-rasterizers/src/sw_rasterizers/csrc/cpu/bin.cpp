@@ -1,0 +1,178 @@
+// Binning: from slots to one front-to-back list of splats per tile.
+//
+// Splats are sorted by depth once (V keys, not P), then dealt to the tiles by a counting sort that keeps the order:
+// threads own contiguous depth ranges and every tile's list is the ranges' parts one after the other. So a list is
+// ordered by (depth, index) by construction and does not depend on the number of threads.
+#include <algorithm>
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "../tiles.h"
+#include "kernels.h"
+#include "parallel.h"
+
+namespace SW_ARCH {
+namespace {
+
+template <class S>
+void for_each_tile(const View<S>& view, const Settings& settings, const Slots<S>& slots, const int32_t* radii,
+                   int64_t slot, int32_t* tiles) {
+  const S* record = slots.records + slot * kRecord;
+  const int columns = view.tiles_x();
+  const auto put = [&](int tx, int ty) { *tiles++ = ty * columns + tx; };
+  if (settings.tight) {
+    const Ellipse<S> e{record[kU],     record[kV],     record[kHalfX], record[kHalfY],
+                       record[kWidth], record[kLeanX], record[kLeanY] * record[kHalfX]};
+    tight_tiles(e, view.width, view.height, put);
+  } else {
+    const TileRange square =
+        classic_tiles(record[kU], record[kV], S(radii[slots.index[slot]]), columns, view.tiles_y());
+    for (int ty = square.y0; ty < square.y1; ++ty)
+      for (int tx = square.x0; tx < square.x1; ++tx) put(tx, ty);
+  }
+}
+
+// Stable LSD radix sort of positive floats by their bit patterns, 11 bits a pass.
+struct RadixSorter {
+  static constexpr int kBits = 11, kBuckets = 1 << kBits, kPasses = 3;
+  int64_t count;
+  int threads;
+  std::unique_ptr<uint32_t[]> keys[2];
+  std::unique_ptr<int32_t[]> values;
+
+  RadixSorter(int64_t count, int threads) : count(count), threads(threads) {
+    for (auto& k : keys) k.reset(new uint32_t[count]);
+    values.reset(new int32_t[count]);
+  }
+
+  // keys[0] and `order` hold the input; afterwards `order` is sorted.
+  void sort(int32_t* order) {
+    int32_t* from_values = order;
+    int32_t* to_values = values.get();
+    for (int pass = 0; pass < kPasses; ++pass) {
+      run_pass(pass * kBits, keys[pass & 1].get(), keys[(pass & 1) ^ 1].get(), from_values, to_values);
+      std::swap(from_values, to_values);
+    }
+    if (from_values != order) std::memcpy(order, from_values, size_t(count) * sizeof *order);
+  }
+
+  void run_pass(int shift, const uint32_t* keys_in, uint32_t* keys_out, const int32_t* in, int32_t* out) {
+    const int parts = threads;
+    std::vector<int64_t> cursor(size_t(parts) * kBuckets, 0);
+    parallel_dynamic(threads, parts, [&](int64_t part) {
+      int64_t* histogram = cursor.data() + part * kBuckets;
+      for (int64_t i = count * part / parts; i < count * (part + 1) / parts; ++i)
+        ++histogram[(keys_in[i] >> shift) & (kBuckets - 1)];
+    });
+    int64_t sum = 0;
+    for (int b = 0; b < kBuckets; ++b)
+      for (int part = 0; part < parts; ++part) {
+        int64_t& c = cursor[size_t(part) * kBuckets + b];
+        const int64_t n = c;
+        c = sum;
+        sum += n;
+      }
+    parallel_dynamic(threads, parts, [&](int64_t part) {
+      int64_t* position = cursor.data() + part * kBuckets;
+      for (int64_t i = count * part / parts; i < count * (part + 1) / parts; ++i) {
+        const int64_t to = position[(keys_in[i] >> shift) & (kBuckets - 1)]++;
+        keys_out[to] = keys_in[i];
+        out[to] = in[i];
+      }
+    });
+  }
+};
+
+template <class S, class Visit>
+void for_each_slot(int64_t count, const Slots<S>& slots, const Visit& visit) {
+  for (int64_t chunk = 0; chunk * kChunk < count; ++chunk)
+    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) visit(s);
+}
+
+}  // namespace
+
+template <class S>
+int64_t number_pairs(int64_t count, const Slots<S>& slots) {
+  int64_t pairs = 0;
+  for_each_slot(count, slots, [&](int64_t s) {
+    slots.first_pair[s] = int32_t(pairs);  // the caller refuses more than 2^31 - 1 pairs
+    pairs += slots.tiles[s];
+  });
+  return pairs;
+}
+
+template <>
+void depth_order<float>(int64_t count, int64_t used, const Slots<float>& slots, int threads, int32_t* order) {
+  RadixSorter sorter(used, threads);
+  int64_t i = 0;
+  for_each_slot(count, slots, [&](int64_t s) {
+    std::memcpy(&sorter.keys[0][i], &slots.records[s * kRecord + kDepth], sizeof(float));
+    order[i++] = int32_t(s);
+  });
+  sorter.sort(order);
+}
+
+template <>
+void depth_order<double>(int64_t count, int64_t, const Slots<double>& slots, int, int32_t* order) {
+  int64_t i = 0;
+  for_each_slot(count, slots, [&](int64_t s) { order[i++] = int32_t(s); });
+  std::stable_sort(order, order + i, [&](int32_t a, int32_t b) {
+    return slots.records[int64_t(a) * kRecord + kDepth] < slots.records[int64_t(b) * kRecord + kDepth];
+  });
+}
+
+template <class S>
+void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots,
+               const int32_t* order, const int32_t* radii, const Pairs<S>& pairs) {
+  const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
+  const int parts = settings.threads;
+
+  // Splat-major: the tile of every pair.
+  std::unique_ptr<int32_t[]> tile_of(new int32_t[pairs.count]);
+  parallel_dynamic(settings.threads, (count + kChunk - 1) / kChunk, [&](int64_t chunk) {
+    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s)
+      if (slots.tiles[s] != 0)  // 0: dropped, its colour is not finite
+        for_each_tile(view, settings, slots, radii, s, tile_of.get() + slots.first_pair[s]);
+  });
+
+  std::vector<int64_t> cursor(size_t(parts) * tiles, 0);
+  const auto for_range = [&](int64_t part, const auto& visit) {
+    for (int64_t i = used * part / parts; i < used * (part + 1) / parts; ++i) {
+      const int32_t s = order[i];
+      for (int64_t p = slots.first_pair[s], end = p + slots.tiles[s]; p < end; ++p) visit(s, int32_t(p), tile_of[p]);
+    }
+  };
+  parallel_dynamic(settings.threads, parts, [&](int64_t part) {
+    int64_t* histogram = cursor.data() + part * tiles;
+    for_range(part, [&](int32_t, int32_t, int32_t tile) { ++histogram[tile]; });
+  });
+  int64_t sum = 0;
+  for (int64_t tile = 0; tile < tiles; ++tile) {
+    pairs.tile_start[tile] = sum;
+    for (int part = 0; part < parts; ++part) {
+      int64_t& c = cursor[size_t(part) * tiles + tile];
+      const int64_t n = c;
+      c = sum;
+      sum += n;
+    }
+  }
+  pairs.tile_start[tiles] = sum;
+  parallel_dynamic(settings.threads, parts, [&](int64_t part) {
+    int64_t* position = cursor.data() + part * tiles;
+    for_range(part, [&](int32_t s, int32_t pair, int32_t tile) {
+      const int64_t to = position[tile]++;
+      pairs.slot[to] = s;
+      if (pairs.origin != nullptr) pairs.origin[to] = pair;
+    });
+  });
+}
+
+template int64_t number_pairs(int64_t, const Slots<float>&);
+template int64_t number_pairs(int64_t, const Slots<double>&);
+template void bin_pairs(const View<float>&, const Settings&, int64_t, int64_t, const Slots<float>&, const int32_t*,
+                        const int32_t*, const Pairs<float>&);
+template void bin_pairs(const View<double>&, const Settings&, int64_t, int64_t, const Slots<double>&, const int32_t*,
+                        const int32_t*, const Pairs<double>&);
+
+}  // namespace SW_ARCH

@@ -1,0 +1,168 @@
+// The CPU kernels: plain pointers and sizes, no torch. One .cpp a kernel; binding.cpp owns the memory.
+//
+//   project            N Gaussians -> records of the drawn ones, in slots (chunk-wise compact, in index order)
+//   bin                slots -> per tile a list of slots, front to back
+//   blend              lists -> image
+//   blend_backward     dL/dimage -> one row of sums per (splat, tile) pair
+//   project_backward   rows -> gradients of the inputs
+//
+// S is float (vectorised) or double (for gradient checks, and for who needs it).
+#pragma once
+
+#include <cstdint>
+
+#include <splatwizard/dispatch.h>
+
+#include "../camera.h"
+
+namespace sw {
+
+constexpr int kChunk = 1024;      // Gaussians a thread takes at a time; slots of a chunk start at its first index
+constexpr int kBlock = 4;         // pixels, edge of the block that one AVX-512 pack covers
+constexpr int kBlocksPerRow = kTile / kBlock;
+constexpr int kBlocks = kBlocksPerRow * kBlocksPerRow;
+constexpr int kBlockPixels = kBlock * kBlock;
+
+// One drawn splat, 16 values: one cache line in float32.
+enum RecordField {
+  kU, kV,                   // pixel position
+  kA, kB, kC, kLevel,       // log2 alpha = A dx^2 + B dx dy + C dy^2 + level
+  kRed, kGreen, kBlue,      //
+  kDepth,                   // tz
+  kLeanY, kLeanX,           // -Kb/Kc, -Kb/Ka: slopes of the ridge, for the box test
+  kHalfX, kHalfY, kWidth,   // extents of the cut-off ellipse (tiles.h)
+  kCutoff,                  // the ellipse is -(A dx^2 + B dx dy + C dy^2) <= cutoff
+  kRecord
+};
+
+// Sums of one (splat, tile) pair over the tile's pixels, v = dL/dsigma: sum v, v dx, v dy, v dx^2, v dx dy, v dy^2, then
+// one sum of weight x gradient per channel; with absgrad two more at the end.
+enum PairSum { kV0, kVx, kVy, kVxx, kVxy, kVyy, kMoments };
+
+template <class S>
+struct Gaussians {
+  int64_t count = 0;
+  const S* means = nullptr;
+  const S* opacities = nullptr;
+  const S* scales = nullptr;  // with quats, or cov3d alone
+  const S* quats = nullptr;
+  const S* cov3d = nullptr;
+  const S* sh_dc = nullptr;  // row i at sh_dc + i * sh_dc_stride; the rest likewise: dense and split are one case
+  const S* sh_rest = nullptr;
+  int64_t sh_dc_stride = 0, sh_rest_stride = 0;
+  int sh_degree = 0;           // active
+  const S* colors = nullptr;   // instead of SH
+  int color_channels = 3;
+  const S* features = nullptr;
+  int feature_channels = 0;
+  const uint8_t* visible = nullptr;
+};
+
+struct Settings {
+  double scale_modifier = 1, eps2d = 0.3;
+  bool antialias = false, clamp_color = true;
+  bool tight = true;           // exact tile coverage, else 3DGS' squares
+  bool pass_clamp = false;     // gradient passes through the clamp of alpha
+  bool original_jacobian = false;  // gradient of the Jacobian's clamp as in the original kernels
+  bool inverse_depth = false, accumulated_depth = false, median_depth = false;
+  bool detach_features = false;
+  bool absgrad = false;
+  int threads = 1;
+};
+
+// Channels of the composited image: colours, then inverse depth, accumulated depth, then features.
+struct Channels {
+  int colors, inverse, accumulated, features;
+  int total() const { return colors + inverse + accumulated + features; }
+};
+
+template <class S>
+struct Slots {
+  S* records;          // [N][kRecord]
+  int32_t* index;      // [N] Gaussian of the slot
+  int32_t* per_chunk;  // [chunks] slots used
+  int32_t* tiles;      // [N] tiles the splat touches
+  int32_t* first_pair; // [N] its first pair: pairs of a splat are contiguous
+  S* color_slope;      // [N][9] d colour_c / d mean_j, or null
+  uint8_t* clamped;    // [N] bit c: colour c was clamped at 0
+  S* channels;         // [N][channels], or null if the three colours in the record are all
+};
+
+template <class S>
+struct Pairs {
+  int64_t count;
+  int64_t* tile_start;   // [tiles + 1]
+  int32_t* slot;         // [P] tile-major, front to back
+  int32_t* origin;       // [P] number of the pair in splat-major order, or null
+  uint16_t* blocks;      // [P] bit b: block b of the tile may be touched; filled by blend, or null
+};
+
+template <class S>
+struct Canvas {
+  int channels, color_channels;
+  S* image;                 // [channels][H][W]
+  const S* background;      // [colors] or [colors][H][W], or null
+  bool background_is_image;
+  S* alpha;                 // [H][W], 1 - transmittance, or null
+  S* transmittance;         // [tiles][kTilePixels], block by block
+  int32_t* last;            // [tiles][kTilePixels] 1-based list position of the last blended splat
+  S* median;                // [H][W] or null
+  int32_t* median_pair;     // [H][W] pair origin of the median splat, -1 if none; or null
+  int64_t* counters;        // [2] evaluated, blended pixel-splat pairs, or null: counting costs time
+};
+
+template <class S>
+struct CanvasGradient {
+  const S* image;   // [channels][H][W]
+  const S* alpha;   // [H][W] or null
+  const S* median;  // [H][W] or null
+};
+
+// Row length of the pair sums.
+inline int pair_columns(int channels, bool absgrad, bool median) {
+  return kMoments + channels + (absgrad ? 2 : 0) + (median ? 1 : 0);
+}
+
+template <class S>
+struct Gradients {  // null: not asked for
+  S *means, *opacities, *scales, *quats, *cov3d, *sh_dc, *sh_rest, *colors, *features;
+  int64_t sh_dc_stride, sh_rest_stride;
+  S *grad2d, *absgrad2d;  // [N][2], NDC units
+};
+
+}  // namespace sw
+
+// The kernels, once per instruction set (splatwizard/dispatch.h).
+//
+// project_gaussians  returns the number of slots in use; counts [2]: Gaussians with a radius, and those culled because a
+//                    value is not finite
+// number_pairs       numbers the pairs splat-major, returns how many there are
+// depth_order        slots in use, nearest first, equal depths in index order; `order` has room for all of them
+// blend_backward     the last `detached` channels do not influence the geometry; sums [P][pair_columns]
+#define SW_DECLARE_KERNELS(arch)                                                                                      \
+  namespace arch {                                                                                                    \
+  using namespace sw;                                                                                                 \
+  template <class S>                                                                                                  \
+  int64_t project_gaussians(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                     \
+                            const Channels& channels, const Slots<S>& slots, int32_t* radii, int64_t* counts);        \
+  template <class S>                                                                                                  \
+  void visible_radii(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii);           \
+  template <class S>                                                                                                  \
+  int64_t number_pairs(int64_t count, const Slots<S>& slots);                                                         \
+  template <class S>                                                                                                  \
+  void depth_order(int64_t count, int64_t used, const Slots<S>& slots, int threads, int32_t* order);                  \
+  template <class S>                                                                                                  \
+  void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots,   \
+                 const int32_t* order, const int32_t* radii, const Pairs<S>& pairs);                                  \
+  template <class S>                                                                                                  \
+  void blend(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,             \
+             const Canvas<S>& canvas);                                                                                \
+  template <class S>                                                                                                  \
+  void blend_backward(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,    \
+                      const Canvas<S>& canvas, const CanvasGradient<S>& gradient, int detached, S* sums);             \
+  template <class S>                                                                                                  \
+  void project_backward(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                         \
+                        const Channels& channels, const Slots<S>& slots, const S* sums, const Gradients<S>& out);     \
+  }
+SW_FOR_EACH_ARCH(SW_DECLARE_KERNELS)
+#undef SW_DECLARE_KERNELS

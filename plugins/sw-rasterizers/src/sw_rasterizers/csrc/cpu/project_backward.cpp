@@ -1,0 +1,210 @@
+// From the pair sums of every splat to the gradients of what was put in.
+//
+// A thread takes a chunk of Gaussians: it zeroes the chunk's rows of every gradient (culled Gaussians get exactly 0) and
+// fills those of the drawn ones while they are still in its cache, so each gradient goes to memory once. The projection
+// is computed again, which is cheaper than to have stored it.
+#include <algorithm>
+
+#include "../projection.h"
+#include "../sh.h"
+#include "gather.h"
+#include "kernels.h"
+#include "parallel.h"
+
+namespace SW_ARCH {
+namespace {
+
+template <class V, bool kCov3d>
+struct ChunkBackward {
+  using S = Scalar<V>;
+  static constexpr int L = lanes_of<V>;
+  const View<S>& view;
+  const Gaussians<S>& g;
+  const Settings& settings;
+  const Channels& channels;
+  const Slots<S>& slots;
+  const S* sums;
+  int columns;
+  const Gradients<S>& out;
+
+  void operator()(int64_t chunk) const {
+    const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, g.count);
+    const auto clear = [&](S* base, int64_t stride) {
+      if (base != nullptr) std::fill(base + begin * stride, base + end * stride, S(0));
+    };
+    clear(out.means, 3), clear(out.opacities, 1), clear(out.scales, 3), clear(out.quats, 4), clear(out.cov3d, 6);
+    clear(out.colors, channels.colors), clear(out.features, channels.features);
+    clear(out.grad2d, 2), clear(out.absgrad2d, 2);
+    clear(out.sh_dc, out.sh_dc_stride);
+    if (out.sh_dc == nullptr || out.sh_rest != out.sh_dc + 3) clear(out.sh_rest, out.sh_rest_stride);  // else one tensor
+    for (int64_t s = begin, stop = begin + slots.per_chunk[chunk]; s < stop; s += L) backward_pack(s, stop);
+  }
+
+  void backward_pack(int64_t first, int64_t end) const {
+    const auto c = [](double value) { return constant<V>(value); };
+    const int lanes = int(std::min<int64_t>(end - first, L));
+    alignas(64) int32_t rows[L];
+    for (int i = 0; i < L; ++i) rows[i] = slots.index[first + (i < lanes ? i : lanes - 1)];
+
+    // Add up the pairs of each splat.
+    constexpr int kFixed = kMoments + 3 + 3;  // moments, RGB, absgrad, median
+    alignas(64) S fixed[kFixed][L];
+    alignas(64) S depth_gradient[L];
+    const int extra = columns - kMoments - channels.total();
+    for (int i = 0; i < L; ++i) {
+      const int64_t slot = first + (i < lanes ? i : lanes - 1);
+      S total[kMoments + 3] = {}, tail[3] = {};
+      const S* row = sums + int64_t(slots.first_pair[slot]) * columns;
+      const int plain = slots.channels == nullptr ? kMoments + 3 : kMoments;
+      for (int n = 0; n < slots.tiles[slot]; ++n, row += columns) {
+        for (int k = 0; k < plain; ++k) total[k] += row[k];
+        for (int k = 0; k < extra; ++k) tail[k] += row[columns - extra + k];
+      }
+      for (int k = 0; k < kMoments + 3; ++k) fixed[k][i] = total[k];
+      for (int k = 0; k < 3; ++k) fixed[kMoments + 3 + k][i] = tail[k];
+      depth_gradient[i] = S(0);
+      if (slots.channels != nullptr && i < lanes) depth_gradient[i] = general_channels(slot, fixed, i);
+    }
+
+    Geometry<V> in;
+    gather_rows<V, 3>(g.means, 3, rows, in.mean);
+    if constexpr (kCov3d) {
+      gather_rows<V, 6>(g.cov3d, 6, rows, in.cov);
+    } else {
+      gather_rows<V, 3>(g.scales, 3, rows, in.scale);
+      gather_rows<V, 4>(g.quats, 4, rows, in.quat);
+    }
+    V opacity;
+    gather_rows<V, 1>(g.opacities, 1, rows, &opacity);
+    Projection<V> p;
+    project<kCov3d>(view, S(settings.scale_modifier), S(settings.eps2d), settings.antialias, in, p);
+
+    const auto sum = [&](int k) { return load<V>(fixed[k]); };
+    ScreenGradient<V> grad;
+    grad.u = p.ka * sum(kVx) + p.kb * sum(kVy);
+    grad.v = p.kb * sum(kVx) + p.kc * sum(kVy);
+    grad.ka = c(0.5) * sum(kVxx);
+    grad.kb = sum(kVxy);
+    grad.kc = c(0.5) * sum(kVyy);
+    grad.opacity = -sum(kV0) / (opacity * p.rho);  // sum of -v = sum of alpha dL/dalpha
+    grad.depth = load<V>(depth_gradient);
+    GeometryGradient<V> result;
+    project_backward<kCov3d>(view, S(settings.scale_modifier), S(settings.eps2d), settings.antialias,
+                             settings.original_jacobian, in, p, opacity, grad, result);
+
+    if (g.sh_dc != nullptr) shade_backward(first, lanes, rows, in.mean, fixed, result.mean);
+    if (out.colors != nullptr && slots.channels == nullptr)
+      for (int i = 0; i < lanes; ++i)
+        for (int k = 0; k < 3; ++k) out.colors[int64_t(rows[i]) * 3 + k] = fixed[kMoments + k][i];
+    if (out.means != nullptr) scatter_rows<V, 3>(result.mean, out.means, 3, rows, lanes);
+    if (out.opacities != nullptr) scatter_rows<V, 1>(&result.opacity, out.opacities, 1, rows, lanes);
+    if constexpr (kCov3d) {
+      if (out.cov3d != nullptr) scatter_rows<V, 6>(result.cov, out.cov3d, 6, rows, lanes);
+    } else {
+      if (out.scales != nullptr) scatter_rows<V, 3>(result.scale, out.scales, 3, rows, lanes);
+      if (out.quats != nullptr) scatter_rows<V, 4>(result.quat, out.quats, 4, rows, lanes);
+    }
+    // NDC units: pixel gradient times half the image size.
+    const V half_width = c(0.5 * view.width), half_height = c(0.5 * view.height);
+    if (out.grad2d != nullptr) {
+      const V ndc[2] = {half_width * grad.u, half_height * grad.v};
+      scatter_rows<V, 2>(ndc, out.grad2d, 2, rows, lanes);
+    }
+    if (out.absgrad2d != nullptr) {
+      const V ndc[2] = {half_width * sum(kMoments + 3), half_height * sum(kMoments + 4)};
+      scatter_rows<V, 2>(ndc, out.absgrad2d, 2, rows, lanes);
+    }
+  }
+
+  // Channels other than plain RGB: sums its pairs again, writes colour and feature gradients, leaves the RGB of SH in
+  // `fixed`, returns dL/dtz.
+  S general_channels(int64_t slot, S (*fixed)[L], int lane_index) const {
+    const int total = channels.total();
+    const int64_t n = slots.index[slot];
+    const S* row = sums + int64_t(slots.first_pair[slot]) * columns + kMoments;
+    const auto add_up = [&](int channel) {
+      S value = 0;
+      for (int p = 0; p < slots.tiles[slot]; ++p) value += row[int64_t(p) * columns + channel];
+      return value;
+    };
+    int channel = 0;
+    for (; channel < channels.colors; ++channel) {
+      const S value = add_up(channel);
+      if (channel < 3) fixed[kMoments + channel][lane_index] = value;
+      if (out.colors != nullptr) out.colors[n * channels.colors + channel] = value;
+    }
+    const S depth = slots.records[slot * kRecord + kDepth];
+    S gradient = 0;
+    if (channels.inverse) gradient -= add_up(channel++) / (depth * depth);
+    if (channels.accumulated) gradient += add_up(channel++);
+    for (int k = 0; channel < total; ++channel, ++k)
+      if (out.features != nullptr) out.features[n * channels.features + k] = add_up(channel);
+    if (settings.median_depth) gradient += fixed[kMoments + 3 + (settings.absgrad ? 2 : 0)][lane_index];
+    return gradient;
+  }
+
+  // dL/dsh_k = B_k dL/dcolour, and the colour's part of dL/dmean through the viewing direction.
+  void shade_backward(int64_t first, int lanes, const int32_t* rows, const V* mean, S (*fixed)[L],
+                      V* mean_gradient) const {
+    alignas(64) S color[3][L];
+    for (int k = 0; k < 3; ++k)
+      for (int i = 0; i < L; ++i) {
+        const bool clamped = i >= lanes || (slots.clamped[first + i] >> k & 1) != 0;
+        color[k][i] = clamped ? S(0) : fixed[kMoments + k][i];
+      }
+    if (out.sh_dc != nullptr)
+      for (int i = 0; i < lanes; ++i)
+        for (int k = 0; k < 3; ++k) out.sh_dc[rows[i] * out.sh_dc_stride + k] = S(kSH0) * color[k][i];
+    if (g.sh_degree == 0) return;
+    if (out.means != nullptr) {
+      alignas(64) int32_t targets[L];
+      for (int i = 0; i < L; ++i) targets[i] = int32_t(first + (i < lanes ? i : lanes - 1));
+      V slope[9];
+      gather_rows<V, 9>(slots.color_slope, 9, targets, slope);
+      for (int k = 0; k < 3; ++k)
+        for (int j = 0; j < 3; ++j) mean_gradient[j] += load<V>(color[k]) * slope[3 * k + j];
+    }
+    if (out.sh_rest == nullptr) return;
+    V direction[3], basis[kMaxBasis] = {};
+    for (int j = 0; j < 3; ++j) direction[j] = mean[j] - view.center[j];
+    const V inverse_length = constant<V>(1) / square_root(dot3(direction, direction));
+    for (V& d : direction) d *= inverse_length;
+    sh_basis(g.sh_degree, direction[0], direction[1], direction[2], basis);
+    alignas(64) S values[kMaxBasis][L];
+    const int count = (g.sh_degree + 1) * (g.sh_degree + 1);
+    for (int k = 1; k < count; ++k) store(values[k], basis[k]);
+    for (int i = 0; i < lanes; ++i) {
+      S* row = out.sh_rest + rows[i] * out.sh_rest_stride;
+      const S red = color[0][i], green = color[1][i], blue = color[2][i];
+      for (int k = 1; k < count; ++k, row += 3) {
+        const S b = values[k][i];
+        row[0] = b * red, row[1] = b * green, row[2] = b * blue;
+      }
+    }
+  }
+};
+
+template <class V, bool kCov3d>
+void backward_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
+                  const Channels& channels, const Slots<Scalar<V>>& slots, const Scalar<V>* sums,
+                  const Gradients<Scalar<V>>& out) {
+  const int columns = pair_columns(channels.total(), settings.absgrad, settings.median_depth);
+  const ChunkBackward<V, kCov3d> backward_chunk{view, g, settings, channels, slots, sums, columns, out};
+  parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, backward_chunk);
+}
+
+}  // namespace
+
+#define SW_INSTANTIATE(S, V)                                                                                     \
+  template <>                                                                                                    \
+  void project_backward<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                 \
+                           const Channels& channels, const Slots<S>& slots, const S* sums,                       \
+                           const Gradients<S>& out) {                                                            \
+    g.cov3d != nullptr ? backward_all<V, true>(view, g, settings, channels, slots, sums, out)                    \
+                       : backward_all<V, false>(view, g, settings, channels, slots, sums, out);                  \
+  }
+SW_INSTANTIATE(float, Lanes)
+SW_INSTANTIATE(double, double)
+#undef SW_INSTANTIATE
+
+}  // namespace SW_ARCH

@@ -1,0 +1,109 @@
+// What the forward and backward blend kernels share: a tile's geometry, and the staging of its splats.
+//
+// Splats of a tile are staged kStage at a time into small arrays, one array a field (L1-resident), and each gets a mask
+// of the 4x4-pixel blocks whose pixel centres its cut-off ellipse reaches: the exact minimum of the quadratic form over
+// the box of centres, which lies on one of the two facing edges. So a pixel is tried with a splat only if its
+// block is touched.
+#pragma once
+
+#include <algorithm>
+#include <numeric>
+#include <vector>
+
+#include "../blend.h"
+#include "kernels.h"
+
+namespace SW_ARCH {
+using namespace sw;
+
+constexpr int kStage = 128;  // list positions in a stage fit a byte
+
+struct TileFrame {
+  int x0, y0;          // first pixel
+  int columns, rows;   // pixels inside the image
+  template <class S>
+  TileFrame(const View<S>& view, int64_t tile)
+      : x0(int(tile % view.tiles_x()) * kTile), y0(int(tile / view.tiles_x()) * kTile),
+        columns(std::min(kTile, view.width - x0)), rows(std::min(kTile, view.height - y0)) {}
+
+  // Pixel of (block, index inside it), relative to the tile.
+  static int pixel_x(int block, int i) { return block % kBlocksPerRow * kBlock + i % kBlock; }
+  static int pixel_y(int block, int i) { return block / kBlocksPerRow * kBlock + i / kBlock; }
+
+  template <class Visit>
+  void for_each_pixel(const Visit& visit) const {  // visit(index in block order, x, y in the tile)
+    for (int i = 0; i < kTilePixels; ++i) {
+      const int x = pixel_x(i / kBlockPixels, i % kBlockPixels), y = pixel_y(i / kBlockPixels, i % kBlockPixels);
+      if (x < columns && y < rows) visit(i, x, y);
+    }
+  }
+};
+
+// Centres of a block's pixels relative to the block's first centre, in lanes.
+template <class S>
+struct LaneOffsets {
+  alignas(64) S x[kBlockPixels], y[kBlockPixels];
+  LaneOffsets() {
+    for (int i = 0; i < kBlockPixels; ++i) x[i] = S(i % kBlock), y[i] = S(i / kBlock);
+  }
+};
+
+template <class V>
+struct TileStage {
+  using S = Scalar<V>;
+  using I = IntOf<V>;
+  static constexpr int L = lanes_of<V>;
+  alignas(64) S field[kCutoff + 1][kStage];
+  alignas(64) int32_t blocks[kStage];
+
+  void load_splats(const Slots<S>& slots, const int32_t* list, int count) {
+    for (int k = 0; k < count; ++k) {
+      const S* record = slots.records + int64_t(list[k]) * kRecord;
+      for (int f = 0; f <= kCutoff; ++f) field[f][k] = record[f];
+    }
+  }
+
+  // Block masks of the staged splats, a pack of splats at a time.
+  void find_blocks(const TileFrame& frame, int count) {
+    const auto c = [](double value) { return constant<V>(value); };
+    for (int k = 0; k < count; k += L) {
+      const auto at = [&](int f) { return load<V>(field[f] + k); };
+      // The quadratic form grows with distance: a, c > 0.
+      const V a = -at(kA), b = -at(kB), cc = -at(kC), cutoff = at(kCutoff);
+      const V lean_x = at(kLeanX), lean_y = at(kLeanY), zero = c(0), edge = c(kBlock - 1);
+      const V left = c(frame.x0 + 0.5) - at(kU), top = c(frame.y0 + 0.5) - at(kV);
+      V low_x[kBlocksPerRow], near_x[kBlocksPerRow], ridge_y[kBlocksPerRow];
+      for (int i = 0; i < kBlocksPerRow; ++i) {
+        low_x[i] = left + c(kBlock * i);
+        near_x[i] = clamp(zero, low_x[i], low_x[i] + edge);
+        ridge_y[i] = lean_y * near_x[i];  // lowest point of the form on the vertical line near_x
+      }
+      I mask = {};
+      for (int j = 0; j < kBlocksPerRow; ++j) {
+        const V low_y = top + c(kBlock * j), high_y = low_y + edge;
+        const V near_y = clamp(zero, low_y, high_y), ridge_x = lean_x * near_y;
+        for (int i = 0; i < kBlocksPerRow; ++i) {
+          const V y = clamp(ridge_y[i], low_y, high_y);
+          const V x = clamp(ridge_x, low_x[i], low_x[i] + edge);
+          const V on_vertical = a * near_x[i] * near_x[i] + (b * near_x[i] + cc * y) * y;
+          const V on_horizontal = cc * near_y * near_y + (b * near_y + a * x) * x;
+          const I bit = I{} + (1 << (j * kBlocksPerRow + i));
+          mask |= select(minimum(on_vertical, on_horizontal) <= cutoff, bit, I{});
+        }
+      }
+      store(blocks + k, mask);
+    }
+  }
+};
+
+// Tiles with work, longest list first, for dynamic scheduling.
+inline std::vector<int32_t> tiles_by_work(const int64_t* tile_start, int64_t tiles) {
+  std::vector<int32_t> order(static_cast<size_t>(tiles));
+  std::iota(order.begin(), order.end(), 0);
+  std::stable_sort(order.begin(), order.end(), [&](int32_t a, int32_t b) {
+    return tile_start[a + 1] - tile_start[a] > tile_start[b + 1] - tile_start[b];
+  });
+  return order;
+}
+
+}  // namespace SW_ARCH

@@ -1,0 +1,82 @@
+// Which tiles a splat touches.
+//
+// Tight (SnugBox + AccuTile of Speedy-Splat, on pixel centres): the ellipse Ka dx^2 + 2 Kb dx dy + Kc dy^2 <= t is cut
+// into slabs, one a tile row; the extreme x of each slab lies either at the ellipse's own rightmost / leftmost point or
+// on one of the slab's two edges. A tile counts when the slab's x interval contains one of its pixel columns' centres.
+// Classic: every tile of the square of the bounding radius, as 3DGS does.
+#pragma once
+
+#include "common.h"
+
+namespace sw {
+
+// The screen ellipse of one splat at its cut-off level, in the form in which slabs are cut from it.
+template <class S>
+struct Ellipse {
+  S u, v;    // centre, pixels
+  S hx, hy;  // half extents
+  S wx;      // half width at the height of the centre, sqrt(t / Ka)
+  S lean;    // x of the chord's middle per y: -Kb/Ka
+  S tip;     // y of the rightmost point, relative to the centre: -(Kb/Kc) hx
+};
+
+struct TileRange {
+  int x0, x1, y0, y1;  // half-open
+  SW_HD int count() const { return x1 > x0 && y1 > y0 ? (x1 - x0) * (y1 - y0) : 0; }
+};
+
+template <class S>
+SW_HD int to_int(S x, int low, int high) {  // clamps first: x may be anything but NaN
+  return x <= S(low) ? low : (x >= S(high) ? high : int(x));
+}
+
+// Tiles of the square of radius r, in the original's integer-centre coordinates (p = u - 0.5).
+template <class S>
+SW_HD TileRange classic_tiles(S u, S v, S radius, int tiles_x, int tiles_y) {
+  const S px = u - S(0.5), py = v - S(0.5), edge = S(1) / kTile;
+  return {to_int((px - radius) * edge, 0, tiles_x), to_int((px + radius + (kTile - 1)) * edge, 0, tiles_x),
+          to_int((py - radius) * edge, 0, tiles_y), to_int((py + radius + (kTile - 1)) * edge, 0, tiles_y)};
+}
+
+// First and last pixel whose centre lies in [center - reach_low, center + reach_high], clipped to [low, high];
+// empty if first > last.
+template <class S>
+SW_HD void pixel_span(S low_edge, S high_edge, int low, int high, int* first, int* last) {
+  *first = to_int(round_up(low_edge - S(0.5)), low, high + 1);
+  *last = to_int(round_down(high_edge - S(0.5)), low - 1, high);
+}
+
+// Calls visit(tile_x, tile_y) for each tile, rows top to bottom, left to right. Returns the number of calls.
+template <class S, class Visit>
+SW_HD int tight_tiles(const Ellipse<S>& e, int width, int height, Visit&& visit) {
+  int i0, i1, j0, j1;
+  pixel_span(e.u - e.hx, e.u + e.hx, 0, width - 1, &i0, &i1);
+  pixel_span(e.v - e.hy, e.v + e.hy, 0, height - 1, &j0, &j1);
+  if (i0 > i1 || j0 > j1) return 0;
+  const int row0 = j0 / kTile, row1 = j1 / kTile;
+  const int column0 = i0 / kTile, column1 = i1 / kTile;
+  int count = 0;
+  if (row0 == row1 || column0 == column1) {
+    for (int ty = row0; ty <= row1; ++ty)
+      for (int tx = column0; tx <= column1; ++tx, ++count) visit(tx, ty);
+    return count;
+  }
+  const S inverse_hy = S(1) / e.hy;
+  for (int ty = row0; ty <= row1; ++ty) {
+    const int first_row = ty * kTile > j0 ? ty * kTile : j0;
+    const int last_row = ty * kTile + kTile - 1 < j1 ? ty * kTile + kTile - 1 : j1;
+    const S low = S(first_row) + S(0.5) - e.v, high = S(last_row) + S(0.5) - e.v;
+    const S rl = low * inverse_hy, rh = high * inverse_hy;
+    const S half_low = e.wx * square_root(maximum(S(0), S(1) - rl * rl));
+    const S half_high = e.wx * square_root(maximum(S(0), S(1) - rh * rh));
+    const S right = low <= e.tip && e.tip <= high ? e.hx : maximum(e.lean * low + half_low, e.lean * high + half_high);
+    const S left = low <= -e.tip && -e.tip <= high ? -e.hx : minimum(e.lean * low - half_low, e.lean * high - half_high);
+    int first, last;
+    pixel_span(e.u + left, e.u + right, i0, i1, &first, &last);
+    if (first > last) continue;
+    for (int tx = first / kTile; tx <= last / kTile; ++tx, ++count) visit(tx, ty);
+  }
+  return count;
+}
+
+}  // namespace sw

@@ -1,0 +1,160 @@
+"""The compiled kernels as one differentiable function of tensors."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.rendering.rasterizer import GradBuffer
+from splatwizard_core.scene.camera import Camera
+from sw_rasterizers.native import MODULE
+
+INPUTS = (
+    "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features",
+)  # fmt: skip
+"""Differentiable inputs in the order in which the ops take them and return their gradients."""
+
+FORWARD_STAGES = ("project", "sort", "bin", "blend")
+BACKWARD_STAGES = ("blend_backward", "project_backward")
+
+
+class Flag(enum.IntFlag):
+    """Switches of one call; mirrors `Flag` in csrc/binding.cpp."""
+
+    ANTIALIAS = 1
+    CLAMP_COLOR = 2
+    TIGHT = 4
+    PASS_CLAMP = 8
+    INVERSE_DEPTH = 16
+    ACCUMULATED_DEPTH = 32
+    MEDIAN_DEPTH = 64
+    DETACH_FEATURES = 128
+    ABSGRAD = 256
+    ALPHA_MAP = 512
+    SAVE = 1024
+    COUNT = 2048
+    ORIGINAL_JACOBIAN = 4096
+
+
+@dataclass
+class Call:
+    """Everything of one call that is not a tensor to differentiate by, and where its by-products go.
+
+    camera          18 numbers: R, tau, fx, fy, cx, cy, near, far
+    seconds         stage -> seconds, filled by the forward and by the backward pass
+    counts          visible Gaussians, (splat, tile) pairs, evaluated and blended pixel-splat pairs (-1 unless counted),
+                    inputs that are not finite
+    """
+
+    camera: list[float]
+    width: int
+    height: int
+    sh_degree: int
+    scale_modifier: float
+    eps2d: float
+    flags: Flag
+    visible: Tensor | None = None
+    background: Tensor | None = None
+    grad2d: GradBuffer | None = None
+    absgrad2d: GradBuffer | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    counts: list[int] = field(default_factory=list)
+
+    def settings(self) -> tuple[Any, ...]:
+        return self.camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, int(self.flags)
+
+
+def camera_numbers(cam: Camera) -> list[float]:
+    """[18]: R row by row, tau, fx, fy, cx, cy, near, far."""
+    pose = [*cam.R.flatten().tolist(), *cam.tau.tolist()]
+    return [*pose, cam.fx, cam.fy, cam.cx, cam.cy, cam.near, cam.far]
+
+
+class _Rasterize(torch.autograd.Function):
+    """(call, dummy, *INPUTS) -> image [C,H,W], radii [N] int32, alpha [0 or 1,H,W], median depth [0 or 1,H,W]."""
+
+    @staticmethod
+    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        tensors = [None if x is None else x.detach().contiguous() for x in inputs]
+        image, radii, alpha, median, saved, call.counts, seconds = torch.ops.sw_rasterizers.render(
+            *tensors, call.visible, call.background, *call.settings()
+        )
+        call.seconds.update(zip(FORWARD_STAGES, seconds, strict=True))
+        ctx.call = call
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        # All state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
+        ctx.present = [x is not None for x in tensors]
+        ctx.save_for_backward(*(x for x in tensors if x is not None), *saved)
+        return image, radii, alpha, median
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, _, alpha, median = grads
+        call: Call = ctx.call
+        stored = list(ctx.saved_tensors)
+        tensors = [stored.pop(0) if present else None for present in ctx.present]
+        if image is None:
+            means = tensors[0]
+            assert means is not None
+            image = means.new_zeros(_channels(tensors, call.flags), call.height, call.width)
+        wanted = [*ctx.needs_input_grad[2:], call.grad2d is not None, call.absgrad2d is not None]
+        found, seconds = torch.ops.sw_rasterizers.render_backward(
+            *tensors, call.visible, call.background, *call.settings(), stored, image.contiguous(),
+            _nonempty(alpha), _nonempty(median), wanted,
+        )  # fmt: skip
+        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=True))
+        for buffer, value in ((call.grad2d, found[-2]), (call.absgrad2d, found[-1])):
+            if buffer is not None:
+                buffer.set(value)
+        return (None, None, *(g if want else None for g, want in zip(found, wanted[: len(INPUTS)], strict=False)))
+
+
+def _nonempty(x: Tensor | None) -> Tensor | None:
+    return None if x is None or x.numel() == 0 else x.contiguous()
+
+
+def _channels(tensors: list[Tensor | None], flags: Flag) -> int:
+    colors, features = tensors[INPUTS.index("colors")], tensors[INPUTS.index("features")]
+    depths = (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
+    return (3 if colors is None else colors.shape[1]) + depths + (0 if features is None else features.shape[1])
+
+
+def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Draw one view. Differentiable by every tensor of INPUTS; all contiguous CPU tensors of one dtype.
+
+    Returns the channels [C + depths + E, H, W] (colours over the background, then inverse and accumulated depth if
+    flagged, then features), radii [N] int32, alpha [1,H,W] or [0,H,W], median depth likewise.
+    State for the backward pass is kept only if something needs a gradient.
+    """
+    MODULE.load()
+    inputs = [tensors.get(name) for name in INPUTS]
+    dummy = None
+    if torch.is_grad_enabled():
+        if call.grad2d is not None or call.absgrad2d is not None:
+            dummy = torch.empty(0, requires_grad=True)  # statistics are wanted even if no input needs a gradient
+        if dummy is not None or any(x is not None and x.requires_grad for x in inputs):
+            call.flags |= Flag.SAVE
+    return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
+
+
+def visible_radii(
+    means: Tensor,
+    scales: Tensor | None,
+    quats: Tensor | None,
+    cov3d: Tensor | None,
+    visible: Tensor | None,
+    cam: Camera,
+) -> Tensor:
+    """Radii [N] int32 from geometry alone; 0 = culled. No gradient."""
+    MODULE.load()
+    geometry = [None if x is None else x.detach().contiguous() for x in (means, scales, quats, cov3d, visible)]
+    found: Tensor = torch.ops.sw_rasterizers.visible_radii(
+        *geometry, camera_numbers(cam), cam.width, cam.height, 1.0, 0.3
+    )
+    return found
