@@ -145,7 +145,7 @@ def evaluate(
     splats: Splats, packed: Tensor, ids: Tensor, valid: Tensor, centres: Tensor, T: Tensor, done: Tensor
 ) -> Terms:
     """Alpha, transmittance and the three cuts for the splats ids [B,L] (where `valid`) at `centres` [B,P,2]."""
-    rows = packed.index_select(0, ids.reshape(-1)).unflatten(0, ids.shape)  # [B,L,8+D]
+    rows = packed.index_select(0, ids.reshape(-1)).reshape(*ids.shape, packed.shape[1])  # [B,L,8+D]
     ka, kb, kc, opacity = (rows[:, None, :, i] for i in range(2, 6))
     if splats.absgrad:
         dx, dy = _Offsets.apply(rows[..., 0:2], rows[..., 6:8], centres)  # type: ignore[no-untyped-call]
@@ -294,7 +294,7 @@ def composite(splats: Splats, lists: TileLists, width: int, height: int) -> Comp
         values = torch.cat(drawn)
         columns, rows = lists.grid
         full = values.new_full((columns * rows, *values.shape[1:]), empty).index_copy(0, where, values)
-        full = full.unflatten(1, (lists.tile, lists.tile)).unflatten(0, (rows, columns))
+        full = full.reshape(rows, columns, lists.tile, lists.tile, -1)
         image = full.permute(4, 0, 2, 1, 3).flatten(3, 4).flatten(1, 2)
         return image[:, :height, :width]
 

@@ -58,7 +58,7 @@ def rotation_matrices(quats: Tensor) -> Tensor:
             2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
         ],
         dim=-1,
-    ).unflatten(-1, (3, 3))  # fmt: skip
+    ).reshape(-1, 3, 3)  # fmt: skip
 
 
 def covariances(scales: Tensor, quats: Tensor, modifier: float = 1.0) -> Tensor:
@@ -68,7 +68,7 @@ def covariances(scales: Tensor, quats: Tensor, modifier: float = 1.0) -> Tensor:
 
 
 def _matrix_from_upper(cov3d: Tensor) -> Tensor:
-    return cov3d[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
+    return cov3d[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
 
 
 def _world_covariances(g: GaussianInputs, rows: Tensor, modifier: float) -> Tensor:
@@ -107,7 +107,7 @@ def _screen(means: Tensor, S: Tensor, cam: Camera, *, dgr_gradient: bool) -> tup
             zero, cam.fy / tz, -cam.fy * slope(ty, cam.fy, cam.cy, cam.height, tan_y),
         ],
         dim=-1,
-    ).unflatten(-1, (2, 3))  # fmt: skip
+    ).reshape(-1, 2, 3)  # fmt: skip
     A = J @ cam.R
     c = A @ S @ A.transpose(1, 2)
     u = torch.stack([cam.fx * tx / tz + cam.cx, cam.fy * ty / tz + cam.cy], dim=-1)

@@ -196,7 +196,7 @@ def _watch_screen_gradient(
         def store(gradient: Tensor) -> None:
             buffer.set(gradient.new_zeros(len(g), 2).index_copy(0, p.rows, gradient * to_ndc))
 
-        x.register_hook(store)
+        x.register_hook(store)  # type: ignore[no-untyped-call]
         return buffer
 
     grad2d = absgrad2d = None

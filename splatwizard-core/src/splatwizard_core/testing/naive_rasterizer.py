@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from torch import Tensor
@@ -12,6 +14,8 @@ from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.gaussians.spherical_harmonics import eval_sh
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.camera import Camera
+
+Note = Callable[["Tensor | float", float], None]
 
 
 @dataclass
@@ -61,7 +65,7 @@ def naive_render(g: GaussianInputs, cam: Camera, opt: RasterOptions) -> NaiveRes
 
     depths = [float((R[2] * mean).sum() + tau[2]) for mean in g.means.detach()]
     order = sorted((z, i) for i, z in enumerate(depths) if z > cam.near)
-    for (z, _), (next_z, _) in zip(order, order[1:], strict=False):
+    for (z, _), (next_z, _) in pairwise(order):
         note(next_z, z)
     ys, xs = torch.meshgrid(torch.arange(H) + 0.5, torch.arange(W) + 0.5, indexing="ij")
     pixels = torch.stack([xs, ys], dim=-1).to(g.means)
@@ -95,7 +99,7 @@ def naive_render(g: GaussianInputs, cam: Camera, opt: RasterOptions) -> NaiveRes
         blended = tried & (after >= 1e-4)
         pairs.append(Pair(i, d.detach(), raw.detach(), T.detach(), alpha.detach(), tried, blended))
         weight = torch.where(blended, alpha * T, 0)
-        color = _color(g, i, cam, R, tau, opt, note)
+        color = _color(g, i, R, tau, opt, note)
         image = (0 if image is None else image) + color[:, None, None] * weight
         if features is not None and g.features is not None:
             own = weight.detach() if opt.features_detach_geometry else weight
@@ -115,11 +119,16 @@ def naive_render(g: GaussianInputs, cam: Camera, opt: RasterOptions) -> NaiveRes
     return NaiveResult(image, 1 - T, {m: sums[m] for m in opt.depth}, features, pairs, margin)
 
 
-def _screen_covariance(g, i, t, R, cam, opt, note):  # type: ignore[no-untyped-def]  # noqa: ANN202
+def _screen_covariance(
+    g: GaussianInputs, i: int, t: Tensor, R: Tensor, cam: Camera, opt: RasterOptions, note: Note
+) -> tuple[Tensor, Tensor]:
+    """[2,2] on the screen, without and with the low-pass."""
     if g.cov3d is not None:
         xx, xy, xz, yy, yz, zz = g.cov3d[i]
         S = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz]).reshape(3, 3)
     else:
+        assert g.scales is not None
+        assert g.quats is not None
         at = i if g.geom_indices is None else int(g.geom_indices[i])
         w, x, y, z = g.quats[at] / g.quats[at].norm()
         rotation = torch.stack([
@@ -144,9 +153,10 @@ def _screen_covariance(g, i, t, R, cam, opt, note):  # type: ignore[no-untyped-d
     return plain, plain + opt.eps2d * torch.eye(2).to(plain)
 
 
-def _color(g, i, cam, R, tau, opt, note):  # type: ignore[no-untyped-def]  # noqa: ANN202
+def _color(g: GaussianInputs, i: int, R: Tensor, tau: Tensor, opt: RasterOptions, note: Note) -> Tensor:
     if g.colors is not None:
         return g.colors[i]
+    assert g.sh is not None
     toward = g.means[i] + R.T @ tau
     raw = eval_sh(g.sh.to_dense()[i : i + 1], (toward / toward.norm())[None], g.sh.active_degree)[0] + 0.5
     if not opt.clamp_color:

@@ -243,7 +243,7 @@ def screen_gradient_is_in_ndc_units(r: Rasterizer, device: str) -> None:
     g.means.requires_grad_()
     cam = front_camera(64, 32)
     result = draw(r, device, g, cam, RasterOptions(grad2d=True))
-    result.image[:, 20, 30].sum().backward()
+    torch.autograd.backward(result.image[:, 20, 30].sum())
     assert result.grad2d is not None
     assert g.colors is not None
     dx, dy = 32 - 30.5, 16 - 20.5
@@ -261,12 +261,12 @@ def absolute_gradient_is_the_sum_over_pixels(r: Rasterizer, device: str) -> None
     options = RasterOptions(grad2d=True, absgrad=True)
     weights = torch.randn(3, 7, 9, generator=torch.Generator().manual_seed(2)).to(device)
     whole = draw(r, device, g, cam, options)
-    (whole.image * weights).sum().backward()
+    torch.autograd.backward((whole.image * weights).sum())
     signed, absolute = torch.zeros(3, 2), torch.zeros(3, 2)
     for row in range(7):
         for column in range(9):
             result = draw(r, device, g, cam, options)
-            (result.image * weights)[:, row, column].sum().backward()
+            torch.autograd.backward((result.image * weights)[:, row, column].sum())
             assert result.grad2d is not None
             signed += result.grad2d.value.cpu()
             absolute += result.grad2d.value.abs().cpu()

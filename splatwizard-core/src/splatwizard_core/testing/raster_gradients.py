@@ -110,7 +110,7 @@ def run(
     result = rasterizer.render(with_tensors(g, leaves), cam, options)
     loss = sum((x * _probe(x.cpu(), 3).to(x)).sum() for x in outputs(result).values())
     assert isinstance(loss, Tensor)
-    loss.backward()
+    torch.autograd.backward(loss)
     return result, {name: x.grad if x.grad is not None else torch.zeros_like(x) for name, x in leaves.items()}
 
 

@@ -11,6 +11,7 @@ from torch import Tensor
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.projection import rotation_matrices
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.testing.raster_scenes import (
     RasterCase,
     concatenate_inputs,
@@ -25,11 +26,11 @@ CASE = RasterCase("robust", n=20, width=37, height=29, color="colors")
 LEAVES = ("means", "opacities", "scales", "quats", "colors")
 
 
-def _gradients(r: Rasterizer, device: str, g: GaussianInputs, cam, options=None) -> tuple[Tensor, list[Tensor]]:  # type: ignore[no-untyped-def]
+def _gradients(r: Rasterizer, device: str, g: GaussianInputs, cam: Camera) -> tuple[Tensor, list[Tensor]]:
     """(image, gradients of LEAVES) under a fixed random weighting of the image."""
     present = g.tensors()
     leaves = {name: present[name].detach().clone().requires_grad_() for name in LEAVES}
-    image = draw(r, device, with_tensors(g, leaves), cam, options or RasterOptions()).image
+    image = draw(r, device, with_tensors(g, leaves), cam, RasterOptions()).image
     weights = torch.randn(image.shape, generator=torch.Generator().manual_seed(8)).to(image)
     return image.detach(), list(torch.autograd.grad((image * weights).sum(), list(leaves.values())))
 
@@ -171,7 +172,7 @@ def nothing_to_draw_gives_the_background(r: Rasterizer, device: str) -> None:
         close(result.image, background[:, None, None].cpu().expand(3, 10, 20))
         assert result.radii.shape == (len(g),)
         assert not bool(result.visible.any())
-        result.image.sum().backward()
+        torch.autograd.backward(result.image.sum())
         assert g.means.grad is not None
         assert float(g.means.grad.abs().sum()) == 0
         assert result.grad2d is not None
@@ -219,7 +220,7 @@ def impossible_covariance_is_culled(r: Rasterizer, device: str) -> None:
     g.cov3d = torch.tensor([[-1.0, 0, 0, 1.0, 0, 1.0], [0.04, 0, 0, 0.04, 0, 0.04]], requires_grad=True)
     result = draw(r, device, g, front_camera(), RasterOptions())
     assert result.visible.tolist() == [False, True]
-    result.image.sum().backward()
+    torch.autograd.backward(result.image.sum())
     assert g.cov3d.grad is not None
     assert float(g.cov3d.grad[0].abs().max()) == 0
     assert float(g.cov3d.grad[1].abs().max()) > 0

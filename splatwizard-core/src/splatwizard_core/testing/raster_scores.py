@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, ScoreSpec
 from splatwizard_core.testing.naive_rasterizer import Pair, naive_render
 from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, margin_scene
@@ -18,7 +19,7 @@ _GAMMA = 0.3
 
 
 def _value(kind: str, pair: Pair, opacity: Tensor) -> Tensor:
-    return {
+    values: dict[str, Tensor] = {
         "hits": torch.ones_like(pair.alpha),
         "opacity": opacity.expand_as(pair.alpha),
         "opacity_T": opacity * pair.before,
@@ -26,7 +27,8 @@ def _value(kind: str, pair: Pair, opacity: Tensor) -> Tensor:
         "blend_max": pair.alpha * pair.before,
         "gamma": pair.alpha ** (2 * _GAMMA) * pair.before ** (2 - 2 * _GAMMA),
         "dist": pair.offset.norm(dim=-1),
-    }[kind]
+    }
+    return values[kind]
 
 
 def _compare(r: Rasterizer, device: str, kind: str, rule: str, weight: Tensor | None = None) -> None:
@@ -110,8 +112,9 @@ def grad_sq_is_the_squared_derivative_of_each_pixel(r: Rasterizer, device: str) 
         close(scores["s"], expected, rtol=1e-4, atol=1e-4)
 
 
-def _grad_sq(g, pairs: list[Pair], background: Tensor, policy: str) -> Tensor:  # type: ignore[no-untyped-def]
+def _grad_sq(g: GaussianInputs, pairs: list[Pair], background: Tensor, policy: str) -> Tensor:
     """One leaf exp(-sigma) per (pixel, splat), so that one backward pass gives every per-pixel derivative."""
+    assert g.colors is not None
     leaves = [(p.raw / g.opacities[p.index]).clone().requires_grad_() for p in pairs]
     T: Tensor | float = 1.0
     light: Tensor | float = 0.0
@@ -125,7 +128,7 @@ def _grad_sq(g, pairs: list[Pair], background: Tensor, policy: str) -> Tensor:  
         T = T * (1 - alpha)
     total = light + T * background.sum()
     assert isinstance(total, Tensor)
-    total.sum().backward()
+    torch.autograd.backward(total.sum())
     scores = torch.zeros(len(g), dtype=torch.float64)
     for pair, leaf in zip(pairs, leaves, strict=True):
         assert leaf.grad is not None

@@ -1,0 +1,105 @@
+"""Requests rewritten so that a rasterizer without a feature can serve them: composition instead of new kernels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.gaussians.inputs import SH, GaussianInputs
+from splatwizard_core.rendering.rasterizer import (
+    AccumOutput,
+    Rasterizer,
+    RasterizerInfo,
+    RasterOptions,
+    RenderResult,
+)
+from splatwizard_core.scene.camera import Camera
+
+_AS_FEATURES = frozenset({"DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED", "ALPHA_MAP"})
+ADAPTABLE = _AS_FEATURES | {"SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM"}
+"""Features that can be had from a rasterizer that does not declare them (maps need EXTRA_FEATURES instead)."""
+
+
+def adapted_requirements(required: frozenset[str], missing: frozenset[str]) -> frozenset[str] | None:
+    """What is asked of the rasterizer once `missing` is adapted; None if some of it cannot be."""
+    if not missing <= ADAPTABLE:
+        return None
+    needs = required - missing
+    if missing & _AS_FEATURES:
+        needs |= {"EXTRA_FEATURES"}
+    return needs
+
+
+class AdaptedRasterizer:
+    """A rasterizer behind rewritten requests; every feature in `missing` is composed from others.
+
+    SPLIT_SH      dc and rest are concatenated
+    INDEXED_*     codebooks are gathered; autograd scatters
+    DEPTH_*, ALPHA_MAP    z, 1/z and 1 are composited as extra features (no median)
+    """
+
+    def __init__(self, inner: Rasterizer, missing: frozenset[str]) -> None:
+        self.inner = inner
+        self.missing = missing
+        self.info: RasterizerInfo = replace(inner.info, features=inner.info.features | missing)
+
+    def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
+        """Draw one view; `RenderResult.inputs` are the inputs as they were handed in."""
+        drawn, depth_names = self._gathered(g), sorted(opt.depth)
+        maps: dict[str, Tensor] = {}
+        needs_maps = bool(self.missing & _AS_FEATURES) and (bool(depth_names) or opt.alpha)
+        if needs_maps:
+            maps = _map_channels(g, cam)
+            extra = torch.stack(list(maps.values()), dim=1)  # [N,3]
+            drawn.features = extra if g.features is None else torch.cat([g.features, extra], dim=1)
+            opt = replace(opt, depth=frozenset(), alpha=False)
+        result = self.inner.render(drawn, cam, opt)
+        if not needs_maps:
+            return replace(result, inputs=g)
+        assert result.features is not None
+        own = result.features.shape[0] - len(maps)
+        found = dict(zip(maps, torch.split(result.features[own:], 1), strict=True))
+        found["expected"] = found["accumulated"] / found["alpha"].clamp(min=1e-10)
+        return replace(
+            result,
+            inputs=g,
+            features=result.features[:own] if g.features is not None else None,
+            depth={name: found[name] for name in depth_names},
+            alpha=found["alpha"],
+        )
+
+    def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
+        """Radii [N] int32 from geometry alone."""
+        return self.inner.visible_filter(self._gathered(g), cam)
+
+    def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
+        """Sum scores over views."""
+        return self.inner.accumulate(self._gathered(g), cams, opt)
+
+    def _gathered(self, g: GaussianInputs) -> GaussianInputs:
+        """A shallow copy without the storage forms that the rasterizer does not read."""
+        g = replace(g)
+        if g.geom_indices is not None and "INDEXED_GEOM" in self.missing:
+            assert g.scales is not None
+            assert g.quats is not None
+            g.scales, g.quats = g.scales[g.geom_indices], g.quats[g.geom_indices]
+            g.geom_indices = None
+        if g.sh is not None and g.sh.codebook is not None and "INDEXED_SH" in self.missing:
+            assert g.sh.indices is not None
+            rest = g.sh.codebook[g.sh.indices]
+            colors = {"dense": rest} if g.sh.dc is None else {"dc": g.sh.dc, "rest": rest}
+            g.sh = SH(**colors, active_degree=g.sh.active_degree)
+        if g.sh is not None and g.sh.dc is not None and "SPLIT_SH" in self.missing:
+            g.sh = SH(dense=g.sh.to_dense(), active_degree=g.sh.active_degree)
+        return g
+
+
+def _map_channels(g: GaussianInputs, cam: Camera) -> dict[str, Tensor]:
+    """One value a Gaussian whose weighted sum over a pixel is the map, [N] each."""
+    cam = cam.to(g.means.device, g.means.dtype)
+    z = g.means @ cam.R[2] + cam.tau[2]
+    safe = torch.where(z > cam.near, z, 1)  # others are culled; 1/z must not turn their gradient into NaN
+    return {"accumulated": safe, "inverse": 1 / safe, "alpha": torch.ones_like(z)}

@@ -1,0 +1,336 @@
+"""Who is chosen for a request, what is composed when nobody offers it, and what the user hears."""
+
+import logging
+from dataclasses import replace
+from itertools import count
+
+import pytest
+import torch
+
+from splatwizard_core import builtin
+from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError
+from splatwizard_core.plugins.manager import PluginManager
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry
+from splatwizard_core.rendering.rasterizer import Feature, RasterizerInfo, RasterOptions, ScoreSpec
+from splatwizard_core.rendering.reference import ReferenceRasterizer
+from splatwizard_core.testing.raster_scenes import RasterCase, draw_scene, with_tensors
+
+_UNIQUE = count()
+NOT_HERE = "needs a GPU that is not here"
+
+
+class Fake:
+    """Draws what the reference draws, but refuses what it does not declare."""
+
+    info = RasterizerInfo("fake", frozenset({"cpu"}), frozenset({"float32"}), frozenset())
+    calls = 0
+
+    def __init__(self):
+        self._inner = ReferenceRasterizer()
+        self._inner.info = self.info
+
+    def render(self, g, cam, opt):
+        type(self).calls += 1
+        return self._inner.render(g, cam, opt)
+
+    def visible_filter(self, g, cam):
+        assert "VISIBLE_FILTER" in self.info.features
+        return self._inner.visible_filter(g, cam)
+
+    def accumulate(self, g, cams, opt):
+        type(self).calls += 1
+        return self._inner.accumulate(g, cams, opt)
+
+
+class FailsToBuild(Fake):
+    def __init__(self):
+        raise NativeBuildError(REASON)
+
+
+class FailsToBuildLater(Fake):
+    def render(self, g, cam, opt):
+        raise NativeBuildError(REASON)
+
+
+REASON = ""
+
+
+def not_here():
+    return NOT_HERE
+
+
+def broken_probe():
+    raise OSError("libcuda.so")
+
+
+@pytest.fixture(autouse=True)
+def fresh_reason(monkeypatch):
+    """Warnings are given once per reason and process: each test has a reason of its own."""
+    monkeypatch.setitem(globals(), "REASON", f"no compiler was found ({next(_UNIQUE)})")
+    monkeypatch.setitem(globals(), "NOT_HERE", f"needs a GPU that is not here ({next(_UNIQUE)})")
+    monkeypatch.delenv("SW_RASTERIZER", raising=False)
+
+
+@pytest.fixture
+def plugins(monkeypatch):
+    """A manager with the reference alone, and `install` to add fakes whose target lives in this module."""
+    manager = PluginManager([])
+    registry = manager.registries["rasterizer"]
+    builtin.register_rasterizers(registry)
+    module = type("Holder", (), {})()
+    monkeypatch.setitem(__import__("sys").modules, "negotiation_fakes", module)
+    module.not_here, module.broken_probe = not_here, broken_probe
+
+    def install(name, *features, base=Fake, speed=5, **declared):
+        known = {"devices": ["cpu"], "dtypes": ["float32"], "exactness": "tight", **declared}
+        registry.add(name, f"negotiation_fakes:{name}", summary="a fake", features=list(features), speed=speed, **known)
+        fake = type(name, (base,), {"info": info_from_entry(registry.entry(name)), "calls": 0})
+        setattr(module, name, fake)
+        return fake
+
+    manager.install = install
+    return manager
+
+
+@pytest.fixture
+def scene():
+    return draw_scene(RasterCase(color="colors"), 0, torch.float32)
+
+
+def test_the_fastest_that_offers_everything_serves(plugins, scene):
+    slow, fast = plugins.install("slow", "ALPHA_MAP", speed=2), plugins.install("fast", "ALPHA_MAP", speed=9)
+    plugins.install("fastest", speed=99, features_note="no alpha map", combos_forbidden=[])
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    result = rasterizer.render(*scene, RasterOptions(alpha=True, scores=()))
+    assert result.alpha is not None
+    assert (slow.calls, fast.calls) == (0, 1)
+    assert rasterizer.choices == {"ALPHA_MAP": "fast"}
+
+
+def test_each_request_is_resolved_by_itself(plugins, scene):
+    plugins.install("painter")
+    plugins.install("counter", "SCORE_HITS", speed=1)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    g, cam = scene
+    scores = rasterizer.accumulate(g, iter([cam, cam]), RasterOptions(scores=(ScoreSpec("n", "hits"),))).scores["n"]
+    assert int(scores.sum()) > 0
+    rasterizer.visible_filter(g, cam)
+    assert rasterizer.choices == {"plain": "painter", "SCORE_HITS": "counter", "VISIBLE_FILTER": "reference"}
+
+
+def test_gradients_are_asked_for_only_where_they_are_recorded(plugins, scene):
+    plugins.install("painter")
+    g, cam = scene
+    g.means.requires_grad_()
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    assert rasterizer.render(g, cam, RasterOptions()).image.requires_grad
+    with torch.no_grad():
+        rasterizer.render(g, cam, RasterOptions())
+    assert rasterizer.choices == {"BACKWARD": "reference", "plain": "painter"}
+
+
+def test_preferred_names_go_first_in_their_order(plugins, scene):
+    for name, speed in (("a", 9), ("b", 1), ("c", 5)):
+        plugins.install(name, speed=speed)
+    for prefer, expected in ((["b", "c"], "b"), (["c", "b"], "c"), (["reference"], "reference"), ([], "a")):
+        rasterizer = NegotiatedRasterizer(plugins, device="cpu", prefer=prefer)
+        rasterizer.render(*scene, RasterOptions())
+        assert rasterizer.choices == {"plain": expected}
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu", prefer=["b"], suggested=["missing", "c"], forbid=["b"])
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "c"}
+
+
+def test_unknown_names_are_errors_with_a_suggestion(plugins, monkeypatch):
+    plugins.install("standard")
+    for arguments in ({"prefer": ["standart"]}, {"forbid": ["standart"]}):
+        with pytest.raises(PluginError, match="did you mean 'standard'"):
+            NegotiatedRasterizer(plugins, device="cpu", **arguments)
+    monkeypatch.setenv("SW_RASTERIZER", "standart")
+    with pytest.raises(PluginError, match="did you mean 'standard'"):
+        NegotiatedRasterizer(plugins, device="cpu")
+
+
+def test_environment_takes_one_rasterizer_or_fails(plugins, scene, monkeypatch):
+    plugins.install("fast", speed=9)
+    plugins.install("odd", exactness="approx-fp16", speed=1)
+    monkeypatch.setenv("SW_RASTERIZER", "odd")
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "odd"}
+    with pytest.raises(CapabilityError, match="NORMALS"):
+        rasterizer.render(*scene, RasterOptions(normals=True))
+
+
+def test_approximate_results_must_be_accepted(plugins, scene):
+    plugins.install("half", exactness="approx-fp16", speed=50)
+    default = NegotiatedRasterizer(plugins, device="cpu")
+    default.render(*scene, RasterOptions())
+    lenient = NegotiatedRasterizer(plugins, device="cpu", exactness=("exact", "approx-fp16"))
+    lenient.render(*scene, RasterOptions())
+    assert (default.choices["plain"], lenient.choices["plain"]) == ("reference", "half")
+
+
+def test_forbidden_combinations_are_respected(plugins, scene):
+    plugins.install("either", "ALPHA_MAP", "DEPTH_MEDIAN", combos_forbidden=[["ALPHA_MAP", "DEPTH_MEDIAN"]])
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions(alpha=True))
+    rasterizer.render(*scene, RasterOptions(alpha=True, depth=frozenset({"median"})))
+    assert rasterizer.choices == {"ALPHA_MAP": "either", "ALPHA_MAP+DEPTH_MEDIAN": "reference"}
+
+
+def test_other_devices_are_not_candidates(plugins, scene):
+    plugins.install("gpu", devices=["cuda"], speed=99)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "reference"}
+
+
+def test_an_error_names_what_is_missing_and_who_is_near(plugins, scene):
+    plugins.install("gpu", "NORMALS", devices=["cuda"])
+    plugins.install("absent", "NORMALS", available="negotiation_fakes:not_here")
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu", forbid=["reference"])
+    with pytest.raises(CapabilityError) as caught:
+        rasterizer.render(*scene, RasterOptions(normals=True, alpha=True))
+    message = str(caught.value)
+    assert "no rasterizer offers ALPHA_MAP + NORMALS on cpu" in message
+    assert "gpu (cuda) lacks ALPHA_MAP" in message
+    assert "reference (cpu/cuda) lacks NORMALS is forbidden" in message
+    assert caught.value.missing == {"ALPHA_MAP"}
+    with pytest.raises(CapabilityError, match="Not usable here: absent: needs a GPU"):
+        rasterizer.render(*scene, RasterOptions(normals=True))
+
+
+def warnings(caplog):
+    return [r.getMessage() for r in caplog.records if r.levelno >= logging.WARNING]
+
+
+@pytest.mark.parametrize("base", [FailsToBuild, FailsToBuildLater])
+def test_a_failed_build_falls_back_with_one_warning(plugins, scene, caplog, base):
+    plugins.install("native", "ALPHA_MAP", base=base, native="kernels:MODULE")
+    plugins.install("sibling", "ALPHA_MAP", base=base, speed=4, native="kernels:MODULE")
+    with caplog.at_level(logging.INFO):
+        for _ in range(2):
+            rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+            for options in (RasterOptions(), RasterOptions(alpha=True), RasterOptions()):
+                rasterizer.render(*scene, options)
+    assert rasterizer.choices == {"plain": "reference", "ALPHA_MAP": "reference"}
+    assert len(warnings(caplog)) == 1
+    assert REASON in warnings(caplog)[0]
+    assert "'reference'" in warnings(caplog)[0]
+
+
+def test_a_failed_build_is_told_even_if_another_fast_one_serves(plugins, scene, caplog):
+    plugins.install("native", base=FailsToBuild, speed=9)
+    plugins.install("other", speed=1)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "other"}
+    assert len(warnings(caplog)) == 1
+
+
+def test_what_cannot_run_here_is_skipped_and_told_if_only_the_oracle_remains(plugins, scene, caplog):
+    plugins.install("absent", available="negotiation_fakes:not_here", speed=9)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "reference"}
+    assert len(warnings(caplog)) == 1
+    assert NOT_HERE in warnings(caplog)[0]
+    plugins.install("other", speed=1)
+    caplog.clear()
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "other"}
+    assert warnings(caplog) == []
+
+
+def test_a_probe_that_raises_counts_as_a_reason(plugins, scene):
+    plugins.install("absent", available="negotiation_fakes:broken_probe", speed=9)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "reference"}
+
+
+def test_forced_rasterizer_that_cannot_be_built_is_an_error(plugins, scene, monkeypatch):
+    plugins.install("native", base=FailsToBuild)
+    monkeypatch.setenv("SW_RASTERIZER", "native")
+    with pytest.raises(NativeBuildError):
+        NegotiatedRasterizer(plugins, device="cpu").render(*scene, RasterOptions())
+
+
+def test_a_choice_is_logged_once_per_request(plugins, scene, caplog):
+    plugins.install("fast")
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    with caplog.at_level(logging.INFO):
+        for _ in range(3):
+            rasterizer.render(*scene, RasterOptions())
+    assert [r.getMessage() for r in caplog.records] == ["plain on cpu: rasterizer 'fast' (tight)"]
+
+
+@pytest.mark.parametrize("storage", [{"color": "split"}, {"color": "indexed"}, {"geometry": "indexed"}])
+def test_storage_forms_are_rewritten_for_a_fast_rasterizer(plugins, storage):
+    """The oracle offers them all, but a fast rasterizer behind an adapter goes before it."""
+    fake = plugins.install("fast", "BACKWARD")
+    g, cam = draw_scene(RasterCase(**storage), 0, torch.float32)
+    found = []
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    for r in (rasterizer, ReferenceRasterizer()):
+        leaves = {k: v.clone().requires_grad_() for k, v in g.tensors().items() if v.is_floating_point()}
+        drawn = with_tensors(g, leaves)
+        result = r.render(drawn, cam, RasterOptions())
+        assert result.inputs is drawn
+        found.append([result.image, *torch.autograd.grad(result.image.square().sum(), list(leaves.values()))])
+    assert fake.calls == 1
+    assert set(rasterizer.choices.values()) == {"fast"}
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("features", [0, 2])
+def test_depth_and_alpha_are_composed_from_features(plugins, features):
+    fake = plugins.install("fast", "BACKWARD", "EXTRA_FEATURES")
+    g, cam = draw_scene(RasterCase(color="colors", features=features), 0, torch.float32)
+    g.means[0] = -10 * cam.R[2]  # behind the camera: z and 1/z of a culled Gaussian must do no harm
+    options = RasterOptions(alpha=True, depth=frozenset({"inverse", "expected"}))
+    found = []
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    for r in (rasterizer, ReferenceRasterizer()):
+        means = g.means.clone().requires_grad_()
+        result = r.render(replace(g, means=means), cam, options)
+        assert set(result.depth) == {"inverse", "expected"}
+        assert (result.features is None) == (features == 0)
+        maps = [result.image, result.alpha, *(result.depth[m] for m in sorted(result.depth))]
+        maps += [] if result.features is None else [result.features]
+        loss = sum(m.square().sum() for m in maps)
+        found.append([*maps, *torch.autograd.grad(loss, means)])
+    assert fake.calls == 1
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)  # expected depth divides by alphas down to 0.004
+
+
+def test_median_depth_is_not_composed(plugins, scene):
+    plugins.install("fast", "EXTRA_FEATURES")
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions(depth=frozenset({"median"})))
+    assert rasterizer.choices == {"DEPTH_MEDIAN": "reference"}
+
+
+def test_visible_filter_needs_no_colour_feature(plugins):
+    plugins.install("fast", "VISIBLE_FILTER")
+    g, cam = draw_scene(RasterCase(color="split", features=2), 0, torch.float32)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    assert torch.equal(rasterizer.visible_filter(g, cam), ReferenceRasterizer().visible_filter(g, cam))
+    assert rasterizer.choices == {"VISIBLE_FILTER": "fast"}
+
+
+def test_unknown_declared_feature_is_an_error(plugins):
+    with pytest.raises(PluginError, match="TELEPORT"):
+        plugins.install("odd", "TELEPORT")
+
+
+def test_negotiated_info_is_the_union(plugins):
+    plugins.install("fast", "NORMALS")
+    info = NegotiatedRasterizer(plugins, device="cpu").info
+    assert {"NORMALS", "BACKWARD"} <= info.features
+    assert info.features <= {f.name for f in Feature}
