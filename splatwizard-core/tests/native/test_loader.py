@@ -353,6 +353,45 @@ def test_kernels_see_their_namespace_and_no_torch_header(package):
     assert call(package.module(kernels=("level.cpp",)).build()) in (2, 3, 4)
 
 
+CUDA_KERNEL = """
+#include "value.h"
+#ifndef SW_WITH_CUDA
+#error "not told about CUDA"
+#endif
+__global__ void fill(int* out) { out[threadIdx.x] = VALUE; }
+"""
+
+
+def test_cuda_sources_are_left_out_without_cuda_in_torch(package):
+    import torch
+
+    if torch.version.cuda is not None:
+        pytest.skip("this torch has CUDA")
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",))
+    assert module.key("native") == package.module().key("native")
+    assert module.state()["target"] == "cpu"
+
+
+@needs_compiler
+@pytest.mark.skipif(toolchain.find_nvcc() is None, reason="no CUDA compiler on this machine")
+def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, tmp_path):
+    import torch
+
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",))
+    before = module.key("native")
+    monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0")
+    assert module.state()["target"] == "cuda"
+    assert module.key("native") != before
+    (job,) = [job for job in module._jobs("native", tmp_path) if job.cuda]
+    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=sm_90"} <= set(job.flags)
+    toolchain.Toolchain().compile([job], tmp_path / "log")
+    assert job.output.stat().st_size > 0
+    assert (package.folder / "value.h") in toolchain.read_dependencies(Path(f"{job.output}.d"))
+
+
 def test_an_unknown_march_is_refused(package):
     with pytest.raises(ValueError, match="march is 'fast'"):
         package.module().build(march="fast")

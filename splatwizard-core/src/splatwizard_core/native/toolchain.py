@@ -211,4 +211,7 @@ def read_dependencies(path: Path) -> list[Path]:
 
 
 def _cuda_home(nvcc: str) -> Path:
-    return Path(nvcc).resolve().parent.parent
+    """The toolkit's folder; an nvcc on the PATH may be a script that stands elsewhere."""
+    beside = Path(nvcc).resolve().parent.parent
+    homes = [beside, Path("/usr/local/cuda")]
+    return next((home for home in homes if (home / "include" / "cuda_runtime.h").is_file()), beside)
