@@ -41,7 +41,7 @@ def rounded_counts(counts: np.ndarray) -> np.ndarray:
 def pack_tables(tables: Sequence[np.ndarray]) -> bytes:
     """Store several count tables; the reader must know their lengths.
 
-    varint M, M bytes of meta counts (as codes), varint length, range-coded differences, u32 CRC-32 of them.
+    The meta counts, varint length, range-coded differences, u32 CRC-32 of them.
     """
     codes = [count_codes(t) for t in tables]
     if not sum(len(c) for c in codes):
@@ -54,8 +54,7 @@ def pack_tables(tables: Sequence[np.ndarray]) -> bytes:
     coded = writer.finish()
     return b"".join(
         [
-            write_varint(len(meta)),
-            meta.astype(np.uint8).tobytes(),
+            _pack_meta(meta),
             write_varint(len(coded)),
             coded,
             writer.crc.to_bytes(4, "little"),
@@ -68,9 +67,7 @@ def unpack_tables(reader: ByteReader, sizes: Sequence[int]) -> list[np.ndarray]:
     total = sum(sizes)
     if not total:
         return [np.empty(0, np.int64) for _ in sizes]
-    meta = np.frombuffer(reader.take(reader.varint(MAX_META)), np.uint8)
-    if not meta.any() or meta.max() > MAX_CODE:
-        raise BitstreamError("the table of tables is empty or out of range")
+    meta = _unpack_meta(reader)
     coded = reader.take(reader.varint(reader.left))
     symbols = SymbolReader(coded)
     differences = symbols.get(total, Table(code_counts(meta)))
@@ -82,6 +79,35 @@ def unpack_tables(reader: ByteReader, sizes: Sequence[int]) -> list[np.ndarray]:
             raise BitstreamError("a stored count is out of range")
         tables.append(code_counts(codes))
     return tables
+
+
+def _pack_meta(meta: np.ndarray) -> bytes:
+    """varint 2 M, then a byte of count code for each of M entries; or, if shorter, varint 2 U + 1, then for each of the
+    U entries in use the varint of how many unused ones precede it, and its byte.
+    """
+    used = np.flatnonzero(meta)
+    dense = write_varint(2 * len(meta)) + meta.astype(np.uint8).tobytes()
+    sparse = write_varint(2 * len(used) + 1)
+    for gap, code in zip(np.diff(used, prepend=-1) - 1, meta[used], strict=True):
+        sparse += write_varint(int(gap)) + bytes([int(code)])
+    return min(dense, sparse, key=len)
+
+
+def _unpack_meta(reader: ByteReader) -> np.ndarray:
+    count = reader.varint(2 * MAX_META + 1)
+    if count % 2 == 0:
+        meta = np.frombuffer(reader.take(count // 2), np.uint8)
+    else:
+        meta, position = np.zeros(MAX_META, np.uint8), -1
+        for _ in range(count // 2):
+            position += reader.varint(MAX_META) + 1
+            if position >= MAX_META:
+                raise BitstreamError("the table of tables is too long")
+            meta[position] = reader.integer(1)
+        meta = meta[: position + 1]  # the length of a table is part of its model
+    if not meta.any() or meta.max() > MAX_CODE:
+        raise BitstreamError("the table of tables is empty or out of range")
+    return meta
 
 
 def table_bits(codes: np.ndarray) -> float:
