@@ -21,6 +21,8 @@ from splatwizard_core.scene.loaders.colmap_model import (
     write_model,
 )
 
+PINHOLE = ColmapCamera(1, "PINHOLE", 32, 24, (30.0, 30.0, 16.0, 12.0))
+
 
 @dataclass
 class ColmapFolder:
@@ -28,7 +30,7 @@ class ColmapFolder:
 
     root: Path
     names: list[str] = field(default_factory=lambda: [f"{i:03d}.png" for i in range(10)])
-    camera: ColmapCamera = ColmapCamera(1, "PINHOLE", 32, 24, (30.0, 30.0, 16.0, 12.0))
+    camera: ColmapCamera = PINHOLE
     picture_size: tuple[int, int] = (32, 24)
     num_points: int = 5
     text: bool = False

@@ -121,10 +121,12 @@ def test_flipped_bytes_are_read_or_refused_and_never_crash(part, data):
         for _ in range(data.draw(st.integers(1, 4))):
             spoilt[data.draw(st.integers(0, len(spoilt) - 1))] ^= data.draw(st.integers(1, 255))
         path.write_bytes(spoilt)
+        outcome = ""
         try:
             READERS[part](path)
         except SceneError as error:
-            assert str(path) in str(error)
+            outcome = str(error)
+        assert outcome == "" or str(path) in outcome
 
 
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D"])

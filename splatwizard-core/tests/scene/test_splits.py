@@ -41,7 +41,7 @@ def test_every_n_is_a_partition(count, n):
 
 @pytest.mark.parametrize("rule", ["every", "every-1", "lod", "lod:x", "some", "", "every8 ", "every99999999999"])
 def test_an_unknown_rule_is_refused_with_what_there_is(rule):
-    with pytest.raises(SceneError, match="unknown split .*'every<n>'"):
+    with pytest.raises(SceneError, match=r"unknown split .*'every<n>'"):
         split_views(range(10), rule)
 
 

@@ -161,8 +161,8 @@ def camera_rays(camera: Camera, *, dx: float = 0.5, dy: float = 0.5) -> tuple[Ve
     gx, gy = gx.ravel(), gy.ravel()
     scale = 1 / np.sqrt(gx * gx + gy * gy + 1)
     R = camera.R.double().cpu().numpy()
-    d = np.stack([(R[0, i] * gx + R[1, i] * gy + R[2, i]) * scale for i in range(3)])
-    return d, scale
+    d = np.stack([R[0, i] * gx + R[1, i] * gy + R[2, i] for i in range(3)])
+    return normalize(d), scale  # normalised anew: a float32 rotation keeps lengths to 1e-7 only
 
 
 def draw(world: World, camera: Camera, *, samples: int, background: float) -> NDArray[np.uint8]:

@@ -63,7 +63,11 @@ def build_world(seed: int = 0) -> World:
     floor = Cylinder((0.0, 0.0, -0.06), r=FLOOR_RADIUS, half_height=0.06)
     ring_tube, ring = 0.13, 0.40
     solids = [
-        Solid(floor, Material(planks((0.62, 0.42, 0.24), (0.30, 0.17, 0.08), width=0.23, seed=first)), casts_shadow=False),
+        Solid(
+            floor,
+            Material(planks((0.62, 0.42, 0.24), (0.30, 0.17, 0.08), width=0.23, seed=first)),
+            casts_shadow=False,
+        ),
         Solid(
             Sphere(place(-0.05, 0.05, 0.52), turn(), r=0.52),
             Material(marble((0.85, 0.83, 0.78), (0.05, 0.22, 0.30), scale=1.5, seed=first + 10), 0.55, 6, 0.06),
@@ -149,17 +153,18 @@ def sample_surfaces(world: World, count: int, generator: torch.Generator) -> tup
     """`count` points on the visible side of the surfaces: xyz [3,n], normals [3,n] and index of the solid [n].
 
     By area within a solid; among solids by the square root of the area, so that small ones get their share.
-    Points inside another solid, or under the stage, are left out.
+    Points inside or against another solid, or under the stage, are left out.
     """
     share = np.sqrt([solid.shape.area for solid in world.solids])
     wanted = np.floor(2.2 * count * share / share.sum()).astype(int) + 8
     points, which = [], []
     for i, solid in enumerate(world.solids):
         p = solid.shape.to_world(solid.shape.sample(int(wanted[i]), generator))
+        before = p + 1e-4 * world.normals(p, np.full(p.shape[1], i))  # open air, if the surface shows
         keep = p[2] > -1e-9
         for j, other in enumerate(world.solids):
             if j != i:
-                keep &= ~other.shape.contains(other.shape.to_local(p))
+                keep &= ~other.shape.contains(other.shape.to_local(before))
         points.append(p[:, keep])
         which.append(np.full(int(keep.sum()), i))
     xyz, index = np.concatenate(points, axis=1), np.concatenate(which)
