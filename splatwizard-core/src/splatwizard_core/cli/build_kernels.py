@@ -8,7 +8,7 @@ from splatwizard_core.cli.options import console, debug_option, json_option, opt
 from splatwizard_core.cli.setup import say
 
 
-@click.command("build-kernels")
+@click.command("build-kernels", short_help="compile all native modules ahead of time")
 @options(
     click.option(
         "--portable", is_flag=True,

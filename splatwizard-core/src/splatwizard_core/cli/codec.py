@@ -23,7 +23,7 @@ from splatwizard_core.cli.options import (
 from splatwizard_core.cli.setup import existing, open_session, resolve_one, resolve_run_options
 
 
-@click.command()
+@click.command(short_help="a trained model to one file")
 @click.argument("source", metavar="SOURCE")
 @options(
     click.option("--out", metavar="FILE", help="The file to write.  [default: scene.swz beside SOURCE]"),
@@ -66,7 +66,7 @@ def encode(
         click.echo(f"{facts['bytes']:,} bytes in {facts['encode_s']:.2f} s: {target}")
 
 
-@click.command()
+@click.command(short_help="a file back to a model, from nothing but itself")
 @click.argument("file", metavar="FILE.swz")
 @options(
     click.option(

@@ -10,12 +10,12 @@ from splatwizard_core.cli.options import assignments, debug_option, json_option,
 from splatwizard_core.cli.setup import resolve_run_options, say
 
 
-@click.group()
+@click.group(short_help="scenes on disk")
 def data() -> None:
     """Scenes on disk."""
 
 
-@data.command()
+@data.command(short_help="write the procedural demo scene")
 @click.argument("out", metavar="OUT")
 @options(
     click.option(

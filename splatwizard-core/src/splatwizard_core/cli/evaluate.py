@@ -24,7 +24,7 @@ from splatwizard_core.cli.options import (
 from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
 
 
-@click.command("eval")
+@click.command("eval", short_help="quality, speed and memory of an encoded scene")
 @click.argument("file", metavar="FILE")
 @options(
     scene_option, images_option, config_option, set_option,

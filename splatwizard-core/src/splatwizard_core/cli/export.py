@@ -10,7 +10,7 @@ from splatwizard_core.cli.options import assignments, debug_option, device_optio
 from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
 
 
-@click.command()
+@click.command(short_help=".ply and other interchange formats")
 @click.argument("file", metavar="FILE")
 @click.argument("out", metavar="OUT")
 @options(

@@ -19,7 +19,7 @@ from splatwizard_core.cli.options import (
 )
 
 
-@click.command()
+@click.command(short_help="what is in a file or scene")
 @click.argument("path", metavar="PATH")
 @options(images_option, set_option, json_option, debug_option)
 def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) -> None:

@@ -9,7 +9,7 @@ import click
 from splatwizard_core.cli.options import console, debug_option, json_option, options, print_json
 
 
-@click.command("list-plugins")
+@click.command("list-plugins", short_help="what is installed, what is broken and why")
 @options(json_option, debug_option)
 @click.pass_context
 def list_plugins(ctx: click.Context, as_json: bool) -> None:

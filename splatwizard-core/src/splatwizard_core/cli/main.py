@@ -8,7 +8,6 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import Any
 
 import click
 
@@ -123,10 +122,12 @@ def _report(error: BaseException, *, debug: bool) -> int:
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        _say("interrupted; the same command resumes")
+        _say("interrupted (the same command resumes a run)")
         return 130
     if isinstance(error, click.ClickException):
-        error.show()
+        context = getattr(error, "ctx", None)
+        hint = f" (`{context.command_path} --help`)" if context is not None and context.command_path != "sw" else ""
+        _say(f"error: {error.format_message()}{hint}")
         return error.exit_code
     if isinstance(error, SplatwizardError):
         _say(f"error: {error}")
@@ -139,8 +140,3 @@ def _report(error: BaseException, *, debug: bool) -> int:
 
 def _say(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
-
-
-def exit_with(status: Any) -> None:
-    """Leave the running command with this status."""
-    click.get_current_context().exit(status)

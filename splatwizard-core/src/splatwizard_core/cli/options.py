@@ -43,7 +43,9 @@ device_option = click.option(
     "--device", type=click.Choice(["auto", "cpu", "cuda"]),
     help="Where to compute.  [default: auto, which is CUDA if its kernels can run]",
 )  # fmt: skip
-seed_option = click.option("--seed", type=click.IntRange(min=0), help="Of every random stream.  [default: 0]")
+seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
+)
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")
 resume_option = click.option(

@@ -21,7 +21,7 @@ from splatwizard_core.cli.options import (
 from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
 
 
-@click.command()
+@click.command(short_help="draw an encoded scene as PNG")
 @click.argument("file", metavar="FILE")
 @options(
     scene_option, images_option, config_option, set_option,

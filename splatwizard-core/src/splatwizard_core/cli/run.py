@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from splatwizard_core.experiments.record import Record
 
 
-@click.command()
+@click.command(short_help="train, encode, decode, evaluate, report: one scene")
 @options(
     click.option(
         "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]",

@@ -19,7 +19,7 @@ from splatwizard_core.cli.options import (
 )
 
 
-@click.command()
+@click.command(short_help="a method's plan as a table")
 @click.argument("method")
 @options(
     preset_option, rate_option, config_option, set_option,

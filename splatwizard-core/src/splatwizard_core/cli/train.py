@@ -27,7 +27,7 @@ from splatwizard_core.cli.options import (
 from splatwizard_core.cli.setup import open_session, resolve_one
 
 
-@click.command()
+@click.command(short_help="train one method on one scene")
 @options(
     method_option, scene_option, images_option, rate_option, preset_option, config_option, set_option,
     click.option(

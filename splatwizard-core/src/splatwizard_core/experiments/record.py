@@ -35,6 +35,7 @@ class ProtocolBlock(Part):
     background: str
     principal_point: str
     quantize8: bool = Field(description="renders were rounded to 8 bit before comparing")
+    masked: bool = Field(description="pictures were multiplied by their masks")
 
 
 class MetricBlock(Part):
@@ -84,7 +85,9 @@ class TrainBlock(Part):
     steps: int | None
     peak_bytes: int | None
     memory_kind: Literal["cuda", "rss"] | None
-    breakdown_s: dict[str, float] | None = Field(description="seconds by part of a step, if profiled")
+    breakdown_s: dict[str, dict[str, float]] | None = Field(
+        description="stage -> part of a step -> seconds, if profiled"
+    )
     trained_in: str | None = Field(description="rate point whose training this one shares (its own, as a rule)")
 
 
@@ -134,7 +137,7 @@ class Record(Part):
     memory: MemoryBlock
     train: TrainBlock
     geometry: dict[str, float] | None = None
-    plan: str | None = Field(description="the executed plan, as printed")
+    plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
     environment: dict[str, Any]
     flags: list[str] = Field(description="fit, rss, ...")
@@ -172,7 +175,7 @@ def missing_reasons(record: Record) -> list[str]:
                 walk(inner, f"{name}.{key}" if name else key)
 
     content = record.model_dump()
-    for free in ("config", "environment", "unknown", "flags"):  # what they hold is described elsewhere
+    for free in ("config", "environment", "unknown", "flags", "plan"):  # what they hold is described elsewhere
         if content.get(free) is not None:
             content.pop(free)
     walk(content, "")

@@ -64,12 +64,11 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
         facts = steps.done("encode", encode_key)
         if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
             trained = train_in(session, request, directory)
+            steps = StepLog(directory)  # training has written into it
             facts = encode(make_method(session, resolved), trained.model, trained.facts["raster"], encoded)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             steps.finish("encode", encode_key, facts)
-        training = steps.done("train", train_key)
-        if training is None:
-            raise SplatwizardError(f"{directory}/steps.json changed while the run went on")
+        training = steps.done("train", train_key) or train_in(session, request, directory).facts
         decoded = _decode_step(session, steps, encoded, facts["sha256"])
         measured = _evaluate_step(session, steps, request, directory, facts["sha256"])
         if decoded["digest"] != measured["digest"]:

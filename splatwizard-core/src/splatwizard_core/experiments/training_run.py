@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.evaluation.evaluate import raster_header
+from splatwizard_core.evaluation.evaluate import evaluate, raster_header
 from splatwizard_core.experiments.config import ResolvedConfig, content_hash
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.experiments.session import Session, TrainedModel
@@ -116,8 +117,14 @@ def run_stages(
     method = make_method(session, resolved)
     stages = list(method.stages())
     ppl = resolved.ppl
-    prefer = [*ppl.raster.prefer, *dict.fromkeys(name for stage in stages for name in stage.prefer)]
-    rasterizer = NegotiatedRasterizer(session.plugins, device=session.device, prefer=prefer, forbid=ppl.raster.forbid)
+    suggested = list(dict.fromkeys(name for stage in stages for name in stage.prefer))
+    rasterizer = NegotiatedRasterizer(
+        session.plugins,
+        device=session.device,
+        prefer=ppl.raster.prefer,
+        forbid=ppl.raster.forbid,
+        suggested=suggested,
+    )
     before: dict[str, float] = {}
 
     def frozen(name: str) -> SplatModel:
@@ -127,6 +134,15 @@ def run_stages(
 
     def create_model() -> SplatModel:
         return method.create_model(scene, stream(ppl.seed, "init")).to(session.device)
+
+    def test_views(model: SplatModel, step: int) -> dict[str, float]:
+        """What the log keeps of an evaluation on the way."""
+        last = stages[-1]
+        options = replace(last.raster_options(last.iterations, scene.background), background=scene.background)
+        result = evaluate(
+            model, scene.test, rasterizer, session.plugins, options=options, label=f"evaluate at step {step:,}"
+        )
+        return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}
 
     outcome = train_stages(
         stages,
@@ -140,6 +156,8 @@ def run_stages(
         stop_after=stop_after,
         resume=resume,
         allow_changed_plan=allow_changed_plan,
+        evaluate=test_views,
+        log_path=directory / "log.jsonl",
     )
     background = scene.background
     last = stages[-1]

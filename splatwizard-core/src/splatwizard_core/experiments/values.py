@@ -112,7 +112,7 @@ def _json(text: str) -> Any:
 def _sequence(kind: Any, text: str) -> list[Any]:
     arguments = [a for a in typing.get_args(kind) if a is not Ellipsis]
     stripped = text.strip()
-    if stripped[:1] in "[(" and stripped[-1:] in ("]", ")"):
+    if _is_bracketed(stripped):
         stripped = stripped[1:-1].strip()
     parts = _split(stripped)
     if not arguments:
@@ -121,6 +121,16 @@ def _sequence(kind: Any, text: str) -> list[Any]:
     if len(each) != len(parts):
         raise ValueError(f"expected {len(each)} values, separated by commas")
     return [parse_text(a, p.strip().strip("\"'")) for a, p in zip(each, parts, strict=True)]
+
+
+def _is_bracketed(text: str) -> bool:
+    """Whether the first character opens a bracket that the last one closes."""
+    depth = 0
+    for i, character in enumerate(text):
+        depth += (character in "[(") - (character in ")]")
+        if depth == 0:
+            return i == len(text) - 1 and i > 0
+    return False
 
 
 def _split(text: str) -> list[str]:

@@ -1,0 +1,101 @@
+"""The result record: its schema, its nulls, and what is said of a damaged one."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from splatwizard_core.errors import UserInputError
+from splatwizard_core.experiments.record import Record, missing_reasons, read_record
+from splatwizard_core.experiments.results import collect_records
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    """A complete record as plain values."""
+    found: dict[str, Any] = {
+        "method": "toy", "method_version": 1, "distribution": "sw-toy 0.1", "preset": "paper", "rate": "r1",
+        "config": {"config": {"iterations": 3}}, "config_hash": "00", "dataset": "demo", "scene": "demo",
+        "protocol": {
+            "id": "demo/i/r-1/every8/black/pp-center/q8", "dataset": "demo", "images": "i", "resolution": -1,
+            "split": "every8", "background": "black", "principal_point": "center", "quantize8": True, "masked": False,
+        },
+        "train_views": 7, "test_views": 1, "views": ["a.png"],
+        "metrics": {"psnr": {"mean": 30.0, "per_view": [30.0], "direction": "higher"}},
+        "file": {"bytes": 12, "sha256": "00", "sections": {"header": 12}, "digest": "00"},
+        "counts": {"num_gaussians": 1}, "visible_gaussians": 0.5,
+        "codec": {
+            "encode_s": 0.1, "decode_s": 0.2, "decode_runs_s": [0.2], "first_decode_s": 0.3, "peak_decode_bytes": 1,
+            "memory_kind": "rss",
+        },
+        "speed": {
+            "fps": 10.0, "latency_ms_median": 100.0, "latency_ms_p95": 120.0, "prepare_s": 0.0, "frames": 1,
+            "rounds": 1, "views": 1, "warmup_frames": 10, "image_size": [4, 3],
+        },
+        "memory": {"kind": "rss", "model_bytes": 1, "peak_render_bytes": 2, "peak_reserved_bytes": None},
+        "train": {
+            "train_s": 1.0, "stages": [{"name": "toy", "seconds": 1.0}], "with_pretraining_s": 1.0, "steps": 3,
+            "peak_bytes": 5, "memory_kind": "rss", "breakdown_s": None, "trained_in": "r1",
+        },
+        "plan": [], "rasterizers": {"train": {"BACKWARD": "reference"}}, "environment": {"python": "3"},
+        "flags": ["rss"],
+        "unknown": {
+            "memory.peak_reserved_bytes": "a CPU has none", "train.breakdown_s": "not profiled",
+            "geometry": "not asked for",
+        },
+        "date": "2026-01-01T00:00:00+00:00",
+    }  # fmt: skip
+    return {**found, **changes}
+
+
+def test_a_record_survives_its_file(tmp_path: Path):
+    record = Record.model_validate(content())
+    record.write(tmp_path / "metrics.json")
+    assert read_record(tmp_path / "metrics.json") == record
+    assert json.loads((tmp_path / "metrics.json").read_text())["schema_version"] == 1
+
+
+def test_every_null_has_its_reason():
+    assert missing_reasons(Record.model_validate(content())) == []
+    without = Record.model_validate(content(unknown={"train.breakdown_s": "not profiled"}))
+    assert missing_reasons(without) == ["memory.peak_reserved_bytes", "geometry"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"unheard_of": 1},
+        {"schema_version": 2},
+        {"visible_gaussians": float("nan")},
+        {"file": {"bytes": 0, "sha256": "", "sections": {}, "digest": ""}},
+        {"metrics": {"psnr": {"mean": 1.0, "per_view": [], "direction": "up"}}},
+    ],
+)
+def test_what_is_not_in_the_schema_is_refused(change: dict[str, Any]):
+    with pytest.raises(ValidationError):
+        Record.model_validate(content(**change))
+
+
+def test_a_damaged_record_is_named_with_its_field(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    damaged = content()
+    del damaged["file"]["bytes"]
+    path.write_text(json.dumps(damaged))
+    with pytest.raises(UserInputError, match=r"not a result record of schema 1: file\.bytes: Field required"):
+        read_record(path)
+    path.write_text("{")
+    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
+        read_record(path)
+
+
+def test_records_are_collected_from_a_tree_in_order_of_size(tmp_path: Path):
+    for folder, size in (("b", 5), ("a", 9)):
+        (tmp_path / folder).mkdir()
+        file = {"bytes": size, "sha256": "00", "sections": {"header": size}, "digest": "00"}
+        Record.model_validate(content(file=file)).write(tmp_path / folder / "metrics.json")
+    assert [r.file.bytes for r in collect_records(tmp_path)] == [5, 9]
+    assert [r.file.bytes for r in collect_records(tmp_path / "a")] == [9]
+    (tmp_path / "none").mkdir()
+    with pytest.raises(UserInputError, match=r"no metrics\.json under"):
+        collect_records(tmp_path / "none")
