@@ -19,6 +19,7 @@ from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.model import GaussianModel, logit
 from splatwizard_core.training.params import Params
 from sw_3dgs.attributes import BASE_COLUMNS, Steps, Values, dequantize, quantize
+from sw_3dgs.band_context import MAX_CLASSES, activity_classes, decode_band, encode_band, suitable_classes
 from sw_3dgs.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ FAINTEST = logit(1 / 255)
 """Rasterizers skip a splat whose alpha is below 1/255, and alpha never exceeds the opacity."""
 
 SECTIONS = {"color": (0, 3), "opacity": (3, 4), "scales": (4, 7), "quats": (7, 10)}
-"""Columns of the attribute matrix by section; SH bands 1 to 3 have one section each."""
+"""Columns of the attribute matrix by section; SH bands 1 to 3 follow with one section each."""
 
 
 class Layout(Params):
@@ -50,6 +51,7 @@ class Layout(Params):
     opacity_step: float = Field(gt=0, le=1e3)
     scale_step: float = Field(gt=0, le=1e3)
     quat_step: float = Field(gt=0, le=1e3)
+    sh_classes: int = Field(ge=1, le=MAX_CLASSES)
 
     @property
     def grid(self) -> PositionGrid:
@@ -68,8 +70,11 @@ def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins:
     writer.static.update(layout.model_dump(mode="json"))
     writer.add("positions", octree.encode(cells, layout.position_bits))
     columns = plugins.entropy_models.load("columns")()
-    for name, (start, stop) in _sections(layout.active_sh_degree).items():
+    for name, (start, stop) in SECTIONS.items():
         writer.add(name, columns.encode(symbols[:, start:stop], None))
+    for band, start, stop in _bands(layout):
+        classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
+        writer.add(f"sh{band}", encode_band(columns, symbols[:, start:stop], classes, count))
 
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
@@ -83,11 +88,15 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
             raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
     columns = plugins.entropy_models.load("columns")()
-    parts = []
-    for name, (start, stop) in _sections(layout.active_sh_degree).items():
+    symbols = np.empty((n, BASE_COLUMNS + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int64)
+    for name, (start, stop) in SECTIONS.items():
         with reader.decoding(name) as data:
-            parts.append(columns.decode(data, (n, stop - start)))
-    model = reconstruct(layout, cells, np.concatenate(parts, axis=1))
+            symbols[:, start:stop] = columns.decode(data, (n, stop - start))
+    for band, start, stop in _bands(layout):
+        classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
+        with reader.decoding(f"sh{band}") as data:
+            symbols[:, start:stop] = decode_band(columns, data, classes, count, stop - start)
+    model = reconstruct(layout, cells, symbols)
     for name, parameter in model.named_parameters():
         if not bool(torch.isfinite(parameter).all()):
             raise BitstreamError(f"{reader.name}: decoded '{name}' is not finite: the file is damaged or hostile")
@@ -134,6 +143,7 @@ def lattice(
         opacity_step=codec.opacity_step,
         scale_step=codec.scale_step,
         quat_step=codec.quat_step,
+        sh_classes=suitable_classes(len(order)),
     )
     return layout, cells[order], quantize(values, layout.steps, deadzone=codec.rest_deadzone)
 
@@ -157,13 +167,19 @@ def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.in
     )
 
 
-def _sections(degree: int) -> dict[str, tuple[int, int]]:
-    """Columns of each section, SH bands up to `degree`."""
-    sections = dict(SECTIONS)
-    for band in range(1, degree + 1):
-        start, stop = (BASE_COLUMNS + 3 * (k * k - 1) for k in (band, band + 1))
-        sections[f"sh{band}"] = (start, stop)
-    return sections
+def _bands(layout: Layout) -> list[tuple[int, int, int]]:
+    """(band, first column, end) of the SH bands that are stored."""
+    return [
+        (band, BASE_COLUMNS + 3 * (band**2 - 1), BASE_COLUMNS + 3 * ((band + 1) ** 2 - 1))
+        for band in range(1, layout.active_sh_degree + 1)
+    ]
+
+
+def _classes(layout: Layout, band: int, lower: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Class of each row for one band, and how many classes; the first band has nothing to go by."""
+    if band == 1:
+        return np.zeros(len(lower), dtype=np.int64), 1
+    return activity_classes(lower, layout.sh_classes), layout.sh_classes
 
 
 def _layout(reader: ContainerReader) -> Layout:

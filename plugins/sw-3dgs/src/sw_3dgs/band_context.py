@@ -1,0 +1,68 @@
+"""Higher SH bands with one set of statistics for each class of activity.
+
+A Gaussian whose lower bands are large has large higher bands too, and one that few views saw has none. So rows are
+classed by the sum of magnitudes of the bands already coded, in classes of about equal size, and each class is coded
+with its own statistics. It is integer arithmetic on decoded symbols; only the number of classes is transmitted.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatwizard_core.errors import BitstreamError
+
+MAX_CLASSES = 16
+ROWS_PER_CLASS = 2048
+"""A class must repay its count tables, about 100 bytes for each of up to 21 columns."""
+
+
+def suitable_classes(rows: int) -> int:
+    """How many classes pay for this many Gaussians: a power of two, 1 .. 8."""
+    count = 1
+    while count < 8 and rows >= 2 * count * ROWS_PER_CLASS:
+        count *= 2
+    return count
+
+
+def activity_classes(lower: NDArray[np.int64], count: int) -> NDArray[np.int64]:
+    """Class 0 .. count - 1 of each row of the symbols [N,C] of lower bands, by the sum of magnitudes."""
+    activity = np.abs(lower).sum(axis=1)
+    ordered = np.sort(activity)
+    limits = ordered[[len(ordered) * i // count for i in range(1, count)]] if len(ordered) else ordered
+    return np.searchsorted(limits, activity, side="right")
+
+
+def encode_band(columns: Any, symbols: NDArray[np.int64], classes: NDArray[np.int64], count: int) -> bytes:
+    """u32 byte length of each class, then the classes; an empty class has no bytes.
+
+    columns     the entropy model for integer matrices
+    """
+    parts = []
+    for k in range(count):
+        rows = symbols[classes == k]
+        parts.append(columns.encode(rows, None) if len(rows) else b"")
+    return struct.pack(f"<{count}I", *map(len, parts)) + b"".join(parts)
+
+
+def decode_band(columns: Any, data: bytes, classes: NDArray[np.int64], count: int, width: int) -> NDArray[np.int64]:
+    """Symbols [N,width]. Raises BitstreamError."""
+    start = 4 * count
+    if len(data) < start:
+        raise BitstreamError(f"{len(data)} bytes cannot hold the lengths of {count} classes")
+    lengths = struct.unpack_from(f"<{count}I", data)
+    if start + sum(lengths) != len(data):
+        raise BitstreamError(f"{len(data):,} bytes, the class lengths say {start + sum(lengths):,}")
+    symbols = np.empty((len(classes), width), dtype=np.int64)
+    for k, length in enumerate(lengths):
+        rows = classes == k
+        found = int(rows.sum())
+        if (found == 0) != (length == 0):
+            raise BitstreamError(f"class {k} has {found:,} rows, but {length:,} bytes")
+        if found:
+            symbols[rows] = columns.decode(data[start : start + length], (found, width))
+        start += length
+    return symbols
