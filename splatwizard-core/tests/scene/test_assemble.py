@@ -89,8 +89,8 @@ def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
 
 def test_a_resized_camera_keeps_its_field_of_view():
     small = CAMERA.resized(16, 8)
-    assert (small.fov_x, small.fov_y) == (CAMERA.fov_x, CAMERA.fov_y)
-    assert (small.fx, small.fy, small.cx, small.cy) == (15.0, 31.0 / 3, 8.0, 4.0)
+    assert (small.fov_x, small.fov_y) == pytest.approx((CAMERA.fov_x, CAMERA.fov_y), rel=1e-12)
+    assert (small.fx, small.fy, small.cx, small.cy) == pytest.approx((15.0, 31 / 3, 8.0, 4.0))
     torch.testing.assert_close(small.K, torch.tensor([[15.0, 0, 8], [0, 31 / 3, 4], [0, 0, 1]]))
     assert CAMERA.to(torch.device("cpu")) is CAMERA
     assert CAMERA.to(dtype=torch.float64).viewmat.dtype == torch.float64

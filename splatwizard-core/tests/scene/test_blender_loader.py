@@ -62,6 +62,19 @@ def test_an_all_transparent_picture_is_all_white_truth(blender_folder, load):
     assert not scene.train[0].mask.any()
 
 
+def test_legacy_compositing_truncates_to_8_bit_and_is_part_of_the_protocol(blender_folder, load):
+    root = blender_folder()
+    Image.new("RGBA", (20, 10), (90, 10, 20, 128)).save(root / "train" / "r_0.png")
+    exact, legacy = load(root), load(root, legacy_8bit_composite=True)
+    expected = [(c * 128 + 255 * 127) / 255 for c in (90, 10, 20)]
+    truth = exact.train[0].image(exact.background)[:, 0, 0] * 255
+    torch.testing.assert_close(truth, torch.tensor(expected), atol=1e-4, rtol=0)
+    assert legacy.train[0].pixels[:, 0, 0].tolist() == [int(c) for c in expected]
+    assert legacy.train[1].pixels.unique().tolist() == [255]
+    assert legacy.protocol.id.endswith("/composite8")
+    assert load(root, legacy_8bit_composite=True, background="black").train[1].pixels.max() == 0
+
+
 def test_start_points_fill_the_cube_with_near_grey_and_follow_the_seed(blender_folder, load):
     root = blender_folder()
     points = load(root).points

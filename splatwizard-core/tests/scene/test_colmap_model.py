@@ -109,14 +109,15 @@ def test_a_binary_file_cut_at_any_byte_names_itself_and_the_offset(colmap_folder
         READERS[part](path)
 
 
+@pytest.mark.parametrize("suffix", ["bin", "txt"])
 @pytest.mark.parametrize("part", ["cameras", "images", "points3D"])
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(data=st.data())
-def test_flipped_bytes_are_read_or_refused_and_never_crash(part, data):
+def test_flipped_bytes_are_read_or_refused_and_never_crash(part, suffix, data):
     with tempfile.TemporaryDirectory() as folder:
         model = data.draw(models())
-        write_model(model, Path(folder))
-        path = Path(folder) / f"{part}.bin"
+        write_model(model, Path(folder), text=suffix == "txt")
+        path = Path(folder) / f"{part}.{suffix}"
         spoilt = bytearray(path.read_bytes())
         for _ in range(data.draw(st.integers(1, 4))):
             spoilt[data.draw(st.integers(0, len(spoilt) - 1))] ^= data.draw(st.integers(1, 255))

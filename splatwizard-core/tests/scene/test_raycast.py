@@ -61,6 +61,14 @@ def test_a_hit_is_the_first_entry_into_the_solid(shape):
     np.testing.assert_allclose(found[both], expected[both], atol=1e-7)
 
 
+def test_one_common_origin_gives_the_same_as_many_equal_ones(shape):
+    o = np.array([[1.5], [-1.2], [0.8]])
+    d = normalize(np.array(shape.position)[:, None] + 0.4 * np.random.default_rng(2).normal(size=(3, 300)) - o)
+    t = shape.intersect(o, d)
+    assert np.isfinite(t).sum() > 50
+    np.testing.assert_array_equal(t, shape.intersect(np.repeat(o, 300, axis=1), d))
+
+
 def test_rays_along_the_axes_and_inside_faces_do_not_fail(shape):
     o = np.array(shape.position)[:, None] + shape.rotate_out(np.array([[-3.0, 0, 0], [0, -3, 0], [0, 0, -3]]).T)
     t = shape.intersect(o, shape.rotate_out(np.eye(3)))

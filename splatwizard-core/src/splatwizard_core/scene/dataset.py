@@ -21,6 +21,8 @@ class SceneOptions:
     principal_point "center" or "file"
     mask_background pictures with alpha are cut out (alpha times colour on the background); False: alpha is a mask only.
                     Blender scenes are always cut out
+    legacy_8bit_composite   Blender pictures are composited on the background at load, in 8 bit with truncation, as the
+                    3DGS code does; False: in float where they are used
     init_points     how many random start points where there is no SfM
     seed            of those points
     """
@@ -32,6 +34,7 @@ class SceneOptions:
     background: str | None = None
     principal_point: str = "center"
     mask_background: bool = False
+    legacy_8bit_composite: bool = False
     init_points: int = 100_000
     seed: int = 0
 

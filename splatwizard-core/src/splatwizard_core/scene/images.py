@@ -114,6 +114,17 @@ def load_picture(path: Path, size: tuple[int, int] | None = None, *, alpha: bool
     return np.asarray(picture)
 
 
+def load_composited(path: Path, size: tuple[int, int], background: int) -> NDArray[np.uint8]:
+    """uint8 [H,W,3]: the picture on a grey of `background` (0..255), truncated to 8 bit and then resized to `size`."""
+    pixels = load_picture(path)
+    if pixels.shape[2] == 4:
+        share = pixels / 255.0
+        mixed = share[..., :3] * share[..., 3:] + background / 255.0 * (1 - share[..., 3:])
+        pixels = (mixed * 255.0).astype(np.uint8)
+    picture = Image.fromarray(pixels)
+    return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.BICUBIC))
+
+
 def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
     """bool [H,W]: True where the mask picture is at least half bright, or half opaque if it has alpha.
 

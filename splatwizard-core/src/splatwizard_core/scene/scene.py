@@ -74,6 +74,7 @@ class Protocol:
     background  "black" or "white"
     quantize8   renders are rounded to 8 bit before metrics
     masked      pictures of a COLMAP scene were cut out by their alpha
+    composite8  pictures with alpha were composited in 8 bit with truncation
     """
 
     dataset: str
@@ -84,16 +85,16 @@ class Protocol:
     principal_point: str = "center"
     quantize8: bool = True
     masked: bool = False
+    composite8: bool = False
 
     @property
     def id(self) -> str:
         """One line that names the protocol, stable across machines."""
-        return "/".join(
-            (
-                self.dataset, self.images, f"r{self.resolution}", self.split, self.background,
-                f"pp-{self.principal_point}", "q8" if self.quantize8 else "float", *(["masked"] if self.masked else []),
-            )
-        )  # fmt: skip
+        parts = [
+            self.dataset, self.images, f"r{self.resolution}", self.split, self.background,
+            f"pp-{self.principal_point}", "q8" if self.quantize8 else "float",
+        ]  # fmt: skip
+        return "/".join(parts + ["masked"] * self.masked + ["composite8"] * self.composite8)
 
 
 @dataclass(eq=False)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import cast
 
 import numpy as np
@@ -57,6 +58,11 @@ class Shape:
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     rotation: Vec = field(default_factory=lambda: np.eye(3))
 
+    @cached_property
+    def is_upright(self) -> bool:
+        """Not turned at all: the local axes are those of the world."""
+        return bool((self.rotation == np.eye(3)).all())
+
     @property
     def radius(self) -> float:
         """Of a sphere about `position` that holds the solid."""
@@ -68,7 +74,7 @@ class Shape:
         raise NotImplementedError
 
     def hit(self, o: Vec, d: Vec) -> Vec:
-        """Distance [n] along unit directions d [3,n] from o [3,n], local frame; inf for a miss."""
+        """Distance [n] along unit directions d [3,n] from o [3,n] or [3,1], local frame; inf for a miss."""
         raise NotImplementedError
 
     def normal(self, p: Vec) -> Vec:
@@ -86,6 +92,8 @@ class Shape:
     def rotate_in(self, v: Vec) -> Vec:
         """World directions -> local."""
         R = self.rotation
+        if self.is_upright:
+            return v
         return np.stack([R[0, i] * v[0] + R[1, i] * v[1] + R[2, i] * v[2] for i in range(3)])
 
     def rotate_out(self, v: Vec) -> Vec:
@@ -102,7 +110,10 @@ class Shape:
         return cast(Vec, self.rotate_out(p) + np.array(self.position)[:, None])
 
     def intersect(self, o: Vec, d: Vec) -> Vec:
-        """Distance [n] along world rays (d unit); inf for a miss. Only rays near the solid are looked at closely."""
+        """Distance [n] along world rays from o [3,n] or [3,1], d [3,n] unit; inf for a miss.
+
+        Only rays near the solid are looked at closely.
+        """
         oc = o - np.array(self.position)[:, None]
         b = dot(oc, d)
         outside = dot(oc, oc) - self.radius**2
@@ -110,8 +121,8 @@ class Shape:
         t = np.full(near.shape, np.inf)
         index = np.flatnonzero(near)
         if len(index):
-            oc = np.broadcast_to(oc, d.shape)
-            t[index] = self.hit(self.rotate_in(oc[:, index]), self.rotate_in(d[:, index]))
+            start = oc if oc.shape[1] == 1 else oc[:, index]
+            t[index] = self.hit(self.rotate_in(start), self.rotate_in(d[:, index]))
         return t
 
 
@@ -275,7 +286,7 @@ class Torus(Shape):
         alive = np.flatnonzero(t < end)
         for _ in range(64):
             way = d[:, alive]
-            p = o[:, alive] + t[alive] * way
+            p = (o if o.shape[1] == 1 else o[:, alive]) + t[alive] * way
             rho = np.sqrt(p[0] * p[0] + p[1] * p[1])
             q = rho - self.ring
             from_circle = np.sqrt(q * q + p[2] * p[2])

@@ -15,7 +15,14 @@ from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.assemble import assemble_scene
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.images import find_pictures, fitted_size, load_mask, load_picture, picture_header
+from splatwizard_core.scene.images import (
+    find_pictures,
+    fitted_size,
+    load_composited,
+    load_mask,
+    load_picture,
+    picture_header,
+)
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 
@@ -53,6 +60,7 @@ class BlenderDataset:
                 split=split,
                 background=options.background or "white",
                 principal_point=options.principal_point,
+                composite8=options.legacy_8bit_composite,
             ),
             path=str(path),
             own_split=(train, test),
@@ -100,7 +108,10 @@ def _read_views(path: Path, file: str, options: SceneOptions) -> list[View]:
         size = fitted_size(width, height, options.resolution)
         camera = Camera(width, height, fx, fy, cx, cy, R, tau).resized(*size)
         mask = partial(load_mask, picture, size) if has_alpha else None
-        views.append(View(camera, name, partial(load_picture, picture, size), mask))
+        load = partial(load_picture, picture, size)
+        if options.legacy_8bit_composite:
+            load = partial(load_composited, picture, size, 0 if options.background == "black" else 255)
+        views.append(View(camera, name, load, mask))
     return views
 
 
