@@ -30,7 +30,9 @@ else:
 ParamsT = TypeVar("ParamsT", bound=Params)
 
 RESERVED = ("method", "preset", "rate", "scene")
-SCENE_KEYS = ("images", "resolution", "test_every", "background", "principal_point", "split", "mask_background", "init_points")
+SCENE_KEYS = (
+    "images", "resolution", "test_every", "background", "principal_point", "split", "mask_background", "init_points",
+)  # fmt: skip
 RATE_ALIASES = ("low", "default", "high", "all")
 
 

@@ -58,6 +58,7 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
     from splatwizard_core.gaussians.ply import load_ply
 
+    session.load_kernels()
     if path.suffix != ".ply":
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
     model = load_ply(path).to(session.device).eval().requires_grad_(False)

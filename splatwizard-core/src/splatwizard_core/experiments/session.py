@@ -8,9 +8,11 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.errors import NativeBuildError
 from splatwizard_core.experiments.config import ResolvedConfig
 from splatwizard_core.experiments.identity import scene_digest
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.native.build import declared_modules, resolve_module
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.scene import Scene
@@ -39,6 +41,7 @@ class Session:
     _scenes: dict[tuple[str, SceneOptions], Scene] = field(default_factory=dict)
     _digests: dict[tuple[str, SceneOptions], str] = field(default_factory=dict)
     _last_trained: TrainedModel | None = None
+    _kernels_loaded: bool = False
 
     def scene(self, resolved: ResolvedConfig) -> Scene:
         """The scene of a run, loaded once; its warnings are told once."""
@@ -58,6 +61,20 @@ class Session:
         if key not in self._digests:
             self._digests[key] = scene_digest(self.scene(resolved))
         return self._digests[key]
+
+    def load_kernels(self) -> None:
+        """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.
+
+        One that cannot be built is told once; whoever needs it falls back or says so.
+        """
+        if self._kernels_loaded:
+            return
+        self._kernels_loaded = True
+        for target in declared_modules(self.plugins):
+            try:
+                resolve_module(target).try_load()
+            except NativeBuildError as error:
+                self.say(f"warning: {error}")
 
     def remember(self, trained: TrainedModel) -> None:
         """Keep the last trained model: the next rate point often starts from it."""

@@ -114,6 +114,7 @@ def run_stages(
     stop_after: int | None,
 ) -> tuple[SplatModel, dict[str, Any]]:
     """Train (or load, where the checkpoints say it is finished); the model and what is reported of the training."""
+    session.load_kernels()
     method = make_method(session, resolved)
     stages = list(method.stages())
     ppl = resolved.ppl
