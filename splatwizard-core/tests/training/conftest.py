@@ -55,13 +55,13 @@ class SoftRasterizer:
         raise NotImplementedError
 
 
-def make_scene(views=6, rgba=False, points=40):
+def make_scene(views=6, rgba=False, points=40, radius=3.0):
     generator = torch.Generator().manual_seed(7)
     made = []
     for i in range(views):
         angle = 2 * math.pi * i / views
         camera = look_at(
-            torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.0]),
+            torch.tensor([radius * math.cos(angle), radius * math.sin(angle), 1.0]),
             torch.zeros(3),
             torch.tensor([0.0, 0.0, 1.0]),
             width=WIDTH,
@@ -144,6 +144,15 @@ class ToyStage(Stage):
     def loss(self, model, view, result, background, step):
         error = (result.image - view.image(background)).abs().mean()
         return LossPack(error, {"l1": error})
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Tensors of a few hundred numbers: threads only cost."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 @pytest.fixture

@@ -90,7 +90,7 @@ class _Run:
         stage = self.stages[index]
         if stage.starts_from is not None:
             # The trained scene belongs to whoever made it, and other stages may be taught by it.
-            model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True)
+            model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True).train()
         elif model is None:
             model = self.create_model()
         return stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))

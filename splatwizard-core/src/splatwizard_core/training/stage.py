@@ -53,7 +53,11 @@ class CameraSampler:
         return {"order": list(self._order), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        self._order = [int(i) for i in state["order"]]
+        """Inverse of `state_dict`. Raises ValueError if it is that of a sampler of other views."""
+        order = [int(i) for i in state["order"]]
+        if order and max(order) >= len(self.views):
+            raise ValueError(f"the state is that of a sampler of other views: view {max(order)} of {len(self.views)}")
+        self._order = order
         self.generator.set_state(state["generator"])
 
 

@@ -146,6 +146,8 @@ def bind(task: Callable[..., Any], stage: str, name: str, sources: Sequence[tupl
                 f"task '{name}': parameter '{p.name}' wants {classes[0].__name__}, which exists after rendering only; "
                 "register the task in register_post_task"
             )
+        if by_keyword and p.kind is p.POSITIONAL_ONLY:
+            raise TaskSignatureError(f"task '{name}': '{p.name}' is positional-only behind a parameter left out")
         keyword = p.name if by_keyword or p.kind is p.KEYWORD_ONLY else None
         arguments.append(Argument(p.name, field, classes, optional, keyword))
     return Binding(task, name, arguments)

@@ -105,7 +105,6 @@ class Trainer:
                 "raise `iterations` to train on"
             )
         guard = guard or InterruptGuard()
-        self.model.train()
         while self.step < min(until, self.stage.iterations) and not self.stopped:
             with guard.step():
                 record = self._run_step(self.step + 1)

@@ -1,0 +1,296 @@
+"""The five stages of a step: their order, what each sees, and how training ends when it goes wrong."""
+
+import json
+import math
+
+import pytest
+import torch
+
+from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TaskSignatureError, TrainingDiverged
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
+from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.params import OptimizationParams, PipelineParams
+from splatwizard_core.training.rng import Streams
+from splatwizard_core.training.scheduler import STOP
+from splatwizard_core.training.stage import LossPack
+from splatwizard_core.training.trainer import Trainer
+
+
+def make_stage(toy, *, iterations=10, pre=(), post=(), loss=None):
+    """The toy stage with other tasks: (when, task) pairs."""
+
+    class Own(toy.Stage):
+        def register_pre_task(self, scheduler, ppl, opt):
+            for when, task in pre:
+                scheduler.register_task(when, task)
+
+        def register_post_task(self, scheduler, ppl, opt):
+            for when, task in post:
+                scheduler.register_task(when, task)
+
+        def loss(self, model, view, result, background, step):
+            return (loss or super().loss)(model, view, result, background, step)
+
+    return Own(OptimizationParams(iterations=iterations))
+
+
+def make_trainer(toy, stage, *, scene=None, ppl=None):
+    scene = scene or toy.scene
+    return Trainer(stage, toy.make_model(scene), scene, ppl or PipelineParams(), toy.Rasterizer(), Streams(0))
+
+
+def test_a_step_runs_its_stages_in_order(toy):
+    order = []
+
+    def before(model: GaussianModel):
+        order.append(("pre", model.means.grad is None, torch.is_grad_enabled()))
+
+    def after(model: GaussianModel, result: RenderResult, loss: LossPack, step: int):
+        order.append(("post", model.means.grad is not None, torch.is_grad_enabled()))
+        assert torch.equal(result.image.detach(), rendered[-1])
+        assert math.isfinite(loss.parts["l1"].item())
+
+    rendered = []
+
+    def loss(model, view, result, background, step):
+        order.append(("loss", model.means.grad is None, torch.is_grad_enabled()))
+        rendered.append(result.image.detach().clone())
+        return LossPack(result.image.mean(), {"l1": result.image.mean()})
+
+    stage = make_stage(toy, pre=[(range(10), before)], post=[(range(10), after)], loss=loss)
+    trainer = make_trainer(toy, stage)
+    start = trainer.model.means.detach().clone()
+    trainer.run(1, lambda record: None)
+    assert order == [("pre", True, False), ("loss", True, True), ("post", True, False)]
+    assert not torch.equal(trainer.model.means, start)
+    assert trainer.model.means.grad is None
+
+
+def test_the_last_step_makes_no_update(toy):
+    trainer = make_trainer(toy, make_stage(toy, iterations=3))
+    digests = [trainer.model.digest()]
+    trainer.run(3, lambda record: digests.append(trainer.model.digest()))
+    assert digests[1] != digests[0]
+    assert digests[2] != digests[1]
+    assert digests[3] == digests[2]
+    assert trainer.optimizer.moments("means")[2] == 2
+
+
+def test_a_replaced_parameter_is_not_updated_in_its_step(toy):
+    def reset(model: GaussianModel, optimizer: SplatOptimizer):
+        optimizer.replace(model, "opacity_logits", torch.full_like(model.opacity_logits, -1.0))
+
+    trainer = make_trainer(toy, make_stage(toy, post=[(2, reset)]))
+    trainer.run(1, lambda record: None)
+    means = trainer.model.means.detach().clone()
+    trainer.run(2, lambda record: None)
+    assert (trainer.model.opacity_logits == -1).all()
+    assert not torch.equal(trainer.model.means, means)
+    assert trainer.optimizer.moments("opacity_logits")[2] == 1
+    assert trainer.optimizer.moments("means")[2] == 2
+
+
+def test_at_a_densification_nothing_is_updated(toy):
+    def restructure(model: GaussianModel, optimizer: SplatOptimizer):
+        optimizer.keep_rows(model, torch.arange(model.num_rows) > 0)
+
+    trainer = make_trainer(toy, make_stage(toy, post=[(2, restructure)]))
+    trainer.run(1, lambda record: None)
+    before = {n: p.detach()[1:].clone() for n, p in trainer.model.named_parameters()}
+    trainer.run(2, lambda record: None)
+    for name, parameter in trainer.model.named_parameters():
+        assert torch.equal(parameter, before[name])
+        if name != "quats":  # the toy rasterizer's splats are round
+            assert trainer.optimizer.moments(name)[2] == 1
+
+
+def test_tasks_can_render_for_scores(toy):
+    seen = []
+
+    def score(model: GaussianModel, rasterizer: Rasterizer):
+        seen.append(type(rasterizer).__name__)
+
+    make_trainer(toy, make_stage(toy, pre=[(1, score)])).run(1, lambda record: None)
+    assert seen == ["SoftRasterizer"]
+
+
+@pytest.mark.parametrize("where", ["pre", "post"])
+def test_stop_ends_training_after_the_whole_step(toy, where):
+    trainer = make_trainer(toy, make_stage(toy, **{where: [(4, lambda: STOP)]}))
+    steps = []
+    trainer.run(10, lambda record: steps.append(record.step))
+    assert steps == [1, 2, 3, 4]
+    assert trainer.stopped
+    assert trainer.optimizer.moments("means")[2] == 4
+
+
+def test_a_loss_that_is_not_finite_names_step_camera_and_part(toy):
+    def loss(model, view, result, background, step):
+        fine = result.image.mean()
+        bad = fine * (float("nan") if step == 3 else 1.0)
+        return LossPack(fine + bad, {"l1": fine, "rate": bad})
+
+    trainer = make_trainer(toy, make_stage(toy, loss=loss))
+    views = []
+    with pytest.raises(TrainingDiverged, match="at step 3: loss part 'rate' is nan") as info:
+        trainer.run(10, lambda record: views.append(record.view))
+    assert info.value.camera in {v.name for v in toy.scene.train} - set(views)
+    assert all(p.isfinite().all() for p in trainer.model.parameters())
+
+
+def test_an_infinite_total_of_finite_parts_is_named_total(toy):
+    def loss(model, view, result, background, step):
+        return LossPack(result.image.mean() * float("inf"), {"l1": result.image.mean()})
+
+    with pytest.raises(TrainingDiverged, match="'total' is inf"):
+        make_trainer(toy, make_stage(toy, loss=loss)).run(10, lambda record: None)
+
+
+def test_losses_on_a_gpu_are_looked_at_in_batches_and_the_first_bad_one_is_named(toy):
+    def loss(model, view, result, background, step):
+        return LossPack(result.image.mean() * (float("nan") if step in (5, 7) else 1.0))
+
+    trainer = make_trainer(toy, make_stage(toy, loss=loss))
+    trainer.device = torch.device("meta")  # anything but a CPU: looks are batched
+    trainer._camera = lambda view: view.camera
+    trainer._background = torch.zeros(3)
+    with pytest.raises(TrainingDiverged, match="at step 5"):
+        trainer.run(10, lambda record: None)
+    assert trainer.step == 10
+
+
+@pytest.mark.parametrize("where", ["pre", "post"])
+def test_pruning_everything_is_an_empty_model(toy, where):
+    def prune(model: GaussianModel, optimizer: SplatOptimizer):
+        optimizer.keep_rows(model, torch.zeros(model.num_rows, dtype=torch.bool))
+
+    with pytest.raises(EmptyModel, match="step 2"):
+        make_trainer(toy, make_stage(toy, **{where: [(2, prune)]})).run(10, lambda record: None)
+
+
+def test_a_failing_task_is_named(toy):
+    def fail():
+        raise OSError("disk full")
+
+    with pytest.raises(TaskError, match=r"task 'fail' \(pre\) failed at step 2: OSError: disk full"):
+        make_trainer(toy, make_stage(toy, pre=[(2, fail)])).run(10, lambda record: None)
+
+
+def test_a_task_for_another_model_fails_before_the_first_step(toy):
+    class Other(GaussianModel):
+        pass
+
+    def task(model: Other):
+        pass
+
+    with pytest.raises(TaskSignatureError, match="wants Other, this run has PhasedModel"):
+        make_trainer(toy, make_stage(toy, post=[(9, task)]))
+
+
+def test_at_or_past_the_end_there_is_nothing_to_do(toy):
+    trainer = make_trainer(toy, make_stage(toy, iterations=3))
+    trainer.step = 3
+    with pytest.raises(NothingToDo, match="ends at step 3, and 3 steps are done"):
+        trainer.run(3, lambda record: None)
+
+
+def test_the_fixed_background_is_the_scenes(toy):
+    trainer = make_trainer(toy, make_stage(toy))
+    trainer.run(3, lambda record: None)
+    assert all(torch.equal(b, toy.scene.background) for b in trainer.rasterizer.backgrounds)
+
+
+def test_a_random_background_is_fresh_each_step_and_the_same_for_render_and_truth(toy):
+    seen = []
+
+    def loss(model, view, result, background, step):
+        seen.append(background)
+        # An RGBA view composited on the colour that was rendered on.
+        truth = view.image(background)
+        alpha = view.pixels[3:].float() / 255
+        expected = view.pixels[:3].float() / 255 * alpha + background[:, None, None] * (1 - alpha)
+        torch.testing.assert_close(truth, expected)
+        return LossPack((result.image - truth).abs().mean())
+
+    scene = toy.make_scene(rgba=True)
+    trainer = make_trainer(toy, make_stage(toy, loss=loss), scene=scene, ppl=PipelineParams(random_background=True))
+    trainer.run(5, lambda record: None)
+    assert trainer.rasterizer.backgrounds == seen
+    assert len({tuple(b.tolist()) for b in seen}) == 5
+    assert all(((b >= 0) & (b < 1)).all() for b in seen)
+
+
+def test_clamp_render_cuts_the_image_before_the_loss(toy):
+    images = []
+
+    def loss(model, view, result, background, step):
+        images.append(result.image)
+        return LossPack(result.image.mean())
+
+    def brighten(model: GaussianModel):
+        model.sh_dc.fill_(30.0)
+
+    for clamp in (False, True):
+        stage = make_stage(toy, pre=[(1, brighten)], loss=loss)
+        make_trainer(toy, stage, ppl=PipelineParams(clamp_render=clamp)).run(1, lambda record: None)
+    assert images[0].max() > 1
+    assert images[1].max() <= 1
+
+
+def test_cameras_are_drawn_without_replacement(toy):
+    views = []
+    make_trainer(toy, make_stage(toy, iterations=13)).run(13, lambda record: views.append(record.view))
+    everything = {v.name for v in toy.scene.train}
+    assert set(views[:6]) == set(views[6:12]) == everything
+    assert views[:6] != views[6:12]
+
+
+def test_a_step_leaves_no_graph_behind(toy):
+    trainer = make_trainer(toy, make_stage(toy))
+    trainer.run(1, lambda record: None)
+    assert trainer.context.result is None
+    assert trainer.context.loss is None
+
+
+def test_stage_times_are_opt_in_and_add_up(toy):
+    assert toy.train(iterations=5).stage_breakdown is None
+    outcome = toy.train(iterations=20, ppl=PipelineParams(profile="stages"))
+    breakdown = outcome.stage_breakdown["toy"]
+    assert list(breakdown) == ["pre", "render", "loss", "backward", "post", "optimize"]
+    assert all(seconds > 0 for seconds in breakdown.values())
+    assert sum(breakdown.values()) <= outcome.train_s
+    assert sum(breakdown.values()) > 0.5 * outcome.train_s
+
+
+def test_housekeeping_is_no_part_of_the_training_time(toy):
+    import time
+
+    def slow(*_):
+        time.sleep(0.02)
+
+    began = time.perf_counter()
+    outcome = toy.train(iterations=20, on_step=slow, evaluate=slow, ppl=PipelineParams(eval_every=1))
+    assert time.perf_counter() - began - outcome.train_s >= 40 * 0.02
+    assert outcome.stage_seconds == {"toy": outcome.train_s}
+
+
+def test_a_record_has_what_the_log_shows(toy, tmp_path):
+    records = []
+    toy.train(iterations=30, on_step=records.append, directory=tmp_path, ppl=PipelineParams(log_every=7))
+    assert [r.step for r in records] == list(range(1, 31))
+    assert all(not r.total.requires_grad for r in records)
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    steps = [line for line in lines if "loss" in line]
+    assert [line["step"] for line in steps] == [1, 7, 14, 21, 28, 30]
+    by_step = {r.step: r for r in records}
+    for line in steps:
+        record = by_step[line["step"]]
+        assert line["stage"] == 0
+        assert line["view"] == record.view
+        assert line["loss"] == record.total.item()
+        assert line["parts"] == {"l1": record.parts["l1"].item()}
+        assert line["num_gaussians"] == record.num_rows
+    assert steps[1]["lr"]["means"] == pytest.approx(1e-2 * (1e-4 / 1e-2) ** (7 / 200))
+    # Tasks registered with log=True leave a line as well.
+    assert [line["step"] for line in lines if line.get("task") == "densify"] == [20, 30]
