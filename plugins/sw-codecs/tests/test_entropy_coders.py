@@ -1,5 +1,6 @@
 """range, rans and huffman under every model: round trips, sizes against the entropy, damage."""
 
+import constriction
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +12,7 @@ from sw_codecs import coders
 from sw_codecs.coders import RangeCoder, RansCoder
 from sw_codecs.huffman_coder import HuffmanCoder
 from sw_codecs.model_spec import Bernoulli, Gaussian, Laplace, Table, Tables, Uniform
+from sw_codecs.symbol_stream import guarded
 
 CODERS = [RangeCoder, RansCoder, HuffmanCoder]
 STREAMS = [RangeCoder, RansCoder]
@@ -173,6 +175,15 @@ def test_the_last_bit_of_one_parameter_is_caught_by_the_crc(coder):
 def test_models_that_make_no_sense_are_refused(make):
     with pytest.raises(ValueError):
         make()
+
+
+def test_a_panic_of_the_library_becomes_an_ordinary_error():
+    # It derives from BaseException, so that `except Exception` would miss it.
+    for error in (ValueError, BitstreamError):
+        with pytest.raises(error, match="coding failed"), guarded(error, "coding"):
+            constriction.stream.model.QuantizedGaussian(0, 5, 0.0, 0.0)
+    with pytest.raises(KeyboardInterrupt), guarded(ValueError, "coding"):
+        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("coder", CODERS)

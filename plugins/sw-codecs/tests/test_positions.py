@@ -118,11 +118,19 @@ def test_claims_of_huge_counts_are_refused(codec):
     points = np.full((70, 3), 5)
     with pytest.raises(BitstreamError, match="at most 60"):
         codec(max_points=60).decode(codec().encode(points, 8))
+    with pytest.raises(ValueError, match="more than a reader accepts"):
+        codec(max_points=60).encode(points, 8)
     data = codec().encode(points, 8)
     at = 2 if codec is Octree else 6  # where the count stands
     assert data[at] == 70
     with pytest.raises(BitstreamError):
         codec().decode(data[:at] + write_varint(2**40) + data[at + 1 :])
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_few_bytes_never_stand_for_millions_of_points(codec):
+    with pytest.raises(ValueError, match="more than a reader accepts"):
+        codec().encode(np.full((1_100_000, 3), 5), 8)
 
 
 @settings(max_examples=200, deadline=None)

@@ -23,13 +23,13 @@ from sw_codecs.bits import ByteReader, pack_fixed, packed_size, unpack_fixed, wr
 from sw_codecs.columns import Columns
 from sw_codecs.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
 from sw_codecs.model_spec import Tables
+from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
 
 VERSION = 1
 CONTEXTS = 4  # by the number of the parent's children; 4 stands for 4..8
 OCCUPANCIES = 255
 UNIFORM, OWN, LATEST = 0, 1, 2  # which count table a level and context takes
-MAX_POINTS = 1 << 26
 
 _POPCOUNT = np.array([bin(i).count("1") for i in range(256)], np.int64)
 _CHILDREN = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(bool)  # [256, 8]
@@ -51,16 +51,15 @@ class Octree:
     def encode(self, points: npt.ArrayLike, bits: int) -> bytes:
         """points [N,3] integers, 0 <= p < 2^bits, in Morton order (`sw_codecs.morton.sort`).
 
-        Raises ValueError if they are not, or for more than `max_points`.
+        Raises ValueError if they are not, or for more points than a reader accepts (`point_limit`).
         """
         codes = morton.sorted_codes(points, bits)
-        if len(codes) > self.max_points:
-            raise ValueError(f"{len(codes):,} points, at most {self.max_points:,} are allowed")
         leaves, extra = _without_duplicates(codes)
         out = bytes([VERSION, bits]) + write_varint(len(codes)) + write_varint(len(leaves))
         if len(leaves):
             out += _encode_tree(leaves, bits) + _encode_duplicates(extra)
-        return out + zlib.crc32(codes.astype("<i8", copy=False)).to_bytes(4, "little")
+        out += zlib.crc32(codes.astype("<i8", copy=False)).to_bytes(4, "little")
+        return check_written(len(codes), out, self.max_points)
 
     def decode(self, data: bytes) -> np.ndarray:
         """[N,3] int64 in Morton order. Raises BitstreamError, in time and memory bounded by `max_points`."""
@@ -70,7 +69,7 @@ class Octree:
             raise BitstreamError(f"octree of version {version} is not known: upgrade sw-codecs")
         if not 1 <= bits <= morton.MAX_BITS:
             raise BitstreamError(f"{bits} bits an axis, must be 1..{morton.MAX_BITS}")
-        count = reader.varint(self.max_points)
+        count = reader.varint(point_limit(len(data), self.max_points))
         distinct = reader.varint(count)
         if (count == 0) != (distinct == 0):
             raise BitstreamError(f"{count:,} points, but {distinct:,} distinct ones")

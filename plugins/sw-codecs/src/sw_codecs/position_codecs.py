@@ -12,9 +12,9 @@ from splatwizard_core.errors import BitstreamError
 from sw_codecs import morton
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.columns import Columns
+from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
 
 VERSION = 1
-MAX_POINTS = 1 << 26
 LOW_BITS = 48  # a step is coded as two columns, so that each stays within what `columns` takes
 
 
@@ -50,12 +50,13 @@ class RawPositions:
         """points [N,3] integers, 0 <= p < 2^bits, in Morton order. Raises ValueError if they are not."""
         codes = morton.sorted_codes(points, bits)
         plain = np.asarray(points).T.astype(_coordinate(bits)).tobytes()
-        return _head(codes, bits) + zstandard.ZstdCompressor(level=19).compress(plain)
+        data = _head(codes, bits) + zstandard.ZstdCompressor(level=19).compress(plain)
+        return check_written(len(codes), data, self.max_points)
 
     def decode(self, data: bytes) -> np.ndarray:
         """[N,3] int64 in Morton order. Raises BitstreamError."""
         reader = ByteReader(data)
-        bits, crc, count = _parse_head(reader, self.max_points)
+        bits, crc, count = _parse_head(reader, point_limit(len(data), self.max_points))
         size = 3 * count * np.dtype(_coordinate(bits)).itemsize
         frame = bytes(reader.take(reader.left))
         try:
@@ -88,11 +89,12 @@ class MortonDelta:
         """points [N,3] integers, 0 <= p < 2^bits, in Morton order. Raises ValueError if they are not."""
         codes = morton.sorted_codes(points, bits)
         steps = np.diff(codes, prepend=0)
-        return _head(codes, bits) + Columns().encode(np.stack([steps >> LOW_BITS, steps & ((1 << LOW_BITS) - 1)], 1))
+        columns = np.stack([steps >> LOW_BITS, steps & ((1 << LOW_BITS) - 1)], 1)
+        return check_written(len(codes), _head(codes, bits) + Columns().encode(columns), self.max_points)
 
     def decode(self, data: bytes) -> np.ndarray:
         """[N,3] int64 in Morton order. Raises BitstreamError."""
         reader = ByteReader(data)
-        bits, crc, count = _parse_head(reader, self.max_points)
+        bits, crc, count = _parse_head(reader, point_limit(len(data), self.max_points))
         high, low = Columns().decode(bytes(reader.take(reader.left)), (count, 2)).T
         return _checked(np.cumsum((high << LOW_BITS) + low), bits, crc)

@@ -1,0 +1,22 @@
+"""How many points a file may claim: a few bytes must not make a reader fill its memory with copies of one point."""
+
+from __future__ import annotations
+
+MAX_POINTS = 1 << 26
+ALWAYS_ALLOWED = 1 << 20
+POINTS_PER_BYTE = 512  # real scenes have under one point a byte
+
+
+def point_limit(size: int, max_points: int) -> int:
+    """The most points that `size` bytes may stand for."""
+    return min(max_points, max(ALWAYS_ALLOWED, POINTS_PER_BYTE * size))
+
+
+def check_written(count: int, data: bytes, max_points: int) -> bytes:
+    """`data`, if a reader will accept that it holds `count` points. Raises ValueError otherwise."""
+    if count > point_limit(len(data), max_points):
+        raise ValueError(
+            f"{count:,} points in {len(data):,} bytes: more than a reader accepts (at most {max_points:,}, and at most "
+            f"{POINTS_PER_BYTE} a byte above {ALWAYS_ALLOWED:,}); remove duplicates first"
+        )
+    return data
