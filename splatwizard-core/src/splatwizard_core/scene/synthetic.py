@@ -152,10 +152,10 @@ class DepthMaps(Mapping[str, Tensor]):
 def sample_surfaces(world: World, count: int, generator: torch.Generator) -> tuple[Vec, Vec, np.ndarray]:
     """`count` points on the visible side of the surfaces: xyz [3,n], normals [3,n] and index of the solid [n].
 
-    By area within a solid; among solids by the square root of the area, so that small ones get their share.
+    Uniform by area within a solid; among solids by area^0.75, so that small ones get their share.
     Points inside or against another solid, or under the stage, are left out.
     """
-    share = np.sqrt([solid.shape.area for solid in world.solids])
+    share = np.array([solid.shape.area**0.75 for solid in world.solids])
     wanted = np.floor(2.2 * count * share / share.sum()).astype(int) + 8
     points, which = [], []
     for i, solid in enumerate(world.solids):
