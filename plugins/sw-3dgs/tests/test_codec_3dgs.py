@@ -117,7 +117,7 @@ def test_errors_stay_within_half_a_step(rate):
         dc = (found.sh_dc[row] - model.sh_dc).norm(dim=-1).max()
         assert dc <= 0.5 * math.sqrt(3) * codec.dc_step * 1.0001
         rest = (found.sh_rest[row] - model.sh_rest).norm(dim=-1).max()
-        assert rest <= (0.5 + codec.rest_deadzone) * math.sqrt(3) * codec.rest_step * 1.0001
+        assert rest <= 0.5 * math.sqrt(3) * codec.rest_step * 1.0001
     scales, quats = canonical(model.log_scales.detach().numpy(), model.quats.detach().numpy())
     assert np.abs(found.log_scales[row].detach().numpy() - scales).max() <= 0.5 * codec.scale_step * 1.0001
     found_quats = found.quats[row].detach().numpy()

@@ -53,10 +53,12 @@ class Values:
     quats: NDArray[Any]
 
 
-def quantize(values: Values, steps: Steps, *, deadzone: float) -> NDArray[np.int64]:
-    """Integers [N, 10 + 3R].
+def quantize(values: Values, steps: Steps) -> NDArray[np.int64]:
+    """Integers [N, 10 + 3R], each the nearest one.
 
-    deadzone    0 .. 0.5: higher SH coefficients round down from up to 0.5 + deadzone
+    A dead zone around zero, as in video codecs, does not pay: it shrinks the coefficients of all the Gaussians behind a
+    pixel in one direction, so their errors add up (a tenth of a step cost 0.05 dB on the demo scene, and saved less
+    than a coarser step that costs as much).
     """
     log_scales, quats = gauge.canonical(values.log_scales, values.quats)
     logits = np.clip(np.asarray(values.opacity_logits, np.float64), -MAX_LOGIT, MAX_LOGIT)
@@ -66,7 +68,7 @@ def quantize(values: Values, steps: Steps, *, deadzone: float) -> NDArray[np.int
         np.rint(logits / steps.opacity)[:, None],
         np.rint(log_scales / steps.scale),
         np.rint(quats[:, 1:] / steps.quat),
-        np.copysign(np.floor(np.abs(rest) + 0.5 - deadzone).clip(min=0), rest),
+        np.rint(rest),
     ]
     return np.clip(np.concatenate(columns, axis=1), -MAX_SYMBOL, MAX_SYMBOL).astype(np.int64)
 

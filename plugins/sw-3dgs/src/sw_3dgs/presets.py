@@ -38,10 +38,10 @@ def _quantized(bits: int, dc: float, rest: float, opacity: float, scale: float, 
 
 
 RATES: Mapping[str, Mapping[str, Any]] = {
-    "r1": _quantized(14, 0.16, 0.24, 0.5, 0.25, 0.06),
-    "r2": _quantized(15, 0.08, 0.12, 0.25, 0.14, 0.03),
-    "r3": _quantized(16, 0.05, 0.06, 0.15, 0.08, 0.02),
-    "r4": _quantized(17, 0.03, 0.03, 0.1, 0.05, 0.012),
-    "r5": _quantized(18, 0.02, 0.015, 0.06, 0.03, 0.008),
+    "r1": _quantized(13, 0.2, 0.2, 0.6, 0.3, 0.07),
+    "r2": _quantized(14, 0.12, 0.1, 0.4, 0.18, 0.04),
+    "r3": _quantized(15, 0.07, 0.055, 0.25, 0.1, 0.022),
+    "r4": _quantized(16, 0.04, 0.028, 0.15, 0.06, 0.012),
+    "r5": _quantized(18, 0.02, 0.012, 0.08, 0.03, 0.007),
     "r6": {"codec.mode": "exact"},
 }

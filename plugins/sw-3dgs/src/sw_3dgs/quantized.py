@@ -145,7 +145,7 @@ def lattice(
         quat_step=codec.quat_step,
         sh_classes=suitable_classes(len(order)),
     )
-    return layout, cells[order], quantize(values, layout.steps, deadzone=codec.rest_deadzone)
+    return layout, cells[order], quantize(values, layout.steps)
 
 
 def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int64]) -> GaussianModel:
