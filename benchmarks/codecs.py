@@ -2,7 +2,7 @@
 
     python benchmarks/codecs.py [--gaussians 250000] [--repeats 3]
 
-Sizes are ratios to the ideal (model entropy) or to zstd level 19 on the same integers; one thread, median of the repeats.
+Sizes are ratios to the entropy of the model or to zstd level 19 on the same integers; one thread, median of repeats.
 """
 
 import argparse

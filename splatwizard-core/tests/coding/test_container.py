@@ -4,6 +4,7 @@ import json
 import os
 import struct
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -320,3 +321,35 @@ def test_static_values_are_checked_when_asked_for():
     ):
         with pytest.raises(BitstreamError, match="header value"):
             call()
+
+
+def test_the_golden_file_of_version_1_reads_as_ever():
+    # Written once by `small_file().write(...)`; later versions must read it, and it is never rewritten.
+    reader = ContainerReader.open(Path(__file__).parent / "golden" / "container_v1.swz")
+    expected = ContainerReader(small_file().to_bytes())
+    assert (reader.method, reader.version, reader.raster, reader.static) == (
+        "3dgs",
+        2,
+        expected.raster,
+        expected.static,
+    )
+    assert {name: reader.section(name) for name in reader.sections} == {
+        name: expected.section(name) for name in expected.sections
+    }
+
+
+def test_the_layout_is_the_documented_one():
+    # Taken apart with nothing but docs/bitstream.md.
+    data = small_file().to_bytes()
+    assert data[:6] == b"SPWZ\x01\x00"
+    length = int.from_bytes(data[6:10], "little")
+    header = json.loads(data[10 : 10 + length])
+    assert zlib.crc32(data[10 : 10 + length]) == int.from_bytes(data[10 + length : 14 + length], "little")
+    assert list(header) == ["method", "method_version", "raster", "static", "sections"]
+    body = data[14 + length :]
+    assert [row[:3] for row in header["sections"]] == [["positions", 0, 8], ["empty", 8, 0], ["bounds", 8, 34]]
+    for _, offset, size, crc in header["sections"]:
+        assert zlib.crc32(body[offset : offset + size]) == crc
+    # f32, two axes, 2 x 3, then the values.
+    assert body[8:18] == bytes([10, 2, 2, 0, 0, 0, 3, 0, 0, 0])
+    assert struct.unpack("<6f", body[18:]) == (0, 1, 2, 3, 4, 5)
