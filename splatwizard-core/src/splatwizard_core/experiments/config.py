@@ -134,17 +134,19 @@ class ResolvedConfig:
         content |= self.config.model_dump(mode="json")
         return tomli_w.dumps(_spell_none(content))
 
-    def training_hash(self) -> str:
-        """SHA-256 over everything that training depends on: not the `codec` block, the device or the rate's name."""
+    def training_content(self) -> dict[str, Any]:
+        """Everything that training depends on: not the `codec` block, the device or the rate's name."""
         run = self.ppl.model_dump(mode="json", include={"seed", "random_background", "clamp_render", "raster"})
-        return content_hash(
-            {
-                "method": self.method,
-                "config": self.config.model_dump(mode="json", exclude={"codec"}),
-                "pipeline": run,
-                "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
-            }
-        )
+        return {
+            "method": self.method,
+            "config": self.config.model_dump(mode="json", exclude={"codec"}),
+            "pipeline": run,
+            "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
+        }
+
+    def training_hash(self) -> str:
+        """SHA-256 over `training_content`."""
+        return content_hash(self.training_content())
 
     def config_hash(self) -> str:
         """SHA-256 over every value of the method, the run and the scene options."""

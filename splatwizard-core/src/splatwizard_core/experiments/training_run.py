@@ -152,7 +152,8 @@ def run_stages(
         ppl,
         rasterizer,
         directory=directory / CHECKPOINTS,
-        identity={"method": method.name, "method_version": method.version, "key": key},
+        # The content besides its key, so that a refused resume can say what differs.
+        identity={**resolved.training_content(), "method_version": method.version, "key": key},
         trained=frozen,
         stop_after=stop_after,
         resume=resume,
