@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+
 from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.testing.raster_gradients import GRADIENT_CASES, applies, check_against, check_gradients
 from splatwizard_core.testing.rasterizer_checks import checks_for

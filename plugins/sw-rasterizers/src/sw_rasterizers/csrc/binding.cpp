@@ -2,6 +2,7 @@
 #include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
+#include <ATen/ops/from_blob.h>
 #include <torch/library.h>
 
 #include <chrono>
@@ -10,6 +11,7 @@
 #include <vector>
 
 #include "cpu/kernels.h"
+#include "cpu/recycler.h"
 
 namespace {
 
@@ -44,6 +46,15 @@ S* data(const Tensor& t) {
 template <class S>
 const S* data(const OptionalTensor& t) {
   return t.has_value() ? data<S>(*t) : nullptr;
+}
+
+// An uninitialised tensor; large ones come from the recycler.
+Tensor make_tensor(at::IntArrayRef shape, const at::TensorOptions& options) {
+  size_t bytes = c10::elementSize(options.dtype().toScalarType());
+  for (const int64_t size : shape) bytes *= size_t(size);
+  if (bytes < sw::Recycler::kSmallest) return at::empty(shape, options);
+  return at::from_blob(sw::Recycler::instance().take(bytes), shape,
+                       [](void* pointer) { sw::Recycler::instance().give(pointer); }, options);
 }
 
 struct Clock {
@@ -184,8 +195,8 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   const int64_t n = g.count, chunks = (n + sw::kChunk - 1) / sw::kChunk, total = channels.total();
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const auto real = in.means.options().requires_grad(false);
-  const auto make = [&](at::IntArrayRef shape) { return at::empty(shape, real); };
-  const auto make_as = [&](at::IntArrayRef shape, at::ScalarType type) { return at::empty(shape, real.dtype(type)); };
+  const auto make = [&](at::IntArrayRef shape) { return make_tensor(shape, real); };
+  const auto make_as = [&](at::IntArrayRef shape, at::ScalarType type) { return make_tensor(shape, real.dtype(type)); };
 
   Rendered out;
   std::vector<Tensor> saved(kSavedCount);
@@ -273,18 +284,18 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
   const auto pairs = pairs_of<S>(saved);
   const auto real = in.means.options().requires_grad(false);
   const sw::CanvasGradient<S> gradient{data<S>(image_gradient), data<S>(alpha_gradient), data<S>(median_gradient)};
-  const int64_t columns = sw::pair_columns(channels.total(), settings.absgrad, settings.median_depth);
+  const int64_t columns = sw::pair_columns(in.plain(), channels.total(), settings.absgrad, settings.median_depth);
 
   Clock clock;
   std::vector<double> seconds;
-  Tensor sums = at::empty({pairs.count, columns}, real);
+  Tensor sums = make_tensor({pairs.count, columns}, real);
   SW_SELECT(blend_backward)(view, settings, slots, pairs, canvas_of<S>(in, saved), gradient,
                      settings.detach_features ? channels.features : 0, data<S>(sums));
   seconds.push_back(clock.lap());
 
   std::vector<Tensor> grads(kWantedCount);
   const auto want = [&](int which, const OptionalTensor& like) {
-    grads[which] = wanted[which] && like.has_value() ? at::empty(like->sizes(), real) : at::empty({0}, real);
+    grads[which] = make_tensor(wanted[which] && like.has_value() ? like->sizes() : at::IntArrayRef{0}, real);
     return data<S>(grads[which]);
   };
   sw::Gradients<S> out{};

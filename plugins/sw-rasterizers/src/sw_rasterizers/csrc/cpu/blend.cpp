@@ -8,14 +8,8 @@
 #include "parallel.h"
 #include "tile_stage.h"
 
-
 namespace SW_ARCH {
 namespace {
-
-template <class V>
-SW_HD V transmittance_or_done(bool inside) {
-  return constant<V>(inside ? 1 : -1);
-}
 
 template <class V, bool kGeneral>
 struct TileBlender {
@@ -32,7 +26,7 @@ struct TileBlender {
 
   struct Workspace {
     TileStage<V> stage;
-    LaneOffsets<S> offsets;
+    PixelCentres<S> centres;
     uint8_t list[kBlocks][kStage];
     int length[kBlocks];
     alignas(64) S transmittance[kTilePixels];
@@ -45,6 +39,7 @@ struct TileBlender {
   void operator()(int64_t tile, Workspace& w) const {
     const TileFrame frame(view, tile);
     const int64_t begin = pairs.tile_start[tile], end = pairs.tile_start[tile + 1];
+    w.centres.set(frame);
     std::fill(w.color.begin(), w.color.end(), S(0));
     std::fill(w.last, w.last + kTilePixels, 0);
     std::fill(w.median, w.median + kTilePixels, 0);
@@ -55,21 +50,21 @@ struct TileBlender {
 
     for (int64_t first = begin; first < end && live != 0; first += kStage) {
       const int count = int(std::min<int64_t>(kStage, end - first));
-      w.stage.load_splats(slots, pairs.slot + first, count);
+      w.stage.load_splats(slots, pairs.slot + first, count, end - first);
       w.stage.find_blocks(frame, count);
       std::fill(w.length, w.length + kBlocks, 0);
       for (int k = 0; k < count; ++k) {
-        unsigned mask = unsigned(w.stage.blocks[k]);
+        unsigned mask = unsigned(w.stage.blocks[k] & live);
         if (pairs.blocks != nullptr) pairs.blocks[first + k] = uint16_t(mask);
-        for (mask &= unsigned(live); mask != 0; mask &= mask - 1) {
+        for (; mask != 0; mask &= mask - 1) {
           const int b = __builtin_ctz(mask);
           w.list[b][w.length[b]++] = uint8_t(k);
         }
       }
       for (int b = 0; b < kBlocks; ++b) {
         if (w.length[b] == 0) continue;
-        if (canvas.counters != nullptr) count_pairs(frame, w, b);
-        for (int pack = 0; pack < kPacks; ++pack) blend_pack(frame, w, b, pack, first, int32_t(first - begin));
+        if (canvas.counters != nullptr) count_pairs(w, b);
+        for (int pack = 0; pack < kPacks; ++pack) blend_pack(w, b, pack, first, int32_t(first - begin));
         if (!is_live(w, b)) live &= ~(1 << b);
       }
     }
@@ -82,11 +77,10 @@ struct TileBlender {
     return false;
   }
 
-  void blend_pack(const TileFrame& frame, Workspace& w, int block, int pack, int64_t first, int32_t base) const {
+  void blend_pack(Workspace& w, int block, int pack, int64_t first, int32_t base) const {
     const int at = block * kBlockPixels + pack * L;
     const auto& field = w.stage.field;
-    const V x = constant<V>(frame.x0 + TileFrame::pixel_x(block, 0) + 0.5) + load<V>(w.offsets.x + pack * L);
-    const V y = constant<V>(frame.y0 + TileFrame::pixel_y(block, 0) + 0.5) + load<V>(w.offsets.y + pack * L);
+    const V x = load<V>(w.centres.x + at), y = load<V>(w.centres.y + at);
     const V zero = constant<V>(0), threshold = constant<V>(kLog2AlphaMin), ceiling = constant<V>(kAlphaMax);
     V transmittance = load<V>(w.transmittance + at);
     I last = load<I>(w.last + at), median{};
@@ -132,12 +126,11 @@ struct TileBlender {
   }
 
   // The counting mode: pixel-splat pairs whose exponent is evaluated, and those that are blended.
-  void count_pairs(const TileFrame& frame, Workspace& w, int block) const {
+  static void count_pairs(Workspace& w, int block) {
     const auto& field = w.stage.field;
     for (int i = 0; i < kBlockPixels; ++i) {
       S transmittance = w.transmittance[block * kBlockPixels + i];
-      const S x = S(frame.x0 + TileFrame::pixel_x(block, i)) + S(0.5);
-      const S y = S(frame.y0 + TileFrame::pixel_y(block, i)) + S(0.5);
+      const S x = w.centres.x[block * kBlockPixels + i], y = w.centres.y[block * kBlockPixels + i];
       for (int n = 0; n < w.length[block]; ++n) {
         const int k = w.list[block][n];
         const S power = log2_alpha<S>(field[kU][k] - x, field[kV][k] - y, field[kA][k], field[kB][k], field[kC][k],

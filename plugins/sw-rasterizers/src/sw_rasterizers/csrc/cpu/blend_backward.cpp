@@ -4,6 +4,7 @@
 // no atomics, and the same bits for any number of threads. Here a splat is the outer loop and the touched blocks the
 // inner one: its nine sums stay in registers over the whole tile and are reduced across lanes once. Because the conic is
 // constant over the tile, moments of v = dL/dsigma are enough; the derivatives are put together in project_backward.
+#include <limits>
 #include <memory>
 
 #include "parallel.h"
@@ -18,7 +19,7 @@ struct TileBackward {
   using I = IntOf<V>;
   static constexpr int L = lanes_of<V>;
   static constexpr int kPacks = kBlockPixels / L;
-  static constexpr int kSums = kMoments + 3 + 2;  // moments, RGB, absgrad
+  static constexpr int kPixels = kTilePixels + kBlockPixels;  // with the spare block
 
   const View<S>& view;
   const Settings& settings;
@@ -30,14 +31,15 @@ struct TileBackward {
   int columns;            // of a row of sums
   S* sums;
 
+  static constexpr int kAhead = 8;  // pairs between prefetch and use of a record
+
   struct Workspace {
-    TileStage<V> stage;
-    LaneOffsets<S> offsets;
-    alignas(64) S transmittance[kTilePixels];
-    alignas(64) S behind[kTilePixels];
-    alignas(64) int32_t last[kTilePixels];
-    int32_t block_last[kBlocks];
-    std::vector<S> image_gradient;  // [channels][kTilePixels]
+    PixelCentres<S, kPixels> centres;
+    alignas(64) S transmittance[kPixels];
+    alignas(64) S behind[kPixels];
+    alignas(64) int32_t last[kPixels];
+    V clamp_limit;                  // of the unclamped alpha, above which its gradient is 0
+    std::vector<S> image_gradient;  // [channels][kPixels]
     std::vector<S> channel_sums;    // [channels][L]
   };
 
@@ -46,15 +48,12 @@ struct TileBackward {
     const int64_t begin = pairs.tile_start[tile], end = pairs.tile_start[tile + 1];
     if (begin == end) return;
     load_pixels(tile, frame, w);
-    const int64_t used = *std::max_element(w.block_last, w.block_last + kBlocks);
+    const int64_t used = *std::max_element(w.last, w.last + kTilePixels);
     // Splats that no pixel reached have no row of their own to fill but must not leave garbage.
     for (int64_t i = begin + used; i < end; ++i) std::fill_n(row(i), columns, S(0));
-    for (int64_t stop = begin + used; stop > begin;) {
-      const int64_t first = std::max(begin, begin + (stop - begin - 1) / kStage * kStage);
-      const int count = int(stop - first);
-      w.stage.load_splats(slots, pairs.slot + first, count);
-      for (int k = count - 1; k >= 0; --k) blend_splat(frame, w, k, first, int32_t(first - begin) + k);
-      stop = first;
+    for (int64_t i = begin + used; i-- > begin;) {
+      if (i >= begin + kAhead) __builtin_prefetch(slots.records + int64_t(pairs.slot[i - kAhead]) * kRecord);
+      blend_splat(w, i, int32_t(i - begin));
     }
     if (gradient.median != nullptr) add_median(frame);
   }
@@ -63,100 +62,117 @@ struct TileBackward {
 
   void load_pixels(int64_t tile, const TileFrame& frame, Workspace& w) const {
     const int64_t size = int64_t(view.width) * view.height;
+    w.centres.set(frame);
+    w.clamp_limit = constant<V>(settings.pass_clamp ? double(std::numeric_limits<float>::max()) : kAlphaMax);
+    std::fill_n(w.transmittance, kPixels, S(1));
+    std::fill_n(w.last, kPixels, 0);
+    std::fill_n(w.behind, kPixels, S(0));
     std::copy_n(canvas.transmittance + tile * kTilePixels, kTilePixels, w.transmittance);
     std::copy_n(canvas.last + tile * kTilePixels, kTilePixels, w.last);
     std::fill(w.image_gradient.begin(), w.image_gradient.end(), S(0));
-    std::fill(w.behind, w.behind + kTilePixels, S(0));
     frame.for_each_pixel([&](int i, int x, int y) {
       const int64_t pixel = int64_t(frame.y0 + y) * view.width + frame.x0 + x;
       S behind = gradient.alpha != nullptr ? -gradient.alpha[pixel] : S(0);
       for (int channel = 0; channel < canvas.channels; ++channel) {
         const S g = gradient.image[channel * size + pixel];
-        w.image_gradient[channel * kTilePixels + i] = g;
+        w.image_gradient[channel * kPixels + i] = g;
         if (canvas.background != nullptr && channel < canvas.color_channels)
           behind += g * canvas.background[canvas.background_is_image ? channel * size + pixel : int64_t(channel)];
       }
       w.behind[i] = w.transmittance[i] * behind;
     });
-    for (int b = 0; b < kBlocks; ++b)
-      w.block_last[b] = *std::max_element(w.last + b * kBlockPixels, w.last + (b + 1) * kBlockPixels);
   }
 
-  void blend_splat(const TileFrame& frame, Workspace& w, int k, int64_t first, int32_t position) const {
-    const auto& field = w.stage.field;
-    const V zero = constant<V>(0), ceiling = constant<V>(kAlphaMax);
-    const V a = V{} + field[kA][k], b = V{} + field[kB][k], c = V{} + field[kC][k], level = V{} + field[kLevel][k];
-    const S u = field[kU][k], v = field[kV][k];
-    const S* channel_value = kGeneral ? slots.channels + int64_t(pairs.slot[first + k]) * canvas.channels : nullptr;
-    V sum[kSums];
-    for (V& s : sum) s = zero;
+  // The sums of one pair, each a pack over the tile's pixels.
+  struct Sums {
+    V v0{}, x{}, y{}, xx{}, xy{}, yy{}, color[3]{}, absolute[2]{};
+  };
+
+  void blend_splat(Workspace& w, int64_t pair, int32_t position) const {
+    const S* record = slots.records + int64_t(pairs.slot[pair]) * kRecord;
+    const S* channels = kGeneral ? slots.channels + int64_t(pairs.slot[pair]) * canvas.channels : nullptr;
+    Sums sums_of_pair;
     if constexpr (kGeneral) std::fill(w.channel_sums.begin(), w.channel_sums.end(), S(0));
 
-    for (unsigned mask = pairs.blocks[first + k]; mask != 0; mask &= mask - 1) {
-      const int block = __builtin_ctz(mask);
-      if (position >= w.block_last[block]) continue;
+    // Two blocks a turn: small splats touch one or two, and a loop that ends there after one turn is predicted well.
+    // The second may be the spare block behind the tile, which no splat changes.
+    unsigned mask = pairs.blocks[pair];
+    while (mask != 0) {
+      const int first = __builtin_ctz(mask);
+      mask &= mask - 1;
+      const int second = mask != 0 ? __builtin_ctz(mask) : kBlocks;
+      mask &= mask - 1;  // 0 stays 0
       for (int pack = 0; pack < kPacks; ++pack) {
-        const int at = block * kBlockPixels + pack * L;
-        const V dx = (u - S(frame.x0 + TileFrame::pixel_x(block, 0) + 0.5)) - load<V>(w.offsets.x + pack * L);
-        const V dy = (v - S(frame.y0 + TileFrame::pixel_y(block, 0) + 0.5)) - load<V>(w.offsets.y + pack * L);
-        const V power = log2_alpha(dx, dy, a, b, c, level);
-        const auto touched = (power >= constant<V>(kLog2AlphaMin)) & (load<I>(w.last + at) > position);
-        const V unclamped = select(touched, exp_2(power), zero);
-        const V alpha = minimum(ceiling, unclamped);
-
-        const S* g = w.image_gradient.data() + at;
-        V phi, weight;
-        if constexpr (kGeneral) {
-          phi = zero;
-          for (int channel = 0; channel < geometry_channels; ++channel)
-            phi += channel_value[channel] * load<V>(g + channel * kTilePixels);
-        } else {
-          phi = field[kRed][k] * load<V>(g) + field[kGreen][k] * load<V>(g + kTilePixels) +
-                field[kBlue][k] * load<V>(g + 2 * kTilePixels);
-        }
-        V transmittance = load<V>(w.transmittance + at), behind = load<V>(w.behind + at);
-        const V alpha_gradient = composite_backward(alpha, phi, transmittance, behind, weight);
-        store(w.transmittance + at, transmittance);
-        store(w.behind + at, behind);
-
-        if constexpr (kGeneral) {
-          for (int channel = 0; channel < canvas.channels; ++channel) {
-            S* total = w.channel_sums.data() + channel * L;
-            store(total, load<V>(total) + weight * load<V>(g + channel * kTilePixels));
-          }
-        } else {
-          for (int channel = 0; channel < 3; ++channel)
-            sum[kMoments + channel] += weight * load<V>(g + channel * kTilePixels);
-        }
-        // The clamp at 0.99 stops the gradient, unless it is asked to pass.
-        const V through = settings.pass_clamp ? unclamped : select(unclamped <= ceiling, unclamped, zero);
-        const V moment = -(through * alpha_gradient);
-        const V mx = moment * dx, my = moment * dy;
-        sum[kV0] += moment;
-        sum[kVx] += mx;
-        sum[kVy] += my;
-        sum[kVxx] += mx * dx;
-        sum[kVxy] += mx * dy;
-        sum[kVyy] += my * dy;
-        if constexpr (kAbsgrad) {
-          sum[kMoments + 3] += absolute(constant<V>(2) * a * mx + b * my);
-          sum[kMoments + 4] += absolute(b * mx + constant<V>(2) * c * my);
-        }
+        blend_pack(w, first * kBlockPixels + pack * L, position, record, channels, sums_of_pair);
+        blend_pack(w, second * kBlockPixels + pack * L, position, record, channels, sums_of_pair);
       }
     }
+    write_row(w, sums_of_pair, row(pair));
+  }
 
-    S* out = row(first + k);
-    for (int i = 0; i < kMoments; ++i) out[i] = horizontal_sum(sum[i]);
+  SW_HD void blend_pack(Workspace& w, int at, int32_t position, const S* record, const S* channels, Sums& sum) const {
+    const V zero = constant<V>(0), ceiling = constant<V>(kAlphaMax);
+    const V a = V{} + record[kA], b = V{} + record[kB], c = V{} + record[kC];
+    const V dx = record[kU] - load<V>(w.centres.x + at), dy = record[kV] - load<V>(w.centres.y + at);
+    const V power = log2_alpha(dx, dy, a, b, c, V{} + record[kLevel]);
+    const auto touched = (power >= constant<V>(kLog2AlphaMin)) & (load<I>(w.last + at) > position);
+    const V unclamped = select(touched, exp_2(power), zero);
+    const V alpha = minimum(ceiling, unclamped);
+
+    const S* gradient_at = w.image_gradient.data() + at;
+    const auto g = [&](int channel) { return load<V>(gradient_at + channel * kPixels); };
+    V phi, weight;
     if constexpr (kGeneral) {
-      for (int channel = 0; channel < canvas.channels; ++channel)
-        out[kMoments + channel] = horizontal_sum(load<V>(w.channel_sums.data() + channel * L));
+      phi = zero;
+      for (int channel = 0; channel < geometry_channels; ++channel) phi += channels[channel] * g(channel);
     } else {
-      for (int channel = 0; channel < 3; ++channel) out[kMoments + channel] = horizontal_sum(sum[kMoments + channel]);
+      phi = record[kRed] * g(0) + record[kGreen] * g(1) + record[kBlue] * g(2);
     }
-    if constexpr (kAbsgrad)
-      for (int i = 0; i < 2; ++i)  // A = -Ka log2(e)/2 and so on: back to natural units
-        out[kMoments + canvas.channels + i] = S(kLn2) * horizontal_sum(sum[kMoments + 3 + i]);
-    if (gradient.median != nullptr) out[columns - 1] = S(0);
+    V transmittance = load<V>(w.transmittance + at), behind = load<V>(w.behind + at);
+    const V alpha_gradient = composite_backward(alpha, phi, transmittance, behind, weight);
+    store(w.transmittance + at, transmittance);
+    store(w.behind + at, behind);
+
+    if constexpr (kGeneral) {
+      for (int channel = 0; channel < canvas.channels; ++channel) {
+        S* total = w.channel_sums.data() + channel * L;
+        store(total, load<V>(total) + weight * g(channel));
+      }
+    } else {
+      for (int channel = 0; channel < 3; ++channel) sum.color[channel] += weight * g(channel);
+    }
+    // The clamp at 0.99 stops the gradient, unless it is asked to pass: then the unclamped alpha stands in front.
+    const V through = select(unclamped <= w.clamp_limit, unclamped, zero);
+    const V moment = -(through * alpha_gradient);
+    const V mx = moment * dx, my = moment * dy;
+    sum.v0 += moment;
+    sum.x += mx;
+    sum.y += my;
+    sum.xx += mx * dx;
+    sum.xy += mx * dy;
+    sum.yy += my * dy;
+    if constexpr (kAbsgrad) {
+      sum.absolute[0] += absolute(constant<V>(2) * a * mx + b * my);
+      sum.absolute[1] += absolute(b * mx + constant<V>(2) * c * my);
+    }
+  }
+
+  void write_row(Workspace& w, const Sums& sum, S* out) const {
+    // A = -Ka log2(e)/2 and so on: absgrad goes back to natural units.
+    const V ln2 = constant<V>(kLn2);
+    V packs[kPlainColumns] = {sum.v0, sum.x, sum.y, sum.xx, sum.xy, sum.yy, sum.color[0], sum.color[1], sum.color[2],
+                              ln2 * sum.absolute[0], ln2 * sum.absolute[1], V{}};
+    if constexpr (!kGeneral) {
+      lane_sums<V, kPlainColumns>(packs, out);
+    } else {
+      alignas(64) S moments[kPlainColumns];
+      lane_sums<V, kPlainColumns>(packs, moments);
+      out = std::copy_n(moments, int(kMoments), out);
+      for (int channel = 0; channel < canvas.channels; ++channel)
+        *out++ = horizontal_sum(load<V>(w.channel_sums.data() + channel * L));
+      if constexpr (kAbsgrad) out = std::copy_n(moments + kMoments + 3, 2, out);
+      if (gradient.median != nullptr) *out = S(0);
+    }
   }
 
   // The median depth is the depth of one splat: its pixel's gradient goes straight to that splat.
@@ -174,7 +190,7 @@ void backward_tiles(const View<Scalar<V>>& view, const Settings& settings, const
                     const Pairs<Scalar<V>>& pairs, const Canvas<Scalar<V>>& canvas,
                     const CanvasGradient<Scalar<V>>& gradient, int detached, Scalar<V>* sums) {
   using Backward = TileBackward<V, kGeneral, kAbsgrad>;
-  const int columns = pair_columns(canvas.channels, kAbsgrad, gradient.median != nullptr);
+  const int columns = pair_columns(!kGeneral, canvas.channels, kAbsgrad, gradient.median != nullptr);
   const Backward backward{view,     settings, slots, pairs, canvas, gradient, canvas.channels - detached,
                           columns, sums};
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
@@ -182,7 +198,7 @@ void backward_tiles(const View<Scalar<V>>& view, const Settings& settings, const
   std::atomic<int64_t> next{0};
   parallel(settings.threads, [&](int, int) {
     const auto w = std::make_unique<typename Backward::Workspace>();
-    w->image_gradient.assign(size_t(canvas.channels) * kTilePixels, Scalar<V>(0));
+    w->image_gradient.assign(size_t(canvas.channels) * Backward::kPixels, Scalar<V>(0));
     w->channel_sums.assign(size_t(canvas.channels) * lanes_of<V>, Scalar<V>(0));
     for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) backward(order[size_t(i)], *w);
   });

@@ -17,13 +17,33 @@ SW_HD void gather_rows(const Scalar<V>* base, int64_t stride, const int32_t* row
   for (int k = 0; k < kFields; ++k) out[k] = load<V>(buffer[k]);
 }
 
+// Long rows: blocks of L fields are loaded whole and transposed in registers. `out` has room for a multiple of L.
 template <class V>
-SW_HD void gather_rows(const Scalar<V>* base, int64_t stride, const int32_t* rows, int fields, V* out) {
+SW_HD void gather_long_rows(const Scalar<V>* base, int64_t stride, const int32_t* rows, int fields, V* out) {
   constexpr int L = lanes_of<V>;
-  for (int i = 0; i < L; ++i) {
-    const Scalar<V>* row = base + rows[i] * stride;
-    Scalar<V>* to = reinterpret_cast<Scalar<V>*>(out) + i;
-    for (int k = 0; k < fields; ++k) to[k * L] = row[k];
+  for (int first = 0; first < fields; first += L) {
+    V* block = out + first;
+    if (fields - first >= L) {
+      for (int i = 0; i < L; ++i) block[i] = load<V>(base + rows[i] * stride + first);
+    } else {
+      for (int i = 0; i < L; ++i) {  // no reading beyond the row's end
+        block[i] = V{};
+        __builtin_memcpy(&block[i], base + rows[i] * stride + first, sizeof(Scalar<V>) * (fields - first));
+      }
+    }
+    transpose(block);
+  }
+}
+
+// The inverse: the first `count` rows are written, `values` (room for a multiple of L) is overwritten.
+template <class V>
+SW_HD void scatter_long_rows(V* values, int fields, Scalar<V>* base, int64_t stride, const int32_t* rows, int count) {
+  constexpr int L = lanes_of<V>;
+  for (int first = 0; first < fields; first += L) {
+    V* block = values + first;
+    transpose(block);
+    const size_t bytes = sizeof(Scalar<V>) * (fields - first < L ? fields - first : L);
+    for (int i = 0; i < count; ++i) __builtin_memcpy(base + rows[i] * stride + first, &block[i], bytes);
   }
 }
 

@@ -94,7 +94,7 @@ struct Pairs {
   int64_t* tile_start;   // [tiles + 1]
   int32_t* slot;         // [P] tile-major, front to back
   int32_t* origin;       // [P] number of the pair in splat-major order, or null
-  uint16_t* blocks;      // [P] bit b: block b of the tile may be touched; filled by blend, or null
+  uint16_t* blocks;      // [P] bit b: block b of the tile may be touched; filled by blend up to `last`, or null
 };
 
 template <class S>
@@ -118,9 +118,11 @@ struct CanvasGradient {
   const S* median;  // [H][W] or null
 };
 
-// Row length of the pair sums.
-inline int pair_columns(int channels, bool absgrad, bool median) {
-  return kMoments + channels + (absgrad ? 2 : 0) + (median ? 1 : 0);
+// Row length of the pair sums: moments, channels, absgrad (2), median (1). Plain RGB has a fixed row of 12 with room
+// for absgrad, written and added up with full-width operations.
+constexpr int kPlainColumns = 12;
+inline int pair_columns(bool plain, int channels, bool absgrad, bool median) {
+  return plain ? kPlainColumns : kMoments + channels + (absgrad ? 2 : 0) + (median ? 1 : 0);
 }
 
 template <class S>

@@ -157,14 +157,15 @@ struct ChunkProjection : Projector<V, kCov3d> {
     for (int i = 0; i < L; ++i) rows[i] = slots.index[first + (i < lanes ? i : lanes - 1)];
     const int degree = g.sh_degree, basis_count = (degree + 1) * (degree + 1);
 
-    alignas(64) V sh[3 * kMaxBasis];
-    gather_rows<V, 3>(g.sh_dc, g.sh_dc_stride, rows, sh);
-    V color[3];
-    for (int k = 0; k < 3; ++k) color[k] = c(0.5) + c(kSH0) * sh[k];
+    V dc[3], color[3];
+    gather_rows<V, 3>(g.sh_dc, g.sh_dc_stride, rows, dc);
+    for (int k = 0; k < 3; ++k) color[k] = c(0.5) + c(kSH0) * dc[k];
     V slope[9];
     for (V& x : slope) x = c(0);
     if (degree > 0) {
-      gather_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 3 * (basis_count - 1), sh + 3);
+      V rest[3 * kMaxBasis];
+      gather_sh_rest(degree, rows, rest);
+      const V* sh = rest - 3;  // sh[3 k + channel]
       V direction[3], basis[kMaxBasis];
       gather_rows<V, 3>(g.means, 3, rows, direction);
       for (int j = 0; j < 3; ++j) direction[j] -= this->view.center[j];
@@ -206,6 +207,14 @@ struct ChunkProjection : Projector<V, kCov3d> {
       for (int i = 0; i < L; ++i) targets[i] = int32_t(first + i);
       scatter_rows<V, 9>(slope, slots.color_slope, 9, targets, lanes);
     }
+  }
+
+  // Constant row lengths: the tails become plain stores.
+  SW_HD void gather_sh_rest(int degree, const int32_t* rows, V* rest) const {
+    const auto& g = this->g;
+    if (degree == 1) gather_long_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 9, rest);
+    if (degree == 2) gather_long_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 24, rest);
+    if (degree == 3) gather_long_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 45, rest);
   }
 
   bool has_finite_colors(int64_t slot) const {

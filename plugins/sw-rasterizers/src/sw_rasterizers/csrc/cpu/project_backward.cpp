@@ -46,24 +46,20 @@ struct ChunkBackward {
     alignas(64) int32_t rows[L];
     for (int i = 0; i < L; ++i) rows[i] = slots.index[first + (i < lanes ? i : lanes - 1)];
 
-    // Add up the pairs of each splat.
-    constexpr int kFixed = kMoments + 3 + 3;  // moments, RGB, absgrad, median
-    alignas(64) S fixed[kFixed][L];
-    alignas(64) S depth_gradient[L];
-    const int extra = columns - kMoments - channels.total();
+    // Add up the pairs of each splat, one field a pack.
+    alignas(64) S fixed[kPlainColumns][L];  // moments, RGB, absgrad
+    alignas(64) S depth_gradient[L] = {};
     for (int i = 0; i < L; ++i) {
       const int64_t slot = first + (i < lanes ? i : lanes - 1);
-      S total[kMoments + 3] = {}, tail[3] = {};
       const S* row = sums + int64_t(slots.first_pair[slot]) * columns;
-      const int plain = slots.channels == nullptr ? kMoments + 3 : kMoments;
-      for (int n = 0; n < slots.tiles[slot]; ++n, row += columns) {
-        for (int k = 0; k < plain; ++k) total[k] += row[k];
-        for (int k = 0; k < extra; ++k) tail[k] += row[columns - extra + k];
+      S total[kPlainColumns] = {};
+      if (slots.channels == nullptr) {
+        for (int n = 0; n < slots.tiles[slot]; ++n, row += kPlainColumns)
+          for (int k = 0; k < kPlainColumns; ++k) total[k] += row[k];
+      } else if (i < lanes) {
+        depth_gradient[i] = add_up_general(slot, row, total);
       }
-      for (int k = 0; k < kMoments + 3; ++k) fixed[k][i] = total[k];
-      for (int k = 0; k < 3; ++k) fixed[kMoments + 3 + k][i] = tail[k];
-      depth_gradient[i] = S(0);
-      if (slots.channels != nullptr && i < lanes) depth_gradient[i] = general_channels(slot, fixed, i);
+      for (int k = 0; k < kPlainColumns; ++k) fixed[k][i] = total[k];
     }
 
     Geometry<V> in;
@@ -116,30 +112,31 @@ struct ChunkBackward {
     }
   }
 
-  // Channels other than plain RGB: sums its pairs again, writes colour and feature gradients, leaves the RGB of SH in
-  // `fixed`, returns dL/dtz.
-  S general_channels(int64_t slot, S (*fixed)[L], int lane_index) const {
-    const int total = channels.total();
+  // Channels other than plain RGB: adds up the rows of one splat into `total` (as in the plain case), writes the
+  // gradients of colours and features, returns dL/dtz.
+  S add_up_general(int64_t slot, const S* row, S* total) const {
     const int64_t n = slots.index[slot];
-    const S* row = sums + int64_t(slots.first_pair[slot]) * columns + kMoments;
-    const auto add_up = [&](int channel) {
+    const auto column = [&](int k) {
       S value = 0;
-      for (int p = 0; p < slots.tiles[slot]; ++p) value += row[int64_t(p) * columns + channel];
+      for (int p = 0; p < slots.tiles[slot]; ++p) value += row[int64_t(p) * columns + k];
       return value;
     };
-    int channel = 0;
-    for (; channel < channels.colors; ++channel) {
-      const S value = add_up(channel);
-      if (channel < 3) fixed[kMoments + channel][lane_index] = value;
-      if (out.colors != nullptr) out.colors[n * channels.colors + channel] = value;
+    for (int k = 0; k < kMoments; ++k) total[k] = column(k);
+    int at = kMoments;
+    for (int k = 0; k < channels.colors; ++k) {
+      const S value = column(at++);
+      if (k < 3) total[kMoments + k] = value;
+      if (out.colors != nullptr) out.colors[n * channels.colors + k] = value;
     }
     const S depth = slots.records[slot * kRecord + kDepth];
     S gradient = 0;
-    if (channels.inverse) gradient -= add_up(channel++) / (depth * depth);
-    if (channels.accumulated) gradient += add_up(channel++);
-    for (int k = 0; channel < total; ++channel, ++k)
-      if (out.features != nullptr) out.features[n * channels.features + k] = add_up(channel);
-    if (settings.median_depth) gradient += fixed[kMoments + 3 + (settings.absgrad ? 2 : 0)][lane_index];
+    if (channels.inverse) gradient -= column(at++) / (depth * depth);
+    if (channels.accumulated) gradient += column(at++);
+    for (int k = 0; k < channels.features; ++k, ++at)
+      if (out.features != nullptr) out.features[n * channels.features + k] = column(at);
+    if (settings.absgrad)
+      for (int k = 0; k < 2; ++k) total[kMoments + 3 + k] = column(at++);
+    if (settings.median_depth) gradient += column(at);
     return gradient;
   }
 
@@ -170,17 +167,17 @@ struct ChunkBackward {
     const V inverse_length = constant<V>(1) / square_root(dot3(direction, direction));
     for (V& d : direction) d *= inverse_length;
     sh_basis(g.sh_degree, direction[0], direction[1], direction[2], basis);
-    alignas(64) S values[kMaxBasis][L];
+    V values[3 * kMaxBasis];
     const int count = (g.sh_degree + 1) * (g.sh_degree + 1);
-    for (int k = 1; k < count; ++k) store(values[k], basis[k]);
-    for (int i = 0; i < lanes; ++i) {
-      S* row = out.sh_rest + rows[i] * out.sh_rest_stride;
-      const S red = color[0][i], green = color[1][i], blue = color[2][i];
-      for (int k = 1; k < count; ++k, row += 3) {
-        const S b = values[k][i];
-        row[0] = b * red, row[1] = b * green, row[2] = b * blue;
-      }
-    }
+    for (int k = 1; k < count; ++k)
+      for (int channel = 0; channel < 3; ++channel)
+        values[3 * (k - 1) + channel] = basis[k] * load<V>(color[channel]);
+    const auto write = [&](int fields) {
+      scatter_long_rows(values, fields, out.sh_rest, out.sh_rest_stride, rows, lanes);
+    };
+    if (g.sh_degree == 1) write(9);  // constant row lengths: the tails become plain stores
+    if (g.sh_degree == 2) write(24);
+    if (g.sh_degree == 3) write(45);
   }
 };
 
@@ -188,7 +185,7 @@ template <class V, bool kCov3d>
 void backward_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
                   const Channels& channels, const Slots<Scalar<V>>& slots, const Scalar<V>* sums,
                   const Gradients<Scalar<V>>& out) {
-  const int columns = pair_columns(channels.total(), settings.absgrad, settings.median_depth);
+  const int columns = pair_columns(slots.channels == nullptr, channels.total(), settings.absgrad, settings.median_depth);
   const ChunkBackward<V, kCov3d> backward_chunk{view, g, settings, channels, slots, sums, columns, out};
   parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, backward_chunk);
 }

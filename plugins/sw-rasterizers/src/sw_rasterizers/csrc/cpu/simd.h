@@ -5,6 +5,8 @@
 // without vectorisation (the benchmark's baseline).
 #pragma once
 
+#include <utility>
+
 #include "../common.h"
 
 #if !defined(SW_LANES)
@@ -62,6 +64,63 @@ SW_HD bool any(PackI mask) {
 SW_HD bool lane(PackI mask, int i) { return mask[i] != 0; }
 SW_HD float lane(PackF x, int i) { return x[i]; }
 
+// Lane i of the result is lane Pick::at(i) of a (if below SW_LANES) or of b.
+template <class Pick, int... I>
+SW_HD PackF shuffle_lanes(PackF a, PackF b, std::integer_sequence<int, I...>) {
+#if defined(__clang__)
+  return __builtin_shufflevector(a, b, Pick::at(I)...);
+#else
+  return __builtin_shuffle(a, b, PackI{Pick::at(I)...});
+#endif
+}
+template <class Pick>
+SW_HD PackF shuffle(PackF a, PackF b) {
+  return shuffle_lanes<Pick>(a, b, std::make_integer_sequence<int, SW_LANES>{});
+}
+
+// Groups of 2 width lanes: the lower halves of a's and b's groups side by side, or the upper ones.
+template <int width, bool upper>
+struct HalfGroups {
+  static constexpr int at(int i) {
+    const int group = i / (2 * width) * (2 * width), k = i % (2 * width), half = upper ? width : 0;
+    return k < width ? group + half + k : SW_LANES + group + half + k - width;
+  }
+};
+struct BitReversed {
+  static constexpr int at(int i) {
+    int reversed = 0;
+    for (int bit = 1; bit < SW_LANES; bit *= 2) reversed = 2 * reversed + (i & bit ? 1 : 0);
+    return reversed;
+  }
+};
+
+// Sums over lanes of `count` <= SW_LANES packs, sum i in lane i; `packs` is overwritten. A tree of folds that halves
+// the number of packs and of lanes per sum at once: three operations a fold instead of log2(lanes) steps a pack.
+template <int width>
+SW_HD PackF fold_lanes(PackF* packs, int count) {
+  for (int i = 0; i < count; i += 2) {
+    const PackF a = packs[i], b = i + 1 < count ? packs[i + 1] : a;
+    packs[i / 2] = shuffle<HalfGroups<width, false>>(a, b) + shuffle<HalfGroups<width, true>>(a, b);
+  }
+  if constexpr (width > 1)
+    return fold_lanes<width / 2>(packs, (count + 1) / 2);
+  else
+    return shuffle<BitReversed>(packs[0], packs[0]);
+}
+
+// rows[i] lane k <-> rows[k] lane i.
+template <int width>
+SW_HD void transpose_step(PackF* rows) {
+  for (int i = 0; i < SW_LANES; ++i) {
+    if (i & width) continue;
+    const PackF a = rows[i], b = rows[i + width];
+    rows[i] = shuffle<HalfGroups<width, false>>(a, b);
+    rows[i + width] = shuffle<HalfGroups<width, true>>(a, b);
+  }
+  if constexpr (width > 1) transpose_step<width / 2>(rows);
+}
+SW_HD void transpose(PackF* rows) { transpose_step<SW_LANES / 2>(rows); }
+
 SW_HD float horizontal_sum(PackF x) {
   float part[SW_LANES];
   __builtin_memcpy(part, &x, sizeof part);
@@ -86,6 +145,9 @@ constexpr int lanes_of = PackTraits<V>::lanes;
 template <class V>
 using IntOf = typename PackTraits<V>::Int;
 
+template <class V>
+SW_HD void transpose(V*) {}  // one lane
+
 SW_HD float to_real(int32_t x) { return float(x); }
 #if SW_LANES > 1
 SW_HD PackF to_real(PackI x) { return __builtin_convertvector(x, PackF); }
@@ -100,6 +162,21 @@ SW_HD V load(const void* from) {
 template <class V>
 SW_HD void store(void* to, V value) {
   __builtin_memcpy(to, &value, sizeof value);
+}
+
+// out[i] = sum over lanes of packs[i]; `packs` is overwritten.
+template <class V, int kCount>
+SW_HD void lane_sums(V* packs, Scalar<V>* out) {
+  constexpr int L = lanes_of<V>;
+  if constexpr (L == 1) {
+    for (int i = 0; i < kCount; ++i) out[i] = packs[i];
+  } else {
+    for (int first = 0; first < kCount; first += L) {
+      const int count = kCount - first < L ? kCount - first : L;
+      const V sums = fold_lanes<L / 2>(packs + first, count);
+      __builtin_memcpy(out + first, &sums, sizeof(Scalar<V>) * count);
+    }
+  }
 }
 
 // 2^x for finite x > -126; relative error below 1e-7. Below that, and for x without meaning, the result is arbitrary

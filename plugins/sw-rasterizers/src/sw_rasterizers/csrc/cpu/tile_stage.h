@@ -39,12 +39,15 @@ struct TileFrame {
   }
 };
 
-// Centres of a block's pixels relative to the block's first centre, in lanes.
-template <class S>
-struct LaneOffsets {
-  alignas(64) S x[kBlockPixels], y[kBlockPixels];
-  LaneOffsets() {
-    for (int i = 0; i < kBlockPixels; ++i) x[i] = S(i % kBlock), y[i] = S(i / kBlock);
+// Centres of the tile's pixels, block by block.
+template <class S, int kCount = kTilePixels>
+struct PixelCentres {
+  alignas(64) S x[kCount], y[kCount];
+  void set(const TileFrame& frame) {
+    for (int i = 0; i < kCount; ++i) {
+      x[i] = S(frame.x0 + TileFrame::pixel_x(i / kBlockPixels, i % kBlockPixels)) + S(0.5);
+      y[i] = S(frame.y0 + TileFrame::pixel_y(i / kBlockPixels, i % kBlockPixels)) + S(0.5);
+    }
   }
 };
 
@@ -53,13 +56,22 @@ struct TileStage {
   using S = Scalar<V>;
   using I = IntOf<V>;
   static constexpr int L = lanes_of<V>;
-  alignas(64) S field[kCutoff + 1][kStage];
+  alignas(64) S field[kRecord][kStage];
   alignas(64) int32_t blocks[kStage];
 
-  void load_splats(const Slots<S>& slots, const int32_t* list, int count) {
-    for (int k = 0; k < count; ++k) {
-      const S* record = slots.records + int64_t(list[k]) * kRecord;
-      for (int f = 0; f <= kCutoff; ++f) field[f][k] = record[f];
+  // Stages list[0..count), of which `available` >= count entries may be read (and their records prefetched).
+  void load_splats(const Slots<S>& slots, const int32_t* list, int count, int64_t available) {
+    constexpr int kAhead = 2 * L < 16 ? 16 : 2 * L;
+    const auto record = [&](int64_t k) { return slots.records + int64_t(list[k]) * kRecord; };
+    for (int k = 0; k < count; k += L) {
+      for (int i = 0; i < L; ++i)
+        if (k + i + kAhead < available) __builtin_prefetch(record(k + i + kAhead));
+      for (int f = 0; f < kRecord; f += L) {
+        V rows[L];
+        for (int i = 0; i < L; ++i) rows[i] = load<V>(record(k + i < count ? k + i : count - 1) + f);
+        transpose(rows);
+        for (int i = 0; i < L; ++i) store(field[f + i] + k, rows[i]);
+      }
     }
   }
 
