@@ -30,9 +30,8 @@ else:
 ParamsT = TypeVar("ParamsT", bound=Params)
 
 RESERVED = ("method", "preset", "rate", "scene")
-SCENE_KEYS = (
-    "images", "resolution", "test_every", "background", "principal_point", "split", "mask_background", "init_points",
-)  # fmt: skip
+# The seed of a scene's start points is the seed of the run.
+SCENE_KEYS = tuple(field.name for field in dataclasses.fields(SceneOptions) if field.name != "seed")
 RATE_ALIASES = ("low", "default", "high", "all")
 
 

@@ -25,7 +25,9 @@ class Part(BaseModel):
 
 
 class ProtocolBlock(Part):
-    """What makes results comparable: only equal ids may stand in one table."""
+    """What makes results comparable: only equal ids may stand in one table. Rules that came later may stand beside."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
     id: str
     dataset: str
@@ -35,7 +37,6 @@ class ProtocolBlock(Part):
     background: str
     principal_point: str
     quantize8: bool = Field(description="renders were rounded to 8 bit before comparing")
-    masked: bool = Field(description="pictures were multiplied by their masks")
 
 
 class MetricBlock(Part):

@@ -1,0 +1,154 @@
+"""A small method of its own distribution, found through an entry point also by fresh processes."""
+
+import importlib
+import importlib.metadata
+import os
+from pathlib import Path
+
+import pytest
+
+TOY = '''
+"""Two methods for tests: `toy` trains Gaussians for a few steps; `toy-student` starts from a trained toy scene."""
+
+import os
+import sys
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+import torch
+from pydantic import Field
+from splatwizard_core.experiments.method import Method
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.scene.scene import PointCloud
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.training.stage import Stage
+
+NAMES = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
+
+
+class Codec(Params):
+    kind: Literal["f2", "f4"] = "f4"
+    fault: str = Field("", description="what to do wrong, for tests of the runner")
+
+
+class ToyConfig(OptimizationParams):
+    iterations: int = Field(8, ge=1)
+    codec: Codec = Codec()
+
+
+class ToyStage(Stage):
+    name = "toy"
+
+    def create_optimizer(self, model, scene):
+        return SplatOptimizer(model, [ParamGroup("sh_dc", 0.02), ParamGroup("means", 1e-3)])
+
+
+class Toy(Method):
+    name = "toy"
+    Config = ToyConfig
+    PRESETS = {"paper": {}, "quick": {"iterations": 6}}
+    RATES = {"r1": {"codec.kind": "f2"}, "r2": {}}
+    DEFAULT_RATE = "r2"
+
+    def create_model(self, scene, generator):
+        points = PointCloud(scene.points.xyz[:60], scene.points.rgb[:60])
+        return GaussianModel.from_points(points, max_sh_degree=1)
+
+    def stages(self) -> Sequence[Stage]:
+        return [ToyStage(self.config)]
+
+    def encode(self, model, writer):
+        codec = self.config.codec
+        writer.static["fault"] = codec.fault
+        for name in NAMES:
+            writer.add_array(name, getattr(model, name).detach().cpu().numpy().astype("<" + codec.kind))
+        if codec.fault == "mutate":
+            with torch.no_grad():
+                model.means.add_(1)
+
+    def decode(self, reader):
+        # What a decoder may see: its file, in a folder that holds nothing else, and no way to the data.
+        if reader.static["fault"] == "look around" and sys.argv[1:2] == ["decode"]:
+            assert os.listdir(".") == ["scene.swz"], os.listdir(".")
+            assert "SPLATWIZARD_DATA" not in os.environ
+        tensors = {}
+        for name in NAMES:
+            dtype = "<f2" if len(reader.section("means")) < 60 * 3 * 4 else "<f4"
+            tensors[name] = torch.from_numpy(reader.array(name, dtype=dtype).astype(np.float32))
+        if reader.static["fault"] == "dice":
+            tensors["means"] = tensors["means"] + torch.rand(1, generator=torch.Generator().manual_seed(os.getpid()))
+        return GaussianModel.from_tensors(**tensors)
+
+
+class StudentStage(ToyStage):
+    name = "student"
+
+    @property
+    def starts_from(self):
+        return "toy"
+
+
+class Student(Toy):
+    name = "toy-student"
+
+    def stages(self):
+        return [StudentStage(self.config)]
+'''
+
+PLUGIN = """
+from splatwizard_core.plugins import hookimpl
+
+
+@hookimpl
+def register_methods(registry):
+    registry.add("toy", "toy_method:Toy", summary="for tests")
+    registry.add("toy-student", "toy_method:Student", summary="for tests")
+
+
+@hookimpl
+def register_metrics(registry):
+    registry.add("toy-error", "toy_plugin:largest_error", summary="largest absolute error", direction="lower")
+    registry.add("toy-absent", "toy_plugin:absent", summary="never there", direction="lower")
+
+
+def largest_error(render, truth):
+    return float((render - truth).abs().max())
+
+
+def absent(render, truth):
+    from splatwizard_core.errors import CapabilityError
+
+    raise CapabilityError("toy weights are missing: get them somewhere")
+"""
+
+
+@pytest.fixture(scope="session")
+def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for PYTHONPATH that holds the distribution sw-toy."""
+    site = tmp_path_factory.mktemp("site")
+    (site / "toy_method.py").write_text(TOY)
+    (site / "toy_plugin.py").write_text(PLUGIN)
+    info = site / "sw_toy-0.1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-toy\nVersion: 0.1\n")
+    (info / "entry_points.txt").write_text("[splatwizard]\ntoy = toy_plugin\n")
+    return site
+
+
+@pytest.fixture(scope="module")
+def toy_plugins(toy_site: Path):
+    """The plugin manager with the core and sw-toy alone, here and in every process started from here."""
+    from splatwizard_core.plugins import load_plugins
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(toy_site))
+        # The kernels of installed plugins stay out of it: these tests are about the run.
+        patch.setenv("SW_PLUGINS", "toy")
+        patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(toy_site), os.environ.get("PYTHONPATH", "")])))
+        patch.setenv("SPLATWIZARD_DATA", str(toy_site))
+        importlib.invalidate_caches()
+        load_plugins.cache_clear()
+        yield load_plugins()
+    load_plugins.cache_clear()
