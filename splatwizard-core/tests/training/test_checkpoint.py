@@ -123,6 +123,17 @@ def test_the_last_of_each_earlier_stage_stays(tmp_path):
         store.last_of(1)
 
 
+def test_what_a_killed_writer_left_is_removed_with_the_next_checkpoint(tmp_path):
+    store = CheckpointStore(tmp_path)
+    for name in (".00-0000050.json.tmp", ".00-0000050.safetensors.tmp", "00-0000050.safetensors"):
+        (tmp_path / name).write_text("half")
+    (tmp_path / "00-0000040.json.damaged").write_text("kept for the curious")
+    store.write(make())
+    assert {p.name for p in tmp_path.iterdir()} == {
+        "00-0000100.json", "00-0000100.safetensors", "00-0000040.json.damaged",
+    }  # fmt: skip
+
+
 def test_other_files_are_left_alone(tmp_path):
     other = tmp_path / "notes.json"
     other.write_text("{}")
@@ -246,6 +257,11 @@ def test_differences_name_keys_tasks_and_extent():
         "plan - pre | a | 1 | priority 0",
         "plan + pre | a | 2 | priority 0",
     ]
+
+
+def test_long_values_are_cut_in_the_message():
+    old = make(identity={"key": "a" * 64})
+    assert differences(old, {"key": "b" * 64}, old.plan, 1.5) == [f"key: {'a' * 37}... -> {'b' * 37}..."]
 
 
 def test_tuples_and_paths_of_an_identity_do_not_count_as_changes(tmp_path):

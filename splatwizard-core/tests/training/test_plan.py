@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.plan import (
     Registration,
     check_when,
@@ -241,3 +242,8 @@ def test_the_digest_sees_names_steps_and_priorities():
     assert digest([1, 2, 3, 4, 5, 6, 8]) != base
     assert digest([1, 2, 3, 4, 5, 6, 7], name="b") != base
     assert digest([1, 2, 3, 4, 5, 6, 7], priority=1) != base
+
+
+def test_a_schedule_is_scaled_only_when_asked():
+    assert OptimizationParams(iterations=3000).schedule_scale == 1.0
+    assert OptimizationParams(iterations=3000, scale_schedule=True).schedule_scale == pytest.approx(0.1)

@@ -31,6 +31,7 @@ log = logging.getLogger(__name__)
 
 FORMAT = 1
 TENSOR_KEY = "$tensor"
+SHOWN_CHARACTERS = 40  # of a value that differs
 _NAME = re.compile(r"(\d{2})-(\d{7})\.json")
 _OURS = re.compile(r"\.?\d{2}-\d{7}\.(json|safetensors)(\.tmp|\.damaged)?")
 
@@ -128,7 +129,7 @@ class CheckpointStore:
                 log.warning("resuming from %s instead, step %d", path.name, found.step)
             return found
         if problem is not None:
-            raise CheckpointError(f"{problem}; no earlier checkpoint is left, so start again without resuming")
+            raise CheckpointError(f"{problem}; no earlier checkpoint is left, so start again (--fresh)")
         return None
 
     def last_of(self, stage: int) -> Checkpoint:
@@ -139,7 +140,7 @@ class CheckpointStore:
                 if found.finished:
                     return found
         raise CheckpointError(
-            f"{self.directory}: the last checkpoint of stage {stage} is missing; start again without resuming"
+            f"{self.directory}: the last checkpoint of stage {stage} is missing; start again (--fresh)"
         )
 
     def clear(self) -> None:
@@ -157,7 +158,8 @@ class CheckpointStore:
             path.stem for number, paths in by_stage.items() for path in paths[: self.keep if number == stage else 1]
         }
         for path in self.directory.iterdir():
-            if re.fullmatch(r"\d{2}-\d{7}\.(json|safetensors)", path.name) and path.stem not in kept:
+            # Also what a killed process left half written; what was set aside as damaged stays.
+            if _OURS.fullmatch(path.name) and path.suffix != ".damaged" and path.stem not in kept:
                 path.unlink()
 
 
@@ -174,7 +176,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
             raise DamagedCheckpointError(f"checkpoint {path} is damaged: its checksum does not fit")
         if content["format"] != FORMAT:
             raise CheckpointError(
-                f"checkpoint {path} has format {content['format']}, this version reads {FORMAT}: start again"
+                f"checkpoint {path} has format {content['format']}, this version reads {FORMAT}: start again (--fresh)"
             )
         with safe_open(tensor_path, framework="pt") as file:
             if (file.metadata() or {}).get("pair") != content["pair"]:
@@ -248,14 +250,23 @@ def normalised(identity: Mapping[str, Any]) -> dict[str, Any]:
 def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Sequence[str], extent: float) -> list[str]:
     """What a checkpoint was made with and this run is not, one line each; empty if nothing differs."""
     old, new = _flat(checkpoint.identity), _flat(normalised(identity))
-    lines = [f"{k}: {old.get(k, 'absent')} -> {new.get(k, 'absent')}" for k in sorted(old.keys() | new.keys())
-             if old.get(k, "absent") != new.get(k, "absent")]  # fmt: skip
+    lines = []
+    for key in sorted(old.keys() | new.keys()):
+        before, now = old.get(key, "absent"), new.get(key, "absent")
+        if before != now:
+            lines.append(f"{key}: {_short(before)} -> {_short(now)}")
     if abs(checkpoint.extent - extent) > 1e-6 * max(abs(extent), 1e-12):
         lines.append(f"scene extent: {checkpoint.extent:.6g} -> {extent:.6g}")
     if plan_digest(checkpoint.plan) != plan_digest(plan):
         changed = (d for d in difflib.ndiff(checkpoint.plan, list(plan)) if d[0] in "+-")
         lines += [f"plan {line}" for line in changed]
     return lines
+
+
+def _short(value: Any) -> str:
+    """A value for a message: digests and long lists are cut."""
+    text = str(value)
+    return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
 
 
 def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

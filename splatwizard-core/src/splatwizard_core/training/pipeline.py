@@ -136,7 +136,7 @@ class _Run:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
             raise CheckpointError(
                 f"the checkpoint of stage '{saved.stage_name}', step {saved.step}, was made by another plan or "
-                f"configuration ({'; '.join(changed[:3])}{more}): resume with --allow-changed-plan, or start again"
+                f"configuration ({'; '.join(changed[:3])}{more}): resume with --allow-changed-plan, or use --fresh"
             )
         for line in changed:
             log.warning("resuming with a changed plan or configuration: %s", line)
