@@ -25,7 +25,14 @@ traceback. Results go to stdout, progress and messages to stderr; with `--json` 
 
 def pages(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, str]]:
     """(`sw run`, its help) for a command and, if it is a group, what is in it; plugins' commands left out."""
-    context = click.Context(command, info_name=name, parent=parent, terminal_width=WIDTH, max_content_width=WIDTH)
+    context = click.Context(
+        command,
+        info_name=name,
+        parent=parent,
+        terminal_width=WIDTH,
+        max_content_width=WIDTH,
+        help_option_names=cli.context_settings["help_option_names"],
+    )
     if command is cli:
         # The list of commands would contain what happens to be installed.
         formatter = context.make_formatter()

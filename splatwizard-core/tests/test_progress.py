@@ -1,0 +1,95 @@
+"""The progress display away from a terminal, and its cost."""
+
+import io
+import time
+
+import pytest
+
+from splatwizard_core import progress
+from splatwizard_core.progress import duration, track
+
+
+def test_a_blink_of_an_eye_prints_nothing():
+    out = io.StringIO()
+    with track("encode", total=3, stream=out) as bar:
+        for _ in range(3):
+            bar.advance()
+    assert out.getvalue() == ""
+
+
+def test_plain_lines_show_count_rate_loss_gaussians_and_time_left(monkeypatch: pytest.MonkeyPatch):
+    now = [100.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    out = io.StringIO()
+    with track("train 3dgs", total=100, start=20, stream=out) as bar:
+        for _ in range(60):
+            now[0] += 0.2
+            bar.advance(1, loss=0.03125, gaussians=120_331)
+    lines = out.getvalue().splitlines()
+    assert lines[0] == "train 3dgs: 45/100 · 5.0 it/s · loss 0.03125 · 120,331 Gaussians · 11.0 s left"
+    assert len(lines) == 3  # every five seconds of twelve, and the last one
+    assert lines[-1] == "train 3dgs: 80 in 12.0 s · 5.0 it/s · loss 0.03125 · 120,331 Gaussians"
+
+
+def test_steps_of_an_earlier_process_do_not_count_for_the_rate(monkeypatch: pytest.MonkeyPatch):
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    with track("t", total=1000, start=900, stream=io.StringIO()) as bar:
+        assert bar.rate is None
+        assert bar.seconds_left is None
+        now[0] = 2.0
+        bar.advance(4)
+        assert bar.rate == pytest.approx(2.0)
+        assert bar.seconds_left == pytest.approx(48.0)
+
+
+def test_values_are_read_only_when_they_are_shown():
+    class Costly:
+        read = 0
+
+        def __float__(self) -> float:
+            Costly.read += 1
+            return 1.0
+
+    with track("t", total=1000, stream=io.StringIO()) as bar:
+        for _ in range(1000):
+            bar.advance(1, loss=Costly())
+    assert Costly.read <= 1
+
+
+def test_advancing_is_cheap():
+    with track("t", stream=io.StringIO()) as bar:
+        began = time.perf_counter()
+        for _ in range(10_000):
+            bar.advance(1, loss=0.5, gaussians=10)
+        per_call = (time.perf_counter() - began) / 10_000
+    assert per_call < 100e-6  # about 1 us; a training step takes 100 ms
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_gets_a_bar_with_the_same_facts_and_nested_bars_share_it(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setenv("COLUMNS", "140")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(progress, "REFRESH_SECONDS", 0.0)
+    monkeypatch.setattr(progress._RichBar, "_interval", 0.0)
+    out = Terminal()
+    with track("train [red]", total=10, stream=out) as bar:
+        bar.advance(4, loss=0.25, gaussians=1234)
+        with track("evaluate", total=2, unit="views", stream=out) as inner:
+            inner.advance(1, PSNR=30.5)
+        bar.advance(6)
+    text = out.getvalue()
+    for part in ("train [red]", "4/10", "loss 0.25", "1,234 Gaussians", "evaluate", "PSNR 30.5", "10/10"):
+        assert part in text
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.04, "0.0 s"), (59.4, "59.4 s"), (60, "1 min 00 s"), (245, "4 min 05 s"), (7380, "2 h 03 min")],
+)
+def test_durations(seconds: float, text: str):
+    assert duration(seconds) == text
