@@ -8,6 +8,7 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
+from typing import Any
 
 import click
 
@@ -54,6 +55,17 @@ class LazyGroup(click.Group):
         if taken in COMMANDS or taken in self.commands:
             raise PluginError(f"command '{taken}' already exists")
         super().add_command(cmd, name)
+
+    def invoke(self, ctx: click.Context) -> Any:
+        """Run the command; a reader that goes away (`sw info x | head`) ends it quietly."""
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            # Keep the interpreter from complaining when it flushes at its end.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise click.exceptions.Exit(SIGPIPE_STATUS) from None
+        return result
 
     def ask_plugins(self) -> None:
         """Let every plugin add its commands, once."""
@@ -105,7 +117,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger(noisy).setLevel(logging.WARNING)
     try:
         status = cli.main(args=arguments, prog_name="sw", standalone_mode=False)
-        sys.stdout.flush()
     except BaseException as error:
         return _report(error, debug=debug)
     return status if isinstance(status, int) else 0
@@ -113,10 +124,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _report(error: BaseException, *, debug: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
-    if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):  # click makes it an exit
-        # Nobody reads any more; keep the interpreter from complaining when it flushes at its end.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return SIGPIPE_STATUS
     if debug and not isinstance(error, (click.ClickException, click.Abort, SystemExit)):
         traceback.print_exception(error)
     if isinstance(error, SystemExit):
