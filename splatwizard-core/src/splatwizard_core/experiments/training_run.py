@@ -61,7 +61,7 @@ def train(
     if done is None:
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
     outcome_model, facts = run_stages(
-        session, resolved, scene, home, key,
+        session, resolved, scene, home,
         trained=trained, resume=resume or done is not None, allow_changed_plan=allow_changed_plan,
         stop_after=stop_after,
     )  # fmt: skip
@@ -106,7 +106,6 @@ def run_stages(
     resolved: ResolvedConfig,
     scene: Scene,
     directory: Path,
-    key: str,
     *,
     trained: Callable[[str], TrainedModel],
     resume: bool,
