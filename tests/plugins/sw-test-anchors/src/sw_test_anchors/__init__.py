@@ -1,0 +1,1 @@
+"""An anchor method that holds the core to its contracts."""

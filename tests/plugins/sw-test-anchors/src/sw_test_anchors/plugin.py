@@ -1,0 +1,8 @@
+"""What this package provides."""
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("test-anchors", "sw_test_anchors.method:TestAnchors", summary="proof of the contracts: anchors")
