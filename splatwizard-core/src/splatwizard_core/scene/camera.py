@@ -74,7 +74,7 @@ class Camera:
         return mat
 
     @property
-    def K(self) -> Tensor:
+    def K(self) -> Tensor:  # noqa: N802 (the field's name)
         """Intrinsics, [3,3]."""
         return torch.tensor(
             [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]],

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatwizard_core.errors import ConfigError, SceneError
+from splatwizard_core.progress import track
 from splatwizard_core.scene.scene import View
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
@@ -145,12 +146,17 @@ def decode_all(views: Iterable[View], *, workers: int | None = None) -> None:
 
     workers     threads; None: one for each core that this process may use, at most 8
     """
-    pending = [view for view in views if view.load is not None]
+    pending = [view for view in views if view.load is not None and "pixels" not in vars(view)]
+    if not pending:
+        return
     if workers is None:
         workers = min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
-    with ThreadPoolExecutor(max_workers=max(1, workers)) as pool:
+    with (
+        track("read pictures", total=len(pending), unit="pictures") as bar,
+        ThreadPoolExecutor(max_workers=max(1, workers)) as pool,
+    ):
         for _ in pool.map(lambda view: view.pixels, pending):
-            pass
+            bar.advance()
 
 
 def _has_alpha(picture: Image.Image) -> bool:

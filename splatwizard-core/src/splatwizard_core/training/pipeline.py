@@ -13,6 +13,7 @@ from splatwizard_core.errors import CheckpointError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter
 from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.images import decode_all
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences, normalised
@@ -282,6 +283,7 @@ def _run_stage(
         trainer, name, progress, run_log, save, meter, label=label, on_step=on_step, evaluate=evaluate
     )
     if until > trainer.step or stop_after is None:
+        decode_all(run.scene.train)  # reading pictures is not training time
         with housekeeping:
             trainer.run(until, housekeeping.after_step, housekeeping.guard)
     finished = trainer.stopped or trainer.step >= iterations
