@@ -143,20 +143,9 @@ class ResolvedConfig:
             "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
         }
 
-    def training_identity(self) -> dict[str, Any]:
-        """Everything that training depends on, readable: not the `codec` block, the device or the rate's name."""
-        return {
-            "method": self.method,
-            "config": self.config.model_dump(mode="json", exclude={"codec"}),
-            "pipeline": self.ppl.model_dump(
-                mode="json", include={"seed", "random_background", "clamp_render", "raster"}
-            ),
-            "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
-        }
-
     def training_hash(self) -> str:
-        """SHA-256 of `training_identity`: rate points that differ in the codec alone share it."""
-        return content_hash(self.training_identity())
+        """SHA-256 of `training_content`: rate points that differ in the codec alone share it."""
+        return content_hash(self.training_content())
 
     def config_hash(self) -> str:
         """SHA-256 over every value of the method, the run and the scene options."""

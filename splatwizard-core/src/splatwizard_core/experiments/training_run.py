@@ -152,7 +152,11 @@ def run_stages(
         rasterizer,
         directory=directory / CHECKPOINTS,
         # The content besides its key, so that a refused resume can say what differs.
-        identity={**resolved.training_content(), "method_version": method.version, "key": key},
+        identity={
+            **resolved.training_content(),
+            "method_version": method.version,
+            "scene_digest": session.scene_digest(resolved),
+        },
         trained=frozen,
         stop_after=stop_after,
         resume=resume,
