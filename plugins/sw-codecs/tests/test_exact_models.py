@@ -33,6 +33,14 @@ def test_round_trip(name, n):
     assert np.array_equal(found, symbols)
 
 
+def test_contexts_are_reached_through_the_registered_class():
+    """A method of another package has the class from the registry and imports nothing of ours."""
+    model = GaussianExact()
+    context = model.IntegerContext(np.zeros(3, np.int64), np.full(3, 4096), model.step_multipliers(np.zeros(3)))
+    assert np.array_equal(model.decode(model.encode(np.arange(3), context), context), np.arange(3))
+    assert model.bits(torch.zeros(2), model.FloatContext(0.0, 1.0)).shape == (2,)
+
+
 symbols_and_parameters = st.lists(
     st.tuples(
         st.integers(-(2**30) + 1, 2**30 - 1) | st.integers(-5, 5),

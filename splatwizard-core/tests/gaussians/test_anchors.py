@@ -145,7 +145,8 @@ class Masked(AnchorModel):
     def attributes(self, rows):
         raw = super().attributes(rows)
         masks = (torch.arange(self.num_offsets) % 2 == 0).float().expand(len(rows), -1)
-        return AnchorAttributes(raw.positions, raw.features / 2, raw.offsets, raw.scales, masks)
+        extras = {"rate": raw.features.abs().sum()}
+        return AnchorAttributes(raw.positions, raw.features / 2, raw.offsets, raw.scales, masks, extras)
 
 
 def test_a_subclass_decides_what_the_networks_see():
@@ -155,6 +156,7 @@ def test_a_subclass_decides_what_the_networks_see():
     assert len(g) > 0
     assert bool((selection.drawn % 2 == 0).all())
     assert float(selection.opacities[:, 1::2].abs().max()) == 0
+    torch.testing.assert_close(g.extras["rate"], model.features[selection.rows].abs().sum())  # with its gradient
     with torch.no_grad():
         model.features /= 2
     plain = make()

@@ -43,7 +43,9 @@ class CategoricalContext:
 
 
 class Categorical:
-    """Counts are gathered by the encoder and stored; nothing is trained."""
+    """Counts are gathered by the encoder and stored; nothing is trained. Its context is a `Categorical.Context`."""
+
+    Context = CategoricalContext
 
     def bits(self, symbols: Tensor, context: CategoricalContext) -> Tensor:
         """Bits per symbol under the counts of `symbols` itself, float64, shape of `symbols`; no gradient."""

@@ -59,9 +59,16 @@ def step_multipliers(outputs: np.ndarray) -> np.ndarray:
 
 
 class ExactModel:
-    """Codes integer symbols [n], |k| < 2^30, in units of the step; see the two subclasses."""
+    """Codes integer symbols [n], |k| < 2^30, in units of the step; see the two subclasses.
+
+    What a caller builds is reached through the class, so that whoever got it from the registry needs no import:
+    `model.FloatContext(...)`, `model.IntegerContext(...)`, `model.step_multipliers(outputs)`.
+    """
 
     family: ClassVar[str]
+    FloatContext = FloatContext
+    IntegerContext = IntegerContext
+    step_multipliers = staticmethod(step_multipliers)
 
     def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
         """Bits of each value (its unit is the context's; rounded or with noise added); differentiable."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -34,6 +34,7 @@ class AnchorAttributes:
     offsets     [V,k,3] in units of the first three scales
     scales      [V,6] linear: three multiply offsets, three are the base scales of the Gaussians, world units
     masks       [V,k] multiplies the opacities (0 removes a Gaussian), or None
+    extras      what belongs to these very values and losses want to see: their rate under the noise that was drawn
     """
 
     positions: Tensor
@@ -41,6 +42,7 @@ class AnchorAttributes:
     offsets: Tensor
     scales: Tensor
     masks: Tensor | None = None
+    extras: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -240,7 +242,7 @@ class AnchorModel(SplatModel):
             scales=scales[:, 3:] * torch.sigmoid(geometry[:, :3]),
             quats=torch.nn.functional.normalize(geometry[:, 3:], dim=1),
             colors=torch.sigmoid(self.mlp_color(context)).reshape(-1, 3)[drawn],
-            extras={"anchors": AnchorSelection(rows, opacities.detach(), drawn)},
+            extras={**a.extras, "anchors": AnchorSelection(rows, opacities.detach(), drawn)},
         )
 
     def state_dict_extra(self) -> dict[str, Any]:
