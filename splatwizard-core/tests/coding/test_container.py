@@ -3,6 +3,7 @@
 import json
 import os
 import struct
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -205,6 +206,16 @@ def test_hostile_headers_are_refused_with_the_reason(raw, reason):
         ContainerReader(rebuilt(None, raw=raw))
 
 
+def test_the_memory_of_a_header_grows_with_its_length_only():
+    # A long key over a long list: its name must not be repeated for each element.
+    data = rebuilt(plain_header(static={"k" * 60_000: [0] * 5000}))
+    tracemalloc.start()
+    ContainerReader(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 100 * len(data)
+
+
 CRC_A = zlib.crc32(b"aaaa")
 
 
@@ -255,6 +266,11 @@ def test_missing_files_and_folders_are_bitstream_errors(tmp_path):
     for path in (tmp_path, tmp_path / "nothing.swz"):
         with pytest.raises(BitstreamError, match="no such file"):
             ContainerReader.open(path)
+
+
+def test_a_path_that_the_system_refuses_is_a_bitstream_error():
+    with pytest.raises(BitstreamError, match="cannot be read: File name too long"):
+        ContainerReader.open("x" * 5000)
 
 
 def test_write_replaces_the_file_and_leaves_nothing_else(tmp_path):

@@ -153,9 +153,9 @@ class ContainerReader:
     def open(cls, path: str | os.PathLike[str]) -> ContainerReader:
         """Read a file. Raises BitstreamError also if the path is not a readable file."""
         where = Path(path)
-        if not where.is_file():
-            raise BitstreamError(f"{where}: there is no such file")
         try:
+            if not where.is_file():
+                raise BitstreamError(f"{where}: there is no such file")
             with where.open("rb") as file:
                 head = file.read(PREFIX.size)
                 cls._prefix(head, where.name)  # a wrong file is refused before it is read whole

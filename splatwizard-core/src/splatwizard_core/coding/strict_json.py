@@ -10,6 +10,9 @@ MAX_DEPTH = 32
 MAX_INTEGER = 2**63 - 1  # what every JSON reader that uses 64-bit integers can hold
 MAX_STRING = 1 << 16
 
+_Path = tuple[Any, Any]
+"""(path of the parent or None, key or index)"""
+
 
 def dump_strict(value: Any) -> bytes:
     """The compact UTF-8 JSON of `value`: keys in the given order, tuples as lists.
@@ -37,40 +40,51 @@ def load_strict(data: bytes) -> Any:
 
 def check_json(value: Any) -> None:
     """Raise ValueError if `value` is not plain JSON data within the bounds of this module."""
-    stack: list[tuple[Any, str, int]] = [(value, "", 1)]
+    # A path is (path of the parent, key or index): spelled out only for a message, since a name repeated for each
+    # element of a long list would take memory by the square of the file.
+    stack: list[tuple[Any, _Path | None, int]] = [(value, None, 1)]
     while stack:
-        item, place, depth = stack.pop()
+        item, path, depth = stack.pop()
         if depth > MAX_DEPTH:
             raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
         if item is None or isinstance(item, bool):
             continue
         if isinstance(item, int):
             if abs(item) > MAX_INTEGER:
-                raise ValueError(f"'{place}': an integer does not fit 64 bits")
+                raise ValueError(f"'{_place(path)}': an integer does not fit 64 bits")
         elif isinstance(item, float):
             if not math.isfinite(item):
-                raise ValueError(f"'{place}': {item} is not a finite number")
+                raise ValueError(f"'{_place(path)}': {item} is not a finite number")
         elif isinstance(item, str):
-            _check_text(item, place)
+            _check_text(item, path)
         elif isinstance(item, (list, tuple)):
-            stack += [(each, f"{place}[{i}]", depth + 1) for i, each in enumerate(item)]
+            stack += [(each, (path, i), depth + 1) for i, each in enumerate(item)]
         elif isinstance(item, dict):
             for key, each in item.items():
                 if not isinstance(key, str):
-                    raise ValueError(f"'{place}': key {key!r} is not a string")
-                _check_text(key, place)
-                stack.append((each, f"{place}.{key}" if place else key, depth + 1))
+                    raise ValueError(f"'{_place(path)}': key {key!r} is not a string")
+                _check_text(key, path)
+                stack.append((each, (path, key), depth + 1))
         else:
-            raise ValueError(f"'{place}': {type(item).__name__} is not JSON data")
+            raise ValueError(f"'{_place(path)}': {type(item).__name__} is not JSON data")
 
 
-def _check_text(text: str, place: str) -> None:
+def _place(path: _Path | None) -> str:
+    """Such as `static.sizes[3]`; long keys are cut."""
+    steps: list[str] = []
+    while path is not None:
+        path, step = path
+        steps.append(f"[{step}]" if isinstance(step, int) else f".{step[:80]}")
+    return "".join(reversed(steps)).removeprefix(".")
+
+
+def _check_text(text: str, path: _Path | None) -> None:
     if len(text) > MAX_STRING:
-        raise ValueError(f"'{place[:80]}': a string of {len(text):,} characters is longer than {MAX_STRING:,}")
+        raise ValueError(f"'{_place(path)}': a string of {len(text):,} characters is longer than {MAX_STRING:,}")
     try:
         text.encode()
     except UnicodeEncodeError:
-        raise ValueError(f"'{place[:80]}': a string holds a lone surrogate") from None
+        raise ValueError(f"'{_place(path)}': a string holds a lone surrogate") from None
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
