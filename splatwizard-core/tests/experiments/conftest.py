@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+import torch
 
 TOY = '''
 """Two methods for tests: `toy` trains Gaussians for a few steps; `toy-student` starts from a trained toy scene."""
@@ -148,7 +149,12 @@ def toy_plugins(toy_site: Path):
         patch.setenv("SW_PLUGINS", "toy")
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(toy_site), os.environ.get("PYTHONPATH", "")])))
         patch.setenv("SPLATWIZARD_DATA", str(toy_site))
+        # Sixty Gaussians are no work to share, and waiting threads take the cores from the other tests.
+        patch.setenv("OMP_NUM_THREADS", "1")
+        threads = torch.get_num_threads()
+        torch.set_num_threads(1)
         importlib.invalidate_caches()
         load_plugins.cache_clear()
         yield load_plugins()
+        torch.set_num_threads(threads)
     load_plugins.cache_clear()

@@ -1,14 +1,17 @@
 """The run: every step once, in order, resumed where it stopped, and honest about what it finds."""
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
-from splatwizard_core.errors import ConfigError, RunLockedError, SplatwizardError, UserInputError
+from splatwizard_core.cli.main import main
+from splatwizard_core.errors import CheckpointError, RunLockedError, SplatwizardError, UserInputError
 from splatwizard_core.experiments.cache import trained_scene
 from splatwizard_core.experiments.config import ResolvedConfig, parse_set, resolve
-from splatwizard_core.experiments.decoding import open_model
+from splatwizard_core.experiments.decoding import open_model, save_decoded, timed_decode
 from splatwizard_core.experiments.fresh import FreshProcessError, decode_fresh, run_fresh
 from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.record import Record, read_record
@@ -106,7 +109,7 @@ def test_another_session_loads_the_shared_training(done, toy_plugins: PluginMana
     """What r2 would encode is what r1 trained, also when it has to be read back from r1's checkpoints."""
     _, _, out = done
     invocation = Run(toy_plugins, out)
-    request = invocation.request(rate="r2")
+    request = invocation.request("codec.fault=look around", rate="r2")
     model = train_in(invocation.session, request, run_directory(request)).model
     decoded, _ = open_model(out / "demo-tiny/toy/r2/scene.swz", toy_plugins, torch.device("cpu"))
     assert torch.equal(model.means, decoded.means)
@@ -189,6 +192,55 @@ def test_fresh_processes_pass_on_what_went_wrong(toy_plugins: PluginManager, tmp
         decode_fresh(broken, "cpu")
 
 
-def test_the_quick_preset_of_the_base_follows_the_outer_method(toy_plugins: PluginManager):
-    with pytest.raises(ConfigError, match="no preset"):
-        resolve(toy_plugins.methods.load("toy"), "inria")
+def said_by(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    """What `sw ARGUMENTS --json` prints, run in this process."""
+    assert main([*arguments, "--json"]) == 0, capsys.readouterr().err
+    return json.loads(capsys.readouterr().out)
+
+
+def test_eval_of_the_file_and_of_the_directory_reproduce_the_record(done, capsys: pytest.CaptureFixture[str]):
+    (_, record), _, out = done
+    directory = out / "demo-tiny/toy/r2"
+    config_file = ["--config", str(directory / "config.toml"), "--no-speed"]
+    of_file = said_by(["eval", str(directory / "scene.swz"), *config_file], capsys)
+    assert of_file["metrics"]["psnr"]["per_view"] == record.metrics["psnr"].per_view
+    assert of_file["digest"] == record.file.digest
+    # r2 keeps float32, so the trained model is the decoded one.
+    of_training = said_by(["eval", str(directory), "--no-speed", "--metrics", "psnr,ssim"], capsys)
+    assert of_training["metrics"]["psnr"]["per_view"] == record.metrics["psnr"].per_view
+
+
+def test_encode_of_a_directory_with_another_codec(done, tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (low, _), _, out = done
+    directory = str(out / "demo-tiny/toy/r2")
+    target = tmp_path / "again.swz"
+    facts = said_by(["encode", directory, "--set", "codec.kind=f2", "--out", str(target)], capsys)
+    assert facts["bytes"] == target.stat().st_size == low.file.bytes
+    told = said_by(["decode", str(target), "--out", str(tmp_path / "x.safetensors"), "--repeats", "1"], capsys)
+    assert told["digest"] == low.file.digest
+    assert len(told["decode_runs_s"]) == 1
+    assert main(["encode", directory, "--set", "iterations=9"]) == 2
+    assert "holds no finished training of this configuration" in capsys.readouterr().err
+
+
+def test_a_decoded_model_is_kept_as_safetensors(done, tmp_path: Path, toy_plugins: PluginManager):
+    from safetensors import safe_open
+
+    (_, record), _, out = done
+    model, report = timed_decode(out / "demo-tiny/toy/r2/scene.swz", toy_plugins, torch.device("cpu"), repeats=0)
+    save_decoded(model, report, tmp_path / "m.safetensors", toy_plugins)
+    with safe_open(tmp_path / "m.safetensors", "pt") as file:
+        assert file.metadata()["digest"] == record.file.digest
+        assert torch.equal(file.get_tensor("means"), model.means)
+
+
+def test_a_changed_configuration_does_not_replace_the_one_that_was_trained(toy_plugins: PluginManager, tmp_path: Path):
+    invocation = Run(toy_plugins, tmp_path)
+    _, directory = train_only(invocation.session, invocation.request("iterations=2"))
+    before = (directory / "config.toml").read_text()
+    with pytest.raises(CheckpointError, match="iterations: 2 -> 3"):
+        train_only(invocation.session, invocation.request("iterations=3"))
+    assert (directory / "config.toml").read_text() == before
+    fresh = RunRequest(invocation.request("iterations=3").resolved, tmp_path, resume=False)
+    assert train_only(invocation.session, fresh)[0].facts["steps"] == 3
+    assert "iterations = 3" in (directory / "config.toml").read_text()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -21,7 +23,11 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
+from splatwizard_core.cli.setup import existing, open_session, resolve_one, resolve_run_options
+from splatwizard_core.errors import SplatwizardError
+
+if TYPE_CHECKING:
+    from splatwizard_core.gaussians.splat_model import SplatModel
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")
@@ -30,6 +36,10 @@ from splatwizard_core.cli.setup import existing, open_session, resolve_run_optio
     scene_option, images_option, config_option, set_option,
     click.option("--metrics", metavar="NAME[,NAME]", help="Which metrics.  [default: every one that is installed]"),
     click.option("--renders", metavar="DIR", help="Keep the rendered test views there as PNG."),
+    click.option(
+        "--roundtrip", is_flag=True,
+        help="Of a run directory: encode it, decode the file in a fresh process, measure that.",
+    ),
     click.option("--no-speed", is_flag=True, help="Leave out rendering speed and memory."),
     device_option, seed_option, json_option, debug_option,
 )  # fmt: skip
@@ -41,15 +51,17 @@ def evaluate(
     sets: tuple[str, ...],
     metrics: str | None,
     renders: str | None,
+    roundtrip: bool,
     no_speed: bool,
     device: str | None,
     seed: int | None,
     as_json: bool,
 ) -> None:
-    """Measure FILE (.swz, or a .ply without codec) on the test views of a scene, by the protocol.
+    """Measure FILE on the test views of a scene, by the protocol.
 
-    The model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...) and
-    keys of the run (raster.prefer, threads, ...).
+    FILE is a .swz, a .ply, or a run directory: then its trained model without codec, on its own scene. Of a file, the
+    model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...) and keys
+    of the run (raster.prefer, threads, ...).
     """
     from splatwizard_core.experiments.measuring import measure, opener
     from splatwizard_core.plugins import load_plugins
@@ -57,40 +69,72 @@ def evaluate(
 
     path = existing(file)
     plugins = load_plugins()
-    ppl, scene_options, said_scene = resolve_run_options(
-        config_file, assignments(sets, images=images, device=device, seed=seed)
-    )
-    spec = scene or said_scene or "demo"
-    session = open_session(ppl, plugins)
-    facts: dict[str, Any] = measure(
-        opener(path, plugins, session.device),
-        lambda: load_scene(spec, scene_options, plugins),
-        plugins,
-        session.device,
-        ppl,
-        metrics=[m.strip() for m in metrics.split(",") if m.strip()] if metrics else None,
-        speed=not no_speed,
-        renders=Path(renders) if renders else None,
-    )
-    if as_json:
-        print_json({"file": {"path": str(path), "bytes": path.stat().st_size}, **facts})
+    values = assignments(sets, images=images, device=device, seed=seed)
+    stored = path.is_dir()
+    if stored:
+        config_file = config_file or str(existing(str(path / "config.toml")))
+        resolved = resolve_one(plugins, None, None, preset=None, config_file=config_file, values=values, scene=scene)
+        ppl, scene_options, spec = resolved.ppl, resolved.scene, resolved.scene_spec
+    elif roundtrip:
+        raise click.UsageError("--roundtrip is for a run directory; a file has been encoded already")
     else:
-        _print(path, facts)
+        ppl, scene_options, said_scene = resolve_run_options(config_file, values)
+        spec = scene or said_scene or "demo"
+    session = open_session(ppl, plugins)
+
+    with contextlib.ExitStack() as stack:
+        if not stored:
+            open_model = opener(path, plugins, session.device)
+        elif roundtrip:
+            from splatwizard_core.experiments.encoding import encode_directory
+            from splatwizard_core.experiments.fresh import decode_fresh
+
+            path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "scene.swz"
+            encode_directory(session, resolved, Path(file), path)
+            digest = decode_fresh(path, str(session.device))["digest"]
+            open_model = opener(path, plugins, session.device)
+        else:
+            from splatwizard_core.experiments.encoding import load_finished
+
+            def open_model() -> tuple[SplatModel, dict[str, Any]]:
+                trained = load_finished(session, resolved, path)
+                return trained.model.eval().requires_grad_(False), trained.facts["raster"]
+
+        facts: dict[str, Any] = measure(
+            open_model,
+            lambda: load_scene(spec, scene_options, plugins),
+            plugins,
+            session.device,
+            ppl,
+            metrics=[m.strip() for m in metrics.split(",") if m.strip()] if metrics else None,
+            speed=not no_speed,
+            renders=Path(renders) if renders else None,
+        )
+        size = None if path.is_dir() else path.stat().st_size
+    if roundtrip and facts["digest"] != digest:
+        raise SplatwizardError(f"{file}: two processes decode different models from the same file")
+    facts = {"file": {"path": file, "bytes": size}, **facts}
+    if as_json:
+        print_json(facts)
+    else:
+        _print(facts)
 
 
-def _print(path: Path, facts: dict[str, Any]) -> None:
+def _print(facts: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    name = Path(facts["file"]["path"]).name
     table = Table(
-        title=f"{escape(path.name)} on {escape(facts['scene'])}, protocol {escape(facts['protocol']['id'])}",
+        title=f"{escape(name)} on {escape(facts['scene'])}, protocol {escape(facts['protocol']['id'])}",
         title_justify="left",
         show_header=False,
     )
     for name, metric in facts["metrics"].items():
         shown = "-" if metric["mean"] is None else f"{metric['mean']:.4f}"
         table.add_row(escape(name), f"{shown}  ({metric['direction']} is better, {len(facts['views'])} views)")
-    table.add_row("bytes", f"{path.stat().st_size:,}")
+    if facts["file"]["bytes"] is not None:
+        table.add_row("bytes", f"{facts['file']['bytes']:,}")
     for name, count in facts["counts"].items():
         table.add_row(name.removeprefix("num_"), f"{count:,}")
     table.add_row("visible, mean of views", f"{facts['visible_gaussians']:,.0f}")

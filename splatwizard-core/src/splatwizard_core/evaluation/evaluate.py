@@ -97,6 +97,7 @@ def evaluate(
     rasterizer: Rasterizer,
     plugins: PluginManager,
     *,
+    device: torch.device,
     options: RasterOptions,
     quantize8: bool = True,
     metrics: Sequence[str] | None = None,
@@ -105,6 +106,7 @@ def evaluate(
 ) -> EvaluationResult:
     """Draw every view at the size of its picture and compare.
 
+    device      where the model is
     options     as `render_options` makes them; their background is also that of RGBA pictures
     quantize8   round renders to 8 bit before comparing
     metrics     names from the registry; None: every one that is installed
@@ -127,7 +129,6 @@ def evaluate(
     visible = drawn = 0
     saved: list[str] = []
     pending: list[Future[None]] = []
-    device = model.device
     if save_to is not None:
         save_to.mkdir(parents=True, exist_ok=True)
     with track(label, total=len(views), unit="views") as bar, ThreadPoolExecutor(1) as writer:

@@ -20,29 +20,32 @@ from splatwizard_core.experiments.training_run import finished_directory, make_m
 from splatwizard_core.gaussians.splat_model import SplatModel
 
 
-def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path) -> dict[str, Any]:
+def encode(
+    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, device: torch.device
+) -> dict[str, Any]:
     """Write one file; {"encode_s", "bytes", "sha256"}.
 
     raster  what the header asks of a rasterizer
+    device  where the model is
 
     The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
     """
     before = model.digest()
-    _synchronize(model)
+    _synchronize(device)
     began = time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad():
         method.encode(model, writer)
     size = writer.write(path)
-    _synchronize(model)
+    _synchronize(device)
     seconds = time.perf_counter() - began
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
     return {"encode_s": seconds, "bytes": size, "sha256": file_sha256(path)}
 
 
-def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
-    """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
+def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
+    """The finished training of a run directory. Raises UserInputError if it is not finished."""
     key = training_key(session, resolved)
     with directory_lock(directory):
         if finished_directory(directory, key) is None:
@@ -50,8 +53,13 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
                 f"{directory} holds no finished training of this configuration: "
                 f"`sw train --config {directory}/config.toml` makes it (only `codec` keys may differ)"
             )
-        trained = train(session, resolved, directory, trained=_nothing_to_start_from)
-        return encode(make_method(session, resolved), trained.model, trained.facts["raster"], target)
+        return train(session, resolved, directory, trained=_nothing_to_start_from)
+
+
+def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
+    """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
+    trained = load_finished(session, resolved, directory)
+    return encode(make_method(session, resolved), trained.model, trained.facts["raster"], target, session.device)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
@@ -66,7 +74,7 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     last = list(method.stages())[-1]
     raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))
     try:
-        return encode(method, model, raster, target)
+        return encode(method, model, raster, target, session.device)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error
 
@@ -75,6 +83,6 @@ def _nothing_to_start_from(name: str) -> TrainedModel:
     raise SplatwizardError(f"a finished training asked for a trained '{name}' scene")
 
 
-def _synchronize(model: SplatModel) -> None:
-    if model.device.type == "cuda":
-        torch.cuda.synchronize(model.device)
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)

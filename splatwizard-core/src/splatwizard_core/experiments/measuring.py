@@ -78,7 +78,7 @@ def measure(
         report = measure_speed(lambda c: render_view(model, c, rasterizer, options).image, cameras, device)
     quality = evaluate(
         model, views, rasterizer, plugins,
-        options=options, quantize8=scene.protocol.quantize8, metrics=metrics, save_to=renders,
+        device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics, save_to=renders,
         label=f"evaluate on {scene.name}",
     )  # fmt: skip
     found = _describe_scene(scene, quality)

@@ -65,10 +65,12 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
         if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
             trained = train_in(session, request, directory)
             steps = StepLog(directory)  # training has written into it
-            facts = encode(make_method(session, resolved), trained.model, trained.facts["raster"], encoded)
+            method = make_method(session, resolved)
+            facts = encode(method, trained.model, trained.facts["raster"], encoded, session.device)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             steps.finish("encode", encode_key, facts)
         training = steps.done("train", train_key) or train_in(session, request, directory).facts
+        write_config(directory, resolved)
         decoded = _decode_step(session, steps, encoded, facts["sha256"])
         measured = _evaluate_step(session, steps, request, directory, facts["sha256"])
         if decoded["digest"] != measured["digest"]:
@@ -103,16 +105,24 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
     def start(name: str) -> TrainedModel:
         return trained_scene(session, name, request.resolved, request.out)
 
-    return train(
+    found = train(
         session, request.resolved, directory,
         trained=start, resume=request.resume, allow_changed_plan=request.allow_changed_plan, stop_after=stop_after,
     )  # fmt: skip
+    write_config(directory, request.resolved)
+    return found
 
 
 def _begin(directory: Path, request: RunRequest) -> None:
     if not request.resume:
         discard(directory)
-    write_atomic(directory / CONFIG, request.resolved.toml())
+    if not (directory / CONFIG).exists():
+        write_config(directory, request.resolved)
+
+
+def write_config(directory: Path, resolved: ResolvedConfig) -> None:
+    """config.toml, which repeats the run. A changed one replaces it only once its training is accepted."""
+    write_atomic(directory / CONFIG, resolved.toml())
 
 
 def discard(directory: Path) -> None:

@@ -140,7 +140,13 @@ def run_stages(
         last = stages[-1]
         options = replace(last.raster_options(last.iterations, scene.background), background=scene.background)
         result = evaluate(
-            model, scene.test, rasterizer, session.plugins, options=options, label=f"evaluate at step {step:,}"
+            model,
+            scene.test,
+            rasterizer,
+            session.plugins,
+            device=session.device,
+            options=options,
+            label=f"evaluate at step {step:,}",
         )
         return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}
 
