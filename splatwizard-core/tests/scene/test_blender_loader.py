@@ -123,6 +123,7 @@ BROKEN = {
     "frames": ({"header": {"frames": 3}}, r"'frames' must be a list"),
     "no file name": ({"frame": {"file_path": 3}}, r"frame 0 has no 'file_path'"),
     "leads out": ({"frame": {"file_path": "../x"}}, r"leads out of"),
+    "endless name": ({"frame": {"file_path": "x" * 400}}, r"3 of 3 images are missing"),
     "no view": ({"train": 0}, r"has 0 views to train and 2 to test"),
 }
 

@@ -12,8 +12,8 @@ import torch
 from PIL import Image
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.loaders.colmap import pinhole
-from splatwizard_core.scene.loaders.colmap_model import MODELS, ColmapCamera
+from splatwizard_core.scene.loaders.colmap import pinhole, pose
+from splatwizard_core.scene.loaders.colmap_model import MODELS, ColmapCamera, ColmapImage
 
 
 @pytest.mark.parametrize("sparse", ["sparse/0", "sparse"])
@@ -238,6 +238,10 @@ BROKEN = {
         r"intrinsics of image '000\.png' make no sense",
     ),
     "size 0": (adjusted(camera=ColmapCamera(1, "PINHOLE", 0, 24, (1.0, 1.0, 0.0, 12.0))), r"camera 1 is 0x24 px"),
+    "size beyond any float": (
+        adjusted(text=True, camera=ColmapCamera(1, "PINHOLE", 10**400, 24, (1.0, 1.0, 0.0, 12.0))),
+        r"camera 1 is 10+x24 px",
+    ),
     "unknown camera": (other_camera, r"image '002\.png' refers to camera 9, which is not in cameras"),
     "no picture": (no_picture_inside, r"004\.png: not a readable picture"),
 }
@@ -259,6 +263,13 @@ def test_a_name_that_leads_out_of_the_folder_is_refused(colmap_folder, load):
     colmap_folder.names = ["a.png", "../../secret.png"]
     with pytest.raises(SceneError, match="leads out of"):
         load(colmap_folder.write())
+
+
+def test_a_quaternion_of_any_length_is_its_direction():
+    for length in (1e-200, 1.0, 1e200):
+        image = ColmapImage(1, (length, length, 0.0, 0.0), (0.0, 0.0, 0.0), 1, "a", np.empty((0, 2)), np.empty(0))
+        R, _ = pose(image)
+        torch.testing.assert_close(R, torch.tensor([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
 
 
 def test_one_camera_can_be_fitted_with_split_all(colmap_folder, load):

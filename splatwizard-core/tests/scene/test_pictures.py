@@ -9,7 +9,16 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from splatwizard_core.errors import ConfigError, SceneError
-from splatwizard_core.scene.images import decode_all, fitted_size, is_inside, load_mask, load_picture, picture_header
+from splatwizard_core.scene.images import (
+    decode_all,
+    find_pictures,
+    fitted_size,
+    is_inside,
+    list_pictures,
+    load_mask,
+    load_picture,
+    picture_header,
+)
 
 
 @pytest.mark.parametrize(
@@ -117,6 +126,33 @@ def test_what_is_no_picture_is_one_clear_line(tmp_path, content):
         with pytest.raises(SceneError, match=r"a\.png: .*picture|a\.png: the mask") as caught:
             read(path)
         assert "\n" not in str(caught.value)
+
+
+EPS = b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n"
+
+
+def test_postscript_is_no_picture_whatever_its_suffix(tmp_path):
+    # Pillow hands EPS to Ghostscript: a stranger's file would be executed.
+    (tmp_path / "a.png").write_bytes(EPS)
+    for read in (picture_header, load_picture, lambda p: load_mask(p, (2, 2))):
+        with pytest.raises(SceneError, match="cannot identify image file"):
+            read(tmp_path / "a.png")
+
+
+def test_links_in_a_ring_come_to_an_end(tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "x.png").write_bytes(b"")
+        for link in ("up", "again"):
+            (tmp_path / name / link).symlink_to(tmp_path, target_is_directory=True)
+    assert list_pictures(tmp_path) == ["a/x.png", "b/x.png"]
+
+
+@pytest.mark.parametrize("name", ["y" * 400 + ".png", "a\nb.png", "\ud800.png", "\x1b[2J.png"])
+def test_a_name_that_no_file_can_have_is_missing_in_one_printable_line(tmp_path, name):
+    with pytest.raises(SceneError, match="1 of 1 images are missing") as caught:
+        find_pictures(tmp_path, [name])
+    assert str(caught.value).isprintable()
 
 
 @pytest.mark.parametrize("name", ["/etc/x.png", "../x.png", "a/../../x.png", "..\\x.png", "", ".", "a\0.png"])

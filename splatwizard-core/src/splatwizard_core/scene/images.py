@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path, PurePosixPath
 
@@ -16,6 +17,9 @@ from splatwizard_core.progress import track
 from splatwizard_core.scene.scene import View
 
 SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+
+FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
+"""What a file may hold, whatever its suffix. Pillow knows more, and for EPS it would start Ghostscript."""
 
 
 def fitted_size(width: int, height: int, resolution: int) -> tuple[int, int]:
@@ -47,9 +51,19 @@ def is_inside(name: str) -> bool:
 
 
 def list_pictures(folder: Path) -> list[str]:
-    """Names of all pictures below `folder`, relative to it with forward slashes, sorted."""
+    """Names of all pictures below `folder`, relative to it with forward slashes, sorted.
+
+    Links are followed, but no folder is entered twice: links in a ring would never end.
+    """
     found = []
-    for root, _, files in os.walk(folder, followlinks=True):
+    entered: set[str] = set()
+    for root, folders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(root)
+        if real in entered:
+            folders.clear()
+            continue
+        entered.add(real)
+        folders.sort()
         for file in files:
             if os.path.splitext(file)[1].lower() in SUFFIXES:
                 found.append((Path(root) / file).relative_to(folder).as_posix())
@@ -71,7 +85,7 @@ def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
     missing: list[str] = []
     for name in names:
         path = folder / name
-        if not path.is_file():
+        if not os.path.isfile(path):  # unlike Path.is_file: False, not an error, for a name that is too long
             if by_stem is None:
                 by_stem = {}
                 for other in list_pictures(folder):
@@ -83,18 +97,15 @@ def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
             path = folder / fallback
         found.append(path)
     if missing:
-        first = ", ".join(f"'{name}'" for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
+        first = ", ".join(repr(name) for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
         raise SceneError(f"{folder}: {len(missing)} of {len(names)} images are missing: {first}", path=str(folder))
     return found
 
 
 def picture_header(path: Path) -> tuple[int, int, bool]:
     """(width, height, has alpha) of a picture file, from its header alone. Raises SceneError if it is no picture."""
-    try:
-        with Image.open(path) as picture:
-            return picture.width, picture.height, _has_alpha(picture)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise SceneError(f"{path}: not a readable picture ({error})", path=str(path)) from error
+    with _opened(path, "not a readable picture") as picture:
+        return picture.width, picture.height, _has_alpha(picture)
 
 
 def load_picture(path: Path, size: tuple[int, int] | None = None, *, alpha: bool = True) -> NDArray[np.uint8]:
@@ -105,11 +116,8 @@ def load_picture(path: Path, size: tuple[int, int] | None = None, *, alpha: bool
     Grey, palette, CMYK and 16-bit pictures are converted; EXIF rotation is ignored, as COLMAP does.
     Raises SceneError if the file cannot be decoded.
     """
-    try:
-        with Image.open(path) as opened:
-            picture = _to_8bit(opened, keep_alpha=alpha)
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise SceneError(f"{path}: the picture cannot be decoded ({error})", path=str(path)) from error
+    with _opened(path, "the picture cannot be decoded") as opened:
+        picture = _to_8bit(opened, keep_alpha=alpha)
     if size is not None and picture.size != size:
         picture = picture.resize(size, Image.Resampling.BICUBIC)
     return np.asarray(picture)
@@ -131,11 +139,8 @@ def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:
 
     size    (width, height) to resize to, nearest neighbour
     """
-    try:
-        with Image.open(path) as opened:
-            grey = opened.convert("RGBA").getchannel("A") if _has_alpha(opened) else _to_8bit(opened).convert("L")
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-        raise SceneError(f"{path}: the mask cannot be decoded ({error})", path=str(path)) from error
+    with _opened(path, "the mask cannot be decoded") as opened:
+        grey = opened.convert("RGBA").getchannel("A") if _has_alpha(opened) else _to_8bit(opened).convert("L")
     if grey.size != size:
         grey = grey.resize(size, Image.Resampling.NEAREST)
     return np.asarray(grey) >= 128
@@ -157,6 +162,16 @@ def decode_all(views: Iterable[View], *, workers: int | None = None) -> None:
     ):
         for _ in pool.map(lambda view: view.pixels, pending):
             bar.advance()
+
+
+@contextlib.contextmanager
+def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
+    """The opened file; what Pillow raises in the block becomes a SceneError."""
+    try:
+        with Image.open(path, formats=FORMATS) as picture:
+            yield picture
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise SceneError(f"{path}: {complaint} ({error})", path=str(path)) from error
 
 
 def _has_alpha(picture: Image.Image) -> bool:

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
+from collections import ChainMap
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -90,10 +93,10 @@ def _read_views(path: Path, file: str, options: SceneOptions) -> list[View]:
         if not isinstance(name, str) or not name:
             raise SceneError(f"{where}: frame {i} has no 'file_path'", path=str(path))
         name = name.removeprefix("./")
-        names.append(name if (path / name).is_file() else name + ".png")
+        names.append(name if os.path.isfile(path / name) else name + ".png")
     views = []
     for frame, name, picture in zip(frames, names, find_pictures(path, names), strict=True):
-        merged = {**data, **frame}
+        merged = ChainMap(frame, data)
         if any(_number(merged.get(key, 0), key, name, where) for key in DISTORTION_KEYS):
             raise SceneError(
                 f"{where}: image '{name}' has lens distortion ({', '.join(DISTORTION_KEYS)}); "
@@ -134,7 +137,7 @@ def _number(value: Any, key: str, name: str, where: str) -> float:
         return math.inf
 
 
-def _intrinsics(values: dict[str, Any], name: str, where: str, width: int, height: int) -> tuple[float, ...]:
+def _intrinsics(values: Mapping[str, Any], name: str, where: str, width: int, height: int) -> tuple[float, ...]:
     """fx, fy, cx, cy in pixels of the file: from fl_x / fl_y (scaled from w, h if given), else camera_angle_x.
 
     Square pixels unless fl_y says otherwise, so the vertical field of view follows from the aspect ratio.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +30,9 @@ RADIAL_FOCALS = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2,
 
 The fisheye models are not: with zero coefficients they are still an equidistant projection.
 """
+
+MAX_SIDE = 1 << 24
+"""Pixels; wider is a damaged file (text may state any integer, also one that no float can hold)."""
 
 
 class ColmapDataset:
@@ -125,7 +129,7 @@ def pinhole(camera: ColmapCamera, scene: Path) -> tuple[float, float, float, flo
             f"sw data undistort {scene} OUT writes an undistorted copy",
             path=str(scene),
         )
-    if camera.width < 1 or camera.height < 1:
+    if not (0 < camera.width < MAX_SIDE and 0 < camera.height < MAX_SIDE):
         raise SceneError(f"{scene}: camera {camera.id} is {camera.width}x{camera.height} px", path=str(scene))
     fx, fy = camera.params[0], camera.params[focals - 1]
     return fx, fy, camera.params[focals], camera.params[focals + 1]
@@ -135,6 +139,7 @@ def pose(image: ColmapImage) -> tuple[torch.Tensor, torch.Tensor]:
     """(R [3,3], tau [3]) float32 of a registered image; NaN where the quaternion is zero or not finite."""
     q = np.array(image.qvec)
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
+        q = q / np.abs(q).max()  # so that the squares neither overflow nor vanish
         w, x, y, z = q / np.sqrt((q * q).sum())
     R = np.array(
         [
@@ -161,7 +166,7 @@ def mask_files(path: Path, names: list[str]) -> list[Path | None]:
     found: list[Path | None] = []
     for name in names:
         candidates = (folder / f"{name}.png", folder / name, (folder / name).with_suffix(".png"))
-        found.append(next((file for file in candidates if file.is_file()), None))
+        found.append(next((file for file in candidates if os.path.isfile(file)), None))
     return found
 
 
