@@ -113,3 +113,14 @@ def test_a_forced_family_that_does_not_fit_says_what_it_misses(tmp_path, load):
         load(f"colmap:{tmp_path}")
     with pytest.raises(SceneError, match=r"transforms_train\.json: not readable JSON"):
         load(f"blender:{tmp_path}")
+
+
+@pytest.mark.parametrize("spec", ["x" * 5000, "nobody/" + "x" * 5000, "~no-such-user/garden", "a\0b"])
+@pytest.mark.parametrize("root", [None, "there"])
+def test_a_name_that_no_folder_can_have_is_one_clear_line(monkeypatch, tmp_path, spec, root):
+    if root is None:
+        monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
+    else:
+        monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
+    with pytest.raises(SceneError, match="is not there"):
+        load_scene(spec, SceneOptions(), Plugins(monkeypatch))

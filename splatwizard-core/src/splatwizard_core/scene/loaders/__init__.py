@@ -35,7 +35,7 @@ def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scen
     if spec == "demo":
         return _dataset(plugins, "demo").load(Path("demo"), options)
     family, separator, rest = spec.partition(":")
-    if separator and family in plugins.datasets and not Path(spec).exists():
+    if separator and family in plugins.datasets and not os.path.exists(spec):
         if family == "demo":
             return _dataset(plugins, "demo").load(Path(rest), options)
         path, options, collection = _locate(rest, options)
@@ -51,11 +51,11 @@ def _dataset(plugins: PluginManager, family: str) -> Dataset:
 
 def _locate(spec: str, options: SceneOptions) -> tuple[Path, SceneOptions, str | None]:
     """(folder, options with the collection's defaults, name of the collection or None)."""
-    path = Path(spec).expanduser()
-    if path.exists():
+    path = Path(os.path.expanduser(spec))
+    if os.path.exists(path):
         return path, options, None
     root = os.environ.get(DATA_VARIABLE)
-    if root and not path.is_absolute() and (found := Path(root) / spec).exists():
+    if root and not path.is_absolute() and os.path.exists(found := Path(root) / spec):
         collection = path.parts[0] if len(path.parts) == 2 else None
         if collection in DATASET_SPLITS and options.split is None:
             options = replace(options, split=DATASET_SPLITS[collection])
