@@ -63,6 +63,16 @@ def test_a_blender_folder_cannot_hold_another_lens_per_view(tiny, tmp_path):
         write_scene(replace(tiny, train=[view]), tmp_path / "out", "blender")
 
 
+def test_a_blender_folder_that_is_not_finished_is_no_scene(tiny, tmp_path):
+    def fail():
+        raise KeyboardInterrupt
+
+    broken = replace(tiny, test=[*tiny.test[:-1], replace(tiny.test[-1], load=fail)])
+    with pytest.raises(KeyboardInterrupt):
+        write_scene(broken, tmp_path / "out", "blender")
+    assert not list((tmp_path / "out").glob("transforms*"))
+
+
 def test_a_folder_with_something_in_it_is_left_alone(tiny, tmp_path):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(SceneError, match="not empty"):

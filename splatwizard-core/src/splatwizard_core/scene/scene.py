@@ -21,6 +21,7 @@ class View:
     camera      geometry, at the resolution of the picture
     name        file name relative to the picture folder, unique in the scene
     load        () -> uint8 array [H,W,3] or [H,W,4] (straight alpha) at the camera's size
+    load_mask   () -> bool array [H,W] at the camera's size; None if there is no mask
     """
 
     camera: Camera
@@ -70,8 +71,9 @@ class Protocol:
     dataset     family id, such as "mipnerf360", or "colmap" / "blender" / "demo"
     images      picture folder
     resolution  the rule of specs: -1, 1, 2, 4, 8 or a width
-    split       "every8", "every<n>", "file", "all"
+    split       "every<n>", "lod:<k>", "file", "all"
     background  "black" or "white"
+    principal_point "center" or "file" (COLMAP's own)
     quantize8   renders are rounded to 8 bit before metrics
     masked      pictures of a COLMAP scene were cut out by their alpha
     composite8  pictures with alpha were composited in 8 bit with truncation

@@ -1,7 +1,8 @@
 """Analytic solids: exact ray intersections, normals, and area-uniform surface samples.
 
 Vectors are float64 [3,n]. Everything a ray meets is computed with + - * / and square roots alone, which IEEE 754
-rounds exactly: pictures come out bit-identical on every machine.
+rounds exactly: one placement gives bit-identical pictures on every machine. (Placing solids and cameras takes
+sine and cosine from the C library, whose last bit may differ between platforms.)
 """
 
 from __future__ import annotations

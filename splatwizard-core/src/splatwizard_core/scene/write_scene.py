@@ -117,6 +117,7 @@ def _colmap_points(points: PointCloud | None) -> ColmapPoints:
 
 def _write_blender(scene: Scene, path: Path) -> None:
     header = _one_camera([view.camera for view in scene.train + scene.test], path)
+    files = {}
     with track("write pictures", total=len(scene.train) + len(scene.test)) as bar:
         for part, views in (("train", scene.train), ("test", scene.test)):
             frames = []
@@ -126,7 +127,10 @@ def _write_blender(scene: Scene, path: Path) -> None:
                 frames.append({"file_path": f"./{stem}", "transform_matrix": _opengl_pose(view.camera)})
                 _save_picture(view, path / part / name)
                 bar.advance(1)
-            (path / f"transforms_{part}.json").write_text(json.dumps({**header, "frames": frames}, indent=1))
+            files[path / f"transforms_{part}.json"] = json.dumps({**header, "frames": frames}, indent=1)
+    # Last, and the test half first: a folder that is not finished is not taken for a scene.
+    for file in reversed(files):
+        file.write_text(files[file])
 
 
 def _one_camera(cameras: list[Camera], path: Path) -> dict[str, Any]:
