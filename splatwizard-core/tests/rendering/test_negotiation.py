@@ -309,6 +309,69 @@ def test_depth_and_alpha_are_composed_from_features(plugins, features):
         torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)  # expected depth divides by alphas down to 0.004
 
 
+def test_maps_that_nobody_asked_for_stay_absent(plugins):
+    plugins.install("fast", "EXTRA_FEATURES")
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    scene = draw_scene(RasterCase(color="colors"), 0, torch.float32)
+    assert rasterizer.render(*scene, RasterOptions(depth=frozenset({"inverse"}))).alpha is None
+    assert rasterizer.render(*scene, RasterOptions(alpha=True)).depth == {}
+    assert rasterizer.choices == {"DEPTH_INVERSE": "fast", "ALPHA_MAP": "fast"}
+
+
+def test_a_median_that_is_offered_stands_beside_maps_that_are_composed(plugins):
+    plugins.install("fast", "EXTRA_FEATURES", "DEPTH_MEDIAN")
+    scene = draw_scene(RasterCase(color="colors"), 0, torch.float32)
+    options = RasterOptions(depth=frozenset({"inverse", "median"}))
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    depth, expected = (r.render(*scene, options).depth for r in (rasterizer, ReferenceRasterizer()))
+    assert rasterizer.choices == {"DEPTH_INVERSE+DEPTH_MEDIAN": "fast"}
+    for mode in ("inverse", "median"):
+        torch.testing.assert_close(depth[mode], expected[mode])
+
+
+@pytest.mark.parametrize("features", [0, 2])
+def test_detached_features_never_detach_a_composed_map(plugins, features):
+    """With features of the user's own it cannot be done in one pass, and is said instead of drawn wrongly."""
+    plugins.install("fast", "BACKWARD", "EXTRA_FEATURES")
+    g, cam = draw_scene(RasterCase(color="colors", features=features), 0, torch.float32)
+    options = RasterOptions(depth=frozenset({"inverse"}), features_detach_geometry=True)
+    found = []
+    for r in (NegotiatedRasterizer(plugins, device="cpu"), ReferenceRasterizer()):
+        opacities = g.opacities.clone().requires_grad_()
+        drawn = replace(g, opacities=opacities)
+        if features and isinstance(r, NegotiatedRasterizer):
+            with pytest.raises(CapabilityError, match="cannot detach"):
+                r.render(drawn, cam, options)
+            return
+        found += torch.autograd.grad(r.render(drawn, cam, options).depth["inverse"].sum(), opacities)
+    assert float(found[1].abs().max()) > 0
+    torch.testing.assert_close(found[0], found[1], atol=1e-5, rtol=1e-4)
+
+
+def test_scale_factors_are_multiplied_in_for_a_rasterizer_that_reads_none(plugins):
+    fake = plugins.install("fast", "VISIBLE_FILTER")
+    g, cam = draw_scene(RasterCase(color="colors"), 0, torch.float32)
+    g.scale_factors = torch.linspace(0.5, 2.0, len(g))
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    result, expected = (r.render(g, cam, RasterOptions()) for r in (rasterizer, ReferenceRasterizer()))
+    assert fake.calls == 1
+    assert rasterizer.choices == {"INDEXED_GEOM": "fast"}
+    torch.testing.assert_close(result.image, expected.image)
+    assert torch.equal(rasterizer.visible_filter(g, cam), expected.radii)
+    plain = ReferenceRasterizer().render(replace(g, scale_factors=None), cam, RasterOptions())
+    assert not torch.allclose(result.image, plain.image)
+
+
+def test_scores_are_summed_whatever_maps_the_options_name(plugins):
+    plugins.install("counter", "EXTRA_FEATURES", "SCORE_HITS")
+    g, cam = draw_scene(RasterCase(color="colors"), 0, torch.float32)
+    options = RasterOptions(scores=(ScoreSpec("n", "hits"),), alpha=True)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    scores, expected = (r.accumulate(g, [cam], options).scores["n"] for r in (rasterizer, ReferenceRasterizer()))
+    assert rasterizer.choices == {"ALPHA_MAP+SCORE_HITS": "counter"}
+    assert torch.equal(scores, expected)
+
+
 def test_median_depth_is_not_composed(plugins, scene):
     plugins.install("fast", "EXTRA_FEATURES")
     rasterizer = NegotiatedRasterizer(plugins, device="cpu")

@@ -8,6 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from splatwizard_core.errors import CapabilityError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.rendering.rasterizer import (
     AccumOutput,
@@ -37,7 +38,7 @@ class AdaptedRasterizer:
     """A rasterizer behind rewritten requests; every feature in `missing` is composed from others.
 
     SPLIT_SH      dc and rest are concatenated
-    INDEXED_*     codebooks are gathered; autograd scatters
+    INDEXED_*     codebooks are gathered, scale factors multiplied in; autograd scatters
     DEPTH_*, ALPHA_MAP    z, 1/z and 1 are composited as extra features (no median)
     """
 
@@ -47,28 +48,37 @@ class AdaptedRasterizer:
         self.info: RasterizerInfo = replace(inner.info, features=inner.info.features | missing)
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
-        """Draw one view; `RenderResult.inputs` are the inputs as they were handed in."""
-        drawn, depth_names = self._gathered(g), sorted(opt.depth)
-        maps: dict[str, Tensor] = {}
-        needs_maps = bool(self.missing & _AS_FEATURES) and (bool(depth_names) or opt.alpha)
-        if needs_maps:
-            maps = _map_channels(g, cam)
-            extra = torch.stack(list(maps.values()), dim=1)  # [N,3]
-            drawn.features = extra if g.features is None else torch.cat([g.features, extra], dim=1)
-            opt = replace(opt, depth=frozenset(), alpha=False)
-        result = self.inner.render(drawn, cam, opt)
-        if not needs_maps:
-            return replace(result, inputs=g)
+        """Draw one view; `RenderResult.inputs` are the inputs as they were handed in.
+
+        Raises CapabilityError for composed maps beside features that are detached from the geometry.
+        """
+        drawn = self._gathered(g)
+        if not self.missing & _AS_FEATURES or not (opt.depth or opt.alpha):
+            return replace(self.inner.render(drawn, cam, opt), inputs=g)
+        if opt.features_detach_geometry and g.features is not None:
+            # The maps would be detached with the features: their gradient would be wrong without a word.
+            composed = self.missing & _AS_FEATURES
+            raise CapabilityError(
+                f"rasterizer '{self.info.name}' composes {', '.join(sorted(composed))} from features and cannot detach "
+                "others; render twice, or prefer one that offers them (`sw list-plugins`)",
+                missing=composed,
+            )
+        maps = _map_channels(g, cam)
+        extra = torch.stack(list(maps.values()), dim=1)  # [N,3]
+        drawn.features = extra if g.features is None else torch.cat([g.features, extra], dim=1)
+        # The median is no sum over splats: whoever serves this request offers it.
+        passed_on = replace(opt, depth=opt.depth & {"median"}, alpha=False, features_detach_geometry=False)
+        result = self.inner.render(drawn, cam, passed_on)
         assert result.features is not None
         own = result.features.shape[0] - len(maps)
-        found = dict(zip(maps, torch.split(result.features[own:], 1), strict=True))
+        found = dict(zip(maps, torch.split(result.features[own:], 1), strict=True)) | result.depth
         found["expected"] = found["accumulated"] / found["alpha"].clamp(min=1e-10)
         return replace(
             result,
             inputs=g,
             features=result.features[:own] if g.features is not None else None,
-            depth={name: found[name] for name in depth_names},
-            alpha=found["alpha"],
+            depth={name: found[name] for name in sorted(opt.depth)},
+            alpha=found["alpha"] if opt.alpha else None,
         )
 
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
@@ -76,17 +86,22 @@ class AdaptedRasterizer:
         return self.inner.visible_filter(self._gathered(g), cam)
 
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
-        """Sum scores over views."""
+        """Sum scores over views; no map is kept, so none is asked for."""
+        if self.missing & _AS_FEATURES:
+            opt = replace(opt, depth=frozenset(), alpha=False)
         return self.inner.accumulate(self._gathered(g), cams, opt)
 
     def _gathered(self, g: GaussianInputs) -> GaussianInputs:
         """A shallow copy without the storage forms that the rasterizer does not read."""
         g = replace(g)
-        if g.geom_indices is not None and "INDEXED_GEOM" in self.missing:
+        if "INDEXED_GEOM" in self.missing:
             assert g.scales is not None
             assert g.quats is not None
-            g.scales, g.quats = g.scales[g.geom_indices], g.quats[g.geom_indices]
-            g.geom_indices = None
+            if g.geom_indices is not None:
+                g.scales, g.quats = g.scales[g.geom_indices], g.quats[g.geom_indices]
+            if g.scale_factors is not None:
+                g.scales = g.scales * g.scale_factors[:, None]
+            g.geom_indices = g.scale_factors = None
         if g.sh is not None and g.sh.codebook is not None and "INDEXED_SH" in self.missing:
             assert g.sh.indices is not None
             rest = g.sh.codebook[g.sh.indices]

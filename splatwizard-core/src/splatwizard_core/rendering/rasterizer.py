@@ -118,6 +118,7 @@ class GradBuffer:
 
     @property
     def value(self) -> Tensor:
+        """[N,2] in NDC units. Raises RuntimeError before `backward`."""
         if self._value is None:
             raise RuntimeError("the screen-space gradient is only there after backward()")
         return self._value
@@ -174,6 +175,7 @@ class RenderResult:
 
     @property
     def visible(self) -> Tensor:
+        """[N] bool: what was not culled."""
         return self.radii > 0
 
     @property
@@ -289,7 +291,7 @@ def required_features(g: GaussianInputs, opt: RasterOptions) -> Feature:
         required |= Feature.BACKWARD
     if g.cov3d is not None:
         required |= Feature.COV3D
-    if g.geom_indices is not None:
+    if g.geom_indices is not None or g.scale_factors is not None:
         required |= Feature.INDEXED_GEOM
     if g.features is not None:
         required |= Feature.EXTRA_FEATURES
