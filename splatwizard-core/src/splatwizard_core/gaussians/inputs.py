@@ -16,7 +16,7 @@ class SH:
     """Spherical-harmonics colours in exactly one storage form. K = (degree + 1)^2 coefficients, then RGB.
 
     dense           [N,K,3]
-    dc + rest       [N,1,3] and [N,K-1,3]
+    dc + rest       [N,1,3] and [N,K-1,3]; dc alone at degree 0
     codebook        [M,K,3] with indices, or [M,K-1,3] together with dc
     indices         [N] int64, row of the codebook for each Gaussian
     active_degree   bands above it are not evaluated and get exactly zero gradient
@@ -41,6 +41,16 @@ class SH:
             assert rest is not None
             return rest
         return self.dc if rest is None else torch.cat([self.dc, rest], dim=1)
+
+    def check_form(self) -> None:
+        """Raise ShapeError unless exactly one storage form is there: two would leave open which one is drawn."""
+        stored = {k for k in ("dense", "dc", "rest", "codebook", "indices") if getattr(self, k) is not None}
+        forms = ({"dense"}, {"dc"}, {"dc", "rest"}, {"codebook", "indices"}, {"dc", "codebook", "indices"})
+        if stored not in forms:
+            raise ShapeError(
+                f"SH holds {', '.join(sorted(stored)) or 'nothing'}; it must be dense, or dc (and rest), "
+                "or codebook and indices (and dc)"
+            )
 
     def __len__(self) -> int:
         for tensor in (self.dense, self.dc, self.indices):
@@ -129,11 +139,23 @@ class GaussianInputs:
         need("colors", self.colors, n, "C")
         need("features", self.features, n, "E")
         need("visible", self.visible, n)
-        if (self.cov3d is None) == (self.scales is None or self.quats is None):
+        shaped = (self.scales, self.quats, self.geom_indices, self.scale_factors)
+        if self.cov3d is not None:
+            if any(t is not None for t in shaped):
+                raise ShapeError("GaussianInputs.cov3d excludes scales, quats, geom_indices and scale_factors")
+        elif self.scales is None or self.quats is None:
             raise ShapeError("GaussianInputs needs either scales and quats, or cov3d")
+        elif self.scales.shape[1] not in (2, 3) or len(self.scales) != len(self.quats):
+            raise ShapeError(
+                f"GaussianInputs.scales must be [{rows}, 3], or [{rows}, 2] for surfels, and as long as quats; "
+                f"got {list(self.scales.shape)} and {list(self.quats.shape)}",
+                actual=self.scales.shape,
+                expected=(rows, "2 or 3"),
+            )
         if (self.sh is None) == (self.colors is None):
             raise ShapeError("GaussianInputs needs either sh or colors")
         if self.sh is not None:
+            self.sh.check_form()
             need("sh.dense", self.sh.dense, n, "K", 3)
             need("sh.dc", self.sh.dc, n, 1, 3)
             need("sh.rest", self.sh.rest, n, "K-1", 3)

@@ -1,0 +1,56 @@
+"""What the fields of GaussianInputs must have in common before anything is drawn."""
+
+import pytest
+import torch
+
+from splatwizard_core.errors import ShapeError
+from splatwizard_core.gaussians.inputs import SH, GaussianInputs
+
+N = 4
+DENSE, DC, REST, INDICES = torch.zeros(N, 4, 3), torch.zeros(N, 1, 3), torch.zeros(N, 3, 3), torch.zeros(N).long()
+
+
+def inputs(**changes) -> GaussianInputs:
+    fields = {"scales": torch.ones(N, 3), "quats": torch.ones(N, 4), "colors": torch.ones(N, 3), **changes}
+    return GaussianInputs(torch.zeros(N, 3), torch.ones(N), **fields)
+
+
+def test_surfels_and_indexed_geometry_are_fine():
+    inputs().validate()
+    inputs(scales=torch.ones(N, 2)).validate()
+    inputs(scales=torch.ones(9, 3), quats=torch.ones(9, 4), geom_indices=INDICES).validate()
+    inputs(scales=None, quats=None, cov3d=torch.ones(N, 6)).validate()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"scales": torch.ones(N, 1)}, r"scales must be \[4, 3\]"),
+        ({"scales": torch.ones(N, 4)}, r"scales must be \[4, 3\]"),
+        ({"scales": torch.ones(9, 3), "quats": torch.ones(8, 4), "geom_indices": INDICES}, "as long as quats"),
+        ({"quats": None}, "either scales and quats, or cov3d"),
+        ({"cov3d": torch.ones(N, 6)}, "cov3d excludes"),
+        ({"cov3d": torch.ones(N, 6), "quats": None}, "cov3d excludes"),
+        ({"colors": torch.ones(N + 1, 3)}, r"colors must be \[4, C\], got \[5, 3\]"),
+        ({"sh": SH(dense=DENSE)}, "either sh or colors"),
+    ],
+)
+def test_fields_that_do_not_fit_together_are_named(changes, message):
+    with pytest.raises(ShapeError, match=message):
+        inputs(**changes).validate()
+
+
+def test_harmonics_have_exactly_one_storage_form():
+    codebook = torch.zeros(2, 3, 3)
+    forms = (
+        {"dense": DENSE}, {"dc": DC}, {"dc": DC, "rest": REST}, {"codebook": codebook, "indices": INDICES},
+        {"dc": DC, "codebook": codebook, "indices": INDICES},
+    )  # fmt: skip
+    for form in forms:
+        inputs(colors=None, sh=SH(**form)).validate()
+    for form in (
+        {}, {"rest": REST}, {"dense": DENSE, "dc": DC}, {"dc": DC, "codebook": codebook},
+        {"dc": DC, "rest": REST, "codebook": codebook, "indices": INDICES},
+    ):  # fmt: skip
+        with pytest.raises(ShapeError, match="SH holds"):
+            inputs(colors=None, sh=SH(**form)).validate()
