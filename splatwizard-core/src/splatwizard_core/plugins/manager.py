@@ -80,7 +80,7 @@ class PluginManager:
             module = entry_point.load()
             self._pluggy.register(module, name=entry_point.name)
             self._pluggy.check_pending()
-        except Exception as error:
+        except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
             reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
             info.error = " ".join(reason.split())
             if self._pluggy.has_plugin(entry_point.name):
@@ -124,6 +124,7 @@ class PluginManager:
 
     @property
     def broken(self) -> list[PluginInfo]:
+        """Those that could not be loaded, or whose hooks failed."""
         return [p for p in self.plugins if p.error is not None]
 
     def register_commands(self, cli: click.Group) -> None:

@@ -83,7 +83,11 @@ class Registry:
 
     def _withdraw(self, distribution: str) -> None:
         """Take back everything that one distribution added (its hook failed half way)."""
-        self._entries = {n: e for n, e in self._entries.items() if e.distribution != distribution}
+        claims = self._clashes | {n: [e] for n, e in self._entries.items()}
+        left = {n: [e for e in found if e.distribution != distribution] for n, found in claims.items()}
+        # A name that only one other still claims belongs to that one again.
+        self._entries = {n: found[0] for n, found in left.items() if len(found) == 1}
+        self._clashes = {n: found for n, found in left.items() if len(found) > 1}
 
     @property
     def clashes(self) -> dict[str, list[Entry]]:
@@ -101,6 +105,7 @@ class Registry:
 
     @property
     def names(self) -> list[str]:
+        """Sorted names that can be asked for."""
         return sorted(self._entries)
 
     def entry(self, name: str) -> Entry:
