@@ -46,6 +46,7 @@ class RasterCase:
     options: dict[str, Any] = field(default_factory=dict)
 
     def raster_options(self, **changes: Any) -> RasterOptions:
+        """The case's own options with `changes` on top."""
         return RasterOptions(**{**self.options, **changes})
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterizerInfo, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
+from splatwizard_core.testing.raster_scenes import with_tensors
 
 CheckFunction = Callable[[Rasterizer, str], None]
 
@@ -85,8 +86,6 @@ def splats(
 
 def draw(rasterizer: Rasterizer, device: str, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
     """Render on `device`; results come back as they are."""
-    from splatwizard_core.testing.raster_scenes import with_tensors
-
     moved = with_tensors(g, {name: x.to(device) for name, x in g.tensors().items()})
     return rasterizer.render(moved, cam.to(device), opt)
 
