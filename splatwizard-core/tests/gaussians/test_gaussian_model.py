@@ -9,7 +9,7 @@ import torch
 
 from splatwizard_core.errors import SceneError, ShapeError
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
-from splatwizard_core.gaussians.model import SH_BAND0, GaussianModel
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import PointCloud
 
@@ -74,7 +74,7 @@ def test_coincident_points_get_the_smallest_sigma():
 def test_start_values_are_those_of_the_paper():
     rgb = torch.tensor([[1.0, 0.5, 0.0], [0.25, 0.75, 0.5]])
     model = GaussianModel.from_points(PointCloud(torch.tensor([[0.0, 0, 0], [1, 0, 0]]), rgb))
-    torch.testing.assert_close(0.5 + SH_BAND0 * model.sh_dc[:, 0], rgb)
+    torch.testing.assert_close(0.5 + 0.28209479177387814 * model.sh_dc[:, 0], rgb)
     assert not model.sh_rest.any()
     assert model.sh_rest.shape == (2, 15, 3)
     assert model.active_sh_degree == 0

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from splatwizard_core.errors import SceneError, ShapeError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
+from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud
@@ -21,9 +22,6 @@ if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import Rasterizer
 
 log = logging.getLogger(__name__)
-
-SH_BAND0 = 0.28209479177387814
-"""Y_0, the constant spherical harmonic: rgb = 0.5 + SH_BAND0 * dc."""
 
 MIN_SQUARED_DISTANCE = 1e-7
 """Floor of the squared neighbour distance at initialisation, world units squared (smallest sigma 3.162e-4)."""
@@ -156,7 +154,7 @@ class GaussianModel(SplatModel):
             log.warning("the %d start points have no colours; they start grey", n)
             sh_dc = xyz.new_zeros(n, 1, 3)
         else:
-            sh_dc = ((rgb.to(xyz) - 0.5) / SH_BAND0)[:, None, :]
+            sh_dc = rgb_to_dc(rgb.to(xyz))[:, None, :]
         squared = mean_squared_neighbor_distance(xyz).clamp_min(MIN_SQUARED_DISTANCE)
         log_scales = (squared.sqrt() * scale_factor).log()[:, None].repeat(1, 3)
         quats = xyz.new_zeros(n, 4)
@@ -203,13 +201,16 @@ class GaussianModel(SplatModel):
         return generator
 
     def state_dict_extra(self) -> dict[str, Any]:
+        """Active SH degree, seed and number of the splits."""
         return {"active_sh_degree": self.active_sh_degree, "split_seed": self.split_seed, "splits": self._splits}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
+        """Inverse of `state_dict_extra`."""
         self.active_sh_degree = int(extra["active_sh_degree"])
         self.split_seed = int(extra["split_seed"])
         self._splits = int(extra["splits"])
 
     def load_resized(self, state: dict[str, Tensor]) -> None:
+        """As for every model; the full SH degree becomes that of the state."""
         super().load_resized(state)
         self.max_sh_degree = math.isqrt(self.sh_rest.shape[1] + 1) - 1

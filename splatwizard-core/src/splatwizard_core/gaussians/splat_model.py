@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -40,6 +42,7 @@ class SplatModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
+        """Where the parameters are."""
         return next(self.parameters()).device
 
     def counts(self) -> dict[str, int]:
@@ -72,10 +75,7 @@ class SplatModel(nn.Module):
         self.load_state_dict(state)
 
     def digest(self) -> str:
-        """SHA-256 over names, shapes and bytes of all parameters, buffers and the extra state: equal models, equal text."""
-        import hashlib
-        import json
-
+        """SHA-256 over names, shapes and bytes of all parameters and buffers, and the extra state."""
         sha = hashlib.sha256(json.dumps(self.state_dict_extra(), sort_keys=True).encode())
         for name, tensor in sorted(self.state_dict().items()):
             sha.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
