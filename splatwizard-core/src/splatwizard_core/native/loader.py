@@ -183,6 +183,7 @@ class NativeModule:
 
     @property
     def cache_folder(self) -> Path:
+        """Where builds for this user go."""
         return cache_root() / "native"
 
     def key(self, march: str) -> str:

@@ -124,6 +124,7 @@ def common_flags() -> tuple[str, ...]:
 
 
 def include_flags(*, torch_headers: bool, cuda: bool) -> tuple[str, ...]:
+    """-isystem flags: our shared headers, torch's (and CUDA's) where asked for."""
     import torch
 
     paths = [SHARED_INCLUDE]
@@ -155,6 +156,7 @@ class Toolchain:
         self.compiler = find_compiler()
 
     def version(self) -> str:
+        """First line of what the compiler says of itself."""
         result = subprocess.run([*self.compiler, "--version"], capture_output=True, text=True, check=False)
         return result.stdout.partition("\n")[0]
 
