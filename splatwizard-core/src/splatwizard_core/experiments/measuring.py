@@ -19,7 +19,7 @@ from splatwizard_core.evaluation.evaluate import (
     save_png,
 )
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
-from splatwizard_core.experiments.decoding import open_model
+from splatwizard_core.experiments.decoding import import_method, open_model
 from splatwizard_core.experiments.environment import describe_environment
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter
@@ -141,6 +141,8 @@ def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable
         model, reader = open_model(path, plugins, device)
         return model, reader.raster
 
+    if path.suffix != ".ply":
+        import_method(path, plugins)  # code is not memory of the model
     return open_file
 
 
