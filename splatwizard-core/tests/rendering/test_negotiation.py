@@ -392,6 +392,28 @@ def test_unknown_declared_feature_is_an_error(plugins):
         plugins.install("odd", "TELEPORT")
 
 
+@pytest.mark.parametrize("declared", [{"features": ["TELEPORT"]}, {"devices": 5}, {"speed": "fast"}])
+def test_an_entry_that_cannot_be_read_harms_no_other(plugins, scene, caplog, declared):
+    """A plugin made for a newer core; whoever asks for it by name hears why."""
+    name = f"odd{next(_UNIQUE)}"
+    plugins.registries["rasterizer"].add(name, "negotiation_fakes:odd", summary="a fake", **declared)
+    for _ in range(2):
+        rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+        rasterizer.render(*scene, RasterOptions())
+        with pytest.raises(CapabilityError, match="NORMALS"):
+            rasterizer.render(*scene, RasterOptions(normals=True))
+    assert rasterizer.choices == {"plain": "reference"}
+    assert len([w for w in warnings(caplog) if name in w]) == 1
+    with pytest.raises(PluginError, match=name):
+        NegotiatedRasterizer(plugins, device="cpu", prefer=[name])
+
+
+def test_unknown_option_values_are_refused(scene):
+    for options in ({"dtype_out": "uint16"}, {"depth": frozenset({"mean"})}, {"scores": (ScoreSpec("a", "glow"),)}):
+        with pytest.raises(ValueError, match=r"uint16|mean|glow"):
+            ReferenceRasterizer().render(*scene, RasterOptions(**options))
+
+
 def test_negotiated_info_is_the_union(plugins):
     plugins.install("fast", "NORMALS")
     info = NegotiatedRasterizer(plugins, device="cpu").info

@@ -35,24 +35,27 @@ T = TypeVar("T")
 
 
 def info_from_entry(entry: Entry) -> RasterizerInfo:
-    """What a registry entry declares. Raises PluginError for a feature that does not exist."""
+    """What a registry entry declares. Raises PluginError for an unknown feature or a field of another kind."""
     declared = entry.declared
     features = frozenset(declared.get("features", ()))
     unknown = sorted(features - {f.name for f in Feature})
     if unknown:
         raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} declares unknown features {unknown}")
     min_cc = declared.get("min_cc")
-    return RasterizerInfo(
-        name=entry.name,
-        devices=frozenset(declared.get("devices", ("cpu",))),
-        dtypes=frozenset(declared.get("dtypes", ("float32",))),
-        features=features,
-        available=declared.get("available"),
-        combos_forbidden=tuple(frozenset(combo) for combo in declared.get("combos_forbidden", ())),
-        exactness=declared.get("exactness", "exact"),
-        speed=int(declared.get("speed", 0)),
-        min_cc=None if min_cc is None else (int(min_cc[0]), int(min_cc[1])),
-    )
+    try:
+        return RasterizerInfo(
+            name=entry.name,
+            devices=frozenset(declared.get("devices", ("cpu",))),
+            dtypes=frozenset(declared.get("dtypes", ("float32",))),
+            features=features,
+            available=declared.get("available"),
+            combos_forbidden=tuple(frozenset(combo) for combo in declared.get("combos_forbidden", ())),
+            exactness=declared.get("exactness", "exact"),
+            speed=int(declared.get("speed", 0)),
+            min_cc=None if min_cc is None else (int(min_cc[0]), int(min_cc[1])),
+        )
+    except (TypeError, ValueError, IndexError) as error:
+        raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} is declared wrongly: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -77,7 +80,8 @@ class NegotiatedRasterizer:
 
     Order: preferred ones; then fast ones that serve directly; then fast ones behind an adapter; then those of speed
     0, the oracle. Within each, the higher speed. A rasterizer whose native module cannot be built is left out with
-    one warning. SW_RASTERIZER=name (for debugging) takes that one or fails.
+    one warning, and so is one whose entry cannot be read (it may know features of a newer core), unless it was asked
+    for by name. SW_RASTERIZER=name (for debugging) takes that one or fails.
     Raises PluginError for a name that is not installed.
     """
 
@@ -104,6 +108,7 @@ class NegotiatedRasterizer:
         self._exactness = frozenset(exactness)
         self._chosen: dict[frozenset[str], Rasterizer] = {}
         self._failed: dict[str, str] = {}
+        self._readable = self._read_entries()
         infos = [info for _, info in self._installed()]
         self.info = RasterizerInfo(
             name="negotiated",
@@ -148,7 +153,7 @@ class NegotiatedRasterizer:
         if best.adapted:
             rasterizer = AdaptedRasterizer(rasterizer, best.adapted)
         if passed_over is not None:
-            _warn_once(passed_over, best.entry.name)
+            _warn_once(f"{passed_over}; rendering with '{best.entry.name}' instead")
         asked = "+".join(sorted(wanted)) or "plain"
         adapted = f", composing {', '.join(sorted(best.adapted))}" if best.adapted else ""
         log.info("%s on %s: rasterizer '%s' (%s)%s", asked, self.device, best.entry.name, best.info.exactness, adapted)
@@ -174,22 +179,27 @@ class NegotiatedRasterizer:
         self._failed |= dict.fromkeys(failed, str(error))
         self._chosen = {k: r for k, r in self._chosen.items() if r.info.name not in failed}
 
-    def _installed(self) -> list[tuple[Entry, RasterizerInfo]]:
-        """What this device, the user's lists and the accepted exactness leave."""
+    def _read_entries(self) -> list[tuple[Entry, RasterizerInfo]]:
+        """Every registered rasterizer whose entry makes sense."""
         found = []
         for entry in self._registry:
-            if self._forced is not None:
-                if entry.name == self._forced:
-                    found.append((entry, info_from_entry(entry)))
-                continue
-            info = info_from_entry(entry)
-            if (
-                self.device.type in info.devices
-                and entry.name not in self._forbid
-                and info.exactness in self._exactness
-            ):
-                found.append((entry, info))
+            try:
+                found.append((entry, info_from_entry(entry)))
+            except PluginError as error:
+                if entry.name in (self._forced, *self._prefer):
+                    raise
+                _warn_once(f"{error}: it is not used")
         return found
+
+    def _installed(self) -> list[tuple[Entry, RasterizerInfo]]:
+        """What this device, the user's lists and the accepted exactness leave."""
+        if self._forced is not None:
+            return [(entry, info) for entry, info in self._readable if entry.name == self._forced]
+        return [
+            (entry, info)
+            for entry, info in self._readable
+            if self.device.type in info.devices and entry.name not in self._forbid and info.exactness in self._exactness
+        ]
 
     def _best(self, wanted: frozenset[str]) -> tuple[_Candidate, str | None]:
         """(the best that can run, why a better one cannot if the user should know)."""
@@ -236,7 +246,7 @@ class NegotiatedRasterizer:
     def _nothing(self, wanted: frozenset[str], unavailable: list[tuple[str, str]]) -> CapabilityError:
         asked = " + ".join(sorted(wanted)) or "plain rendering"
         message = f"no rasterizer offers {asked} on {self.device.type}"
-        infos = [info_from_entry(e) for e in self._registry]
+        infos = [info for _, info in self._readable]
         near = sorted(infos, key=lambda i: (len(wanted - i.features), -i.speed, i.name))[:3]
         lacks = [
             f"{i.name} ({'/'.join(sorted(i.devices))})"
@@ -254,6 +264,6 @@ class NegotiatedRasterizer:
 
 
 @functools.cache
-def _warn_once(reason: str, instead: str) -> None:
-    """Once per reason and process: several rasterizers may share one kernel module."""
-    log.warning("%s; rendering with '%s' instead", reason, instead)
+def _warn_once(message: str) -> None:
+    """Once per process: several rasterizers may share one kernel module."""
+    log.warning("%s", message)

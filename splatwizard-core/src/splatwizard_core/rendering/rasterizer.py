@@ -271,6 +271,8 @@ def option_features(opt: RasterOptions) -> Feature:
     ):
         if asked:
             required |= feature
+    if opt.dtype_out not in ("float32", "uint8"):
+        raise ValueError(f"dtype_out is '{opt.dtype_out}': one of float32, uint8")
     for mode in opt.depth:
         if mode not in _DEPTH_FEATURES:
             raise ValueError(f"unknown depth mode '{mode}': one of {', '.join(_DEPTH_FEATURES)}")
