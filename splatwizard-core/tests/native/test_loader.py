@@ -171,6 +171,11 @@ def test_a_wrong_cxx_is_named(package, monkeypatch):
     assert "no-such-compiler" in str(package.module().available())
 
 
+def test_a_cxx_that_is_no_command_is_a_reason_like_any_other(package, monkeypatch):
+    monkeypatch.setenv("CXX", "g++ '-O2")
+    assert "which is no command (No closing quotation)" in package.module().available()
+
+
 @needs_compiler
 def test_a_cached_build_needs_no_compiler(package, monkeypatch, tmp_path):
     package.module().build()

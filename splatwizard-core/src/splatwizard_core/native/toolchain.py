@@ -62,7 +62,10 @@ def find_compiler() -> list[str]:
     """The C++ compiler's command: $CXX, else the first of g++, c++, clang++. Raises CompilerMissingError."""
     chosen = os.environ.get("CXX", "").strip()
     if chosen:
-        command = shlex.split(chosen)
+        try:
+            command = shlex.split(chosen)
+        except ValueError as error:
+            raise CompilerMissingError(f"$CXX is '{chosen}', which is no command ({error}): correct it") from error
         if shutil.which(command[0]) is None:
             raise CompilerMissingError(f"$CXX is '{chosen}', which is not there: unset CXX or correct it")
         return command
