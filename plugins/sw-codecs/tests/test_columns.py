@@ -1,5 +1,7 @@
 """Entropy model `columns`: any integer matrix comes back; size, estimate, damage, hostile claims."""
 
+import zlib
+
 import numpy as np
 import pytest
 import torch
@@ -9,6 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from splatwizard_core.errors import BitstreamError
 from sw_codecs import columns as columns_module
+from sw_codecs.column_plan import CONSTANT, ColumnPlan, choose_plan
 from sw_codecs.columns import Columns
 
 LIMIT = 2**60
@@ -112,6 +115,28 @@ def test_damage_is_found(assert_survives_damage):
     matrix = many_kinds(40)[:, [0, 1, 2, 5, 6]]
     data = Columns().encode(matrix)
     assert_survives_damage(data, lambda d: Columns().decode(d, matrix.shape), matrix)
+
+
+def test_the_crc_of_every_chunk_is_checked(monkeypatch):
+    monkeypatch.setattr(columns_module, "CHUNK", 20)
+    values = np.random.default_rng(0).integers(0, 7, 50)
+    plan = choose_plan(values)
+    classes = plan.split(plan.residuals(values))[0]
+    data = Columns().encode(values)
+    for start in (0, 20, 40):
+        crc = zlib.crc32(classes[start : start + 20].astype("<i4")).to_bytes(4, "little")
+        assert data.count(crc) == 1
+        with pytest.raises(BitstreamError, match="CRC-32"):
+            Columns().decode(data.replace(crc, b"none"), (50,))
+
+
+@pytest.mark.parametrize("plan", [ColumnPlan(CONSTANT, 2 * LIMIT), ColumnPlan(CONSTANT, LIMIT, first=LIMIT)])
+def test_decoded_values_keep_to_the_documented_range(plan):
+    values = plan.values(np.full(20, plan.offset))
+    crc = zlib.crc32(values.astype("<i8"))
+    head = bytes([1]) + (20).to_bytes(4, "little") + (1).to_bytes(2, "little") + crc.to_bytes(4, "little")
+    with pytest.raises(BitstreamError, match="beyond 2"):
+        Columns().decode(head + plan.pack() + b"\x00", (20,))
 
 
 def test_a_shape_that_the_caller_does_not_expect_is_refused_before_memory_is_taken():

@@ -1,5 +1,7 @@
 """Morton codes and the position codecs: sets and multisets of points, sizes, damage, hostile claims."""
 
+import zlib
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 from splatwizard_core.errors import BitstreamError
 from sw_codecs import morton
 from sw_codecs.bits import write_varint
+from sw_codecs.columns import Columns
 from sw_codecs.octree import Octree
 from sw_codecs.position_codecs import MortonDelta, RawPositions
 
@@ -111,6 +114,15 @@ def test_damage_is_found(assert_survives_damage, codec, name):
     points = in_order(points[:60])
     data = codec().encode(points, bits)
     assert_survives_damage(data, codec().decode, points)
+
+
+def test_codes_so_far_apart_that_their_difference_wraps_are_out_of_order():
+    codes = np.array([0, 2**62, 2**63 - 1, -(2**63), -(2**62), 0, 5])
+    steps = np.diff(codes, prepend=0)
+    columns = np.stack([steps >> 48, steps & (2**48 - 1)], 1)
+    head = bytes([1, 4]) + zlib.crc32(codes.astype("<i8")).to_bytes(4, "little") + write_varint(len(codes))
+    with pytest.raises(BitstreamError, match="Morton order"):
+        MortonDelta().decode(head + Columns().encode(columns))
 
 
 @pytest.mark.parametrize("codec", CODECS)

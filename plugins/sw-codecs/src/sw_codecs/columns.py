@@ -101,6 +101,8 @@ class Columns:
             else:
                 classes = next(classes_of)
                 column[:] = plan.values(plan.join(classes, _unpack_raw(reader, classes, plan)))
+            if rows and not -MAX_VALUE <= column.min() <= column.max() <= MAX_VALUE:
+                raise BitstreamError("a value is beyond 2^60")
             found_crc = zlib.crc32(column.astype("<i8", copy=False), found_crc)
         chunks.finish()
         reader.finish()
@@ -146,7 +148,7 @@ def _encode_classes(classes_of: list[np.ndarray], tables: list[Table]) -> bytes:
 def _decode_classes(chunks: ByteReader, rows: int, tables: list[Table]) -> Iterator[np.ndarray]:
     """The classes of each coded column, int64 [rows]; checks each chunk's CRC when it has been used up."""
     reader, crc = None, 0
-    for table in tables:
+    for number, table in enumerate(tables, 1):
         classes = np.empty(rows, np.int64)
         for start in range(0, rows, CHUNK):
             count = min(CHUNK, rows - start)
@@ -156,6 +158,8 @@ def _decode_classes(chunks: ByteReader, rows: int, tables: list[Table]) -> Itera
                 length, crc = chunks.integer(4), chunks.integer(4)
                 reader = SymbolReader(chunks.take(length))
             classes[start : start + count] = reader.get(count, table)
+        if reader is not None and number == len(tables):
+            reader.check(crc)
         yield classes
 
 

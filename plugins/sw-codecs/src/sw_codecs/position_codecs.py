@@ -33,7 +33,8 @@ def _parse_head(reader: ByteReader, max_points: int) -> tuple[int, int, int]:
 def _checked(codes: np.ndarray, bits: int, crc: int) -> np.ndarray:
     if zlib.crc32(codes.astype("<i8")) != crc:
         raise BitstreamError("the decoded points do not match their CRC-32")
-    if len(codes) and (codes[0] < 0 or int(codes[-1]) >> (3 * bits) or (np.diff(codes) < 0).any()):
+    # Compared, not subtracted: a stranger's codes may be so far apart that their difference wraps around.
+    if len(codes) and (codes[0] < 0 or int(codes[-1]) >> (3 * bits) or (codes[1:] < codes[:-1]).any()):
         raise BitstreamError("the decoded points are out of range or not in Morton order")
     return morton.decode(codes)
 
