@@ -74,6 +74,13 @@ def test_values_that_are_not_finite_are_refused(value):
         SteRound(1.0).encode(torch.tensor([0.0, value]))
 
 
+def test_ranges_that_make_no_lattice_are_refused():
+    with pytest.raises(ValueError, match="ends before it starts"):
+        Uniform(8, low=[0.0, 1.0], high=0.5)
+    with pytest.raises(ValueError, match="float32"):
+        Uniform(8).encode(torch.tensor([0.0, 1e300], dtype=torch.float64))
+
+
 @pytest.mark.parametrize("bits", [0, 25, 2.5, [8, 0]])
 def test_bits_must_be_whole_and_in_range(bits):
     with pytest.raises(ValueError, match="bits"):

@@ -63,6 +63,14 @@ def test_weights_pull_entries():
     assert float(vq.codebook) == 1.0
 
 
+@pytest.mark.parametrize("unit", [1e-9, 1e9])
+def test_only_the_ratio_of_weights_matters(unit):
+    x = torch.tensor([[0.0], [1.0], [50.0], [52.0]])
+    vq = VectorQuantizer(2)
+    vq.fit(x, generator=gen(), weights=unit * torch.tensor([3.0, 1.0, 1.0, 1.0]))
+    assert vq.codebook.flatten().sort().values.tolist() == pytest.approx([0.25, 51.0])
+
+
 def test_fewer_rows_than_entries_are_kept_exactly():
     x = torch.randn(5, 3, generator=gen())
     vq = VectorQuantizer(64)
@@ -132,6 +140,8 @@ def test_wrong_use_is_refused():
     vq.fit(torch.zeros(3, 2), generator=gen())
     with pytest.raises(ShapeError):
         vq.assign(torch.zeros(3, 4))
+    with pytest.raises(ValueError, match="finite"):
+        vq.encode(torch.tensor([[float("nan"), 0.0]]))
     with pytest.raises(ValueError, match="weights"):
         vq.fit(torch.zeros(3, 2), generator=gen(), weights=torch.tensor([1.0, -1.0, 1.0]))
 

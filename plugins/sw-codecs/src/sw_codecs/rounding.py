@@ -35,7 +35,7 @@ class _RoundThrough(torch.autograd.Function):
 
 
 class SteRound:
-    """x^ = round(x / step) * step; gradient 1 for x.
+    """x^ = round(x / step) * step; gradient 1 for x (0 where `index_clamp` acts).
 
     step            > 0, a number or a tensor that broadcasts with x; also an argument of each call
     step_gradient   gradient (k - x / step) for the step (as in LSQ) instead of none

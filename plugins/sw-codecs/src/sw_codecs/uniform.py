@@ -23,7 +23,8 @@ class Uniform:
     noise       forward adds uniform noise of one step instead of rounding (for training with a rate term)
 
     `forward` uses the same lattice, its gradient is 1 inside the range and 0 outside. Arithmetic is float64, results
-    float32. Source: specification of the codec library, quantisers (FakeQuantAffine, SteRound).
+    float32. Source: specification of the codec library, quantisers (FakeQuantAffine, SteRound). Unlike FakeQuantAffine
+    the lattice starts at `low` itself, not at a multiple of the step: both ends of the range are lattice points.
     """
 
     def __init__(
@@ -37,6 +38,8 @@ class Uniform:
         self.bits = np.asarray(bits)
         if not np.issubdtype(self.bits.dtype, np.integer) or self.bits.min() < 1 or self.bits.max() > MAX_BITS:
             raise ValueError(f"bits are {bits}, must be integers in 1..{MAX_BITS}")
+        if low is not None and high is not None and not (np.asarray(low) <= np.asarray(high)).all():
+            raise ValueError(f"the range {low} .. {high} ends before it starts")
         self.low, self.high, self.noise = low, high, noise
 
     def _lattice(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -59,6 +62,8 @@ class Uniform:
         low = ends[0].to(torch.float32).to(torch.float64)
         levels = torch.as_tensor(2.0**self.bits - 1, dtype=torch.float64, device=x.device).expand(channels)
         step = ((ends[1] - low) / levels).to(torch.float32).to(torch.float64)
+        if not bool(torch.isfinite(low).all() and torch.isfinite(step).all()):
+            raise ValueError("the range to quantize does not fit float32")
         return low, torch.where(step > 0, step, torch.ones_like(step)), levels
 
     def forward(self, x: Tensor, generator: torch.Generator | None = None) -> Tensor:
@@ -83,7 +88,7 @@ class Uniform:
     def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Indices int64 of the shape of x, and {"low", "step"} float32 [C], {"bits"} uint8 [C] as numpy arrays.
 
-        Raises ValueError for values that are not finite.
+        Raises ValueError for values that are not finite or whose range float32 cannot hold.
         """
         low, step, levels = self._lattice(x)
         index = ((_columns(x).detach().to(torch.float64) - low) / step).round().clamp(torch.zeros_like(levels), levels)

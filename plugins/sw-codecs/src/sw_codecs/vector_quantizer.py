@@ -69,9 +69,8 @@ class VectorQuantizer:
             index, distance = self._search(x)
             counts, sums = self._gather(x, weights, index)
             used = counts > 0
-            self.codebook = torch.where(used[:, None], sums / counts.clamp_min(EPSILON)[:, None], self.codebook).to(
-                x.dtype
-            )
+            means = sums / torch.where(used, counts, 1.0)[:, None]
+            self.codebook = torch.where(used[:, None], means, self.codebook).to(x.dtype)
             errors.append((distance * weights).sum() / weights.sum())
             empty = torch.nonzero(~used).squeeze(1)
             if len(empty) and len(x) > self.size:
@@ -125,8 +124,11 @@ class VectorQuantizer:
     def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Indices [N] int64, and {"codebook"} [K, d] float32 (float16 with `half`) as a numpy array.
 
-        Searches in the codebook as it is stored, so that `decode` gives the nearest stored entry.
+        Searches in the codebook as it is stored, so that `decode` gives the nearest stored entry. Raises ValueError for
+        values that are not finite.
         """
+        if not bool(torch.isfinite(x).all()):
+            raise ValueError("values to quantize must be finite")
         codebook = self._fitted().detach().to(torch.float16 if self.half else torch.float32)
         if not bool(torch.isfinite(codebook).all()):
             raise ValueError("the codebook holds values that are not finite in its stored precision")
