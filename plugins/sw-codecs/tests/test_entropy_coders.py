@@ -126,6 +126,13 @@ def test_many_chunks(coder, name, monkeypatch):
         coder().decode(data, 400, spec.part(0, 400))
 
 
+@pytest.mark.parametrize("coder", CODERS)
+def test_a_chunk_under_a_float_model_that_does_not_decode_is_not_written(coder, monkeypatch):
+    monkeypatch.setattr(coder, "_decode_chunk", lambda self, payload, count, spec: np.zeros(count, np.int32))
+    with pytest.raises(RuntimeError, match="does not decode"):
+        coder().encode(np.array([0, 1, 2]), Gaussian(0.0, 1.0, -5, 5))
+
+
 @pytest.mark.parametrize("coder", STREAMS)
 @pytest.mark.parametrize("scale", [0.2, 1.0, 20.0])
 def test_size_is_the_entropy_of_the_model(coder, scale):

@@ -36,7 +36,8 @@ def test_round_trip(name, n):
 def test_contexts_are_reached_through_the_registered_class():
     """A method of another package has the class from the registry and imports nothing of ours."""
     model = GaussianExact()
-    context = model.IntegerContext(np.zeros(3, np.int64), np.full(3, 4096), model.step_multipliers(np.zeros(3)))
+    multiplier = model.step_multipliers(np.zeros(3, np.int64))
+    context = model.IntegerContext(np.zeros(3, np.int64), np.full(3, 4096), multiplier)
     assert np.array_equal(model.decode(model.encode(np.arange(3), context), context), np.arange(3))
     assert model.bits(torch.zeros(2), model.FloatContext(0.0, 1.0)).shape == (2,)
 
@@ -111,6 +112,11 @@ def test_step_multipliers_follow_1_plus_tanh():
     t = np.array([-(2**20), -32_768, 0, 4096, 2**20])
     expected = 4096 * (1 + np.tanh(np.clip(t / 4096 + 0.5 / 8, -8 + 0.5 / 8, 8 - 0.5 / 8)))
     assert np.abs(step_multipliers(t) - np.maximum(64, expected)).max() <= 1
+
+
+def test_step_multipliers_take_no_floats():
+    with pytest.raises(ValueError, match="integers"):
+        step_multipliers(np.array([0.5]))
 
 
 def test_many_chunks(monkeypatch):

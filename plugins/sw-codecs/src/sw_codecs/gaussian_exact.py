@@ -53,7 +53,12 @@ class IntegerContext:
 
 
 def step_multipliers(outputs: np.ndarray) -> np.ndarray:
-    """Step multipliers 64..8192 (int64) for network outputs t with 12 fractional bits: round(4096 (1 + tanh t))."""
+    """Step multipliers 64..8192 (int64) for network outputs t with 12 fractional bits: round(4096 (1 + tanh t)).
+
+    Raises ValueError for floats: they would be cut off, and are not exact.
+    """
+    if not np.issubdtype(np.asarray(outputs).dtype, np.integer):
+        raise ValueError(f"step outputs must be integers, not {np.asarray(outputs).dtype}")
     j = np.clip((np.asarray(outputs, np.int64) + (1 << 15)) >> 9, 0, 127)
     return exact_tables().multipliers[j]
 

@@ -94,8 +94,7 @@ class IntegerMlp:
         """
         if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
             raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
-        blocks = [self._evaluate(block) for block in inputs.split(max(rows, 1))]
-        return torch.cat(blocks) if blocks else inputs.new_zeros(0, self._layers[-1][0].shape[0])
+        return torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
 
     def _evaluate(self, inputs: Tensor) -> Tensor:
         device = self._layers[0][0].device

@@ -82,7 +82,8 @@ def laplace_bits(
 
 def bernoulli_bits(symbols: Tensor, p: Tensor | float) -> Tensor:
     """Bits of symbols in {0, 1} (or relaxed in between) with P(1) = p, clamped to 1e-6 from 0 and 1."""
-    p = torch.as_tensor(p, dtype=torch.get_default_dtype(), device=symbols.device).clamp(1e-6, 1 - 1e-6)
+    dtype = torch.promote_types(symbols.dtype, torch.get_default_dtype())
+    p = torch.as_tensor(p, dtype=dtype, device=symbols.device).clamp(1e-6, 1 - 1e-6)
     return -symbols * torch.log2(p) - (1 - symbols) * torch.log2(1 - p)
 
 
