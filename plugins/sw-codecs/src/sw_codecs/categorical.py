@@ -12,7 +12,7 @@ from splatwizard_core.errors import BitstreamError
 from sw_codecs.bits import ByteReader
 from sw_codecs.coders import RangeCoder
 from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables
-from sw_codecs.model_spec import Tables
+from sw_codecs.model_spec import Tables, as_symbols
 
 VERSION = 1
 MAX_ENTRIES = 1 << 24
@@ -49,7 +49,7 @@ class Categorical:
 
     def bits(self, symbols: Tensor, context: CategoricalContext) -> Tensor:
         """Bits per symbol under the counts of `symbols` itself, float64, shape of `symbols`; no gradient."""
-        flat = symbols.detach().cpu().numpy().reshape(-1)
+        flat = as_symbols(symbols.detach().cpu().numpy().reshape(-1))
         index, tables = _histograms(flat, context)
         stored = np.stack([rounded_counts(t) for t in tables])
         found = np.log2(np.maximum(stored.sum(1), 1)[index] / stored[index, flat])
@@ -57,7 +57,7 @@ class Categorical:
 
     def encode(self, symbols: np.ndarray, context: CategoricalContext) -> bytes:
         """u8 version, the count tables, chunks of the `range` coder. Raises ValueError for symbols out of range."""
-        symbols = np.asarray(symbols)
+        symbols = as_symbols(symbols)
         index, tables = _histograms(symbols, context)
         head = bytes([VERSION])
         if len(symbols) == 0:
@@ -82,8 +82,6 @@ class Categorical:
 
 def _histograms(symbols: np.ndarray, context: CategoricalContext) -> tuple[np.ndarray, np.ndarray]:
     """The table of each symbol, and the counts [tables, size]."""
-    if symbols.ndim != 1 or not np.issubdtype(symbols.dtype, np.integer):
-        raise ValueError(f"symbols must be a list of integers, not {symbols.dtype} of shape {list(symbols.shape)}")
     if symbols.size and not 0 <= symbols.min() <= symbols.max() < context.size:
         raise ValueError(f"symbols {symbols.min()}..{symbols.max()} leave 0..{context.size - 1}")
     index = context.rows(len(symbols))

@@ -16,7 +16,7 @@ import numpy as np
 
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.bits import ByteReader
-from sw_codecs.model_spec import Gaussian, Laplace, ModelSpec, check_length, domain
+from sw_codecs.model_spec import Gaussian, Laplace, ModelSpec, as_symbols, check_length, domain
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
 
 CHUNK = 1 << 20
@@ -31,9 +31,7 @@ class ChunkedCoder:
 
         Raises ValueError for symbols outside the domain or parameters of another length.
         """
-        symbols = np.asarray(symbols)
-        if symbols.ndim != 1 or not np.issubdtype(symbols.dtype, np.integer):
-            raise ValueError(f"symbols must be a list of integers, not {symbols.dtype} of shape {list(symbols.shape)}")
+        symbols = as_symbols(symbols)
         check_length(model, len(symbols))
         low, high = domain(model)
         if len(symbols) and (symbols.min() < low or symbols.max() > high):

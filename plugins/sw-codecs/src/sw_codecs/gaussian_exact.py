@@ -20,6 +20,7 @@ from sw_codecs import exp_golomb
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.coders import CHUNK, HEADER
 from sw_codecs.exact_tables import FRACTIONS, Family, exact_tables
+from sw_codecs.model_spec import as_symbols
 from sw_codecs.rates import gaussian_bits, laplace_bits
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
 
@@ -159,9 +160,7 @@ class LaplaceExact(ExactModel):
 
 
 def _check_symbols(symbols: Any) -> np.ndarray:
-    symbols = np.asarray(symbols)
-    if symbols.ndim != 1 or not np.issubdtype(symbols.dtype, np.integer):
-        raise ValueError(f"symbols must be a list of integers, not {symbols.dtype} of shape {list(symbols.shape)}")
+    symbols = as_symbols(symbols)
     if symbols.size and (symbols.min() <= -SYMBOL_LIMIT or symbols.max() >= SYMBOL_LIMIT):
         raise ValueError("a symbol is beyond 2^30")
     return symbols.astype(np.int64)

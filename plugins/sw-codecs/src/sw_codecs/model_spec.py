@@ -170,6 +170,14 @@ def domain(spec: ModelSpec) -> tuple[int, int]:
     return 0, spec.size - 1
 
 
+def as_symbols(symbols: Any) -> np.ndarray:
+    """`symbols` as an array [n]. Raises ValueError unless they are a list of integers."""
+    symbols = np.asarray(symbols)
+    if symbols.ndim != 1 or not np.issubdtype(symbols.dtype, np.integer):
+        raise ValueError(f"symbols must be a list of integers, not {symbols.dtype} of shape {list(symbols.shape)}")
+    return symbols
+
+
 def check_length(spec: ModelSpec, n: int) -> None:
     """Raise ValueError if `spec` has per-symbol parameters for another number of symbols than n."""
     for name in ("mu", "sigma", "b", "p", "index"):

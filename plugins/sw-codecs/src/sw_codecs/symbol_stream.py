@@ -15,7 +15,18 @@ import constriction
 import numpy as np
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.model_spec import Bernoulli, Gaussian, Laplace, ModelSpec, Table, Tables, Uniform, check_length, domain
+from sw_codecs.model_spec import (
+    Bernoulli,
+    Gaussian,
+    Laplace,
+    ModelSpec,
+    Table,
+    Tables,
+    Uniform,
+    as_symbols,
+    check_length,
+    domain,
+)
 
 _models = constriction.stream.model
 
@@ -90,9 +101,7 @@ class SymbolWriter:
 
     def put(self, symbols: np.ndarray, spec: ModelSpec) -> None:
         """Append symbols [n], integers within the model's domain. Raises ValueError if one is not."""
-        symbols = np.asarray(symbols)
-        if symbols.ndim != 1 or not np.issubdtype(symbols.dtype, np.integer):
-            raise ValueError(f"symbols must be a list of integers, not {symbols.dtype} of shape {list(symbols.shape)}")
+        symbols = as_symbols(symbols)
         check_length(spec, len(symbols))
         if len(symbols) == 0:
             return
