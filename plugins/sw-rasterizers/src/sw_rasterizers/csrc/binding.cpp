@@ -35,7 +35,7 @@ enum Flag : int64_t {  // mirrored in ops.py
 };
 
 enum Saved {  // the state that the backward pass needs
-  kRecords, kIndex, kPerChunk, kTiles, kFirstPair, kColorSlope, kClamped, kChannels, kTileStart, kSlot, kOrigin,
+  kRecords, kIndex, kPerChunk, kRuns, kColorSlope, kClamped, kChannels, kTileStart, kSlot, kOrigin,
   kBlocksOfPair, kTransmittance, kLast, kMedianPair, kSavedCount
 };
 
@@ -155,9 +155,9 @@ struct Inputs {
 
 template <class S>
 sw::Slots<S> slots_of(const std::vector<Tensor>& saved) {
-  return {data<S>(saved[kRecords]),    data<int32_t>(saved[kIndex]),     data<int32_t>(saved[kPerChunk]),
-          data<int32_t>(saved[kTiles]), data<int32_t>(saved[kFirstPair]), data<S>(saved[kColorSlope]),
-          data<uint8_t>(saved[kClamped]), data<S>(saved[kChannels])};
+  return {data<S>(saved[kRecords]),        data<int32_t>(saved[kIndex]), data<int32_t>(saved[kPerChunk]),
+          data<sw::PairRun>(saved[kRuns]), data<S>(saved[kColorSlope]),  data<uint8_t>(saved[kClamped]),
+          data<S>(saved[kChannels])};
 }
 
 template <class S>
@@ -204,8 +204,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   saved[kRecords] = make({n, sw::kRecord});
   saved[kIndex] = make_as({n}, at::kInt);
   saved[kPerChunk] = make_as({chunks}, at::kInt);
-  saved[kTiles] = make_as({n}, at::kInt);
-  saved[kFirstPair] = make_as({n}, at::kInt);
+  saved[kRuns] = make_as({n, 2}, at::kInt);
   saved[kClamped] = make_as({n}, at::kByte);
   saved[kColorSlope] = make({save && g.colors == nullptr && g.sh_degree > 0 ? n : 0, 9});
   saved[kChannels] = make({in.plain() ? 0 : n, total});
@@ -214,14 +213,14 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   int64_t seen[2] = {0, 0};
   const int64_t used =
       n == 0 ? 0
-             : SW_SELECT(project_gaussians)(view, g, settings, channels, slots, data<int32_t>(out.radii), seen);
-  const int64_t count = SW_SELECT(number_pairs)(n, slots);
+             : SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(out.radii), seen);
+  const int64_t count = SW_SELECT(number_pairs<S>)(n, slots, settings.threads);
   TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
               " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
   out.seconds.push_back(clock.lap());
 
   Tensor order = make_as({used}, at::kInt);
-  if (used > 0) SW_SELECT(depth_order)(n, used, slots, settings.threads, data<int32_t>(order));
+  if (used > 0) SW_SELECT(depth_order<S>)(n, used, slots, settings.threads, data<int32_t>(order));
   out.seconds.push_back(clock.lap());
 
   saved[kTileStart] = make_as({tiles + 1}, at::kLong);
@@ -229,7 +228,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   saved[kOrigin] = make_as({save ? count : 0}, at::kInt);
   saved[kBlocksOfPair] = make_as({save ? count : 0}, at::kShort);
   const auto pairs = pairs_of<S>(saved);
-  SW_SELECT(bin_pairs)(view, settings, n, used, slots, data<int32_t>(order), data<int32_t>(out.radii), pairs);
+  SW_SELECT(bin_pairs<S>)(view, settings, n, used, slots, data<int32_t>(order), data<int32_t>(out.radii), pairs);
   out.seconds.push_back(clock.lap());
 
   const bool median = settings.median_depth;
@@ -243,7 +242,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   auto canvas = canvas_of<S>(in, saved);
   canvas.image = data<S>(out.image), canvas.alpha = data<S>(out.alpha), canvas.median = data<S>(out.median);
   if (in.flags & kCount) canvas.counters = counters;
-  SW_SELECT(blend)(view, settings, slots, pairs, canvas);
+  SW_SELECT(blend<S>)(view, settings, slots, pairs, canvas);
   out.seconds.push_back(clock.lap());
   out.counts = {seen[0], count, counters[0], counters[1], seen[1]};
   if (save) out.saved = std::move(saved);
@@ -289,7 +288,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
   Clock clock;
   std::vector<double> seconds;
   Tensor sums = make_tensor({pairs.count, columns}, real);
-  SW_SELECT(blend_backward)(view, settings, slots, pairs, canvas_of<S>(in, saved), gradient,
+  SW_SELECT(blend_backward<S>)(view, settings, slots, pairs, canvas_of<S>(in, saved), gradient,
                      settings.detach_features ? channels.features : 0, data<S>(sums));
   seconds.push_back(clock.lap());
 
@@ -319,7 +318,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
   const OptionalTensor screen = at::empty({wanted[kWantGrad2d] || wanted[kWantAbsgrad2d] ? g.count : 0, 2}, real);
   out.grad2d = want(kWantGrad2d, screen);
   out.absgrad2d = want(kWantAbsgrad2d, screen);
-  if (g.count > 0) SW_SELECT(project_backward)(view, g, settings, channels, slots, data<S>(sums), out);
+  if (g.count > 0) SW_SELECT(project_backward<S>)(view, g, settings, channels, slots, data<S>(sums), out);
   seconds.push_back(clock.lap());
   return {std::move(grads), std::move(seconds)};
 }
@@ -346,7 +345,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> render_backward(
 template <class S>
 void radii_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int64_t height, Tensor& radii) {
   const auto view = sw::View<S>::from(camera.data(), int(width), int(height));
-  if (in.means.size(0) > 0) SW_SELECT(visible_radii)(view, in.gaussians<S>(), in.settings(), data<int32_t>(radii));
+  if (in.means.size(0) > 0) SW_SELECT(visible_radii<S>)(view, in.gaussians<S>(), in.settings(), data<int32_t>(radii));
 }
 
 Tensor visible_radii(const Tensor& means, const OptionalTensor& scales, const OptionalTensor& quats,

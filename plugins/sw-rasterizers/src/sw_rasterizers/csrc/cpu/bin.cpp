@@ -84,40 +84,60 @@ struct RadixSorter {
   }
 };
 
-template <class S, class Visit>
-void for_each_slot(int64_t count, const Slots<S>& slots, const Visit& visit) {
-  for (int64_t chunk = 0; chunk * kChunk < count; ++chunk)
-    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) visit(s);
+int64_t chunks_of(int64_t count) { return (count + kChunk - 1) / kChunk; }
+
+// Slots in use, in order; fill_key(i, slot) sees each of them.
+template <class S, class FillKey>
+void list_slots(int64_t count, const Slots<S>& slots, int threads, int32_t* order, const FillKey& fill_key) {
+  std::vector<int64_t> start(size_t(chunks_of(count)) + 1, 0);
+  for (int64_t chunk = 0; chunk < chunks_of(count); ++chunk)
+    start[size_t(chunk) + 1] = start[size_t(chunk)] + slots.per_chunk[chunk];
+  parallel_dynamic(threads, chunks_of(count), [&](int64_t chunk) {
+    int64_t i = start[size_t(chunk)];
+    for (int64_t s = chunk * kChunk; i < start[size_t(chunk) + 1]; ++s, ++i) {
+      order[i] = int32_t(s);
+      fill_key(i, s);
+    }
+  });
 }
 
 }  // namespace
 
 template <class S>
-int64_t number_pairs(int64_t count, const Slots<S>& slots) {
-  int64_t pairs = 0;
-  for_each_slot(count, slots, [&](int64_t s) {
-    slots.first_pair[s] = int32_t(pairs);  // the caller refuses more than 2^31 - 1 pairs
-    pairs += slots.tiles[s];
+int64_t number_pairs(int64_t count, const Slots<S>& slots, int threads) {
+  std::vector<int64_t> start(size_t(chunks_of(count)) + 1, 0);
+  const auto for_chunk = [&](int64_t chunk, const auto& visit) {
+    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) visit(slots.run[s]);
+  };
+  parallel_dynamic(threads, chunks_of(count), [&](int64_t chunk) {
+    int64_t pairs = 0;
+    for_chunk(chunk, [&](PairRun& run) { pairs += run.count; });
+    start[size_t(chunk) + 1] = pairs;
   });
-  return pairs;
+  for (size_t chunk = 1; chunk < start.size(); ++chunk) start[chunk] += start[chunk - 1];
+  parallel_dynamic(threads, chunks_of(count), [&](int64_t chunk) {
+    int64_t next = start[size_t(chunk)];
+    for_chunk(chunk, [&](PairRun& run) {
+      run.first = int32_t(next);  // the caller refuses more than 2^31 - 1 pairs
+      next += run.count;
+    });
+  });
+  return start.back();
 }
 
 template <>
 void depth_order<float>(int64_t count, int64_t used, const Slots<float>& slots, int threads, int32_t* order) {
   RadixSorter sorter(used, threads);
-  int64_t i = 0;
-  for_each_slot(count, slots, [&](int64_t s) {
+  list_slots(count, slots, threads, order, [&](int64_t i, int64_t s) {
     std::memcpy(&sorter.keys[0][i], &slots.records[s * kRecord + kDepth], sizeof(float));
-    order[i++] = int32_t(s);
   });
   sorter.sort(order);
 }
 
 template <>
-void depth_order<double>(int64_t count, int64_t, const Slots<double>& slots, int, int32_t* order) {
-  int64_t i = 0;
-  for_each_slot(count, slots, [&](int64_t s) { order[i++] = int32_t(s); });
-  std::stable_sort(order, order + i, [&](int32_t a, int32_t b) {
+void depth_order<double>(int64_t count, int64_t used, const Slots<double>& slots, int threads, int32_t* order) {
+  list_slots(count, slots, threads, order, [](int64_t, int64_t) {});
+  std::stable_sort(order, order + used, [&](int32_t a, int32_t b) {
     return slots.records[int64_t(a) * kRecord + kDepth] < slots.records[int64_t(b) * kRecord + kDepth];
   });
 }
@@ -127,20 +147,24 @@ void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int
                const int32_t* order, const int32_t* radii, const Pairs<S>& pairs) {
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const int parts = settings.threads;
+  constexpr int64_t kAhead = 12;
 
   // Splat-major: the tile of every pair.
   std::unique_ptr<int32_t[]> tile_of(new int32_t[pairs.count]);
   parallel_dynamic(settings.threads, (count + kChunk - 1) / kChunk, [&](int64_t chunk) {
     for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s)
-      if (slots.tiles[s] != 0)  // 0: dropped, its colour is not finite
-        for_each_tile(view, settings, slots, radii, s, tile_of.get() + slots.first_pair[s]);
+      if (slots.run[s].count != 0) for_each_tile(view, settings, slots, radii, s, tile_of.get() + slots.run[s].first);
   });
 
   std::vector<int64_t> cursor(size_t(parts) * tiles, 0);
   const auto for_range = [&](int64_t part, const auto& visit) {
-    for (int64_t i = used * part / parts; i < used * (part + 1) / parts; ++i) {
-      const int32_t s = order[i];
-      for (int64_t p = slots.first_pair[s], end = p + slots.tiles[s]; p < end; ++p) visit(s, int32_t(p), tile_of[p]);
+    const int64_t stop = used * (part + 1) / parts;
+    for (int64_t i = used * part / parts; i < stop; ++i) {
+      // Depth order is random order in memory: ask for the run, then for its tiles, some splats ahead.
+      if (i + 2 * kAhead < stop) __builtin_prefetch(slots.run + order[i + 2 * kAhead]);
+      if (i + kAhead < stop) __builtin_prefetch(tile_of.get() + slots.run[order[i + kAhead]].first);
+      const PairRun run = slots.run[order[i]];
+      for (int32_t p = run.first; p < run.first + run.count; ++p) visit(order[i], p, tile_of[p]);
     }
   };
   parallel_dynamic(settings.threads, parts, [&](int64_t part) {
@@ -168,8 +192,8 @@ void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int
   });
 }
 
-template int64_t number_pairs(int64_t, const Slots<float>&);
-template int64_t number_pairs(int64_t, const Slots<double>&);
+template int64_t number_pairs(int64_t, const Slots<float>&, int);
+template int64_t number_pairs(int64_t, const Slots<double>&, int);
 template void bin_pairs(const View<float>&, const Settings&, int64_t, int64_t, const Slots<float>&, const int32_t*,
                         const int32_t*, const Pairs<float>&);
 template void bin_pairs(const View<double>&, const Settings&, int64_t, int64_t, const Slots<double>&, const int32_t*,

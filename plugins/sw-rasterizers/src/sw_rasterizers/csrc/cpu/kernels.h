@@ -76,13 +76,16 @@ struct Channels {
   int total() const { return colors + inverse + accumulated + features; }
 };
 
+struct PairRun {  // the (splat, tile) pairs of a splat, one after the other; count 0: it turned out to draw nothing
+  int32_t first, count;
+};
+
 template <class S>
 struct Slots {
   S* records;          // [N][kRecord]
   int32_t* index;      // [N] Gaussian of the slot
   int32_t* per_chunk;  // [chunks] slots used
-  int32_t* tiles;      // [N] tiles the splat touches
-  int32_t* first_pair; // [N] its first pair: pairs of a splat are contiguous
+  PairRun* run;        // [N]
   S* color_slope;      // [N][9] d colour_c / d mean_j, or null
   uint8_t* clamped;    // [N] bit c: colour c was clamped at 0
   S* channels;         // [N][channels], or null if the three colours in the record are all
@@ -150,7 +153,7 @@ struct Gradients {  // null: not asked for
   template <class S>                                                                                                  \
   void visible_radii(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii);           \
   template <class S>                                                                                                  \
-  int64_t number_pairs(int64_t count, const Slots<S>& slots);                                                         \
+  int64_t number_pairs(int64_t count, const Slots<S>& slots, int threads);                                            \
   template <class S>                                                                                                  \
   void depth_order(int64_t count, int64_t used, const Slots<S>& slots, int threads, int32_t* order);                  \
   template <class S>                                                                                                  \

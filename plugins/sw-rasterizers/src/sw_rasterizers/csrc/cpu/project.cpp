@@ -143,7 +143,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
       S* record = slots.records + slot * kRecord;
       for (int k = 0; k < kRecord; ++k) record[k] = fields[k][i];
       slots.index[slot] = int32_t(n);
-      slots.tiles[slot] = tiles;
+      slots.run[slot] = {0, tiles};
       ++slot;
     }
     return slot;
@@ -230,7 +230,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
   // Turns a slot into one that touches no tile and passes no gradient on.
   void drop(int64_t slot) const {
     radii[slots.index[slot]] = 0;
-    slots.tiles[slot] = 0;
+    slots.run[slot].count = 0;
     slots.clamped[slot] = 7;
     if (slots.color_slope != nullptr) std::fill_n(slots.color_slope + slot * 9, 9, S(0));
   }

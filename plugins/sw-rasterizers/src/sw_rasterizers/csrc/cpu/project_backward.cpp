@@ -51,10 +51,10 @@ struct ChunkBackward {
     alignas(64) S depth_gradient[L] = {};
     for (int i = 0; i < L; ++i) {
       const int64_t slot = first + (i < lanes ? i : lanes - 1);
-      const S* row = sums + int64_t(slots.first_pair[slot]) * columns;
+      const S* row = sums + int64_t(slots.run[slot].first) * columns;
       S total[kPlainColumns] = {};
       if (slots.channels == nullptr) {
-        for (int n = 0; n < slots.tiles[slot]; ++n, row += kPlainColumns)
+        for (int n = 0; n < slots.run[slot].count; ++n, row += kPlainColumns)
           for (int k = 0; k < kPlainColumns; ++k) total[k] += row[k];
       } else if (i < lanes) {
         depth_gradient[i] = add_up_general(slot, row, total);
@@ -118,7 +118,7 @@ struct ChunkBackward {
     const int64_t n = slots.index[slot];
     const auto column = [&](int k) {
       S value = 0;
-      for (int p = 0; p < slots.tiles[slot]; ++p) value += row[int64_t(p) * columns + k];
+      for (int p = 0; p < slots.run[slot].count; ++p) value += row[int64_t(p) * columns + k];
       return value;
     };
     for (int k = 0; k < kMoments; ++k) total[k] = column(k);
