@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 import sysconfig
 import venv
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKSPACE = [ROOT / "splatwizard-core", *sorted(p.parent for p in (ROOT / "plugins").glob("*/pyproject.toml"))]
@@ -57,16 +60,31 @@ class FreshEnvironment:
 
     def run(self, *args: str, check: bool = True, **env: str) -> subprocess.CompletedProcess[str]:
         """Run `sw ARGS` there, away from the source tree."""
-        work = self.prefix / "work"
-        work.mkdir(exist_ok=True)
-        kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "SW_", "COVERAGE"))}
-        done = subprocess.run(
-            [str(self.prefix / "bin" / "sw"), *args],
-            cwd=work, env={**kept, "OMP_NUM_THREADS": "2", **env}, capture_output=True, text=True, timeout=300,
-        )  # fmt: skip
+        done = subprocess.run(self._command(args), **self._surroundings(env), capture_output=True, timeout=300)
         if check and done.returncode:
             raise AssertionError(f"sw {' '.join(args)} exited {done.returncode}:\n{done.stdout}\n{done.stderr}")
         return done
+
+    def start(self, *args: str, **env: str) -> subprocess.Popen[str]:
+        """Start `sw ARGS` there as a foreground process of a terminal would run: Ctrl-C (SIGINT) reaches it."""
+
+        def heed_interrupts() -> None:
+            # What a shell started in the background ignores, its children ignore too.
+            signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+        return subprocess.Popen(
+            self._command(args), **self._surroundings(env),
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, preexec_fn=heed_interrupts,
+        )  # fmt: skip
+
+    def _command(self, args: Sequence[str]) -> list[str]:
+        return [str(self.prefix / "bin" / "sw"), *args]
+
+    def _surroundings(self, env: dict[str, str]) -> dict[str, Any]:
+        work = self.prefix / "work"
+        work.mkdir(exist_ok=True)
+        kept = {k: v for k, v in os.environ.items() if not k.startswith(("PYTHON", "SW_", "COVERAGE"))}
+        return {"cwd": work, "env": {**kept, "OMP_NUM_THREADS": "1", **env}, "text": True}
 
     def plugins(self, **env: str) -> dict[str, dict[str, object]]:
         """`sw list-plugins --json`, by distribution."""

@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import json
 import math
+import signal
+import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fresh_environments import ROOT, FreshEnvironment, build_wheel, make_environment
@@ -24,8 +27,14 @@ PACKAGES = {
 SHORT = {
     "opacity-prune": ("base_iterations=40", "base_preset=paper", "iterations=10"),
     "test-distill": ("base_iterations=25", "iterations=25"),
-    "test-anchors": ("iterations=50",),
+    # The opacity that keeps an anchor is raised, or none of them would have gone after so few steps.
+    "test-anchors": ("iterations=50", "min_opacity=0.99", "log_every=1"),
 }
+INTERRUPTED = {
+    "test-distill": (1, ("base_iterations=10", "iterations=150", "log_every=1")),
+    "test-anchors": (0, ("iterations=150", "adjust_interval=10", "grad_threshold=5e-3", "log_every=1")),
+}
+"""The stage that is interrupted, and a run long enough that it has not ended before the interrupt arrives."""
 
 
 @pytest.fixture(scope="module")
@@ -38,11 +47,20 @@ def strangers(tmp_path_factory: pytest.TempPathFactory, wheels) -> FreshEnvironm
     return environment
 
 
-def run(environment: FreshEnvironment, method: str, out: Path, *more: str) -> dict[str, object]:
-    sets = [argument for pair in SHORT[method] for argument in ("--set", pair)]
-    environment.run("run", "--method", method, "--scene", "demo", "--out", str(out), *sets, *more)
-    (record,) = out.glob(f"**/{method}/**/metrics.json")
+def arguments(method: str, out: Path, sets: tuple[str, ...], scene: str = "demo") -> list[str]:
+    pairs = [argument for pair in sets for argument in ("--set", pair)]
+    return ["--method", method, "--scene", scene, "--out", str(out), *pairs]
+
+
+def record_of(out: Path) -> dict[str, Any]:
+    (record,) = out.glob("**/metrics.json")
     return json.loads(record.read_text())
+
+
+def log_of(out: Path) -> list[dict[str, Any]]:
+    """The lines of log.jsonl; a run that writes it may be in the middle of the last one."""
+    text = "".join(path.read_text() for path in out.glob("**/log.jsonl"))
+    return [json.loads(line) for line in text.splitlines(keepends=True) if line.endswith("\n")]
 
 
 def test_they_are_listed_with_their_distribution(strangers):
@@ -55,7 +73,8 @@ def test_they_are_listed_with_their_distribution(strangers):
 
 @pytest.mark.parametrize("method", PACKAGES)
 def test_it_runs_by_name_and_its_file_decodes_in_a_fresh_process(strangers, tmp_path, method):
-    record = run(strangers, method, tmp_path / "out")
+    strangers.run("run", *arguments(method, tmp_path / "out", SHORT[method]))
+    record = record_of(tmp_path / "out")
     assert record["method"] == method
     (path,) = (tmp_path / "out").glob("**/scene.swz")
     assert record["file"]["bytes"] == path.stat().st_size == sum(record["file"]["sections"].values())
@@ -66,6 +85,33 @@ def test_it_runs_by_name_and_its_file_decodes_in_a_fresh_process(strangers, tmp_
     (lonely / "copy.swz").write_bytes(path.read_bytes())
     decoded = json.loads(strangers.run("decode", str(lonely / "copy.swz"), "--json").stdout)
     assert decoded["digest"] == record["file"]["digest"]
+    if method == "test-anchors":
+        rows = [line["num_anchors"] for line in log_of(tmp_path / "out") if "num_anchors" in line]
+        assert rows[0] != rows[-1] == record["counts"]["num_anchors"]
+
+
+@pytest.mark.parametrize("method", INTERRUPTED)
+def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strangers, tmp_path, method):
+    stage, sets = INTERRUPTED[method]
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    strangers.run("train", *arguments(method, whole, sets, "demo:tiny"))
+    with strangers.start("train", *arguments(method, broken, sets, "demo:tiny")) as process:
+        while process.poll() is None and not any(x["stage"] == stage and x["step"] > 20 for x in log_of(broken)):
+            time.sleep(0.01)
+        process.send_signal(signal.SIGINT)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    last = log_of(broken)[-1]
+    assert (last["stage"], last["step"] < 150) == (stage, True)
+    assert list(broken.glob(f"**/checkpoints/{stage:02}-{last['step']:07}.safetensors"))
+    strangers.run("train", *arguments(method, broken, sets, "demo:tiny"))
+    assert log_of(broken)[-1]["step"] == 150
+    files = []
+    for out in (whole, broken):
+        (directory,) = (path.parent for path in out.glob("**/config.toml"))
+        strangers.run("encode", str(directory))
+        files.append((directory / "scene.swz").read_bytes())
+    assert files[0] == files[1]
 
 
 def test_the_plan_of_a_stranger_is_printed_stage_by_stage(strangers):
