@@ -20,7 +20,7 @@ from sw_rasterizers.standard import StandardRasterizer
 
 pytestmark = pytest.mark.skipif(MODULE.available() is not None, reason=str(MODULE.available()))
 ALL_DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})
-MANY = RasterCase("many", n=1500, width=75, height=50, spread=2.0, scale=(0.01, 0.25), degree=3)
+MANY = RasterCase("many", n=1000, width=75, height=50, spread=2.0, scale=(0.01, 0.25), degree=3)
 """Fills 5 x 4 tiles, the last ones partial, with lists longer than a stage of the kernels."""
 
 
@@ -44,17 +44,16 @@ def split(g: GaussianInputs) -> GaussianInputs:
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("form", "options"),
     [
-        RasterOptions(grad2d=True, absgrad=True),
-        RasterOptions(alpha=True, depth=ALL_DEPTHS, grad2d=True, absgrad=True, antialias=True),
-        RasterOptions(profile="dgr-exact", grad2d=True),
-        RasterOptions(clamp_grad="pass", scale_modifier=1.4, eps2d=0.1),
+        ("dense", RasterOptions(grad2d=True, absgrad=True)),
+        ("split", RasterOptions(clamp_grad="pass", scale_modifier=1.4, eps2d=0.1)),
+        ("split", RasterOptions(alpha=True, depth=ALL_DEPTHS, grad2d=True, absgrad=True, antialias=True)),
+        ("dense", RasterOptions(profile="dgr-exact", grad2d=True)),
     ],
-    ids=["plain", "everything", "dgr-exact", "pass"],
+    ids=["plain", "pass", "everything", "dgr-exact"],
 )
-@pytest.mark.parametrize("form", ["dense", "split"])
-def test_many_splats_equal_the_reference_in_float64(options, form):
+def test_many_splats_equal_the_reference_in_float64(form, options):
     g, cam = draw_scene(MANY, 3)
     g.opacities[:50] = 1.0  # the clamp of alpha is active somewhere
     if form == "split":

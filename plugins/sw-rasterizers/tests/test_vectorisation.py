@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from sw_rasterizers.native import MODULE
 
 BENCHMARK = Path(__file__).parents[3] / "benchmarks" / "rasterize_cpu.py"

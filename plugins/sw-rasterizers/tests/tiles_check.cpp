@@ -1,6 +1,7 @@
-// Tile coverage against brute force, compiled by test_tiles.py, on random ellipses. A tile is missed if one of its pixel
-// centres lies inside the ellipse but it is not listed (once); it is in excess if it is listed although the ellipse does
-// not even meet the rectangle spanned by its pixel centres. Prints: cases, missed, excess, tiles that meet the ellipse.
+// Tile coverage against brute force, compiled by test_tiles.py, on random ellipses. A tile is missed if one of its
+// pixel centres lies inside the ellipse but it is not listed (once); it is in excess if it is listed although the
+// ellipse does not even meet the rectangle spanned by its pixel centres. Prints: cases, missed, excess, tiles that meet
+// the ellipse.
 #include <cstdio>
 #include <random>
 #include <vector>
@@ -35,7 +36,8 @@ int main() {
     // Axes from 0.5 to 60 px, condition of the covariance up to 1e4, any orientation, centre also outside.
     const double major = 0.5 * std::pow(120, uniform(generator)), minor = major * std::pow(0.01, uniform(generator));
     const double angle = 3.14159265358979 * uniform(generator), c = std::cos(angle), s = std::sin(angle);
-    const double c00 = major * major * c * c + minor * minor * s * s, c11 = major * major * s * s + minor * minor * c * c;
+    const double c00 = major * major * c * c + minor * minor * s * s,
+                 c11 = major * major * s * s + minor * minor * c * c;
     const double c01 = (major * major - minor * minor) * c * s, det = major * major * minor * minor;
     const double ka = c11 / det, kb = -c01 / det, kc = c00 / det, t = 0.1 + 11 * uniform(generator);
     const double u = -40 + (width + 80) * uniform(generator), v = -40 + (height + 80) * uniform(generator);

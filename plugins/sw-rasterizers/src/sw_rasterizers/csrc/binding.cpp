@@ -34,10 +34,12 @@ enum Flag : int64_t {  // mirrored in ops.py
   kOriginalJacobian = 4096,
 };
 
+// clang-format off
 enum Saved {  // the state that the backward pass needs
   kRecords, kIndex, kPerChunk, kRuns, kColorSlope, kClamped, kChannels, kTileStart, kSlot, kOrigin,
   kBlocksOfPair, kTransmittance, kLast, kMedianPair, kSavedCount
 };
+// clang-format on
 
 template <class S>
 S* data(const Tensor& t) {
@@ -53,8 +55,9 @@ Tensor make_tensor(at::IntArrayRef shape, const at::TensorOptions& options) {
   size_t bytes = c10::elementSize(options.dtype().toScalarType());
   for (const int64_t size : shape) bytes *= size_t(size);
   if (bytes < sw::Recycler::kSmallest) return at::empty(shape, options);
-  return at::from_blob(sw::Recycler::instance().take(bytes), shape,
-                       [](void* pointer) { sw::Recycler::instance().give(pointer); }, options);
+  return at::from_blob(
+      sw::Recycler::instance().take(bytes), shape, [](void* pointer) { sw::Recycler::instance().give(pointer); },
+      options);
 }
 
 struct Clock {
@@ -212,8 +215,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   const auto slots = slots_of<S>(saved);
   int64_t seen[2] = {0, 0};
   const int64_t used =
-      n == 0 ? 0
-             : SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(out.radii), seen);
+      n == 0 ? 0 : SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(out.radii), seen);
   const int64_t count = SW_SELECT(number_pairs<S>)(n, slots, settings.threads);
   TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
               " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
@@ -264,10 +266,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int6
   return {r.image, r.radii, r.alpha, r.median, std::move(r.saved), std::move(r.counts), std::move(r.seconds)};
 }
 
+// clang-format off
 enum Wanted {  // order of the gradients asked for and returned
-  kWantMeans, kWantOpacities, kWantScales, kWantQuats, kWantCov3d, kWantSh, kWantShDc, kWantShRest, kWantColors,
-  kWantFeatures, kWantGrad2d, kWantAbsgrad2d, kWantedCount
+  kWantMeans, kWantOpacities, kWantScales, kWantQuats, kWantCov3d, kWantSh, kWantShDc, kWantShRest,
+  kWantColors, kWantFeatures, kWantGrad2d, kWantAbsgrad2d, kWantedCount
 };
+// clang-format on
 
 template <class S>
 std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
@@ -289,7 +293,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
   std::vector<double> seconds;
   Tensor sums = make_tensor({pairs.count, columns}, real);
   SW_SELECT(blend_backward<S>)(view, settings, slots, pairs, canvas_of<S>(in, saved), gradient,
-                     settings.detach_features ? channels.features : 0, data<S>(sums));
+                               settings.detach_features ? channels.features : 0, data<S>(sums));
   seconds.push_back(clock.lap());
 
   std::vector<Tensor> grads(kWantedCount);
@@ -335,11 +339,10 @@ std::tuple<std::vector<Tensor>, std::vector<double>> render_backward(
                   features, visible,   background, sh_degree, scale_modifier, eps2d, flags};
   in.check();
   TORCH_CHECK(saved.size() == kSavedCount, "sw_rasterizers: the forward pass kept no state for the backward pass");
-  return means.scalar_type() == at::kDouble
-             ? backward_as<double>(in, camera, width, height, saved, image_gradient, alpha_gradient, median_gradient,
-                                   wanted)
-             : backward_as<float>(in, camera, width, height, saved, image_gradient, alpha_gradient, median_gradient,
-                                  wanted);
+  return means.scalar_type() == at::kDouble ? backward_as<double>(in, camera, width, height, saved, image_gradient,
+                                                                  alpha_gradient, median_gradient, wanted)
+                                            : backward_as<float>(in, camera, width, height, saved, image_gradient,
+                                                                 alpha_gradient, median_gradient, wanted);
 }
 
 template <class S>
@@ -353,8 +356,8 @@ Tensor visible_radii(const Tensor& means, const OptionalTensor& scales, const Op
                      int64_t width, int64_t height, double scale_modifier, double eps2d) {
   const OptionalTensor none, colors = means;
   const Tensor opacities = at::empty({0}, means.options());
-  const Inputs in{means, opacities, scales,  quats, cov3d, none,           none,  none, colors,
-                  none,  visible,   none, 0,     scale_modifier, eps2d, 0};
+  const Inputs in{means,  opacities, scales,  quats, cov3d, none,           none,  none,
+                  colors, none,      visible, none,  0,     scale_modifier, eps2d, 0};
   Tensor radii = at::empty({means.size(0)}, means.options().dtype(at::kInt).requires_grad(false));
   means.scalar_type() == at::kDouble ? radii_as<double>(in, camera, width, height, radii)
                                      : radii_as<float>(in, camera, width, height, radii);

@@ -18,15 +18,15 @@
 namespace sw {
 
 // Constants of profile "3dgs".
-constexpr int kTile = 16;                   // pixels, tile edge
-constexpr int kTilePixels = kTile * kTile;  //
-constexpr double kAlphaMin = 1.0 / 255.0;   // contributions below are skipped
-constexpr double kAlphaMax = 0.99;          // alpha is clamped here
-constexpr double kTransmittanceMin = 1e-4;  // a pixel is finished below
-constexpr double kJacobianClamp = 0.3;      // tx/tz is clamped 0.3 tan(fov/2) outside the image
-constexpr double kRadiusSigma = 3.0;        // bounding radius in standard deviations
-constexpr double kLambdaFloor = 0.1;        // under the root of the radius
-constexpr double kCompensationMin = 2.5e-5; // floor of the antialias factor, squared
+constexpr int kTile = 16;                    // pixels, tile edge
+constexpr int kTilePixels = kTile * kTile;   //
+constexpr double kAlphaMin = 1.0 / 255.0;    // contributions below are skipped
+constexpr double kAlphaMax = 0.99;           // alpha is clamped here
+constexpr double kTransmittanceMin = 1e-4;   // a pixel is finished below
+constexpr double kJacobianClamp = 0.3;       // tx/tz is clamped 0.3 tan(fov/2) outside the image
+constexpr double kRadiusSigma = 3.0;         // bounding radius in standard deviations
+constexpr double kLambdaFloor = 0.1;         // under the root of the radius
+constexpr double kCompensationMin = 2.5e-5;  // floor of the antialias factor, squared
 constexpr double kLog2e = 1.4426950408889634;
 constexpr double kLn2 = 0.6931471805599453;
 constexpr double kLog2AlphaMin = -7.994353436858858;  // log2(1/255)

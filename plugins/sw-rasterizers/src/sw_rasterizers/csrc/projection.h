@@ -24,17 +24,17 @@ struct Geometry {  // of one Gaussian, as given
 template <class V>
 struct Projection {
   V t[3], inverse_z;
-  V u, v;               // pixels
-  V ratio_x, ratio_y;   // tx/tz, ty/tz after the clamp
-  V free_x, free_y;     // 1 where the clamp is not active, else 0
-  V rotation[9];        // Rq, rows (not with cov3d)
+  V u, v;              // pixels
+  V ratio_x, ratio_y;  // tx/tz, ty/tz after the clamp
+  V free_x, free_y;    // 1 where the clamp is not active, else 0
+  V rotation[9];       // Rq, rows (not with cov3d)
   V quat[4], inverse_norm;
-  V row0[3], row1[3];   // P (A S with cov3d: rows of A S)
-  V jr0[3], jr1[3];     // A = J R
-  V c00, c01, c11;      // dilated covariance
-  V det, det0;          // of the dilated and of the raw covariance
-  V ka, kb, kc;         // conic
-  V rho;                // antialias factor, 1 if off
+  V row0[3], row1[3];  // P (A S with cov3d: rows of A S)
+  V jr0[3], jr1[3];    // A = J R
+  V c00, c01, c11;     // dilated covariance
+  V det, det0;         // of the dilated and of the raw covariance
+  V ka, kb, kc;        // conic
+  V rho;               // antialias factor, 1 if off
 };
 
 template <class V>
@@ -118,7 +118,8 @@ SW_HD void project(const View<Scalar<V>>& view, Scalar<V> scale_modifier, Scalar
   p.rho = antialias ? square_root(maximum(c(kCompensationMin), p.det0 * inverse_det)) : c(1);
 }
 
-// Bounding radius in pixels, an integer: ceil(3 sqrt(largest eigenvalue)), with the floor that 3DGS puts under the root.
+// Bounding radius in pixels, an integer: ceil(3 sqrt(largest eigenvalue)), with the floor that 3DGS puts under the
+// root.
 template <class V>
 SW_HD V bounding_radius(const Projection<V>& p) {
   const auto c = [](double value) { return constant<V>(value); };
@@ -145,8 +146,8 @@ struct GeometryGradient {
 
 template <bool kCov3d, class V>
 SW_HD void project_backward(const View<Scalar<V>>& view, Scalar<V> scale_modifier, Scalar<V> eps2d, bool antialias,
-                            bool original_clamp, const Geometry<V>& g, const Projection<V>& p, V opacity, const ScreenGradient<V>& grad,
-                            GeometryGradient<V>& out) {
+                            bool original_clamp, const Geometry<V>& g, const Projection<V>& p, V opacity,
+                            const ScreenGradient<V>& grad, GeometryGradient<V>& out) {
   const auto c = [](double value) { return constant<V>(value); };
   const V half = c(0.5), two = c(2);
 
@@ -228,8 +229,7 @@ SW_HD void project_backward(const View<Scalar<V>>& view, Scalar<V> scale_modifie
   // kernels take 2 in both cases, which is not the derivative; profile "dgr-exact" asks for that.
   const V factor_x = original_clamp ? two : c(1) + p.free_x, factor_y = original_clamp ? two : c(1) + p.free_y;
   gt[2] = -(view.fx * p.t[0] * grad.u + view.fy * p.t[1] * grad.v) * iz2 - (view.fx * j00 + view.fy * j11) * iz2 +
-          factor_x * (view.fx * p.ratio_x * j02 * iz2) + factor_y * (view.fy * p.ratio_y * j12 * iz2) +
-          grad.depth;
+          factor_x * (view.fx * p.ratio_x * j02 * iz2) + factor_y * (view.fy * p.ratio_y * j12 * iz2) + grad.depth;
   for (int j = 0; j < 3; ++j) out.mean[j] = R[j] * gt[0] + R[3 + j] * gt[1] + R[6 + j] * gt[2];
 }
 

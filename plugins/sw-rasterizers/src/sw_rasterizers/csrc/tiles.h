@@ -70,7 +70,8 @@ SW_HD int tight_tiles(const Ellipse<S>& e, int width, int height, Visit&& visit)
     const S half_low = e.wx * square_root(maximum(S(0), S(1) - rl * rl));
     const S half_high = e.wx * square_root(maximum(S(0), S(1) - rh * rh));
     const S right = low <= e.tip && e.tip <= high ? e.hx : maximum(e.lean * low + half_low, e.lean * high + half_high);
-    const S left = low <= -e.tip && -e.tip <= high ? -e.hx : minimum(e.lean * low - half_low, e.lean * high - half_high);
+    const S left =
+        low <= -e.tip && -e.tip <= high ? -e.hx : minimum(e.lean * low - half_low, e.lean * high - half_high);
     int first, last;
     pixel_span(e.u + left, e.u + right, i0, i1, &first, &last);
     if (first > last) continue;

@@ -22,8 +22,13 @@ void for_each_tile(const View<S>& view, const Settings& settings, const Slots<S>
   const int columns = view.tiles_x();
   const auto put = [&](int tx, int ty) { *tiles++ = ty * columns + tx; };
   if (settings.tight) {
-    const Ellipse<S> e{record[kU],     record[kV],     record[kHalfX], record[kHalfY],
-                       record[kWidth], record[kLeanX], record[kLeanY] * record[kHalfX]};
+    const Ellipse<S> e{record[kU],
+                       record[kV],
+                       record[kHalfX],
+                       record[kHalfY],
+                       record[kWidth],
+                       record[kLeanX],
+                       record[kLeanY] * record[kHalfX]};
     tight_tiles(e, view.width, view.height, put);
   } else {
     const TileRange square =

@@ -88,7 +88,8 @@ struct TileBlender {
     if constexpr (kGeneral)
       median = load<I>(w.median + at);
     else
-      for (int channel = 0; channel < 3; ++channel) color[channel] = load<V>(w.color.data() + channel * kTilePixels + at);
+      for (int channel = 0; channel < 3; ++channel)
+        color[channel] = load<V>(w.color.data() + channel * kTilePixels + at);
 
     const uint8_t* list = w.list[block];
     for (int n = 0; n < w.length[block]; ++n) {
@@ -187,12 +188,12 @@ void blend_tiles(const View<Scalar<V>>& view, const Settings& settings, const Sl
 
 }  // namespace
 
-#define SW_INSTANTIATE(S, V)                                                                                   \
-  template <>                                                                                                  \
-  void blend<S>(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,   \
-                const Canvas<S>& canvas) {                                                                     \
-    slots.channels != nullptr ? blend_tiles<V, true>(view, settings, slots, pairs, canvas)                     \
-                              : blend_tiles<V, false>(view, settings, slots, pairs, canvas);                   \
+#define SW_INSTANTIATE(S, V)                                                                                 \
+  template <>                                                                                                \
+  void blend<S>(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs, \
+                const Canvas<S>& canvas) {                                                                   \
+    slots.channels != nullptr ? blend_tiles<V, true>(view, settings, slots, pairs, canvas)                   \
+                              : blend_tiles<V, false>(view, settings, slots, pairs, canvas);                 \
   }
 SW_INSTANTIATE(float, Lanes)
 SW_INSTANTIATE(double, double)

@@ -1,9 +1,10 @@
 // Backward compositing: every tile walks its list back to front and writes one row of sums per (splat, tile) pair.
 //
-// Rows are numbered splat-major (Pairs::origin), so a splat's rows lie together and are added up later in a fixed order:
-// no atomics, and the same bits for any number of threads. Here a splat is the outer loop and the touched blocks the
-// inner one: its nine sums stay in registers over the whole tile and are reduced across lanes once. Because the conic is
-// constant over the tile, moments of v = dL/dsigma are enough; the derivatives are put together in project_backward.
+// Rows are numbered splat-major (Pairs::origin), so a splat's rows lie together and are added up later in a fixed
+// order: no atomics, and the same bits for any number of threads. Here a splat is the outer loop and the touched blocks
+// the inner one: its nine sums stay in registers over the whole tile and are reduced across lanes once. Because the
+// conic is constant over the tile, moments of v = dL/dsigma are enough; the derivatives are put together in
+// project_backward.
 #include <limits>
 #include <memory>
 
@@ -160,8 +161,18 @@ struct TileBackward {
   void write_row(Workspace& w, const Sums& sum, S* out) const {
     // A = -Ka log2(e)/2 and so on: absgrad goes back to natural units.
     const V ln2 = constant<V>(kLn2);
-    V packs[kPlainColumns] = {sum.v0, sum.x, sum.y, sum.xx, sum.xy, sum.yy, sum.color[0], sum.color[1], sum.color[2],
-                              ln2 * sum.absolute[0], ln2 * sum.absolute[1], V{}};
+    V packs[kPlainColumns] = {sum.v0,
+                              sum.x,
+                              sum.y,
+                              sum.xx,
+                              sum.xy,
+                              sum.yy,
+                              sum.color[0],
+                              sum.color[1],
+                              sum.color[2],
+                              ln2 * sum.absolute[0],
+                              ln2 * sum.absolute[1],
+                              V{}};
     if constexpr (!kGeneral) {
       lane_sums<V, kPlainColumns>(packs, out);
     } else {
@@ -191,8 +202,7 @@ void backward_tiles(const View<Scalar<V>>& view, const Settings& settings, const
                     const CanvasGradient<Scalar<V>>& gradient, int detached, Scalar<V>* sums) {
   using Backward = TileBackward<V, kGeneral, kAbsgrad>;
   const int columns = pair_columns(!kGeneral, canvas.channels, kAbsgrad, gradient.median != nullptr);
-  const Backward backward{view,     settings, slots, pairs, canvas, gradient, canvas.channels - detached,
-                          columns, sums};
+  const Backward backward{view, settings, slots, pairs, canvas, gradient, canvas.channels - detached, columns, sums};
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const std::vector<int32_t> order = tiles_by_work(pairs.tile_start, tiles);
   std::atomic<int64_t> next{0};
@@ -206,15 +216,14 @@ void backward_tiles(const View<Scalar<V>>& view, const Settings& settings, const
 
 }  // namespace
 
-#define SW_INSTANTIATE(S, V)                                                                                      \
-  template <>                                                                                                     \
-  void blend_backward<S>(const View<S>& view, const Settings& settings, const Slots<S>& slots,                    \
-                         const Pairs<S>& pairs, const Canvas<S>& canvas, const CanvasGradient<S>& gradient,       \
-                         int detached, S* sums) {                                                                 \
-    const auto run = slots.channels != nullptr                                                                    \
-                         ? (settings.absgrad ? backward_tiles<V, true, true> : backward_tiles<V, true, false>)    \
-                         : (settings.absgrad ? backward_tiles<V, false, true> : backward_tiles<V, false, false>); \
-    run(view, settings, slots, pairs, canvas, gradient, detached, sums);                                          \
+#define SW_INSTANTIATE(S, V)                                                                                          \
+  template <>                                                                                                         \
+  void blend_backward<S>(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs, \
+                         const Canvas<S>& canvas, const CanvasGradient<S>& gradient, int detached, S* sums) {         \
+    const auto run = slots.channels != nullptr                                                                        \
+                         ? (settings.absgrad ? backward_tiles<V, true, true> : backward_tiles<V, true, false>)        \
+                         : (settings.absgrad ? backward_tiles<V, false, true> : backward_tiles<V, false, false>);     \
+    run(view, settings, slots, pairs, canvas, gradient, detached, sums);                                              \
   }
 SW_INSTANTIATE(float, Lanes)
 SW_INSTANTIATE(double, double)

@@ -17,26 +17,28 @@
 
 namespace sw {
 
-constexpr int kChunk = 1024;      // Gaussians a thread takes at a time; slots of a chunk start at its first index
-constexpr int kBlock = 4;         // pixels, edge of the block that one AVX-512 pack covers
+constexpr int kChunk = 1024;  // Gaussians a thread takes at a time; slots of a chunk start at its first index
+constexpr int kBlock = 4;     // pixels, edge of the block that one AVX-512 pack covers
 constexpr int kBlocksPerRow = kTile / kBlock;
 constexpr int kBlocks = kBlocksPerRow * kBlocksPerRow;
 constexpr int kBlockPixels = kBlock * kBlock;
 
 // One drawn splat, 16 values: one cache line in float32.
+// clang-format off
 enum RecordField {
   kU, kV,                   // pixel position
   kA, kB, kC, kLevel,       // log2 alpha = A dx^2 + B dx dy + C dy^2 + level
-  kRed, kGreen, kBlue,      //
+  kRed, kGreen, kBlue,
   kDepth,                   // tz
-  kLeanY, kLeanX,           // -Kb/Kc, -Kb/Ka: slopes of the ridge, for the box test
+  kLeanY, kLeanX,           // -Kb/Kc, -Kb/Ka: slopes of the ridges, for the box test
   kHalfX, kHalfY, kWidth,   // extents of the cut-off ellipse (tiles.h)
   kCutoff,                  // the ellipse is -(A dx^2 + B dx dy + C dy^2) <= cutoff
   kRecord
 };
+// clang-format on
 
-// Sums of one (splat, tile) pair over the tile's pixels, v = dL/dsigma: sum v, v dx, v dy, v dx^2, v dx dy, v dy^2, then
-// one sum of weight x gradient per channel; with absgrad two more at the end.
+// Sums of one (splat, tile) pair over the tile's pixels, v = dL/dsigma: sum v, v dx, v dy, v dx^2, v dx dy, v dy^2,
+// then one sum of weight x gradient per channel; with absgrad two more at the end.
 enum PairSum { kV0, kVx, kVy, kVxx, kVxy, kVyy, kMoments };
 
 template <class S>
@@ -50,8 +52,8 @@ struct Gaussians {
   const S* sh_dc = nullptr;  // row i at sh_dc + i * sh_dc_stride; the rest likewise: dense and split are one case
   const S* sh_rest = nullptr;
   int64_t sh_dc_stride = 0, sh_rest_stride = 0;
-  int sh_degree = 0;           // active
-  const S* colors = nullptr;   // instead of SH
+  int sh_degree = 0;          // active
+  const S* colors = nullptr;  // instead of SH
   int color_channels = 3;
   const S* features = nullptr;
   int feature_channels = 0;
@@ -61,8 +63,8 @@ struct Gaussians {
 struct Settings {
   double scale_modifier = 1, eps2d = 0.3;
   bool antialias = false, clamp_color = true;
-  bool tight = true;           // exact tile coverage, else 3DGS' squares
-  bool pass_clamp = false;     // gradient passes through the clamp of alpha
+  bool tight = true;               // exact tile coverage, else 3DGS' squares
+  bool pass_clamp = false;         // gradient passes through the clamp of alpha
   bool original_jacobian = false;  // gradient of the Jacobian's clamp as in the original kernels
   bool inverse_depth = false, accumulated_depth = false, median_depth = false;
   bool detach_features = false;
@@ -94,24 +96,24 @@ struct Slots {
 template <class S>
 struct Pairs {
   int64_t count;
-  int64_t* tile_start;   // [tiles + 1]
-  int32_t* slot;         // [P] tile-major, front to back
-  int32_t* origin;       // [P] number of the pair in splat-major order, or null
-  uint16_t* blocks;      // [P] bit b: block b of the tile may be touched; filled by blend up to `last`, or null
+  int64_t* tile_start;  // [tiles + 1]
+  int32_t* slot;        // [P] tile-major, front to back
+  int32_t* origin;      // [P] number of the pair in splat-major order, or null
+  uint16_t* blocks;     // [P] bit b: block b of the tile may be touched; filled by blend up to `last`, or null
 };
 
 template <class S>
 struct Canvas {
   int channels, color_channels;
-  S* image;                 // [channels][H][W]
-  const S* background;      // [colors] or [colors][H][W], or null
+  S* image;             // [channels][H][W]
+  const S* background;  // [colors] or [colors][H][W], or null
   bool background_is_image;
-  S* alpha;                 // [H][W], 1 - transmittance, or null
-  S* transmittance;         // [tiles][kTilePixels], block by block
-  int32_t* last;            // [tiles][kTilePixels] 1-based list position of the last blended splat
-  S* median;                // [H][W] or null
-  int32_t* median_pair;     // [H][W] pair origin of the median splat, -1 if none; or null
-  int64_t* counters;        // [2] evaluated, blended pixel-splat pairs, or null: counting costs time
+  S* alpha;              // [H][W], 1 - transmittance, or null
+  S* transmittance;      // [tiles][kTilePixels], block by block
+  int32_t* last;         // [tiles][kTilePixels] 1-based list position of the last blended splat
+  S* median;             // [H][W] or null
+  int32_t* median_pair;  // [H][W] pair origin of the median splat, -1 if none; or null
+  int64_t* counters;     // [2] evaluated, blended pixel-splat pairs, or null: counting costs time
 };
 
 template <class S>
@@ -139,35 +141,36 @@ struct Gradients {  // null: not asked for
 
 // The kernels, once per instruction set (splatwizard/dispatch.h).
 //
-// project_gaussians  returns the number of slots in use; counts [2]: Gaussians with a radius, and those culled because a
+// project_gaussians  returns the number of slots in use; counts [2]: Gaussians with a radius, and those culled because
+// a
 //                    value is not finite
 // number_pairs       numbers the pairs splat-major, returns how many there are
 // depth_order        slots in use, nearest first, equal depths in index order; `order` has room for all of them
 // blend_backward     the last `detached` channels do not influence the geometry; sums [P][pair_columns]
-#define SW_DECLARE_KERNELS(arch)                                                                                      \
-  namespace arch {                                                                                                    \
-  using namespace sw;                                                                                                 \
-  template <class S>                                                                                                  \
-  int64_t project_gaussians(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                     \
-                            const Channels& channels, const Slots<S>& slots, int32_t* radii, int64_t* counts);        \
-  template <class S>                                                                                                  \
-  void visible_radii(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii);           \
-  template <class S>                                                                                                  \
-  int64_t number_pairs(int64_t count, const Slots<S>& slots, int threads);                                            \
-  template <class S>                                                                                                  \
-  void depth_order(int64_t count, int64_t used, const Slots<S>& slots, int threads, int32_t* order);                  \
-  template <class S>                                                                                                  \
-  void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots,   \
-                 const int32_t* order, const int32_t* radii, const Pairs<S>& pairs);                                  \
-  template <class S>                                                                                                  \
-  void blend(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,             \
-             const Canvas<S>& canvas);                                                                                \
-  template <class S>                                                                                                  \
-  void blend_backward(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,    \
-                      const Canvas<S>& canvas, const CanvasGradient<S>& gradient, int detached, S* sums);             \
-  template <class S>                                                                                                  \
-  void project_backward(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                         \
-                        const Channels& channels, const Slots<S>& slots, const S* sums, const Gradients<S>& out);     \
+#define SW_DECLARE_KERNELS(arch)                                                                                    \
+  namespace arch {                                                                                                  \
+  using namespace sw;                                                                                               \
+  template <class S>                                                                                                \
+  int64_t project_gaussians(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                   \
+                            const Channels& channels, const Slots<S>& slots, int32_t* radii, int64_t* counts);      \
+  template <class S>                                                                                                \
+  void visible_radii(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii);         \
+  template <class S>                                                                                                \
+  int64_t number_pairs(int64_t count, const Slots<S>& slots, int threads);                                          \
+  template <class S>                                                                                                \
+  void depth_order(int64_t count, int64_t used, const Slots<S>& slots, int threads, int32_t* order);                \
+  template <class S>                                                                                                \
+  void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots, \
+                 const int32_t* order, const int32_t* radii, const Pairs<S>& pairs);                                \
+  template <class S>                                                                                                \
+  void blend(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,           \
+             const Canvas<S>& canvas);                                                                              \
+  template <class S>                                                                                                \
+  void blend_backward(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,  \
+                      const Canvas<S>& canvas, const CanvasGradient<S>& gradient, int detached, S* sums);           \
+  template <class S>                                                                                                \
+  void project_backward(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                       \
+                        const Channels& channels, const Slots<S>& slots, const S* sums, const Gradients<S>& out);   \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_KERNELS)
 #undef SW_DECLARE_KERNELS

@@ -49,8 +49,8 @@ struct Projector {
     const V zero = constant<V>(0);
     const V derived = finite_probe(p.u) + finite_probe(p.v) + finite_probe(p.det) + finite_probe(p.ka) +
                       finite_probe(p.kb) + finite_probe(p.kc);
-    return (probe == zero) & (derived == zero) & (p.t[2] > constant<V>(view.near)) &
-           (p.t[2] < constant<V>(view.far)) & (p.det > zero) & (p.c00 > zero) & (p.c11 > zero) & (opacity >= zero);
+    return (probe == zero) & (derived == zero) & (p.t[2] > constant<V>(view.near)) & (p.t[2] < constant<V>(view.far)) &
+           (p.det > zero) & (p.c00 > zero) & (p.c11 > zero) & (opacity >= zero);
   }
 };
 
@@ -134,8 +134,12 @@ struct ChunkProjection : Projector<V, kCov3d> {
       if (!(fields[kCutoff][i] > S(kCutoffShift))) continue;  // nowhere above 1/255
       int tiles = square.count();
       if (settings.tight) {
-        const Ellipse<S> e{fields[kU][i],     fields[kV][i],     fields[kHalfX][i],
-                           fields[kHalfY][i], fields[kWidth][i], fields[kLeanX][i],
+        const Ellipse<S> e{fields[kU][i],
+                           fields[kV][i],
+                           fields[kHalfX][i],
+                           fields[kHalfY][i],
+                           fields[kWidth][i],
+                           fields[kLeanX][i],
                            fields[kLeanY][i] * fields[kHalfX][i]};
         tiles = tight_tiles(e, view.width, view.height, [](int, int) {});
         if (tiles == 0) continue;
@@ -308,18 +312,17 @@ void radii_of_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, co
 
 }  // namespace
 
-#define SW_INSTANTIATE(S, V)                                                                                    \
-  template <>                                                                                                   \
-  int64_t project_gaussians<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings,            \
-                               const Channels& channels, const Slots<S>& slots, int32_t* radii,                 \
-                               int64_t* counts) {                                                               \
-    return g.cov3d != nullptr ? project_all<V, true>(view, g, settings, channels, slots, radii, counts)         \
-                              : project_all<V, false>(view, g, settings, channels, slots, radii, counts);       \
-  }                                                                                                             \
-  template <>                                                                                                   \
-  void visible_radii<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii) { \
-    g.cov3d != nullptr ? radii_of_all<V, true>(view, g, settings, radii)                                        \
-                       : radii_of_all<V, false>(view, g, settings, radii);                                      \
+#define SW_INSTANTIATE(S, V)                                                                                       \
+  template <>                                                                                                      \
+  int64_t project_gaussians<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings,               \
+                               const Channels& channels, const Slots<S>& slots, int32_t* radii, int64_t* counts) { \
+    return g.cov3d != nullptr ? project_all<V, true>(view, g, settings, channels, slots, radii, counts)            \
+                              : project_all<V, false>(view, g, settings, channels, slots, radii, counts);          \
+  }                                                                                                                \
+  template <>                                                                                                      \
+  void visible_radii<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii) {    \
+    g.cov3d != nullptr ? radii_of_all<V, true>(view, g, settings, radii)                                           \
+                       : radii_of_all<V, false>(view, g, settings, radii);                                         \
   }
 SW_INSTANTIATE(float, Lanes)
 SW_INSTANTIATE(double, double)

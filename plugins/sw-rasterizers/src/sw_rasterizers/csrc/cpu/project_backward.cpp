@@ -1,8 +1,8 @@
 // From the pair sums of every splat to the gradients of what was put in.
 //
-// A thread takes a chunk of Gaussians: it zeroes the chunk's rows of every gradient (culled Gaussians get exactly 0) and
-// fills those of the drawn ones while they are still in its cache, so each gradient goes to memory once. The projection
-// is computed again, which is cheaper than to have stored it.
+// A thread takes a chunk of Gaussians: it zeroes the chunk's rows of every gradient (culled Gaussians get exactly 0)
+// and fills those of the drawn ones while they are still in its cache, so each gradient goes to memory once. The
+// projection is computed again, which is cheaper than to have stored it.
 #include <algorithm>
 
 #include "../projection.h"
@@ -36,7 +36,8 @@ struct ChunkBackward {
     clear(out.colors, channels.colors), clear(out.features, channels.features);
     clear(out.grad2d, 2), clear(out.absgrad2d, 2);
     clear(out.sh_dc, out.sh_dc_stride);
-    if (out.sh_dc == nullptr || out.sh_rest != out.sh_dc + 3) clear(out.sh_rest, out.sh_rest_stride);  // else one tensor
+    if (out.sh_dc == nullptr || out.sh_rest != out.sh_dc + 3)
+      clear(out.sh_rest, out.sh_rest_stride);  // else one tensor
     for (int64_t s = begin, stop = begin + slots.per_chunk[chunk]; s < stop; s += L) backward_pack(s, stop);
   }
 
@@ -170,8 +171,7 @@ struct ChunkBackward {
     V values[3 * kMaxBasis];
     const int count = (g.sh_degree + 1) * (g.sh_degree + 1);
     for (int k = 1; k < count; ++k)
-      for (int channel = 0; channel < 3; ++channel)
-        values[3 * (k - 1) + channel] = basis[k] * load<V>(color[channel]);
+      for (int channel = 0; channel < 3; ++channel) values[3 * (k - 1) + channel] = basis[k] * load<V>(color[channel]);
     const auto write = [&](int fields) {
       scatter_long_rows(values, fields, out.sh_rest, out.sh_rest_stride, rows, lanes);
     };
@@ -185,20 +185,20 @@ template <class V, bool kCov3d>
 void backward_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
                   const Channels& channels, const Slots<Scalar<V>>& slots, const Scalar<V>* sums,
                   const Gradients<Scalar<V>>& out) {
-  const int columns = pair_columns(slots.channels == nullptr, channels.total(), settings.absgrad, settings.median_depth);
+  const int columns =
+      pair_columns(slots.channels == nullptr, channels.total(), settings.absgrad, settings.median_depth);
   const ChunkBackward<V, kCov3d> backward_chunk{view, g, settings, channels, slots, sums, columns, out};
   parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, backward_chunk);
 }
 
 }  // namespace
 
-#define SW_INSTANTIATE(S, V)                                                                                     \
-  template <>                                                                                                    \
-  void project_backward<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                 \
-                           const Channels& channels, const Slots<S>& slots, const S* sums,                       \
-                           const Gradients<S>& out) {                                                            \
-    g.cov3d != nullptr ? backward_all<V, true>(view, g, settings, channels, slots, sums, out)                    \
-                       : backward_all<V, false>(view, g, settings, channels, slots, sums, out);                  \
+#define SW_INSTANTIATE(S, V)                                                                                          \
+  template <>                                                                                                         \
+  void project_backward<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                      \
+                           const Channels& channels, const Slots<S>& slots, const S* sums, const Gradients<S>& out) { \
+    g.cov3d != nullptr ? backward_all<V, true>(view, g, settings, channels, slots, sums, out)                         \
+                       : backward_all<V, false>(view, g, settings, channels, slots, sums, out);                       \
   }
 SW_INSTANTIATE(float, Lanes)
 SW_INSTANTIATE(double, double)

@@ -19,12 +19,14 @@ using namespace sw;
 constexpr int kStage = 128;  // list positions in a stage fit a byte
 
 struct TileFrame {
-  int x0, y0;          // first pixel
-  int columns, rows;   // pixels inside the image
+  int x0, y0;         // first pixel
+  int columns, rows;  // pixels inside the image
   template <class S>
   TileFrame(const View<S>& view, int64_t tile)
-      : x0(int(tile % view.tiles_x()) * kTile), y0(int(tile / view.tiles_x()) * kTile),
-        columns(std::min(kTile, view.width - x0)), rows(std::min(kTile, view.height - y0)) {}
+      : x0(int(tile % view.tiles_x()) * kTile),
+        y0(int(tile / view.tiles_x()) * kTile),
+        columns(std::min(kTile, view.width - x0)),
+        rows(std::min(kTile, view.height - y0)) {}
 
   // Pixel of (block, index inside it), relative to the tile.
   static int pixel_x(int block, int i) { return block % kBlocksPerRow * kBlock + i % kBlock; }
