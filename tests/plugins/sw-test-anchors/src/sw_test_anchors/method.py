@@ -54,7 +54,7 @@ class AnchorStage(Stage):
 
     def create_optimizer(self, model: ContextAnchors, scene: Scene) -> SplatOptimizer:
         rates = {"offsets": 0.01 * scene.extent, "features": 7.5e-3, "log_scales": 7e-3, "mlp_opacity": 2e-3,
-                 "mlp_cov": 4e-3, "mlp_color": 8e-3, "context": 5e-3}  # fmt: skip
+                 "mlp_cov": 4e-3, "mlp_color": 8e-3, "context": 2e-2}  # fmt: skip
         return SplatOptimizer(model, [ParamGroup(name, lr) for name, lr in rates.items()])
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
