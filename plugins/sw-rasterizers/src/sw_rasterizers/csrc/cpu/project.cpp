@@ -167,6 +167,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
     V slope[9];
     for (V& x : slope) x = c(0);
     if (degree > 0) {
+      prefetch_sh_rest(first + L, end, basis_count);
       V rest[3 * kMaxBasis];
       gather_sh_rest(degree, rows, rest);
       const V* sh = rest - 3;  // sh[3 k + channel]
@@ -210,6 +211,16 @@ struct ChunkProjection : Projector<V, kCov3d> {
       alignas(64) int32_t targets[L];
       for (int i = 0; i < L; ++i) targets[i] = int32_t(first + i);
       scatter_rows<V, 9>(slope, slots.color_slope, 9, targets, lanes);
+    }
+  }
+
+  // The next pack's coefficients: rows of culled Gaussians in between keep the hardware from seeing a stream.
+  SW_HD void prefetch_sh_rest(int64_t first, int64_t end, int basis_count) const {
+    const auto& g = this->g;
+    constexpr int kLine = 64 / sizeof(S);
+    for (int64_t slot = first; slot < first + L && slot < end; ++slot) {
+      const S* row = g.sh_rest + slots.index[slot] * g.sh_rest_stride;
+      for (int k = 0; k < 3 * (basis_count - 1); k += kLine) __builtin_prefetch(row + k);
     }
   }
 
