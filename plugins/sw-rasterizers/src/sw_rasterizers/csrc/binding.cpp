@@ -159,8 +159,8 @@ struct Inputs {
 template <class S>
 sw::Slots<S> slots_of(const std::vector<Tensor>& saved) {
   return {data<S>(saved[kRecords]),        data<int32_t>(saved[kIndex]), data<int32_t>(saved[kPerChunk]),
-          data<sw::PairRun>(saved[kRuns]), data<S>(saved[kColorSlope]),  data<uint8_t>(saved[kClamped]),
-          data<S>(saved[kChannels])};
+          data<sw::PairRun>(saved[kRuns]), nullptr,                      data<S>(saved[kColorSlope]),
+          data<uint8_t>(saved[kClamped]),  data<S>(saved[kChannels])};
 }
 
 template <class S>
@@ -212,11 +212,13 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   saved[kColorSlope] = make({save && g.colors == nullptr && g.sh_degree > 0 ? n : 0, 9});
   saved[kChannels] = make({in.plain() ? 0 : n, total});
   out.radii = make_as({n}, at::kInt);
-  const auto slots = slots_of<S>(saved);
+  std::vector<std::vector<int32_t>> tile_lists(static_cast<size_t>(chunks));
+  auto slots = slots_of<S>(saved);
+  slots.tile_lists = tile_lists.data();
   int64_t seen[2] = {0, 0};
   const int64_t used =
       n == 0 ? 0 : SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(out.radii), seen);
-  const int64_t count = SW_SELECT(number_pairs<S>)(n, slots, settings.threads);
+  const int64_t count = SW_SELECT(count_pairs<S>)(n, slots);
   TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
               " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
   out.seconds.push_back(clock.lap());
@@ -230,7 +232,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   saved[kOrigin] = make_as({save ? count : 0}, at::kInt);
   saved[kBlocksOfPair] = make_as({save ? count : 0}, at::kShort);
   const auto pairs = pairs_of<S>(saved);
-  SW_SELECT(bin_pairs<S>)(view, settings, n, used, slots, data<int32_t>(order), data<int32_t>(out.radii), pairs);
+  SW_SELECT(bin_pairs<S>)(view, settings, n, used, slots, data<int32_t>(order), pairs);
   out.seconds.push_back(clock.lap());
 
   const bool median = settings.median_depth;

@@ -8,35 +8,11 @@
 #include <memory>
 #include <vector>
 
-#include "../tiles.h"
 #include "kernels.h"
 #include "parallel.h"
 
 namespace SW_ARCH {
 namespace {
-
-template <class S>
-void for_each_tile(const View<S>& view, const Settings& settings, const Slots<S>& slots, const int32_t* radii,
-                   int64_t slot, int32_t* tiles) {
-  const S* record = slots.records + slot * kRecord;
-  const int columns = view.tiles_x();
-  const auto put = [&](int tx, int ty) { *tiles++ = ty * columns + tx; };
-  if (settings.tight) {
-    const Ellipse<S> e{record[kU],
-                       record[kV],
-                       record[kHalfX],
-                       record[kHalfY],
-                       record[kWidth],
-                       record[kLeanX],
-                       record[kLeanY] * record[kHalfX]};
-    tight_tiles(e, view.width, view.height, put);
-  } else {
-    const TileRange square =
-        classic_tiles(record[kU], record[kV], S(radii[slots.index[slot]]), columns, view.tiles_y());
-    for (int ty = square.y0; ty < square.y1; ++ty)
-      for (int tx = square.x0; tx < square.x1; ++tx) put(tx, ty);
-  }
-}
 
 // Stable LSD radix sort of positive floats by their bit patterns, 11 bits a pass.
 struct RadixSorter {
@@ -109,25 +85,11 @@ void list_slots(int64_t count, const Slots<S>& slots, int threads, int32_t* orde
 }  // namespace
 
 template <class S>
-int64_t number_pairs(int64_t count, const Slots<S>& slots, int threads) {
-  std::vector<int64_t> start(size_t(chunks_of(count)) + 1, 0);
-  const auto for_chunk = [&](int64_t chunk, const auto& visit) {
-    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) visit(slots.run[s]);
-  };
-  parallel_dynamic(threads, chunks_of(count), [&](int64_t chunk) {
-    int64_t pairs = 0;
-    for_chunk(chunk, [&](PairRun& run) { pairs += run.count; });
-    start[size_t(chunk) + 1] = pairs;
-  });
-  for (size_t chunk = 1; chunk < start.size(); ++chunk) start[chunk] += start[chunk - 1];
-  parallel_dynamic(threads, chunks_of(count), [&](int64_t chunk) {
-    int64_t next = start[size_t(chunk)];
-    for_chunk(chunk, [&](PairRun& run) {
-      run.first = int32_t(next);  // the caller refuses more than 2^31 - 1 pairs
-      next += run.count;
-    });
-  });
-  return start.back();
+int64_t count_pairs(int64_t count, const Slots<S>& slots) {
+  int64_t pairs = 0;
+  for (int64_t chunk = 0; chunk < chunks_of(count); ++chunk)
+    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) pairs += slots.run[s].count;
+  return pairs;
 }
 
 template <>
@@ -149,16 +111,28 @@ void depth_order<double>(int64_t count, int64_t used, const Slots<double>& slots
 
 template <class S>
 void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots,
-               const int32_t* order, const int32_t* radii, const Pairs<S>& pairs) {
+               const int32_t* order, const Pairs<S>& pairs) {
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const int parts = settings.threads;
   constexpr int64_t kAhead = 12;
 
-  // Splat-major: the tile of every pair.
+  // Splat-major: the tile of every pair, chunk after chunk. A splat that was dropped leaves its tiles out.
   std::unique_ptr<int32_t[]> tile_of(new int32_t[pairs.count]);
-  parallel_dynamic(settings.threads, (count + kChunk - 1) / kChunk, [&](int64_t chunk) {
-    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s)
-      if (slots.run[s].count != 0) for_each_tile(view, settings, slots, radii, s, tile_of.get() + slots.run[s].first);
+  std::vector<int64_t> start(size_t(chunks_of(count)) + 1, 0);
+  const auto for_chunk = [&](int64_t chunk, const auto& visit) {
+    for (int64_t s = chunk * kChunk, end = s + slots.per_chunk[chunk]; s < end; ++s) visit(slots.run[s]);
+  };
+  parallel_dynamic(settings.threads, chunks_of(count), [&](int64_t chunk) {
+    for_chunk(chunk, [&](const PairRun& run) { start[size_t(chunk) + 1] += run.count; });
+  });
+  for (size_t chunk = 1; chunk < start.size(); ++chunk) start[chunk] += start[chunk - 1];
+  parallel_dynamic(settings.threads, chunks_of(count), [&](int64_t chunk) {
+    int64_t next = start[size_t(chunk)];
+    for_chunk(chunk, [&](PairRun& run) {
+      const int32_t* from = slots.tile_lists[chunk].data() + run.first;
+      run.first = int32_t(next);
+      for (int32_t k = 0; k < run.count; ++k) tile_of[size_t(next++)] = from[k];
+    });
   });
 
   std::vector<int64_t> cursor(size_t(parts) * tiles, 0);
@@ -197,11 +171,11 @@ void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int
   });
 }
 
-template int64_t number_pairs(int64_t, const Slots<float>&, int);
-template int64_t number_pairs(int64_t, const Slots<double>&, int);
+template int64_t count_pairs(int64_t, const Slots<float>&);
+template int64_t count_pairs(int64_t, const Slots<double>&);
 template void bin_pairs(const View<float>&, const Settings&, int64_t, int64_t, const Slots<float>&, const int32_t*,
-                        const int32_t*, const Pairs<float>&);
+                        const Pairs<float>&);
 template void bin_pairs(const View<double>&, const Settings&, int64_t, int64_t, const Slots<double>&, const int32_t*,
-                        const int32_t*, const Pairs<double>&);
+                        const Pairs<double>&);
 
 }  // namespace SW_ARCH

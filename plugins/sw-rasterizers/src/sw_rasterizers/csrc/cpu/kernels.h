@@ -10,6 +10,7 @@
 #pragma once
 
 #include <cstdint>
+#include <vector>
 
 #include <splatwizard/dispatch.h>
 
@@ -87,7 +88,8 @@ struct Slots {
   S* records;          // [N][kRecord]
   int32_t* index;      // [N] Gaussian of the slot
   int32_t* per_chunk;  // [chunks] slots used
-  PairRun* run;        // [N]
+  PairRun* run;        // [N]; `first` counts within the chunk until bin_pairs
+  std::vector<int32_t>* tile_lists;  // [chunks] the tiles of the chunk's pairs; forward pass only
   S* color_slope;      // [N][9] d colour_c / d mean_j, or null
   uint8_t* clamped;    // [N] bit c: colour c was clamped at 0
   S* channels;         // [N][channels], or null if the three colours in the record are all
@@ -141,10 +143,9 @@ struct Gradients {  // null: not asked for
 
 // The kernels, once per instruction set (splatwizard/dispatch.h).
 //
-// project_gaussians  returns the number of slots in use; counts [2]: Gaussians with a radius, and those culled because
-// a
-//                    value is not finite
-// number_pairs       numbers the pairs splat-major, returns how many there are
+// project_gaussians  returns the number of slots in use; counts [2]: Gaussians with a radius, and those culled
+//                    because a value is not finite
+// count_pairs        (splat, tile) pairs in all
 // depth_order        slots in use, nearest first, equal depths in index order; `order` has room for all of them
 // blend_backward     the last `detached` channels do not influence the geometry; sums [P][pair_columns]
 #define SW_DECLARE_KERNELS(arch)                                                                                    \
@@ -156,12 +157,12 @@ struct Gradients {  // null: not asked for
   template <class S>                                                                                                \
   void visible_radii(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii);         \
   template <class S>                                                                                                \
-  int64_t number_pairs(int64_t count, const Slots<S>& slots, int threads);                                          \
+  int64_t count_pairs(int64_t count, const Slots<S>& slots);  \
   template <class S>                                                                                                \
   void depth_order(int64_t count, int64_t used, const Slots<S>& slots, int threads, int32_t* order);                \
   template <class S>                                                                                                \
   void bin_pairs(const View<S>& view, const Settings& settings, int64_t count, int64_t used, const Slots<S>& slots, \
-                 const int32_t* order, const int32_t* radii, const Pairs<S>& pairs);                                \
+                 const int32_t* order, const Pairs<S>& pairs);                                                      \
   template <class S>                                                                                                \
   void blend(const View<S>& view, const Settings& settings, const Slots<S>& slots, const Pairs<S>& pairs,           \
              const Canvas<S>& canvas);                                                                              \

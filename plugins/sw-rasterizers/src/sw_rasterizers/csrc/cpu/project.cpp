@@ -4,6 +4,7 @@
 // first index, so that slots ascend with the Gaussian index without a second pass. Colours are evaluated for
 // slots only: their coefficients, three quarters of all input bytes, are not even read for the culled ones.
 #include <algorithm>
+#include <limits>
 
 #include "../projection.h"
 #include "../sh.h"
@@ -59,6 +60,15 @@ SW_HD void lane_rows(int64_t first, int64_t end, int32_t* rows) {
   for (int i = 0; i < lanes_of<V>; ++i) rows[i] = int32_t(first + i < end ? first + i : end - 1);
 }
 
+struct TileList {
+  std::vector<int32_t>& tiles;
+  bool keep;
+  size_t size() const { return tiles.size(); }
+  void put(int tile) {
+    if (keep) tiles.push_back(tile);
+  }
+};
+
 template <class V, bool kCov3d>
 struct ChunkProjection : Projector<V, kCov3d> {
   using S = Scalar<V>;
@@ -68,11 +78,13 @@ struct ChunkProjection : Projector<V, kCov3d> {
   const Slots<S>& slots;
   int32_t* radii;
 
-  void operator()(int64_t chunk, int64_t* invalid) const {
+  // `keep_tiles`: false once there are more pairs than can be numbered; then they are only counted.
+  void operator()(int64_t chunk, bool keep_tiles, int64_t* invalid) const {
     const auto& g = this->g;
     const int64_t begin = chunk * kChunk, end = begin + kChunk < g.count ? begin + kChunk : g.count;
     int64_t slot = begin;
-    for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, invalid);
+    TileList tile_list{slots.tile_lists[chunk], keep_tiles};
+    for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, tile_list, invalid);
     const int64_t used = slot - begin;
     slots.per_chunk[chunk] = int32_t(used);
     if (g.sh_dc != nullptr)
@@ -86,7 +98,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
       }
   }
 
-  int64_t project_pack(int64_t first, int64_t end, int64_t slot, int64_t* invalid) const {
+  int64_t project_pack(int64_t first, int64_t end, int64_t slot, TileList& tile_list, int64_t* invalid) const {
     const auto& g = this->g;
     const auto& view = this->view;
     const auto& settings = this->settings;
@@ -101,56 +113,71 @@ struct ChunkProjection : Projector<V, kCov3d> {
     const V level = log_2(maximum(strength, c(1e-30)));
     const V cutoff = (level - c(kLog2AlphaMin)) * c(kCutoffScale) + c(kCutoffShift);
     const V two_ln2_cutoff = maximum(cutoff, c(0)) * c(2 * kLn2);
-    const V lean_x = -p.kb / p.ka, lean_y = -p.kb / p.kc;
 
-    alignas(64) S fields[kRecord][L], radius_of[L];
-    store(fields[kU], p.u);
-    store(fields[kV], p.v);
-    store(fields[kA], c(-0.5 * kLog2e) * p.ka);
-    store(fields[kB], c(-kLog2e) * p.kb);
-    store(fields[kC], c(-0.5 * kLog2e) * p.kc);
-    store(fields[kLevel], level);
-    for (int k = kRed; k <= kBlue; ++k) store(fields[k], c(0));
-    store(fields[kDepth], p.t[2]);
-    store(fields[kLeanX], lean_x);
-    store(fields[kLeanY], lean_y);
-    store(fields[kHalfX], square_root(two_ln2_cutoff * p.c00));
-    store(fields[kHalfY], square_root(two_ln2_cutoff * p.c11));
-    store(fields[kWidth], square_root(two_ln2_cutoff / p.ka));
-    store(fields[kCutoff], cutoff);
-    store(radius_of, radius);
+    V fields[kRecord];
+    fields[kU] = p.u, fields[kV] = p.v;
+    fields[kA] = c(-0.5 * kLog2e) * p.ka, fields[kB] = c(-kLog2e) * p.kb, fields[kC] = c(-0.5 * kLog2e) * p.kc;
+    fields[kLevel] = level;
+    fields[kRed] = fields[kGreen] = fields[kBlue] = c(0);
+    fields[kDepth] = p.t[2];
+    fields[kLeanX] = -p.kb / p.ka, fields[kLeanY] = -p.kb / p.kc;
+    fields[kHalfX] = square_root(two_ln2_cutoff * p.c00), fields[kHalfY] = square_root(two_ln2_cutoff * p.c11);
+    fields[kWidth] = square_root(two_ln2_cutoff / p.ka);
+    fields[kCutoff] = cutoff;
+    alignas(64) S records[L][kRecord];
+    for (int f = 0; f < kRecord; f += L) {
+      transpose(fields + f);
+      for (int i = 0; i < L; ++i) store(records[i] + f, fields[f + i]);
+    }
+
+    // Seen by 3DGS: the square of the bounding radius meets a tile.
+    const V edge = c(1.0 / kTile), half = c(0.5), zero = c(0);
+    const auto meets = [&](V centre, int tiles) {
+      const V low = (centre - half - radius) * edge, high = (centre - half + radius + c(kTile - 1)) * edge;
+      return minimum(round_down(maximum(high, zero)), c(tiles)) > minimum(round_down(maximum(low, zero)), c(tiles));
+    };
+    const auto seen = alive & meets(p.u, view.tiles_x()) & meets(p.v, view.tiles_y());
+    alignas(64) int32_t radius_of[L];
+    store(radius_of, to_integer(select(seen, minimum(radius, c(1 << 30)), zero)));
 
     const int lanes = int(end - first < L ? end - first : L);
     for (int i = 0; i < lanes; ++i) {
       const int64_t n = first + i;
-      radii[n] = 0;
-      if (g.visible != nullptr && !g.visible[n]) continue;
-      if (lane(finite, i) != S(0)) ++*invalid;
-      if (!lane(alive, i)) continue;
-      const TileRange square =
-          classic_tiles(fields[kU][i], fields[kV][i], radius_of[i], view.tiles_x(), view.tiles_y());
-      if (square.count() == 0) continue;
-      radii[n] = to_int(radius_of[i], 0, 1 << 30);
-      if (!(fields[kCutoff][i] > S(kCutoffShift))) continue;  // nowhere above 1/255
-      int tiles = square.count();
-      if (settings.tight) {
-        const Ellipse<S> e{fields[kU][i],
-                           fields[kV][i],
-                           fields[kHalfX][i],
-                           fields[kHalfY][i],
-                           fields[kWidth][i],
-                           fields[kLeanX][i],
-                           fields[kLeanY][i] * fields[kHalfX][i]};
-        tiles = tight_tiles(e, view.width, view.height, [](int, int) {});
-        if (tiles == 0) continue;
-      }
-      S* record = slots.records + slot * kRecord;
-      for (int k = 0; k < kRecord; ++k) record[k] = fields[k][i];
+      const bool asked = g.visible == nullptr || g.visible[n];
+      radii[n] = asked ? radius_of[i] : 0;
+      if (asked && lane(finite, i) != S(0)) ++*invalid;
+      const S* record = records[i];
+      // The second is false where alpha is nowhere above 1/255.
+      if (radii[n] == 0 || !(record[kCutoff] > S(kCutoffShift))) continue;
+      const size_t listed = tile_list.size();
+      const int tiles = list_tiles(record, radii[n], tile_list);
+      if (tiles == 0) continue;
+      std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       slots.index[slot] = int32_t(n);
-      slots.run[slot] = {0, tiles};
+      slots.run[slot] = {int32_t(listed), tiles};
       ++slot;
     }
     return slot;
+  }
+
+  // Appends the tiles that the splat is tried in.
+  SW_HD int list_tiles(const S* record, int32_t radius, TileList& list) const {
+    const auto& view = this->view;
+    const auto put = [&](int x, int y) { list.put(y * view.tiles_x() + x); };
+    if (this->settings.tight) {
+      const Ellipse<S> e{record[kU],
+                         record[kV],
+                         record[kHalfX],
+                         record[kHalfY],
+                         record[kWidth],
+                         record[kLeanX],
+                         record[kLeanY] * record[kHalfX]};
+      return tight_tiles(e, view.width, view.height, put);
+    }
+    const TileRange square = classic_tiles(record[kU], record[kV], S(radius), view.tiles_x(), view.tiles_y());
+    for (int y = square.y0; y < square.y1; ++y)
+      for (int x = square.x0; x < square.x1; ++x) put(x, y);
+    return square.count();
   }
 
   void shade_pack(int64_t first, int64_t end) const {
@@ -279,10 +306,11 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
                     const Channels& channels, const Slots<Scalar<V>>& slots, int32_t* radii, int64_t* counts) {
   const int64_t chunks = (g.count + kChunk - 1) / kChunk;
   const ChunkProjection<V, kCov3d> project_chunk{{view, g, settings}, channels, slots, radii};
-  std::atomic<int64_t> visible{0}, invalid{0};
+  std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
   parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
     int64_t bad = 0;
-    project_chunk(chunk, &bad);
+    project_chunk(chunk, pairs <= std::numeric_limits<int32_t>::max(), &bad);
+    pairs += int64_t(slots.tile_lists[chunk].size());
     const int32_t* first = radii + chunk * kChunk;
     visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
                              [](int32_t radius) { return radius > 0; });

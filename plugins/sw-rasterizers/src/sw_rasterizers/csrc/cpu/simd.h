@@ -54,6 +54,10 @@ SW_HD PackF round_up(PackF x) {
   for (int i = 0; i < SW_LANES; ++i) x[i] = __builtin_ceilf(x[i]);
   return x;
 }
+SW_HD PackF round_down(PackF x) {
+  for (int i = 0; i < SW_LANES; ++i) x[i] = __builtin_floorf(x[i]);
+  return x;
+}
 SW_HD PackF absolute(PackF x) { return (PackF)((PackI)x & 0x7fffffff); }
 
 SW_HD bool any(PackI mask) {
@@ -149,8 +153,11 @@ template <class V>
 SW_HD void transpose(V*) {}  // one lane
 
 SW_HD float to_real(int32_t x) { return float(x); }
+SW_HD int32_t to_integer(float x) { return int32_t(x); }
+SW_HD int32_t to_integer(double x) { return int32_t(x); }
 #if SW_LANES > 1
 SW_HD PackF to_real(PackI x) { return __builtin_convertvector(x, PackF); }
+SW_HD PackI to_integer(PackF x) { return __builtin_convertvector(x, PackI); }
 #endif
 
 template <class V>
