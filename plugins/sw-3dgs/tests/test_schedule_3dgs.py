@@ -20,7 +20,7 @@ from splatwizard_core.training.tasks import TaskContext
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
 from sw_3dgs.stage import ThreeDGSStage
-from sw_3dgs.tasks import PruneAndDensify, UpdateLearningRate
+from sw_3dgs.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
 PAPER_PLAN = """\
 Stage | Task                        | Plan
@@ -168,8 +168,22 @@ def test_a_pause_after_a_reset_skips_densification():
     task = PruneAndDensify(pause_after_reset=200)
     for step, ran in ((100, True), (2900, True), (3000, False), (3100, False), (3200, True), (6100, False)):
         model.denom.fill_(1.0)
-        task(model, optimizer, scene, step)
+        task(model, optimizer, scene, ThreeDGSConfig(), step)
         assert (not model.denom.any()) is ran, step
+
+
+def test_the_last_step_neither_densifies_nor_resets():
+    """No update follows that could repair the picture."""
+    scene = tiny_scene()
+    model = begin(stage_of(), scene)
+    optimizer = ThreeDGSStage(ThreeDGSConfig()).create_optimizer(model, scene)
+    before = model.opacity_logits.detach().clone()
+    for step, runs in ((6000, False), (3000, True)):
+        model.denom.fill_(1.0)
+        PruneAndDensify()(model, optimizer, scene, ThreeDGSConfig(iterations=6000), step)
+        assert (not model.denom.any()) is runs, step
+        ResetOpacity(ceiling=0.001)(model, optimizer, ThreeDGSConfig(iterations=6000), step)
+        assert (not torch.equal(model.opacity_logits[:1], before[:1])) is runs, step
 
 
 def test_absgrad_asks_the_rasterizer_for_absolute_gradients_only():
