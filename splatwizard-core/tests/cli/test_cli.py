@@ -105,6 +105,22 @@ def test_docs_cli_md_is_what_help_says():
         (["info", "demo:tiny", "--set", "resolutoin=3"], "did you mean 'resolution'"),
         (["info", "demo:tiny", "--set", "resolution"], "--set needs key=value"),
         (["info", "demo:tiny", "--set", "iterations=3"], "of no use here"),
+        (["info", "demo:tiny", "--set", "principal_point=middle"], "expected one of center, file"),
+        (["info", "demo:tiny", "--set", "background=puce"], "expected one of black, white"),
+        (["info", ""], "PATH is empty"),
+        (["run", "--scene", ""], "--scene is empty"),
+        (["run", "--method", ""], "--method is empty"),
+        (["run", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
+        (["train", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
+        (["decode", "{folder}"], "{folder} is a folder, and this command takes a file"),
+        (["render", "{folder}"], "{folder} is a folder, and this command takes a file"),
+        (["export", "{folder}", "x.ply"], "{folder} is a folder, and this command takes a file"),
+        (["export", "{text}", "{folder}/none/x.ply"], "there is no folder {folder}/none"),
+        (["decode", "{text}", "--out", "{folder}"], "{folder} is a folder: give the name of a file in it"),
+        (["encode", "{text}", "--out", "{folder}/none/x.swz"], "there is no folder {folder}/none"),
+        (["eval", "{text}", "--metrics", ","], "--metrics is empty"),
+        (["eval", "{text}", "--metrics", "pnsr"], "no metric is called 'pnsr'"),
+        (["eval", "{text}", "--renders", "{text}"], "cannot write into {text}: it is a file"),
     ],
 )  # fmt: skip
 def test_wrong_input_is_one_or_two_lines_and_status_2(
@@ -138,6 +154,33 @@ def test_an_error_nobody_foresaw_is_one_line_and_status_1(
     assert main(["list-plugins"]) == 1
     told = capsys.readouterr().err
     assert told == "error: RuntimeError: the sky fell (a traceback: add --debug)\n"
+
+
+@pytest.mark.parametrize(
+    ("problem", "status", "told"),
+    [
+        (FileNotFoundError(2, "No such file or directory", "a/b"), 2, "a/b: No such file or directory"),
+        (PermissionError(13, "Permission denied", "a/b"), 2, "a/b: Permission denied"),
+        (OSError(28, "No space left on device"), 1, "No space left on device"),
+    ],
+)
+def test_what_the_system_refuses_is_one_line_without_its_python_name(
+    problem: OSError, status: int, told: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def fail(*_: object) -> None:
+        raise problem
+
+    monkeypatch.setattr("splatwizard_core.cli.list_plugins.gather", fail)
+    assert main(["list-plugins"]) == status
+    assert capsys.readouterr().err == f"error: {told} (a traceback: add --debug)\n"
+
+
+@pytest.mark.parametrize("arguments", [[], ["data"]])
+def test_a_group_alone_shows_its_help_and_is_status_2(arguments: list[str], capsys: pytest.CaptureFixture[str]):
+    assert main(arguments) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("Usage: sw")
 
 
 def test_an_interrupt_is_status_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):

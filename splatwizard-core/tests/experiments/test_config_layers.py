@@ -11,7 +11,7 @@ from pydantic import Field
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.experiments.config import apply_overrides, parse_set, rate_points, resolve
-from splatwizard_core.experiments.method import Method
+from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.experiments.values import parse_text
 from splatwizard_core.training.params import OptimizationParams, Params
 
@@ -141,6 +141,8 @@ def test_rate_aliases():
         ("qqq=1", r"unknown key 'qqq' in --set: the keys are .*densify"),
         ("densify.grad_threshold=-1", r"bad value '-1' for 'densify.grad_threshold' in --set: must be greater than 0"),
         ("densify.grad_threshold=x", r"bad value 'x' for 'densify.grad_threshold' in --set: expected a number"),
+        ("densify.grad_threshold=inf", "must be a finite number"),
+        ("densify.grad_threshold=nan", "bad value 'nan' for 'densify.grad_threshold' in --set"),
         ("iterations=0", r"bad value '0' for 'iterations' in --set: must be greater than or equal to 1"),
         ("iterations=1.5", "expected a whole number"),
         ("codec.mode=lossy", "expected one of exact, quantized"),
@@ -173,6 +175,9 @@ def test_an_unknown_preset_lists_those_there_are():
         ("iteration = 3", r"unknown key 'iteration' in .*c.toml: did you mean 'iterations'"),
         ("[densify]\ngrad_treshold = 1", r"unknown key 'densify.grad_treshold' in .*c.toml"),
         ("iterations = 'many'", r"bad value 'many' for 'iterations' in .*c.toml"),
+        ("method = 5", r"bad value 5 for 'method' in .*c.toml: expected a name"),
+        ("rate = ['r1']", r"bad value \['r1'\] for 'rate' in .*c.toml: expected a name"),
+        ("scene = ''", r"bad value '' for 'scene' in .*c.toml: expected a name"),
         ("method = 'other'", r"written for method 'other', not 'toy'"),
     ],
 )
@@ -223,3 +228,19 @@ def test_overrides_leave_the_original_alone():
     assert changed.densify.grad_threshold == 1.0
     assert changed.codec.bits == {"means": 16, "sh": 4}
     assert config == Config()
+
+
+def test_a_borrowed_preset_leaves_the_keys_of_the_run_to_the_run():
+    class Registry:
+        def load(self, name: str) -> type[Method]:
+            return Borrowed
+
+    class Manager:
+        methods = Registry()
+
+    class Borrowed(Toy):
+        PRESETS = {"paper": {}, "quick": {}, "old": {"clamp_render": True, "test_every": 4, "iterations": 77}}
+
+    assert create_method(Manager(), "toy", preset="old").config.iterations == 77  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="clamp_render"):
+        create_method(Manager(), "toy", {"clamp_render": True})  # type: ignore[arg-type]

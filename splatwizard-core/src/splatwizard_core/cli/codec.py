@@ -20,7 +20,15 @@ from splatwizard_core.cli.options import (
     rate_option,
     set_option,
 )
-from splatwizard_core.cli.setup import existing, open_session, resolve_one, resolve_run_options
+from splatwizard_core.cli.setup import (
+    existing,
+    existing_file,
+    open_session,
+    output_file,
+    rate_values,
+    resolve_one,
+    resolve_run_options,
+)
 
 
 @click.command(short_help="a trained model to one file")
@@ -42,8 +50,8 @@ def encode(
 ) -> None:
     """Encode SOURCE into one .swz file.
 
-    SOURCE is a run directory whose training is finished (its config.toml holds; --set changes values of the codec),
-    or a .ply of explicit Gaussians, for methods that encode such.
+    SOURCE is a run directory whose training is finished (its config.toml holds; --rate and --set change values of the
+    codec), or a .ply of explicit Gaussians, for methods that encode such.
     """
     from splatwizard_core.experiments.encoding import encode_directory, encode_ply
     from splatwizard_core.plugins import load_plugins
@@ -51,9 +59,11 @@ def encode(
     path = existing(source)
     plugins = load_plugins()
     values = assignments(sets, device=device)
-    target = Path(out) if out else (path if path.is_dir() else path.parent) / "scene.swz"
-    if path.is_dir():
-        config_file = config_file or str(existing(str(path / "config.toml")))
+    target = output_file(out if out is not None else (path if path.is_dir() else path.parent) / "scene.swz")
+    if path.is_dir() and config_file is None:
+        config_file = str(existing(str(path / "config.toml")))
+        if rate is not None:
+            values, rate = {**rate_values(plugins, method, rate, config_file), **values}, None
     resolved = resolve_one(plugins, method, rate, preset=preset, config_file=config_file, values=values, scene=None)
     session = open_session(resolved.ppl, plugins)
     if path.is_dir():
@@ -84,7 +94,9 @@ def decode(file: str, out: str | None, repeats: int, device: str | None, as_json
     from splatwizard_core.experiments.decoding import save_decoded, timed_decode
     from splatwizard_core.plugins import load_plugins
 
-    path = existing(file)
+    path = existing_file(file)
+    if out is not None:
+        output_file(out)
     plugins = load_plugins()
     ppl, _, _ = resolve_run_options(None, assignments((), device=device))
     session = open_session(ppl, plugins)

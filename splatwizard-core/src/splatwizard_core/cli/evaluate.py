@@ -23,7 +23,7 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import existing, open_session, resolve_one, resolve_run_options
+from splatwizard_core.cli.setup import existing, open_session, output_folder, resolve_one, resolve_run_options
 from splatwizard_core.errors import SplatwizardError
 
 if TYPE_CHECKING:
@@ -68,7 +68,14 @@ def evaluate(
     from splatwizard_core.scene.loaders import load_scene
 
     path = existing(file)
+    wanted = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
+    if wanted == []:
+        raise click.UsageError("--metrics is empty: give names, or leave it out")
     plugins = load_plugins()
+    for name in wanted or ():
+        plugins.metrics.entry(name)
+    if renders is not None:
+        output_folder(renders)
     values = assignments(sets, images=images, device=device, seed=seed)
     stored = path.is_dir()
     if stored:
@@ -106,7 +113,7 @@ def evaluate(
             plugins,
             session.device,
             ppl,
-            metrics=[m.strip() for m in metrics.split(",") if m.strip()] if metrics else None,
+            metrics=wanted,
             speed=not no_speed,
             renders=Path(renders) if renders else None,
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from splatwizard_core.cli.options import assignments, debug_option, device_option, json_option, options, print_json
-from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
+from splatwizard_core.cli.setup import existing_file, open_session, output_file, resolve_run_options
 
 
 @click.command(short_help=".ply and other interchange formats")
@@ -25,7 +25,8 @@ def export(file: str, out: str, exporter: str | None, device: str | None, as_jso
     from splatwizard_core.experiments.measuring import opener
     from splatwizard_core.plugins import load_plugins
 
-    path = existing(file)
+    path = existing_file(file)
+    output_file(out)
     plugins = load_plugins()
     ppl, _, _ = resolve_run_options(None, assignments((), device=device))
     session = open_session(ppl, plugins)

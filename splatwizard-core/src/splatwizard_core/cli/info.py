@@ -23,8 +23,13 @@ from splatwizard_core.cli.options import (
 @click.argument("path", metavar="PATH")
 @options(images_option, set_option, json_option, debug_option)
 def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) -> None:
-    """What is in PATH: a .swz file (bytes by section), a .ply, or a scene (folder, `demo`, dataset/scene)."""
+    """What is in PATH: a .swz file (bytes by section), a run directory (its file), a .ply, or a scene (folder, `demo`,
+    dataset/scene)."""
+    if not path.strip():
+        raise click.UsageError("PATH is empty")
     where = Path(path)
+    if (where / "scene.swz").is_file() and (where / "config.toml").is_file():
+        where = where / "scene.swz"
     if where.suffix == ".swz" or (where.is_file() and _starts_with(where, b"SPWZ")):
         facts = {"kind": "file", **file_facts(where)}
     elif where.suffix == ".ply":

@@ -28,6 +28,8 @@ COMMANDS = {
     "data": "splatwizard_core.cli.data:data",
     "build-kernels": "splatwizard_core.cli.build_kernels:build_kernels",
 }
+# A path that somebody gave does not fit what is on the disk; a full disk is another matter.
+PATH_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 SIGPIPE_STATUS = 141  # what a shell reports of a program whose reader has gone
 
 
@@ -131,6 +133,9 @@ def _report(error: BaseException, *, debug: bool) -> int:
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
         _say("interrupted (the same command resumes a run)")
         return 130
+    if isinstance(error, click.exceptions.NoArgsIsHelpError):
+        _say(error.format_message())
+        return error.exit_code
     if isinstance(error, click.ClickException):
         context = getattr(error, "ctx", None)
         hint = f" (`{context.command_path} --help`)" if context is not None and context.command_path != "sw" else ""
@@ -139,6 +144,10 @@ def _report(error: BaseException, *, debug: bool) -> int:
     if isinstance(error, SplatwizardError):
         _say(f"error: {error}")
         return error.exit_status
+    if isinstance(error, OSError) and error.strerror is not None:
+        at = "" if error.filename is None else f"{error.filename}: "
+        _say(f"error: {at}{error.strerror}{'' if debug else ' (a traceback: add --debug)'}")
+        return 2 if isinstance(error, PATH_ERRORS) else 1
     if not debug:
         text = " ".join(str(error).split())
         _say(f"error: {type(error).__name__}: {text:.500} (a traceback: add --debug)")

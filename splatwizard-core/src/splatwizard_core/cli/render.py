@@ -18,7 +18,7 @@ from splatwizard_core.cli.options import (
     scene_option,
     set_option,
 )
-from splatwizard_core.cli.setup import existing, open_session, resolve_run_options
+from splatwizard_core.cli.setup import existing_file, open_session, output_folder, resolve_run_options
 
 
 @click.command(short_help="draw an encoded scene as PNG")
@@ -48,10 +48,11 @@ def render(
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.scene.loaders import load_scene
 
-    path = existing(file)
+    path = existing_file(file)
     plugins = load_plugins()
     ppl, scene_options, said_scene = resolve_run_options(config_file, assignments(sets, images=images, device=device))
     session = open_session(ppl, plugins)
+    output_folder(out)
     model, raster = opener(path, plugins, session.device)()
     loaded = load_scene(scene or said_scene or "demo", scene_options, plugins)
     chosen = {"test": loaded.test, "train": loaded.train, "all": [*loaded.train, *loaded.test]}[views]

@@ -24,7 +24,7 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import method_names, open_session, resolve_all, say
+from splatwizard_core.cli.setup import method_names, open_session, output_folder, resolve_all, say
 
 if TYPE_CHECKING:
     from splatwizard_core.experiments.record import Record
@@ -78,6 +78,7 @@ def run(
         plugins, method_names(methods, config_file), rates,
         preset=preset, config_file=config_file, values=values, scene=scene,
     )  # fmt: skip
+    output_folder(out)
     session = open_session(resolved[0].ppl, plugins)
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")

@@ -29,6 +29,8 @@ def method_names(methods: Sequence[str], config_file: str | None) -> list[str]:
     names = [name.strip() for text in methods for name in text.split(",") if name.strip()]
     if names:
         return list(dict.fromkeys(names))
+    if methods:
+        raise click.UsageError("--method is empty: give a name, or leave it out")
     if config_file is not None:
         from splatwizard_core.experiments.config import read_config_file
 
@@ -58,7 +60,7 @@ def resolve_all(
     found = []
     for name in methods:
         cls = load_method(plugins, name)
-        for rate in rate_points(cls, rates) if rates else [None]:
+        for rate in rate_points(cls, rates) if rates is not None else [None]:
             found.append(resolve(cls, preset, rate, config_file, values, scene=scene))
     return found
 
@@ -74,11 +76,34 @@ def resolve_one(
     scene: str | None,
 ) -> ResolvedConfig:
     """The configuration of a command that makes one thing."""
-    names = method_names([method] if method else [], config_file)
+    names = method_names([] if method is None else [method], config_file)
     found = resolve_all(plugins, names, rate, preset=preset, config_file=config_file, values=values, scene=scene)
     if len(found) != 1:
         raise click.UsageError("this command takes one method and one rate point; `sw run` takes several")
     return found[0]
+
+
+def rate_values(plugins: PluginManager, method: str | None, rate: str, config_file: str) -> dict[str, Any]:
+    """What another rate point changes in the configuration of a run: the values of every key that rate points set.
+
+    Raises ConfigError for an unknown rate point.
+    """
+    from splatwizard_core.experiments.config import read_config_file, resolve
+    from splatwizard_core.experiments.keys import value_at
+
+    (name,) = method_names([] if method is None else [method], config_file)
+    cls = load_method(plugins, name)
+    preset = read_config_file(config_file).get("preset", "paper")
+    wanted = resolve(cls, str(preset), rate)
+    keys = dict.fromkeys(key for values in cls.RATES.values() for key in values)
+    return {key: value_at(wanted.config, key) for key in keys if field_in_config(cls, key)}
+
+
+def field_in_config(method: type[Method], key: str) -> bool:
+    """Whether a dotted key is one of the method's own config."""
+    from splatwizard_core.experiments.keys import field_at
+
+    return field_at(method.Config, key) is not None
 
 
 def resolve_run_options(
@@ -108,6 +133,8 @@ def resolve_run_options(
     for key in values:
         if key in OptimizationParams.model_fields:
             raise ConfigError(f"key '{key}' in --set is of no use here: one of {', '.join(sorted(known))}", key=key)
+    for name in (n for n in RESERVED if not isinstance(tables.get(n, ""), str)):
+        raise ConfigError(f"bad value {tables[name]!r} for '{name}' in {config_file}: expected a name", key=name)
     resolved = resolve(NoMethod, "paper", "r1", sets={**from_file, **values})
     return resolved.ppl, resolved.scene, tables.get("scene")
 
@@ -129,3 +156,45 @@ def existing(path: str) -> Path:
     if not found.exists():
         raise UserInputError(f"{path}: there is no such file or folder")
     return found
+
+
+def existing_file(path: str) -> Path:
+    """An encoded file that must be there. Raises UserInputError; of a run directory it names the file inside."""
+    from splatwizard_core.errors import UserInputError
+
+    found = existing(path)
+    if found.is_dir():
+        inside = found / "scene.swz"
+        hint = f"the file in it is {inside}" if inside.is_file() else "name the .swz or .ply in it"
+        raise UserInputError(f"{path} is a folder, and this command takes a file: {hint}")
+    return found
+
+
+def output_file(path: str | Path) -> Path:
+    """A path that a file can be written to; asked before the work, not after it. Raises UserInputError."""
+    import os
+
+    from splatwizard_core.errors import UserInputError
+
+    target = Path(path)
+    if target.is_dir():
+        raise UserInputError(f"{path} is a folder: give the name of a file in it")
+    if not target.parent.is_dir():
+        raise UserInputError(f"cannot write {path}: there is no folder {target.parent}")
+    if not os.access(target.parent, os.W_OK):
+        raise UserInputError(f"cannot write {path}: the folder {target.parent} is not writable")
+    return target
+
+
+def output_folder(path: str | Path) -> Path:
+    """A folder that files can be written to, made if needed, asked before the work. Raises UserInputError."""
+    from splatwizard_core.errors import UserInputError
+
+    target = Path(path)
+    try:
+        target.mkdir(parents=True, exist_ok=True)
+    except FileExistsError:
+        raise UserInputError(f"cannot write into {path}: it is a file, not a folder") from None
+    except OSError as error:
+        raise UserInputError(f"cannot write into {path}: {error.strerror}") from error
+    return target

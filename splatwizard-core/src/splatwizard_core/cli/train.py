@@ -24,7 +24,7 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import open_session, resolve_one
+from splatwizard_core.cli.setup import open_session, output_folder, resolve_one
 
 
 @click.command(short_help="train one method on one scene")
@@ -58,6 +58,7 @@ def train(
     plugins = load_plugins()
     values = assignments(sets, images=images, device=device, seed=seed)
     resolved = resolve_one(plugins, method, rate, preset=preset, config_file=config_file, values=values, scene=scene)
+    output_folder(out)
     session = open_session(resolved.ppl, plugins)
     request = RunRequest(resolved, Path(out), resume=resume, allow_changed_plan=allow_changed_plan)
     trained, directory = train_only(session, request)

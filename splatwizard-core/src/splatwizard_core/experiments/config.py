@@ -242,6 +242,12 @@ def resolve(
     """
     tables = read_config_file(config_file) if config_file is not None else {}
     said = {name: tables.pop(name) for name in RESERVED if name in tables}
+    for name, value in said.items():
+        if not isinstance(value, str) or not value.strip():
+            raise ConfigError(f"bad value {value!r} for '{name}' in {config_file}: expected a name", key=name)
+    for name, asked in (("preset", preset), ("rate", rate), ("scene", scene)):
+        if asked is not None and not asked.strip():
+            raise ConfigError(f"--{name} is empty: give a name, or leave it out", key=name)
     for name, asked in (("method", method.name), ("preset", preset), ("rate", rate)):
         if asked is not None and said.get(name, asked) != asked:
             raise ConfigError(

@@ -105,3 +105,21 @@ def suggest(key: str, known: Sequence[str]) -> str | None:
     leaves = {k.rpartition(".")[2]: k for k in known}
     near = difflib.get_close_matches(leaf, list(leaves), n=1, cutoff=0.75)
     return leaves[near[0]] if near else None
+
+
+def is_beside_method(config: type[BaseModel], key: str) -> bool:
+    """Whether a key is none of a method's `config` but one of the run or of how the scene is read."""
+    from splatwizard_core.scene.dataset import SceneOptions
+    from splatwizard_core.training.params import PipelineParams
+
+    return field_at(config, key) is None and (
+        field_at(PipelineParams, key) is not None or key in SceneOptions.__dataclass_fields__
+    )
+
+
+def value_at(config: BaseModel, key: str) -> Any:
+    """The value at a dotted key, blocks as plain dicts."""
+    value: Any = config.model_dump()
+    for part in key.split("."):
+        value = value[part]
+    return value

@@ -69,13 +69,18 @@ def create_method(
 ) -> Method:
     """Another method by name, with values for its config by dotted key: how one method borrows from another.
 
+    preset  values that it sets beyond the method's config (of the run or the scene, such as clamp_render) are left to
+            the run: they are the user's, and one run has one of each
+
     Raises PluginError if it is not installed, ConfigError for an unknown preset, key or value.
     """
     from splatwizard_core.errors import ConfigError
     from splatwizard_core.experiments.config import apply_overrides
+    from splatwizard_core.experiments.keys import is_beside_method
 
     cls: type[Method] = plugins.methods.load(name)
     if preset not in cls.PRESETS:
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
-    values = {**cls.PRESETS[preset], **(config or {})}
+    borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
+    values = {**borrowed, **(config or {})}
     return cls(plugins, apply_overrides(cls.Config(), values, source=f"config of '{name}'"))

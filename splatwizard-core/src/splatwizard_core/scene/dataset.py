@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 from typing import Protocol as TypingProtocol
 
 from splatwizard_core.scene.scene import Scene
@@ -31,8 +32,8 @@ class SceneOptions:
     resolution: int = -1
     test_every: int = 8
     split: str | None = None
-    background: str | None = None
-    principal_point: str = "center"
+    background: Literal["black", "white"] | None = None
+    principal_point: Literal["center", "file"] = "center"
     mask_background: bool = False
     legacy_8bit_composite: bool = False
     init_points: int = 100_000

@@ -11,7 +11,7 @@ FULL_RUN_ITERATIONS = 30_000
 class Params(BaseModel):
     """Base of every configuration block: unknown keys and values out of bounds are errors; blocks may nest."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True, allow_inf_nan=False)
 
 
 class RasterParams(Params):
