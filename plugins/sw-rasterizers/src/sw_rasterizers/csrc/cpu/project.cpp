@@ -154,6 +154,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
       if (tiles == 0) continue;
       std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       slots.index[slot] = int32_t(n);
+      prefetch_sh_rest(n);
       slots.run[slot] = {int32_t(listed), tiles};
       ++slot;
     }
@@ -194,7 +195,6 @@ struct ChunkProjection : Projector<V, kCov3d> {
     V slope[9];
     for (V& x : slope) x = c(0);
     if (degree > 0) {
-      prefetch_sh_rest(first + L, end, basis_count);
       V rest[3 * kMaxBasis];
       gather_sh_rest(degree, rows, rest);
       const V* sh = rest - 3;  // sh[3 k + channel]
@@ -241,14 +241,15 @@ struct ChunkProjection : Projector<V, kCov3d> {
     }
   }
 
-  // The next pack's coefficients: rows of culled Gaussians in between keep the hardware from seeing a stream.
-  SW_HD void prefetch_sh_rest(int64_t first, int64_t end, int basis_count) const {
+  // Asks for the coefficients of a Gaussian as soon as it is known to be drawn; they arrive while others are projected.
+  SW_HD void prefetch_sh_rest(int64_t n) const {
     const auto& g = this->g;
+    if (g.sh_dc == nullptr || g.sh_degree == 0) return;
     constexpr int kLine = 64 / sizeof(S);
-    for (int64_t slot = first; slot < first + L && slot < end; ++slot) {
-      const S* row = g.sh_rest + slots.index[slot] * g.sh_rest_stride;
-      for (int k = 0; k < 3 * (basis_count - 1); k += kLine) __builtin_prefetch(row + k);
-    }
+    const S* row = g.sh_rest + n * g.sh_rest_stride;
+    const int fields = 3 * ((g.sh_degree + 1) * (g.sh_degree + 1) - 1);
+    for (int k = 0; k < fields; k += kLine) __builtin_prefetch(row + k, 0, 2);
+    __builtin_prefetch(row + fields - 1, 0, 2);
   }
 
   // Constant row lengths: the tails become plain stores.
