@@ -217,6 +217,13 @@ def test_encode_of_a_directory_with_another_codec(done, tmp_path: Path, capsys: 
     told = said_by(["decode", str(target), "--out", str(tmp_path / "x.safetensors"), "--repeats", "1"], capsys)
     assert told["digest"] == low.file.digest
     assert len(told["decode_runs_s"]) == 1
+    by_rate = said_by(["encode", directory, "--rate", "r1", "--out", str(target)], capsys)
+    assert by_rate["sha256"] == low.file.sha256
+    assert main(["encode", directory, "--rate", "r9"]) == 2
+    assert "no rate point 'r9'" in capsys.readouterr().err
+    assert said_by(["info", directory], capsys)["kind"] == "file"
+    assert main(["decode", directory]) == 2
+    assert "the file in it is" in capsys.readouterr().err
     assert main(["encode", directory, "--set", "iterations=9"]) == 2
     assert "holds no finished training of this configuration" in capsys.readouterr().err
 
