@@ -1,4 +1,4 @@
-"""Locks, finished steps and atomic files of a run directory."""
+"""Locks and finished steps of a run directory."""
 
 import json
 import os
@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 
 from splatwizard_core.errors import RunLockedError
-from splatwizard_core.experiments.files import file_sha256, write_atomic, write_json
 from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.steps import StepLog
 
@@ -87,21 +86,3 @@ def test_a_step_is_done_only_under_the_key_it_was_done_with(tmp_path: Path):
 def test_a_damaged_step_log_means_that_nothing_is_done(tmp_path: Path, content: str):
     (tmp_path / "steps.json").write_text(content)
     assert StepLog(tmp_path).done("train", "key") is None
-
-
-def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path: Path):
-    path = tmp_path / "x.json"
-    write_json(path, {"a": 1})
-    with pytest.raises(ValueError, match="JSON"):
-        write_json(path, {"a": float("nan")})
-    with pytest.raises(UnicodeEncodeError):
-        write_atomic(path, "\udc80")
-    assert json.loads(path.read_text()) == {"a": 1}
-    assert os.listdir(tmp_path) == ["x.json"]
-
-
-def test_sha256_of_a_file(tmp_path: Path):
-    (tmp_path / "abc").write_bytes(b"abc")
-    # FIPS 180-2, example B.1
-    expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
-    assert file_sha256(tmp_path / "abc") == expected

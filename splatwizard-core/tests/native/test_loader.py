@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.native import build, loader, toolchain
+from splatwizard_core.files import file_sha256
+from splatwizard_core.native import build, toolchain
 from splatwizard_core.native.build import build_all, declared_modules, resolve_module
 from splatwizard_core.native.build_lock import build_lock
 from splatwizard_core.native.loader import NativeModule, cache_root
@@ -201,7 +202,7 @@ def test_a_damaged_library_is_rebuilt(package, damage):
         facts.unlink()
     else:  # the digest fits, and still it is no library
         library.write_bytes(b"not a library")
-        facts.write_text(json.dumps({"sha256": loader._digest(library)}))
+        facts.write_text(json.dumps({"sha256": file_sha256(library)}))
     module = package.module()
     module.load()
     assert package.compilations == 2

@@ -125,7 +125,8 @@ def test_the_last_of_each_earlier_stage_stays(tmp_path):
 
 def test_what_a_killed_writer_left_is_removed_with_the_next_checkpoint(tmp_path):
     store = CheckpointStore(tmp_path)
-    for name in (".00-0000050.json.tmp", ".00-0000050.safetensors.tmp", "00-0000050.safetensors"):
+    half = [f".00-0000050.{suffix}.{os.getpid()}-0123abcd.tmp" for suffix in ("json", "safetensors")]
+    for name in (*half, "00-0000050.safetensors"):
         (tmp_path / name).write_text("half")
     (tmp_path / "00-0000040.json.damaged").write_text("kept for the curious")
     store.write(make())

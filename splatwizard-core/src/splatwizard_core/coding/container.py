@@ -19,7 +19,6 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import secrets
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -32,6 +31,7 @@ import numpy.typing as npt
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.strict_json import dump_strict, load_strict
 from splatwizard_core.errors import BitstreamError
+from splatwizard_core.files import write_atomic
 
 MAGIC = b"SPWZ"
 VERSION = 1
@@ -108,18 +108,7 @@ class ContainerWriter:
         Atomic: the path holds either what it held before or the complete new file, also after a crash.
         """
         data = self.to_bytes()
-        target = Path(path)
-        temporary = target.with_name(f".{target.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-        try:
-            with temporary.open("xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, target)
-        except BaseException:
-            with contextlib.suppress(OSError):
-                temporary.unlink()
-            raise
+        write_atomic(path, data)
         return len(data)
 
 

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError, CapabilityError, PluginError, SceneError
 from splatwizard_core.evaluation.image import prepare_render
+from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
@@ -184,6 +185,5 @@ def save_png(image: Tensor, path: Path) -> None:
     from PIL import Image
 
     pixels = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).numpy()
-    temporary = path.with_name(f".{path.name}.tmp")
-    Image.fromarray(pixels).save(temporary, format="PNG")
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        Image.fromarray(pixels).save(temporary, format="PNG")

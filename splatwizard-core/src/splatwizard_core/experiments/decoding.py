@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import statistics
 import time
 from dataclasses import asdict, dataclass
@@ -14,6 +13,7 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, SplatwizardError, UserInputError
+from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter
 from splatwizard_core.plugins import PluginManager
@@ -135,9 +135,8 @@ def save_decoded(model: SplatModel, report: DecodeReport, path: Path, plugins: P
 
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
     told = {"method": report.method, "digest": report.digest, "extra": json.dumps(model.state_dict_extra())}
-    temporary = path.with_name(f".{path.name}.tmp")
-    save_file(tensors, temporary, metadata=told)
-    os.replace(temporary, path)
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata=told)
 
 
 def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: str | None = None) -> str:

@@ -12,11 +12,11 @@ from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
 from splatwizard_core.experiments.config import ResolvedConfig
-from splatwizard_core.experiments.files import file_sha256
 from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.training_run import finished_directory, make_method, train, training_key
+from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
 
 

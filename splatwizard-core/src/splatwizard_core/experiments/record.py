@@ -12,7 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from splatwizard_core.errors import UserInputError
-from splatwizard_core.experiments.files import write_atomic
+from splatwizard_core.files import write_atomic
 
 SCHEMA: Literal[1] = 1
 FILE_NAME = "metrics.json"

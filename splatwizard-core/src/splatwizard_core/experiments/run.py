@@ -16,13 +16,13 @@ from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.experiments.cache import trained_scene
 from splatwizard_core.experiments.config import SCENE_KEYS, ResolvedConfig, absolute_spec, content_hash
 from splatwizard_core.experiments.encoding import encode
-from splatwizard_core.experiments.files import file_sha256, write_atomic
 from splatwizard_core.experiments.fresh import decode_fresh, run_fresh
 from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.record import FILE_NAME, Record, missing_reasons, read_record
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.experiments.training_run import make_method, train, training_key
+from splatwizard_core.files import file_sha256, write_atomic
 
 ENCODED = "scene.swz"
 CONFIG = "config.toml"

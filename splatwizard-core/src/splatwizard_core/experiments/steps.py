@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.experiments.files import write_json
+from splatwizard_core.files import write_json
 
 NAME = "steps.json"
 

@@ -15,6 +15,7 @@ from plyfile import PlyData, PlyElement
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 
@@ -90,7 +91,6 @@ def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
 
     The file is complete or absent: it is written beside `path` and then renamed.
     """
-    path = Path(path)
     n = model.num_rows
     parts = [
         model.means,
@@ -109,12 +109,8 @@ def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
         table[:, column : column + width] = part.detach().cpu().float().numpy()
         column += width
     rows = table.view([(name, "<f4") for name in names])[:, 0]
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<").write(str(beside))
-        os.replace(beside, path)
-    finally:
-        beside.unlink(missing_ok=True)
+    with replacing(path) as temporary:
+        PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<").write(str(temporary))
 
 
 def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:

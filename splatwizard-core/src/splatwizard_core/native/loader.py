@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import NativeBuildError
+from splatwizard_core.files import file_sha256, write_json
 from splatwizard_core.native import toolchain
 from splatwizard_core.native.build_lock import build_lock
 from splatwizard_core.native.toolchain import Job, Toolchain
@@ -295,11 +296,9 @@ class NativeModule:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
             self._check_headers(jobs)
             seconds = round(time.monotonic() - started, 1)
-            facts = {"sha256": _digest(built), "seconds": seconds, "compiler": tools.version(), "march": march}
+            facts = {"sha256": file_sha256(built), "seconds": seconds, "compiler": tools.version(), "march": march}
             os.replace(built, library)
-            side = Path(scratch) / "facts.json"
-            side.write_text(json.dumps(facts), encoding="utf-8")
-            os.replace(side, library.with_suffix(".json"))
+            write_json(library.with_suffix(".json"), facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
 
     def _check_headers(self, jobs: list[Job]) -> None:
@@ -343,15 +342,11 @@ def _timeout() -> float:
         return BUILD_TIMEOUT
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _intact(library: Path) -> bool:
     """Whether the file is what the build wrote. A truncated library may load and crash the process later."""
     try:
         facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
-        return isinstance(facts, dict) and facts.get("sha256") == _digest(library)
+        return isinstance(facts, dict) and facts.get("sha256") == file_sha256(library)
     except (OSError, ValueError):
         return False
 

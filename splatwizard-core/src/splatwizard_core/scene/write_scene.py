@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatwizard_core.errors import ConfigError, SceneError
+from splatwizard_core.files import write_atomic
 from splatwizard_core.progress import track
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import is_inside
@@ -130,7 +131,7 @@ def _write_blender(scene: Scene, path: Path) -> None:
             files[path / f"transforms_{part}.json"] = json.dumps({**header, "frames": frames}, indent=1)
     # Last, and the test half first: a folder that is not finished is not taken for a scene.
     for file in reversed(files):
-        file.write_text(files[file])
+        write_atomic(file, files[file])
 
 
 def _one_camera(cameras: list[Camera], path: Path) -> dict[str, Any]:

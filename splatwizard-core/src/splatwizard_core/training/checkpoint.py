@@ -25,6 +25,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from splatwizard_core.errors import CheckpointError
+from splatwizard_core.files import TEMPORARY, replacing
 from splatwizard_core.training.plan import plan_digest
 
 log = logging.getLogger(__name__)
@@ -33,7 +34,7 @@ FORMAT = 1
 TENSOR_KEY = "$tensor"
 SHOWN_CHARACTERS = 40  # of a value that differs
 _NAME = re.compile(r"(\d{2})-(\d{7})\.json")
-_OURS = re.compile(r"\.?\d{2}-\d{7}\.(json|safetensors)(\.tmp|\.damaged)?")
+_OURS = re.compile(rf"\.?\d{{2}}-\d{{7}}\.(json|safetensors)({TEMPORARY}|\.damaged)?")
 
 
 class DamagedCheckpointError(CheckpointError):
@@ -90,17 +91,10 @@ class CheckpointStore:
         tensor_path = path.with_suffix(".safetensors")
         body = json.dumps(content)
         text = json.dumps({"crc": zlib.crc32(body.encode()), "content": content})
-        temporary = [p.with_name(f".{p.name}.tmp") for p in (tensor_path, path)]
-        try:
-            save_file(tensors, temporary[0], {"pair": content["pair"]})
-            temporary[1].write_text(text)
-            os.replace(temporary[0], tensor_path)
-            os.replace(temporary[1], path)
-        except BaseException:
-            for leftover in temporary:
-                with contextlib.suppress(OSError):
-                    leftover.unlink()
-            raise
+        # The inner file takes its place first: the JSON file makes the pair valid.
+        with replacing(path) as beside, replacing(tensor_path) as tensors_beside:
+            save_file(tensors, tensors_beside, {"pair": content["pair"]})
+            beside.write_text(text)
         self._prune(checkpoint.stage)
         return path
 
