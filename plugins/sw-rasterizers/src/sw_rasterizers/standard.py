@@ -7,12 +7,12 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
 from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.plugins.registry import Registry
-from splatwizard_core.rendering.negotiation import info_from_entry
+from splatwizard_core.rendering.checks import check_placement, check_request, checked_background
+from splatwizard_core.rendering.negotiation import declared_info
 from splatwizard_core.rendering.rasterizer import (
     AccumOutput,
+    Feature,
     GradBuffer,
     RasterizerInfo,
     RasterOptions,
@@ -20,19 +20,10 @@ from splatwizard_core.rendering.rasterizer import (
     RenderResult,
     check_offered,
     option_features,
-    required_features,
 )
 from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_radii
-
-PROFILES = ("3dgs", "dgr-exact")
-
-
-def _declared() -> RasterizerInfo:
-    registry = Registry("rasterizer")
-    plugin.register_rasterizers(registry)
-    return info_from_entry(registry.entry("standard"))
 
 
 class StandardRasterizer:
@@ -45,14 +36,15 @@ class StandardRasterizer:
     count   also count evaluated and blended pixel-splat pairs into the statistics; slow, for benchmarks
     """
 
-    info: RasterizerInfo = _declared()
+    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "standard")
 
     def __init__(self, *, count: bool = False) -> None:
         self.count = count
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        self._check(g, opt)
+        check_request(self.info, g, opt)
+        check_placement(self.info, g)
         call = self._call(g, cam, opt)
         sh = g.sh
         image, radii, alpha, median = rasterize(
@@ -109,11 +101,8 @@ class StandardRasterizer:
         """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
         g.validate()
         if g.geom_indices is not None or g.scale_factors is not None:
-            raise CapabilityError(
-                f"rasterizer '{self.info.name}' does not offer INDEXED_GEOM; `sw list-plugins` shows which one does",
-                missing={"INDEXED_GEOM"},
-            )
-        self._check_device(g)
+            check_offered(self.info, Feature.INDEXED_GEOM)
+        check_placement(self.info, g)
         return visible_radii(g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam)
 
     @torch.no_grad()
@@ -121,38 +110,6 @@ class StandardRasterizer:
         """No score is declared: raises CapabilityError for any that is asked for."""
         check_offered(self.info, option_features(opt))
         return AccumOutput({})
-
-    def _check(self, g: GaussianInputs, opt: RasterOptions) -> None:
-        g.validate()
-        check_offered(self.info, required_features(g, opt))
-        if g.scale_factors is not None:
-            raise CapabilityError(
-                f"rasterizer '{self.info.name}' does not offer INDEXED_GEOM (scale_factors); "
-                "`sw list-plugins` shows which one does",
-                missing={"INDEXED_GEOM"},
-            )
-        if opt.profile not in PROFILES:
-            raise ConfigError(
-                f"rasterizer '{self.info.name}' knows no profile '{opt.profile}'; one of {', '.join(PROFILES)}",
-                key="raster.profile",
-            )
-        if opt.clamp_grad not in ("exact", "pass"):
-            raise ConfigError(f"clamp_grad is '{opt.clamp_grad}', must be 'exact' or 'pass'")
-        self._check_device(g)
-
-    def _check_device(self, g: GaussianInputs) -> None:
-        if g.means.device.type not in self.info.devices:
-            raise CapabilityError(
-                f"rasterizer '{self.info.name}' draws on {', '.join(sorted(self.info.devices))}, "
-                f"the Gaussians are on {g.means.device}",
-                missing=(),
-            )
-        name = str(g.means.dtype).removeprefix("torch.")
-        mixed = {t.dtype for t in g.tensors().values() if t.is_floating_point()} != {g.means.dtype}
-        if name not in self.info.dtypes or mixed:
-            raise ShapeError(
-                f"rasterizer '{self.info.name}' needs all tensors in one dtype of {', '.join(sorted(self.info.dtypes))}"
-            )
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
         quirks = opt.profile == "dgr-exact"
@@ -174,6 +131,7 @@ class StandardRasterizer:
             if asked:
                 flags |= flag
         watch = torch.is_grad_enabled()
+        background = checked_background(opt, 3 if g.colors is None else g.colors.shape[1], cam, g.means)
         return Call(
             camera_numbers(cam),
             cam.width,
@@ -183,7 +141,7 @@ class StandardRasterizer:
             opt.eps2d,
             flags,
             visible=_as_bytes(g.visible),
-            background=_background(g, cam, opt),
+            background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if watch and opt.grad2d else None,
             absgrad2d=GradBuffer() if watch and opt.absgrad else None,
         )
@@ -191,18 +149,3 @@ class StandardRasterizer:
 
 def _as_bytes(mask: Tensor | None) -> Tensor | None:
     return None if mask is None else mask.to(torch.bool).contiguous().view(torch.uint8)
-
-
-def _background(g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Tensor | None:
-    """[C] or [C,H,W] in the dtype of the means."""
-    if opt.background is None:
-        return None
-    channels = 3 if g.colors is None else g.colors.shape[1]
-    background = opt.background.detach().to(g.means).contiguous()
-    if background.shape not in ((channels,), (channels, cam.height, cam.width)):
-        raise ShapeError(
-            f"background must be [{channels}] or [{channels}, {cam.height}, {cam.width}], got {list(background.shape)}",
-            actual=background.shape,
-            expected=(channels, cam.height, cam.width),
-        )
-    return background

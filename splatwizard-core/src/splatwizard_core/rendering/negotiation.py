@@ -16,7 +16,7 @@ from torch import Tensor
 from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_core.plugins.registry import Entry
+from splatwizard_core.plugins.registry import Entry, Registry
 from splatwizard_core.rendering.adapters import AdaptedRasterizer, adapted_requirements
 from splatwizard_core.rendering.rasterizer import (
     AccumOutput,
@@ -32,6 +32,13 @@ from splatwizard_core.scene.camera import Camera
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+
+
+def declared_info(hook: Callable[[Registry], None], name: str) -> RasterizerInfo:
+    """What a plugin's `register_rasterizers` declares of one rasterizer, for the class itself to show."""
+    registry = Registry("rasterizer")
+    hook(registry)
+    return info_from_entry(registry.entry(name))
 
 
 def info_from_entry(entry: Entry) -> RasterizerInfo:

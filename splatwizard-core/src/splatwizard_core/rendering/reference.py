@@ -11,12 +11,11 @@ import torch
 from torch import Tensor
 
 from splatwizard_core import builtin
-from splatwizard_core.errors import ConfigError, ShapeError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.gaussians.spherical_harmonics import view_colors
-from splatwizard_core.plugins.registry import Registry
+from splatwizard_core.rendering.checks import check_request, checked_background
 from splatwizard_core.rendering.compositing import Splats, composite, tile_lists
-from splatwizard_core.rendering.negotiation import info_from_entry
+from splatwizard_core.rendering.negotiation import declared_info
 from splatwizard_core.rendering.projection import CLASSIC_TILE, Projection, project, visible_radii
 from splatwizard_core.rendering.rasterizer import (
     AccumOutput,
@@ -25,19 +24,9 @@ from splatwizard_core.rendering.rasterizer import (
     RasterOptions,
     RasterStats,
     RenderResult,
-    check_offered,
-    required_features,
 )
 from splatwizard_core.rendering.scores import merge_scores, score_dtype, view_scores
 from splatwizard_core.scene.camera import Camera
-
-PROFILES = ("3dgs", "dgr-exact")
-
-
-def _declared() -> RasterizerInfo:
-    registry = Registry("rasterizer")
-    builtin.register_rasterizers(registry)
-    return info_from_entry(registry.entry("reference"))
 
 
 class ReferenceRasterizer:
@@ -51,7 +40,7 @@ class ReferenceRasterizer:
     In both cases a Gaussian is culled where the original culls it (radii == 0).
     """
 
-    info: RasterizerInfo = _declared()
+    info: RasterizerInfo = declared_info(builtin.register_rasterizers, "reference")
 
     def __init__(self, *, classic_tiles: bool = False, tile: int = 8) -> None:
         self.classic_tiles = classic_tiles
@@ -59,7 +48,7 @@ class ReferenceRasterizer:
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        self._check(g, opt)
+        check_request(self.info, g, opt)
         cam = cam.to(g.means.device, g.means.dtype)
         quirks = opt.profile == "dgr-exact"
         classic = self.classic_tiles or quirks
@@ -137,17 +126,6 @@ class ReferenceRasterizer:
                 totals[spec.name] = merge_scores(spec, totals[spec.name], view[spec.name])
         return AccumOutput(totals)
 
-    def _check(self, g: GaussianInputs, opt: RasterOptions) -> None:
-        g.validate()
-        check_offered(self.info, required_features(g, opt))
-        if opt.profile not in PROFILES:
-            raise ConfigError(
-                f"rasterizer 'reference' knows no profile '{opt.profile}'; one of {', '.join(PROFILES)}",
-                key="raster.profile",
-            )
-        if opt.clamp_grad not in ("exact", "pass"):
-            raise ConfigError(f"clamp_grad is '{opt.clamp_grad}', must be 'exact' or 'pass'")
-
     @staticmethod
     def _depth_channels(p: Projection, opt: RasterOptions) -> dict[str, Tensor]:
         """Depth maps that are sums of one value a splat, [V,1] each."""
@@ -169,18 +147,12 @@ def _colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) ->
 
 def _background(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor:
     """[C,H,W]."""
-    if opt.background is None:
+    background = checked_background(opt, channels, cam, like)
+    if background is None:
         return like.new_zeros(channels, cam.height, cam.width)
-    background = opt.background.to(like)
-    if background.shape == (channels,):
+    if background.ndim == 1:
         return background[:, None, None].expand(channels, cam.height, cam.width)
-    if background.shape == (channels, cam.height, cam.width):
-        return background
-    raise ShapeError(
-        f"background must be [{channels}] or [{channels}, {cam.height}, {cam.width}], got {list(background.shape)}",
-        actual=background.shape,
-        expected=(channels, cam.height, cam.width),
-    )
+    return background
 
 
 def _watch_screen_gradient(
