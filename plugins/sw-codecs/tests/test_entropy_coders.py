@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from splatwizard_core.errors import BitstreamError
+from splatwizard_core.plugins import load_plugins
 from sw_codecs import coders
 from sw_codecs.coders import RangeCoder, RansCoder
 from sw_codecs.huffman_coder import HuffmanCoder
@@ -42,6 +43,14 @@ def models(n, seed=1):
         "bernoulli-shared": (r.random(n) < 0.1, Bernoulli(0.1)),
         "uniform": (r.integers(0, 1000, n), Uniform(1000)),
     }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["range", "rans", "huffman"])
+def test_a_package_that_imports_nothing_of_ours_builds_a_model(name):
+    coder = load_plugins().coders.load(name)
+    model = coder.specs.Table(np.array([1, 2, 5]))
+    symbols = np.array([2, 2, 0, 1, 2], np.int32)
+    assert np.array_equal(coder().decode(coder().encode(symbols, model), 5, model), symbols)
 
 
 @pytest.mark.parametrize("coder", STREAMS)

@@ -10,11 +10,13 @@ from __future__ import annotations
 import dataclasses
 import struct
 import zlib
+from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
 
 from splatwizard_core.errors import BitstreamError
+from sw_codecs import model_spec
 from sw_codecs.bits import ByteReader
 from sw_codecs.model_spec import Gaussian, Laplace, ModelSpec, as_symbols, check_length, domain
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
@@ -24,7 +26,13 @@ HEADER = struct.Struct("<IiiII")
 
 
 class ChunkedCoder:
-    """Framing that all entropy coders share; a subclass codes the payload of one chunk."""
+    """Framing that all entropy coders share; a subclass codes the payload of one chunk.
+
+    specs   the probability models that `encode` and `decode` take (`specs.Table(counts)`, ...), for packages that
+            asked the registry for a coder and import nothing of this one
+    """
+
+    specs: ClassVar[ModuleType] = model_spec
 
     def encode(self, symbols: np.ndarray, model: ModelSpec) -> bytes:
         """Bytes of `symbols` [n]: integers within the model's domain.

@@ -37,7 +37,12 @@ class EntropyModel(Protocol):
 
 
 class EntropyCoder(Protocol):
-    """Symbols under a ModelSpec (sw-codecs) to bytes and back, with chunking, CRC and range checks."""
+    """Symbols under a ModelSpec to bytes and back, with chunking, CRC and range checks.
+
+    The class has the models that it takes as attributes of `specs`: `coder.specs.Table(counts)`.
+    """
+
+    specs: Any
 
     def encode(self, symbols: np.ndarray, model: Any) -> bytes: ...
 
@@ -53,12 +58,4 @@ class PositionCodec(Protocol):
 
     def decode(self, data: bytes) -> np.ndarray:
         """[N,3] int64, in Morton order. Raises BitstreamError."""
-        ...
-
-
-class Pruner(Protocol):
-    """Scores primitives; how many go is the caller's business."""
-
-    def score(self, model: Any, cameras: Any, rasterizer: Any) -> Tensor:
-        """[N] float32, higher = keep."""
         ...
