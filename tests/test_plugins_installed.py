@@ -86,6 +86,7 @@ def test_asking_for_a_clashing_name_exits_2_and_names_both(core, make_plugin):
 def test_sw_plugins_restricts_what_loads(core, make_plugin):
     core.install(good(make_plugin, "sw-one"), good(make_plugin, "sw-two"))
     assert set(core.plugins(SW_PLUGINS="two")) == {"splatwizard-core", "sw-two"}
+    assert set(core.plugins(SW_PLUGINS="sw-two")) == {"splatwizard-core", "sw-two"}
     assert set(core.plugins(SW_PLUGINS="")) == {"splatwizard-core"}
 
 

@@ -59,3 +59,28 @@ def test_a_plugin_that_exits_when_imported_is_listed_as_broken(manager_of, tmp_p
     entry_points = [importlib.metadata.EntryPoint("quitter", "fake_quitter", "splatwizard")]
     (info,) = PluginManager(entry_points).plugins
     assert info.error == "SystemExit: needs a licence"
+
+
+@pytest.fixture
+def installed(tmp_path):
+    """Entry points of two installed distributions, as importlib finds them."""
+    for name in ("sw-3dgs", "Sw_Other"):
+        info = tmp_path / f"{name.replace('-', '_')}-0.1.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+        (info / "entry_points.txt").write_text(f"[splatwizard]\n{name[3:].lower()} = math\n")
+    found = [e for d in importlib.metadata.distributions(path=[str(tmp_path)]) for e in d.entry_points]
+    assert sorted(e.name for e in found) == ["3dgs", "other"]
+    return found
+
+
+@pytest.mark.parametrize("name", ["3dgs", "sw-3dgs", "SW_3dgs"])
+def test_a_plugin_is_chosen_by_its_entry_point_or_its_distribution(installed, name):
+    assert [p.distribution for p in PluginManager(installed, only={name}).plugins] == ["sw-3dgs"]
+    assert [p.key for p in PluginManager(installed, only={name, "sw-other"}).plugins] == ["3dgs", "other"]
+    assert PluginManager(installed, only=set()).plugins == []
+
+
+def test_a_plugin_that_is_chosen_but_not_installed_is_an_error_that_names_those_that_are(installed):
+    with pytest.raises(PluginError, match=r"SW_PLUGINS names 'sw-4dgs', .*there are: 3dgs, other"):
+        PluginManager(installed, only={"sw-4dgs", "sw-3dgs"})

@@ -53,7 +53,11 @@ class PluginInfo:
 
 
 class PluginManager:
-    """All registries, filled by the plugins that loaded. A broken plugin is recorded and harms nothing else."""
+    """All registries, filled by the plugins that loaded. A broken plugin is recorded and harms nothing else.
+
+    only    load no others than these (and the core), each named by its entry point or its distribution; raises
+            PluginError for one that is not installed
+    """
 
     def __init__(self, entry_points: Iterable[importlib.metadata.EntryPoint], only: set[str] | None = None) -> None:
         self.plugins: list[PluginInfo] = []
@@ -61,9 +65,18 @@ class PluginManager:
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
         self._modules: list[tuple[PluginInfo, Any]] = []
-        for entry_point in sorted(entry_points, key=lambda e: (e.name != "core", e.name)):
-            if only is None or entry_point.name in only or entry_point.name == "core":
-                self._load(entry_point)
+        found = sorted(entry_points, key=lambda e: (e.name != "core", e.name))
+        if only is not None:
+            chosen = {_normal(name) for name in only}
+            unknown = [name for name in sorted(only) if not any(_normal(name) in _names(e) for e in found)]
+            if unknown:
+                raise PluginError(
+                    f"SW_PLUGINS names '{', '.join(unknown)}', which is not installed; there are: "
+                    f"{', '.join(e.name for e in found if e.name != 'core') or 'no plugins'}"
+                )
+            found = [e for e in found if e.name == "core" or chosen & _names(e)]
+        for entry_point in found:
+            self._load(entry_point)
 
     def _load(self, entry_point: importlib.metadata.EntryPoint) -> None:
         dist = entry_point.dist
@@ -139,6 +152,17 @@ class PluginManager:
                 info.error = f"register_commands: {type(error).__name__}: {error}"
 
 
+def _normal(name: str) -> str:
+    """Distribution names are compared without case, and with `-`, `_` and `.` alike (PEP 503)."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _names(entry_point: importlib.metadata.EntryPoint) -> set[str]:
+    """What a user may call a plugin: its entry point, its distribution."""
+    dist = entry_point.dist
+    return {_normal(name) for name in (entry_point.name, dist.metadata["Name"] if dist else None) if name}
+
+
 def missing_requirements(dist: importlib.metadata.Distribution | None) -> list[str]:
     """The sw-* distributions that `dist` lists as (unconditional) dependencies and that are not installed."""
     missing = []
@@ -156,11 +180,11 @@ def missing_requirements(dist: importlib.metadata.Distribution | None) -> list[s
 
 @functools.cache
 def load_plugins() -> PluginManager:
-    """The installed plugins, found once per process. SW_PLUGINS=a,b restricts them (empty: the core alone)."""
+    """The installed plugins, found once per process.
+
+    SW_PLUGINS=a,b restricts them, by the names of entry points or distributions (empty: the core alone). Raises
+    PluginError for a name that is not installed.
+    """
     names = os.environ.get("SW_PLUGINS")
     only = None if names is None else {n.strip() for n in names.split(",") if n.strip()}
-    manager = PluginManager(importlib.metadata.entry_points(group=hookspecs.ENTRY_POINT_GROUP), only)
-    unknown = (only or set()) - {p.key for p in manager.plugins}
-    if unknown:
-        raise PluginError(f"SW_PLUGINS names '{', '.join(sorted(unknown))}', which is not installed")
-    return manager
+    return PluginManager(importlib.metadata.entry_points(group=hookspecs.ENTRY_POINT_GROUP), only)
