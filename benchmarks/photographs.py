@@ -67,8 +67,9 @@ def report(scene: str, out: Path, bar: float | None) -> None:
         f"{train['steps'] / train['train_s']:.2f} it/s; "
         f"peak {train['peak_bytes'] / 1e9:.2f} GB ({train['memory_kind']})"
     )
-    for part, seconds in (train["breakdown_s"] or {}).items():
-        console.print(f"  {part:<12}{seconds:9.1f} s  {seconds / train['train_s']:6.1%}")
+    for stage, parts in (train["breakdown_s"] or {}).items():
+        for part, seconds in parts.items():
+            console.print(f"  {stage} {part:<12}{seconds:9.1f} s  {seconds / train['train_s']:6.1%}")
 
 
 if __name__ == "__main__":
