@@ -250,12 +250,18 @@ def test_info_of_a_file_lists_bytes_that_sum_to_its_size(tmp_path: Path, capsys:
     assert f"{size:,}" in text
 
 
-def test_an_unknown_method_in_a_file_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+def test_decoding_a_file_of_a_method_that_is_not_installed_says_what_to_install(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
     from splatwizard_core.coding.container import ContainerWriter
 
     ContainerWriter("method-from-mars", 1).write(tmp_path / "x.swz")
     assert main(["decode", str(tmp_path / "x.swz")]) == 2
-    assert "no method is called 'method-from-mars'" in capsys.readouterr().err
+    said = " ".join(capsys.readouterr().err.split())
+    assert said == (
+        "error: x.swz was written by method 'method-from-mars', which is not installed: "
+        "pip install sw-method-from-mars (or the package that provides it)"
+    )
 
 
 def test_synth_writes_a_scene_that_info_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

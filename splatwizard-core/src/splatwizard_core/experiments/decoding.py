@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from splatwizard_core.coding.container import ContainerReader
-from splatwizard_core.errors import BitstreamError, SplatwizardError, UserInputError
+from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter
@@ -56,7 +56,7 @@ def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -
     Raises BitstreamError for a damaged file, PluginError if its method is not installed.
     """
     reader = ContainerReader.open(path)
-    method_class = plugins.methods.load(reader.method)
+    method_class = _method_of(reader, plugins)
     if reader.version > method_class.version:
         raise BitstreamError(
             f"{reader.name}: version {reader.version} of the layout of '{reader.method}' is newer than "
@@ -70,7 +70,20 @@ def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -
 
 def import_method(path: str | Path, plugins: PluginManager) -> None:
     """Import the method that a file names, so that its code counts neither as memory nor as time of what follows."""
-    plugins.methods.load(ContainerReader.open(path).method)
+    _method_of(ContainerReader.open(path), plugins)
+
+
+def _method_of(reader: ContainerReader, plugins: PluginManager) -> Any:
+    """The class of the method that wrote a file. Raises PluginError that says what to install."""
+    name, methods = reader.method, plugins.methods
+    if name in methods or name in methods.clashes:
+        return methods.load(name)
+    problem = f"{reader.name} was written by method '{name}', which is not installed"
+    broken = [p.distribution for p in plugins.broken]
+    if broken:
+        problem += f" (or does not load: {', '.join(broken)}, see `sw list-plugins`)"
+    # The name comes from the file; the reader lets none through that a shell could misread.
+    raise PluginError(f"{problem}: pip install sw-{name} (or the package that provides it)")
 
 
 def timed_decode(
