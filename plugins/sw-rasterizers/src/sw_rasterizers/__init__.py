@@ -1,3 +1,3 @@
-"""Compiled rasterizers, fused SSIM and Adam for Splatwizard, CPU and CUDA."""
+"""Compiled rasterizers for Splatwizard: one C++ kernel family, vectorised and multi-threaded on the CPU."""
 
 __version__ = "0.1.0"
