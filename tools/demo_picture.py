@@ -1,7 +1,7 @@
 """Photograph, decoded render and difference (x 4) of two demo views side by side: the picture in the README.
 
-    .venv/bin/sw render out/demo/3dgs/r6/scene.swz --scene demo --out renders
-    .venv/bin/python tools/demo_picture.py renders docs/images/demo.png
+.venv/bin/sw render out/demo/3dgs/r6/scene.swz --scene demo --out renders
+.venv/bin/python tools/demo_picture.py renders docs/images/demo.png
 """
 
 from __future__ import annotations
