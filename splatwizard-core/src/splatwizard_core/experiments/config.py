@@ -203,7 +203,8 @@ def read_config_file(path: str | Path) -> dict[str, Any]:
     """The tables of a TOML file. Raises ConfigError that names the line."""
     try:
         with open(path, "rb") as file:
-            return tomllib.load(file)
+            tables: dict[str, Any] = tomllib.load(file)
+            return tables
     except OSError as error:
         raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
