@@ -249,3 +249,15 @@ def test_a_changed_configuration_does_not_replace_the_one_that_was_trained(toy_p
     fresh = RunRequest(invocation.request("iterations=3").resolved, tmp_path, resume=False)
     assert train_only(invocation.session, fresh)[0].facts["steps"] == 3
     assert "iterations = 3" in (directory / "config.toml").read_text()
+
+
+def test_starting_again_does_not_take_the_training_of_another_rate_point(toy_plugins: PluginManager, tmp_path: Path):
+    old = Run(toy_plugins, tmp_path)
+    train_only(old.session, old.request("iterations=2", rate="r2"))
+    new = Run(toy_plugins, tmp_path)
+    for rate in ("r1", "r2"):
+        resolved = new.request("iterations=2", rate=rate).resolved
+        found, _ = train_only(new.session, RunRequest(resolved, tmp_path, resume=False))
+        assert found.facts["trained_in"] == "r1"
+    assert sum(line.startswith("training toy") for line in new.said) == 1
+    assert (tmp_path / "demo-tiny/toy/r1/checkpoints").is_dir()  # else nothing would be left to encode again

@@ -158,6 +158,19 @@ def test_ctrl_c_between_steps_saves_too(toy, whole, tmp_path):
     assert resumed.model.digest() == whole.model.digest()
 
 
+def test_ctrl_c_after_the_last_step_leaves_a_finished_stage(toy, tmp_path):
+    def interrupt(record):
+        if record.step == 20:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        toy.train(iterations=20, directory=tmp_path, on_step=interrupt)
+    steps = []
+    resumed = toy.train(iterations=20, directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    assert steps == []
+    assert resumed.model.digest() == toy.train(iterations=20).model.digest()
+
+
 def test_a_second_ctrl_c_stops_at_once(toy, tmp_path):
     class Impatient(toy.Rasterizer):
         def render(self, g, cam, opt):

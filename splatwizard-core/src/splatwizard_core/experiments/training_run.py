@@ -47,6 +47,7 @@ def train(
     """The trained model of this configuration on this scene, from wherever it already exists.
 
     directory   run directory, held by the caller; another rate point's beside it is used if it was trained equally
+    resume      False: neither a checkpoint nor another rate point's training is used, only what this session trained
     trained     (method name) -> the trained scene that a stage starts from
     stop_after  end the process's part of the training after this many steps (raises KeyboardInterrupt then)
     """
@@ -54,7 +55,8 @@ def train(
     in_memory = session.trained(key)
     if in_memory is not None:
         return _share(session, in_memory, directory, resolved)
-    home = finished_directory(directory, key) or directory
+    # Starting again takes nothing old, least of all from a neighbour that the same command is about to clear.
+    home = (finished_directory(directory, key) if resume else None) or directory
     scene = session.scene(resolved)
     steps = StepLog(home)
     done = steps.done(STEP, key)

@@ -101,6 +101,7 @@ class Housekeeping:
 
     def after_step(self, record: StepRecord) -> None:
         """Everything that is due after this step."""
+        last = record.step == self.trainer.stage.iterations or self.trainer.stopped
         with self.clock.paused():
             try:
                 self._bar.advance(1, loss=record.total, **{self._rows_are: record.num_rows})
@@ -110,14 +111,14 @@ class Housekeeping:
                 every = self.trainer.ppl.eval_every
                 if self.evaluate is not None and every and record.step % every == 0:
                     self._evaluate(self.evaluate, record.step)
-                last = record.step == self.trainer.stage.iterations or self.trainer.stopped
                 if not last and record.step % self.trainer.ppl.checkpoint_every == 0:
                     self.save()
                 if self.guard.pending:
                     raise KeyboardInterrupt
             except KeyboardInterrupt:
-                # Between steps the state is whole, so nothing that is done is lost.
-                self.save()
+                # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
+                # over: a resumed run must neither train past a STOP nor find that there is nothing to do.
+                self.save(finished=last)
                 raise
 
     def save(self, *, finished: bool = False) -> None:
