@@ -4,7 +4,8 @@
 
 Compared with: the same source compiled without vectorisation (SW_LANES=1, -fno-tree-vectorize, otherwise the same
 -O3 -march=native), the same with the compiler's own vectorisation, the pure-torch reference, and the roofline of
-this machine (FMA rate and copy bandwidth measured at the start). Times are minima over --repeats.
+this machine (FMA rate and copy bandwidth measured at the start). Times are minima over --repeats, of the reference
+over 2, of the scaling series over half as many.
 """
 
 from __future__ import annotations
@@ -119,7 +120,7 @@ def limits(c: dict[str, int], flops: float, bandwidth: float, *, evaluated: str)
 def baseline(kind: str, arguments: argparse.Namespace) -> dict[str, float]:
     """The same measurement with another build, in a process of its own (op names are per process)."""
     command = [sys.executable, __file__, "--worker", kind, "--n", str(arguments.n), "--size", arguments.size]
-    done = subprocess.run([*command, "--repeats", str(max(2, arguments.repeats // 3))], capture_output=True, text=True)
+    done = subprocess.run([*command, "--repeats", str(arguments.repeats)], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)
     return json.loads(done.stdout.splitlines()[-1])
@@ -208,7 +209,8 @@ def print_scaling(arguments: argparse.Namespace) -> None:
         print(f"\nscaling in {what}")
         for x, run in zip(xs, runs, strict=True):
             print(f"  {x:10d}  forward {1e3 * run['forward']:8.2f} ms  backward {1e3 * run['backward']:8.2f} ms")
-        for stage in ("forward", "backward"):
+        # With the stages whose work is the pixels': the others depend on the Gaussians alone and flatten the sums.
+        for stage in ("forward", "blend", "backward", "blend_backward"):
             print(f"  {stage}: time ~ {what}^{exponent(list(map(float, xs)), [r[stage] for r in runs]):.2f}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
@@ -16,6 +17,7 @@ from splatwizard_core.testing.raster_gradients import run
 from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, with_tensors
 from splatwizard_core.testing.rasterizer_checks import front_camera, splats
 from sw_rasterizers.native import MODULE
+from sw_rasterizers.ops import visible_radii
 from sw_rasterizers.standard import StandardRasterizer
 
 pytestmark = pytest.mark.skipif(MODULE.available() is not None, reason=str(MODULE.available()))
@@ -88,6 +90,22 @@ def test_results_are_bit_equal_for_any_number_of_threads(threads, dtype):
     for i in (0, 1):
         for other in (found[i + 2], found[i + 4]):
             assert all(torch.equal(a, b) for a, b in zip(found[i], other, strict=True))
+
+
+def test_python_threads_may_draw_at_once():
+    g, cam = draw_scene(replace(MANY, n=20_000, scale=(0.002, 0.02)), 4, torch.float32)
+    scenes = [with_tensors(g, {"means": g.means + 0.05 * k}) for k in range(4)]
+
+    def step(inputs: GaussianInputs) -> list[torch.Tensor]:
+        result, gradients = run(StandardRasterizer(), inputs, cam, RasterOptions(grad2d=True))
+        return [result.image, result.grad2d.value, *gradients.values()]
+
+    alone = [step(inputs) for inputs in scenes]
+    assert not torch.equal(alone[0][0], alone[1][0])
+    with ThreadPoolExecutor(4) as pool:
+        for _ in range(3):
+            for found, expected in zip(pool.map(step, scenes), alone, strict=True):
+                assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
 
 
 def test_features_may_leave_the_geometry_alone():
@@ -251,6 +269,15 @@ def test_what_is_not_offered_is_refused():
         rasterizer.render(indexed, cam, RasterOptions())
     with pytest.raises(CapabilityError, match="INDEXED_GEOM"):
         rasterizer.visible_filter(indexed, cam)
+    surfels = replace(g, scales=g.scales[:, :2].contiguous())
+    with pytest.raises(CapabilityError, match="SURFEL"):
+        rasterizer.render(surfels, cam, RasterOptions())
+    with pytest.raises(CapabilityError, match="SURFEL"):
+        rasterizer.visible_filter(surfels, cam)
+    with pytest.raises(RuntimeError, match="scales must be"):  # the op itself, too, reads no further than there is
+        visible_radii(g.means, surfels.scales, g.quats, None, None, cam)
+    with pytest.raises(ShapeError, match="no channel"):
+        rasterizer.render(replace(g, sh=None, colors=torch.zeros(5, 0)), cam, RasterOptions())
     with pytest.raises(CapabilityError, match="meta"):
         rasterizer.render(cast_inputs(g, device="meta"), cam, RasterOptions())
 

@@ -2,7 +2,9 @@
 // pixel centres lies inside the ellipse but it is not listed (once); it is in excess if it is listed although the
 // ellipse does not even meet the rectangle spanned by its pixel centres. Prints: cases, missed, excess, tiles that meet
 // the ellipse.
+#include <cmath>
 #include <cstdio>
+#include <limits>
 #include <random>
 #include <vector>
 
@@ -57,6 +59,16 @@ int main() {
         total += lowest <= t;
       }
     if (listed != count) ++missed;
+  }
+  // A needle so long that its extent overflows, the edge of a pixel row on its upper or lower end.
+  for (int i = 0; i < 1000; ++i) {
+    const float inf = std::numeric_limits<float>::infinity(), hy = 0.5f + 30 * float(uniform(generator));
+    const float v = float(int(100 * uniform(generator))) + 0.5f + (i % 2 ? hy : -hy);
+    const sw::Ellipse<float> ellipse{8, v, inf, hy, inf, 0, std::nanf("")};
+    bool inside = true;
+    const int count = sw::tight_tiles(
+        ellipse, width, height, [&](int x, int y) { inside &= x >= 0 && x < columns && y >= 0 && y < rows; });
+    if (!inside || count % columns != 0) ++missed;
   }
   std::printf("%ld %ld %ld %ld\n", cases, missed, excess, total);
 }

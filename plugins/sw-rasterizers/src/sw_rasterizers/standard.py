@@ -7,6 +7,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
+from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.checks import check_placement, check_request, checked_background
 from splatwizard_core.rendering.negotiation import declared_info
@@ -46,6 +47,8 @@ class StandardRasterizer:
         check_request(self.info, g, opt)
         check_placement(self.info, g)
         call = self._call(g, cam, opt)
+        if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
+            raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
         sh = g.sh
         image, radii, alpha, median = rasterize(
             call,
@@ -102,6 +105,8 @@ class StandardRasterizer:
         g.validate()
         if g.geom_indices is not None or g.scale_factors is not None:
             check_offered(self.info, Feature.INDEXED_GEOM)
+        if g.scales is not None and g.scales.shape[1] == 2:
+            check_offered(self.info, Feature.SURFEL)
         check_placement(self.info, g)
         return visible_radii(g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam)
 

@@ -78,39 +78,54 @@ struct Inputs {
   int64_t flags;
 
   void check() const {
-    const auto check_one = [](const char* name, const OptionalTensor& t, std::initializer_list<int64_t> shape) {
-      if (!t.has_value()) return;
-      bool fits = t->is_contiguous() && t->device().is_cpu() && t->dim() == int64_t(shape.size());
-      for (int64_t d = 0; fits && d < t->dim(); ++d) fits = shape.begin()[d] < 0 || t->size(d) == shape.begin()[d];
-      TORCH_CHECK(fits, "sw_rasterizers: ", name, " must be a contiguous CPU tensor of shape ",
-                  c10::IntArrayRef(shape.begin(), shape.size()), " (-1: any), got ", t->sizes());
-    };
+    check_geometry();
     const int64_t n = means.size(0);
-    TORCH_CHECK(n < std::numeric_limits<int32_t>::max(), "sw_rasterizers: more than 2^31 - 1 Gaussians");
-    check_one("means", means, {n, 3});
-    check_one("opacities", opacities, {n});
-    check_one("scales", scales, {n, 3});
-    check_one("quats", quats, {n, 4});
-    check_one("cov3d", cov3d, {n, 6});
-    check_one("sh", sh, {n, -1, 3});
-    check_one("sh_dc", sh_dc, {n, 1, 3});
-    check_one("sh_rest", sh_rest, {n, -1, 3});
-    check_one("colors", colors, {n, -1});
-    check_one("features", features, {n, -1});
-    check_one("visible", visible, {n});
-    TORCH_CHECK(cov3d.has_value() != (scales.has_value() && quats.has_value()),
-                "sw_rasterizers: either scales and quats or cov3d is needed");
+    check_shape("opacities", opacities, {n});
+    check_shape("sh", sh, {n, -1, 3});
+    check_shape("sh_dc", sh_dc, {n, 1, 3});
+    check_shape("sh_rest", sh_rest, {n, -1, 3});
+    check_shape("colors", colors, {n, -1});
+    check_shape("features", features, {n, -1});
     TORCH_CHECK(int(sh.has_value()) + int(sh_dc.has_value()) + int(colors.has_value()) == 1,
                 "sw_rasterizers: exactly one of sh, sh_dc and colors is needed");
     const int64_t basis = (sh_degree + 1) * (sh_degree + 1);
     const int64_t stored = sh.has_value() ? sh->size(1) : 1 + (sh_rest.has_value() ? sh_rest->size(1) : 0);
     TORCH_CHECK(colors.has_value() || (sh_degree >= 0 && sh_degree <= 3 && basis <= stored),
                 "sw_rasterizers: SH degree ", sh_degree, " needs ", basis, " coefficients, got ", stored);
-    for (const OptionalTensor* t : {&scales, &quats, &cov3d, &sh, &sh_dc, &sh_rest, &colors, &features, &background})
+    for (const OptionalTensor* t : {&sh, &sh_dc, &sh_rest, &colors, &features, &background})
       TORCH_CHECK(!t->has_value() || (*t)->scalar_type() == means.scalar_type(),
                   "sw_rasterizers: all tensors must have the dtype of means, ", means.scalar_type());
+    TORCH_CHECK(channels().total() > 0, "sw_rasterizers: there is no channel to draw");
     TORCH_CHECK(opacities.scalar_type() == means.scalar_type(),
                 "sw_rasterizers: opacities must have the dtype of means, ", means.scalar_type());
+  }
+
+  static void check_shape(const char* name, const OptionalTensor& t, std::initializer_list<int64_t> shape) {
+    if (!t.has_value()) return;
+    bool fits = t->is_contiguous() && t->device().is_cpu() && t->dim() == int64_t(shape.size());
+    for (int64_t d = 0; fits && d < t->dim(); ++d) fits = shape.begin()[d] < 0 || t->size(d) == shape.begin()[d];
+    TORCH_CHECK(fits, "sw_rasterizers: ", name, " must be a contiguous CPU tensor of shape ",
+                c10::IntArrayRef(shape.begin(), shape.size()), " (-1: any), got ", t->sizes());
+  }
+
+  // What visible_radii reads too.
+  void check_geometry() const {
+    const auto type = means.scalar_type();
+    TORCH_CHECK(type == at::kFloat || type == at::kDouble, "sw_rasterizers: means must be float32 or float64, got ",
+                type);
+    const int64_t n = means.size(0);
+    TORCH_CHECK(n < std::numeric_limits<int32_t>::max(), "sw_rasterizers: more than 2^31 - 1 Gaussians");
+    check_shape("means", means, {n, 3});
+    check_shape("scales", scales, {n, 3});
+    check_shape("quats", quats, {n, 4});
+    check_shape("cov3d", cov3d, {n, 6});
+    check_shape("visible", visible, {n});
+    TORCH_CHECK(!visible.has_value() || visible->scalar_type() == at::kByte, "sw_rasterizers: visible must be uint8");
+    TORCH_CHECK(cov3d.has_value() != (scales.has_value() && quats.has_value()),
+                "sw_rasterizers: either scales and quats or cov3d is needed");
+    for (const OptionalTensor* t : {&scales, &quats, &cov3d})
+      TORCH_CHECK(!t->has_value() || (*t)->scalar_type() == type,
+                  "sw_rasterizers: all tensors must have the dtype of means, ", type);
   }
 
   template <class S>
@@ -360,6 +375,7 @@ Tensor visible_radii(const Tensor& means, const OptionalTensor& scales, const Op
   const Tensor opacities = at::empty({0}, means.options());
   const Inputs in{means,  opacities, scales,  quats, cov3d, none,           none,  none,
                   colors, none,      visible, none,  0,     scale_modifier, eps2d, 0};
+  in.check_geometry();
   Tensor radii = at::empty({means.size(0)}, means.options().dtype(at::kInt).requires_grad(false));
   means.scalar_type() == at::kDouble ? radii_as<double>(in, camera, width, height, radii)
                                      : radii_as<float>(in, camera, width, height, radii);

@@ -73,7 +73,8 @@ SW_HD int tight_tiles(const Ellipse<S>& e, int width, int height, Visit&& visit)
     const S left =
         low <= -e.tip && -e.tip <= high ? -e.hx : minimum(e.lean * low - half_low, e.lean * high - half_high);
     int first, last;
-    pixel_span(e.u + left, e.u + right, i0, i1, &first, &last);
+    // Extents that overflow make the slab's ends NaN (infinity times 0): the comparisons then choose the ellipse's own.
+    pixel_span(e.u + maximum(left, -e.hx), e.u + minimum(right, e.hx), i0, i1, &first, &last);
     if (first > last) continue;
     for (int tx = first / kTile; tx <= last / kTile; ++tx, ++count) visit(tx, ty);
   }
