@@ -32,14 +32,6 @@ class StepLog:
         found = self._steps.get(step)
         return found["facts"] if found is not None and found["key"] == key else None
 
-    def key(self, step: str) -> str | None:
-        """What the finished step was done from; None if it was not done."""
-        return self._steps[step]["key"] if step in self._steps else None
-
-    def facts(self, step: str) -> dict[str, Any] | None:
-        """The facts of a finished step whatever its inputs were."""
-        return self._steps[step]["facts"] if step in self._steps else None
-
     def finish(self, step: str, key: str, facts: dict[str, Any]) -> None:
         """Remember a finished step."""
         self._steps[step] = {"key": key, "facts": facts}
