@@ -446,3 +446,40 @@ def test_the_cache_follows_the_platforms_convention(monkeypatch, tmp_path):
     assert cache_root() == tmp_path / "splatwizard"
     monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "mine"))
     assert cache_root() == tmp_path / "mine"
+
+
+@needs_compiler
+def test_load_built_takes_what_is_there_and_compiles_nothing(package):
+    assert package.module().load_built() is False
+    assert package.compilations == 0
+    package.module().build()
+    module = package.module()
+    assert module.load_built() is True
+    assert module.state()["loaded"]
+    assert package.compilations == 1
+
+
+@needs_compiler
+def test_a_damaged_build_is_neither_loaded_nor_called_built(package):
+    library = package.module().build()
+    library.write_bytes(library.read_bytes()[:-1])
+    module = package.module()
+    assert module.load_built() is False
+    assert module.state()["state"] == "damaged"
+    assert package.compilations == 1
+
+
+@needs_compiler
+def test_load_built_says_why_a_build_does_not_load(package):
+    library = package.module().build()
+    library.write_bytes(b"no library")
+    facts = json.loads(library.with_suffix(".json").read_text())
+    library.with_suffix(".json").write_text(json.dumps({**facts, "sha256": file_sha256(library)}))
+    with pytest.raises(NativeBuildError, match=f"{library.name} does not load: "):
+        package.module().load_built()
+
+
+def test_load_built_says_that_native_code_is_switched_off(package, monkeypatch):
+    monkeypatch.setenv("SPLATWIZARD_NATIVE", "0")
+    with pytest.raises(NativeBuildError, match="SPLATWIZARD_NATIVE=0"):
+        package.module().load_built()

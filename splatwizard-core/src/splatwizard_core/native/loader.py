@@ -111,6 +111,20 @@ class NativeModule:
             return False
         return True
 
+    def load_built(self) -> bool:
+        """Load a build that is there already, and say whether there was one; compiles nothing.
+
+        Raises NativeBuildError if native code is switched off, or if what is there does not load.
+        """
+        if self._session.loaded is not None:
+            return True
+        if _disabled():
+            raise NativeBuildError("native code is switched off by SPLATWIZARD_NATIVE=0")
+        self._session.loaded, problems = self._load_existing()
+        if self._session.loaded is None and problems:
+            raise NativeBuildError("; ".join(problems))
+        return self._session.loaded is not None
+
     def available(self) -> str | None:
         """Why `load` would fail, or None. Compiles nothing: a compiler that is there is taken to work."""
         if self._session.loaded is not None:
@@ -127,10 +141,13 @@ class NativeModule:
         return None
 
     def state(self) -> dict[str, Any]:
-        """Facts for `sw doctor`: name, state (prebuilt, cached, not built), loaded, path, target (cpu, cuda)."""
+        """Facts for `sw doctor`: name, state (prebuilt, cached, damaged, not built), loaded, path, target (cpu, cuda).
+
+        damaged: there is a library for this machine and these sources, but not the one that the build wrote.
+        """
         found = next(self._existing(), None)
         path = self._session.loaded or found
-        state = "not built"
+        state = "damaged" if any(library.exists() for library in self._places()) else "not built"
         if path is not None:
             state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
         return {
@@ -211,12 +228,9 @@ class NativeModule:
     def _load(self, say: Say) -> Path:
         if _disabled():
             raise NativeBuildError(self._explain("native code is switched off by SPLATWIZARD_NATIVE=0"))
-        for library in self._existing():
-            try:
-                _load_library(library)
-                return library
-            except (OSError, RuntimeError) as error:
-                log.debug("%s does not load: %s", library, error)
+        library, _ = self._load_existing()
+        if library is not None:
+            return library
         library = self.build(force=_intact(self._library(self.cache_folder, "native")), say=say)
         try:
             _load_library(library)
@@ -226,13 +240,27 @@ class NativeModule:
             ) from error
         return library
 
+    def _load_existing(self) -> tuple[Path | None, list[str]]:
+        """(the first build that is there and loads, why others before it do not load)."""
+        problems: list[str] = []
+        for library in self._existing():
+            try:
+                _load_library(library)
+                return library, problems
+            except (OSError, RuntimeError) as error:
+                log.debug("%s does not load: %s", library, error)
+                problems.append(f"{library} does not load: {error.__cause__ or error}")
+        return None, problems
+
     def _existing(self) -> Iterator[Path]:
         """Undamaged libraries for this machine and these sources, best first."""
+        return (library for library in self._places() if _intact(library))
+
+    def _places(self) -> Iterator[Path]:
+        """Where a library for this machine and these sources may be, best first."""
         for folder in (self.prebuilt_folder, self.cache_folder):
             for march in MARCHES:
-                library = self._library(folder, march)
-                if _intact(library):
-                    yield library
+                yield self._library(folder, march)
 
     def _library(self, folder: Path, march: str) -> Path:
         return folder / f"{self.name}-{self.key(march)}.so"
