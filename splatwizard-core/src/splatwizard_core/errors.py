@@ -60,7 +60,14 @@ class ShapeError(UserInputError):
 
 
 class PluginError(UserInputError):
-    """A plugin is missing, broken, or collides with another one."""
+    """A plugin is missing, broken, or collides with another one.
+
+    kind, name  what was asked for and is not there, if that is what happened
+    """
+
+    def __init__(self, message: str, *, kind: str | None = None, name: str | None = None) -> None:
+        super().__init__(message)
+        self.kind, self.name = kind, name
 
 
 class CapabilityError(UserInputError):

@@ -176,7 +176,7 @@ def test_every_flipped_bit_is_refused():
 
 
 def test_newer_version_says_what_to_upgrade():
-    with pytest.raises(BitstreamError, match="upgrade splatwizard-core"):
+    with pytest.raises(BitstreamError, match="pip install --upgrade splatwizard-core"):
         ContainerReader(rebuilt(plain_header(), version=container.VERSION + 1))
 
 

@@ -48,10 +48,15 @@ def _starts_with(path: Path, magic: bytes) -> bool:
 
 
 def file_facts(path: Path) -> dict[str, Any]:
-    """Header and bytes by section of a .swz; the bytes sum to its size."""
+    """Header and bytes by section of a .swz, which sum to its size; and what is missing here to decode it, and why."""
     from splatwizard_core.coding.container import ContainerReader
+    from splatwizard_core.experiments.file_needs import missing_parts, missing_plugin
+    from splatwizard_core.plugins import load_plugins
 
-    return {"path": str(path), **ContainerReader.open(path).summary()}
+    reader, plugins = ContainerReader.open(path), load_plugins()
+    missing = {f"{kind} {name}": str(missing_plugin(reader, plugins, kind, name))
+               for kind, name in missing_parts(reader, plugins)}  # fmt: skip
+    return {"path": str(path), **reader.summary(), "missing": missing}
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:
@@ -88,6 +93,8 @@ def _print_file(facts: dict[str, Any]) -> None:
 
     out = console()
     out.print(escape(f"{facts['path']}: {facts['method']} (layout version {facts['method_version']})"), soft_wrap=True)
+    if facts["requires"]:
+        out.print(escape(f"written with: {_shown(facts['requires'])}"), soft_wrap=True)
     for name in ("raster", "static"):
         if facts[name]:
             out.print(escape(f"{name}: {_shown(facts[name])}"), soft_wrap=True)
@@ -100,6 +107,8 @@ def _print_file(facts: dict[str, Any]) -> None:
     table.add_section()
     table.add_row("file", f"{facts['size']:,}", "100.0%")
     out.print(table)
+    for reason in facts["missing"].values():
+        out.print(escape(reason), soft_wrap=True)
 
 
 def _print_plain(facts: dict[str, Any]) -> None:

@@ -9,38 +9,52 @@ Layout, little-endian, byte by byte in docs/bitstream.md:
     u32       CRC-32 of the H header bytes
     ...       the sections, back to back in the order of the section table
 
-The header holds `method`, `method_version`, `raster` (what a renderer must do, such as {"antialias": false}),
-`static` (whatever the method wants to remember) and `sections`, a list of [name, offset, length, crc32] whose
-offsets count from the end of the header's CRC. Source: specification of the codec library, container.
+The header holds `method`, `method_version`, `requires` (which distributions wrote it, see requirements.py), `raster`
+(what a renderer must do, such as {"antialias": false}), `static` (whatever the method wants to remember) and
+`sections`, a list of [name, offset, length, crc32] whose offsets count from the end of the header's CRC.
+Source: specification of the codec library, container.
 """
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import re
 import struct
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.coding.array_section import pack_array, unpack_array
+from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
 from splatwizard_core.coding.strict_json import dump_strict, load_strict
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.files import write_atomic
 
 MAGIC = b"SPWZ"
 VERSION = 1
-MAX_HEADER = 1 << 22  # 4 MiB; anything longer belongs into a section
+MAX_HEADER = 1 << 20  # 1 MiB; anything longer belongs into a section
 MAX_SECTIONS = 4096
+EXPANSION = 1024
+"""Bytes of decoded model that each byte of a file may stand for, and FREE more; real files are below 100."""
+FREE = 1 << 24
 NAME = re.compile(r"(?!header$)[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}")  # "header" would clash in the breakdown
 METHOD_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 PREFIX = struct.Struct("<4sHI")
 CRC = struct.Struct("<I")
+
+
+def decoded_limit(size: int) -> int:
+    """The most bytes of decoded model that a file of `size` bytes may claim.
+
+    A few bytes must not make a reader fill its memory. A file that claims more is refused, and none is written.
+    """
+    return FREE + EXPANSION * size
 
 
 class ContainerWriter:
@@ -50,7 +64,8 @@ class ContainerWriter:
     version     version of that method's own layout, >= 0
     raster      what the decoded scene asks of a rasterizer, JSON values, such as {"antialias": False, "sh_degree": 3}
 
-    `static` is a dict of JSON values that goes into the header: fill it in place.
+    `static` is a dict of JSON values that goes into the header: fill it in place. `requires` is what a reader is told
+    to install if it lacks something; whoever knows the installed distributions fills it.
     """
 
     def __init__(self, method: str, version: int, *, raster: Mapping[str, Any] | None = None) -> None:
@@ -61,6 +76,7 @@ class ContainerWriter:
         self.method, self.version = method, version
         self.raster: dict[str, Any] = dict(raster or {})
         self.static: dict[str, Any] = {}
+        self.requires: list[Requirement] = []
         self._sections: dict[str, bytes] = {}
 
     def add(self, name: str, data: bytes | bytearray | memoryview) -> None:
@@ -82,6 +98,19 @@ class ContainerWriter:
         """Bytes of each section added so far."""
         return {name: len(data) for name, data in self._sections.items()}
 
+    def allow(self, decoded: int, what: str) -> None:
+        """Raise ValueError if the sections added so far may not stand for `decoded` bytes of `what`.
+
+        A method that decodes to far more than it stores calls it at the end of `encode`, so that it writes no file
+        which its own `decode` (`ContainerReader.allow`) refuses.
+        """
+        size = sum(map(len, self._sections.values()))
+        if decoded > decoded_limit(size):
+            raise ValueError(
+                f"{what} of {decoded:,} bytes in {size:,} bytes of file is more than a reader accepts "
+                f"({decoded_limit(size):,}): most of it repeats itself"
+            )
+
     def to_bytes(self) -> bytes:
         """The whole file. Raises ValueError if `static` or `raster` hold something that is not JSON data."""
         table, offset = [], 0
@@ -92,6 +121,7 @@ class ContainerWriter:
             {
                 "method": self.method,
                 "method_version": self.version,
+                **({"requires": dump_requirements(self.requires)} if self.requires else {}),
                 "raster": self.raster,
                 "static": self.static,
                 "sections": table,
@@ -119,6 +149,7 @@ class ContainerReader:
     name    what error messages call it
 
     method, version     which method decodes it, and the version of its layout
+    requires            which distributions wrote it; empty if the file does not say
     raster, static      header values, plain JSON data
     sections            bytes of each section, in file order
     size                bytes of the whole file = header_bytes + the sum over `sections`
@@ -127,59 +158,61 @@ class ContainerReader:
     """
 
     def __init__(self, data: bytes, name: str = "file") -> None:
-        self.name = name
-        self.size = len(data)
-        header, start = self._header(data)
-        self.header_bytes = start
-        self.method: str = header["method"]
-        self.version: int = header["method_version"]
-        self.raster: dict[str, Any] = header["raster"]
-        self.static: dict[str, Any] = header["static"]
-        self._payload = self._split(header["sections"], data, start)
-        self.sections: dict[str, int] = {key: len(part) for key, part in self._payload.items()}
+        self._read(io.BytesIO(data), len(data), name)
 
     @classmethod
     def open(cls, path: str | os.PathLike[str]) -> ContainerReader:
         """Read a file. Raises BitstreamError also if the path is not a readable file."""
         where = Path(path)
+        reader = cls.__new__(cls)
         try:
             if not where.is_file():
                 raise BitstreamError(f"{where}: there is no such file")
             with where.open("rb") as file:
-                head = file.read(PREFIX.size)
-                cls._prefix(head, where.name)  # a wrong file is refused before it is read whole
-                data = head + file.read()
+                reader._read(file, os.fstat(file.fileno()).st_size, where.name)
         except OSError as error:
             raise BitstreamError(f"{where}: cannot be read: {error.strerror}") from error
-        return cls(data, where.name)
+        return reader
 
-    @staticmethod
-    def _prefix(data: bytes, name: str) -> int:
-        """The header length."""
+    def _read(self, file: BinaryIO, size: int, name: str) -> None:
+        self.name = name
+        self.size = size
+        header = self._header(file)
+        self.header_bytes = file.tell()
+        self.method: str = header["method"]
+        self.version: int = header["method_version"]
+        try:
+            self.requires = parse_requirements(header.get("requires", {}))
+        except ValueError as error:
+            raise self._damage(str(error), "header") from error
+        self.raster: dict[str, Any] = header["raster"]
+        self.static: dict[str, Any] = header["static"]
+        self._payload = self._split(header["sections"], file)
+        self.sections: dict[str, int] = {key: len(part) for key, part in self._payload.items()}
+
+    def _prefix(self, data: bytes) -> tuple[int, int]:
+        """Container version and header length; a wrong file is refused before it is read whole."""
         if data[:4] != MAGIC[: len(data[:4])] or not data:
-            raise BitstreamError(f"{name}: not a .swz file (it starts with {data[:4]!r}, not {MAGIC!r})")
+            raise BitstreamError(f"{self.name}: not a .swz file (it starts with {data[:4]!r}, not {MAGIC!r})")
         if len(data) < PREFIX.size:
-            raise BitstreamError(f"{name}: {len(data)} bytes are too few for a .swz file: it is truncated")
-        _, version, length = PREFIX.unpack_from(data)
-        if version > VERSION:
-            raise BitstreamError(
-                f"{name}: container version {version} is newer than {VERSION}, the newest that this installation "
-                "reads: upgrade splatwizard-core"
-            )
+            raise BitstreamError(f"{self.name}: {len(data)} bytes are too few for a .swz file: it is truncated")
+        _, version, length = PREFIX.unpack(data)
         if version < 1:
-            raise BitstreamError(f"{name}: container version {version} does not exist: the file is damaged")
+            raise BitstreamError(f"{self.name}: container version {version} does not exist: the file is damaged")
         if length > MAX_HEADER:
-            raise BitstreamError(f"{name}: header of {length:,} bytes, at most {MAX_HEADER:,} are allowed")
-        return int(length)
+            raise BitstreamError(f"{self.name}: header of {length:,} bytes, at most {MAX_HEADER:,} are allowed")
+        return version, length
 
-    def _header(self, data: bytes) -> tuple[dict[str, Any], int]:
-        length = self._prefix(data[: PREFIX.size], self.name)
-        start = PREFIX.size + length + CRC.size
-        if len(data) < start:
-            raise self._damage(f"the file ends inside its header ({len(data):,} of {start:,} bytes): it is truncated")
-        raw = data[PREFIX.size : PREFIX.size + length]
-        (crc,) = CRC.unpack_from(data, PREFIX.size + length)
-        if zlib.crc32(raw) != crc:
+    def _header(self, file: BinaryIO) -> dict[str, Any]:
+        version, length = self._prefix(file.read(PREFIX.size))
+        raw, stored = file.read(length), file.read(CRC.size)
+        whole = len(raw) == length and len(stored) == CRC.size
+        if version > VERSION:
+            raise self._too_new(version, raw if whole and zlib.crc32(raw) == CRC.unpack(stored)[0] else b"")
+        if not whole:
+            start = PREFIX.size + length + CRC.size
+            raise self._damage(f"the file ends inside its header ({self.size:,} of {start:,} bytes): it is truncated")
+        if zlib.crc32(raw) != CRC.unpack(stored)[0]:
             raise self._damage("the CRC-32 of the header does not match: the file is damaged", "header")
         try:
             header = load_strict(raw)
@@ -192,20 +225,32 @@ class ContainerReader:
             "static": dict,
             "sections": list,
         }
-        if not isinstance(header, dict) or set(header) != set(kinds):
-            raise self._damage(f"header must hold exactly {', '.join(kinds)}", "header")
+        if not isinstance(header, dict) or set(header) - {"requires"} != set(kinds):
+            raise self._damage(f"header must hold exactly {', '.join(kinds)}, and it may hold requires", "header")
         for key, kind in kinds.items():
             if not isinstance(header[key], kind) or isinstance(header[key], bool):
                 raise self._damage(f"header value '{key}' is not of type {kind.__name__}", "header")
         if not METHOD_NAME.fullmatch(header["method"]) or not 0 <= header["method_version"] < 1 << 31:
             raise self._damage("header names no valid method and version", "header")
-        return header, start
+        return header
 
-    def _split(self, table: list[Any], data: bytes, start: int) -> dict[str, bytes]:
+    def _too_new(self, version: int, raw: bytes) -> BitstreamError:
+        """Of a later container version only the key `requires` of the header is looked at: it keeps its form."""
+        command = "pip install --upgrade splatwizard-core"
+        with contextlib.suppress(ValueError, AttributeError):
+            needed = {each.distribution: each for each in parse_requirements(load_strict(raw).get("requires"))}
+            if "splatwizard-core" in needed:
+                command = needed["splatwizard-core"].command
+        return BitstreamError(
+            f"{self.name}: container version {version} is newer than {VERSION}, the newest that this installation "
+            f"reads: upgrade splatwizard-core with {command}"
+        )
+
+    def _split(self, table: list[Any], file: BinaryIO) -> dict[str, bytes]:
         if len(table) > MAX_SECTIONS:
             raise self._damage(f"{len(table):,} sections, at most {MAX_SECTIONS} are allowed", "header")
         payload: dict[str, bytes] = {}
-        position = 0
+        position, available = 0, self.size - file.tell()
         for row in table:
             if not isinstance(row, list) or len(row) != 4 or not isinstance(row[0], str):
                 raise self._damage("a row of the section table is not [name, offset, length, crc32]", "header")
@@ -215,15 +260,15 @@ class ContainerReader:
             if any(type(n) is not int or n < 0 for n in numbers) or numbers[0] != position:
                 raise self._damage("offset, length or crc32 make no sense in the section table", key)
             _, length, crc = numbers
-            part = data[start + position : start + position + length]
+            part = file.read(min(length, available - position))  # never more than there is
             if len(part) != length:
                 raise self._damage(f"is {len(part):,} bytes, header says {length:,}: the file is truncated", key)
             if zlib.crc32(part) != crc:
                 raise self._damage("its CRC-32 does not match: the file is damaged", key)
             payload[key] = part
             position += length
-        if start + position != len(data):
-            raise self._damage(f"{len(data) - start - position:,} bytes follow the last section: the file is damaged")
+        if position != available:
+            raise self._damage(f"{available - position:,} bytes follow the last section: the file is damaged")
         return payload
 
     def _damage(self, reason: str, section: str | None = None) -> BitstreamError:
@@ -296,6 +341,18 @@ class ContainerReader:
             raise self._damage("holds values that are not finite", name)
         return found
 
+    def allow(self, decoded: int, what: str) -> None:
+        """Raise BitstreamError if a file of this size may not stand for `decoded` bytes of `what`.
+
+        To be asked before anything of that size is allocated; `decoded_limit` has the rule.
+        """
+        if decoded > decoded_limit(self.size):
+            raise self._damage(
+                f"claims {what} of {decoded:,} bytes, a file of {self.size:,} may stand for at most "
+                f"{decoded_limit(self.size):,}",
+                "header",
+            )
+
     def integer(self, key: str, *, low: int, high: int) -> int:
         """The integer `static[key]` in low..high. Raises BitstreamError if it is missing or outside."""
         value = self.static.get(key)
@@ -323,6 +380,7 @@ class ContainerReader:
             "container_version": VERSION,
             "method": self.method,
             "method_version": self.version,
+            "requires": {each.distribution: each.version for each in self.requires},
             "raster": self.raster,
             "static": self.static,
             "size": self.size,

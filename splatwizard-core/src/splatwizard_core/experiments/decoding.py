@@ -13,6 +13,11 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
+from splatwizard_core.experiments.file_needs import (
+    missing_plugin,
+    newer_than_installed,
+    upgrade_command,
+)
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter
@@ -53,19 +58,40 @@ class DecodeReport:
 def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
     """The decoded model, ready to render on `device`, and the file it came from.
 
-    Raises BitstreamError for a damaged file, PluginError if its method is not installed.
+    Raises BitstreamError for a damaged file, PluginError if something that it needs is not installed.
     """
     reader = ContainerReader.open(path)
+    return decode_model(reader, plugins).to(device).eval().requires_grad_(False), reader
+
+
+def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
+    """The model in a parsed file, on the CPU. Raises as `open_model`."""
     method_class = _method_of(reader, plugins)
     if reader.version > method_class.version:
+        entry = plugins.methods.entry(reader.method)
         raise BitstreamError(
             f"{reader.name}: version {reader.version} of the layout of '{reader.method}' is newer than "
-            f"{method_class.version}, which is installed: upgrade {plugins.methods.entry(reader.method).distribution}"
+            f"{method_class.version}, which {entry.distribution} {entry.version} reads: upgrade it with "
+            f"{upgrade_command(reader, entry.distribution)}"
         )
-    with torch.no_grad():
-        model: SplatModel = method_class(plugins, None).decode(reader)
-    model = model.to(device).eval().requires_grad_(False)
-    return model, reader
+    try:
+        with torch.no_grad():
+            model: SplatModel = method_class(plugins, None).decode(reader)
+    except PluginError as error:
+        # Asked for only now: what helped to write the file may have nothing to do with reading it.
+        if error.kind is None or error.name is None:
+            raise
+        raise missing_plugin(reader, plugins, error.kind, error.name) from error
+    except BitstreamError as error:
+        newer = newer_than_installed(reader, plugins)
+        if not newer:
+            raise
+        told = "; ".join(f"{each.distribution} {each.version}, installed is {have}" for each, have in newer)
+        wanted = " ".join(f"'{each.distribution}>={each.version}'" for each, _ in newer)
+        raise BitstreamError(
+            f"{error} (the file was written with {told}: pip install {wanted})", section=error.section
+        ) from error
+    return model
 
 
 def import_method(path: str | Path, plugins: PluginManager) -> None:
@@ -78,12 +104,7 @@ def _method_of(reader: ContainerReader, plugins: PluginManager) -> Any:
     name, methods = reader.method, plugins.methods
     if name in methods or name in methods.clashes:
         return methods.load(name)
-    problem = f"{reader.name} was written by method '{name}', which is not installed"
-    broken = [p.distribution for p in plugins.broken]
-    if broken:
-        problem += f" (or does not load: {', '.join(broken)}, see `sw list-plugins`)"
-    # The name comes from the file; the reader lets none through that a shell could misread.
-    raise PluginError(f"{problem}: pip install sw-{name} (or the package that provides it)")
+    raise missing_plugin(reader, plugins, "method", name)
 
 
 def timed_decode(

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import time
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import torch
 
 from splatwizard_core.coding.container import ContainerWriter
+from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
 from splatwizard_core.experiments.config import ResolvedConfig
@@ -18,6 +21,11 @@ from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.training_run import finished_directory, make_method, train, training_key
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import Entry
+
+CORE = "splatwizard-core"
+NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
+"""What a decoder may want again; a pruner or a rasterizer has done its work by then."""
 
 
 def encode(
@@ -34,14 +42,30 @@ def encode(
     _synchronize(device)
     began = time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
-    with torch.no_grad():
+    with torch.no_grad(), method.plugins.recording() as loaded:
         method.encode(model, writer)
+    if method.name in method.plugins.methods:
+        loaded.insert(0, method.plugins.methods.entry(method.name))
+    writer.requires = requirements(loaded)
     size = writer.write(path)
     _synchronize(device)
     seconds = time.perf_counter() - began
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
     return {"encode_s": seconds, "bytes": size, "sha256": file_sha256(path)}
+
+
+def requirements(entries: Iterable[Entry]) -> list[Requirement]:
+    """What a reader needs for a file that these entries wrote: the core first, each distribution once."""
+    versions = {CORE: importlib.metadata.version(CORE)}
+    provided: dict[str, dict[tuple[str, str], None]] = {CORE: {}}
+    for entry in entries:
+        if entry.distribution and entry.version and entry.kind in NEEDED_KINDS:
+            versions[entry.distribution] = entry.version
+            provided.setdefault(entry.distribution, {})[entry.kind, entry.name] = None
+    # A local version (1.0+cpu) is no lower bound that pip takes.
+    found = [Requirement(name, versions[name].partition("+")[0], tuple(pairs)) for name, pairs in provided.items()]
+    return [each for each in found if each.is_well_formed]  # it is advice: an odd name must not spoil the file
 
 
 def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:

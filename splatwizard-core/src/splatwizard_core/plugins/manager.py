@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 import logging
 import os
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -134,6 +135,18 @@ class PluginManager:
         if kind in registries:
             return registries[kind]
         raise AttributeError(name)
+
+    @contextlib.contextmanager
+    def recording(self) -> Iterator[list[Entry]]:
+        """The entries that a block asks any registry to load, in order, repetitions included."""
+        record: list[Entry] = []
+        for registry in self.registries.values():
+            registry._recorders.append(record)
+        try:
+            yield record
+        finally:
+            for registry in self.registries.values():
+                registry._recorders[:] = [each for each in registry._recorders if each is not record]
 
     @property
     def broken(self) -> list[PluginInfo]:

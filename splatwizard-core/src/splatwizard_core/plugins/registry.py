@@ -55,6 +55,7 @@ class Registry:
         self._entries: dict[str, Entry] = {}
         self._clashes: dict[str, list[Entry]] = {}
         self._owner: tuple[str, str] = ("", "")
+        self._recorders: list[list[Entry]] = []
 
     def add(self, name: str, target: str, *, summary: str, **declared: Any) -> None:
         """Add one entry.
@@ -119,8 +120,13 @@ class Registry:
             )
         near = difflib.get_close_matches(name, self.names, n=1)
         hint = f"did you mean '{near[0]}'?" if near else f"installed: {', '.join(self.names) or 'none'}"
-        raise PluginError(f"no {self.kind} is called '{name}'; {hint} (`sw list-plugins` shows all)")
+        raise PluginError(
+            f"no {self.kind} is called '{name}'; {hint} (`sw list-plugins` shows all)", kind=self.kind, name=name
+        )
 
     def load(self, name: str) -> Any:
         """Import and return what `name` stands for."""
-        return self.entry(name).load()
+        entry = self.entry(name)
+        for record in self._recorders:
+            record.append(entry)
+        return entry.load()
