@@ -44,6 +44,14 @@ class BitstreamError(UserInputError):
         self.section = section
 
 
+class FetchError(SplatwizardError):
+    """A data set could not be downloaded, verified or unpacked."""
+
+    def __init__(self, message: str, *, address: str | None = None) -> None:
+        super().__init__(message)
+        self.address = address
+
+
 class ShapeError(UserInputError):
     """A tensor does not have the shape, dtype or device that a function documents."""
 

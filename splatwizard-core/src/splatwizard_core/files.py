@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import os
 import re
 import secrets
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -32,6 +34,28 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
+        raise
+
+
+@contextlib.contextmanager
+def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """An empty folder beside `path` to fill; when the block ends, it is renamed to `path`.
+
+    If the block raises, `path` is not there and what was written is gone. What killed processes left of earlier tries
+    is removed. Raises FileExistsError if `path` holds something; other errors of the system pass through.
+    """
+    path = Path(path)
+    if path.exists() and (not path.is_dir() or any(path.iterdir())):
+        raise FileExistsError(errno.EEXIST, "is there already and not empty", str(path))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_leftovers(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary.mkdir()
+    try:
+        yield temporary
+        os.rename(temporary, path)  # also over an empty folder, never over one that holds something
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
         raise
 
 
@@ -65,7 +89,11 @@ def _remove_leftovers(path: Path) -> None:
         for name in os.listdir(path.parent):
             match = pattern.fullmatch(name)
             if match is not None and not _is_running(int(match[1])):
-                (path.parent / name).unlink(missing_ok=True)
+                left = path.parent / name
+                if left.is_dir() and not left.is_symlink():
+                    shutil.rmtree(left, ignore_errors=True)
+                else:
+                    left.unlink(missing_ok=True)
 
 
 def _is_running(process: int) -> bool:
