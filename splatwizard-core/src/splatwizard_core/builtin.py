@@ -32,6 +32,19 @@ def register_datasets(registry: Registry) -> None:
                  summary="transforms_train.json / transforms_test.json with RGBA pictures")  # fmt: skip
     registry.add("demo", "splatwizard_core.scene.loaders.demo:DemoDataset",
                  summary="procedural scene with exact geometry, made on the spot")  # fmt: skip
+    collections = "splatwizard_core.scene.loaders.collections"
+    registry.add("mipnerf360", f"{collections}:MIPNERF360",
+                 summary="Mip-NeRF 360: COLMAP, nine scenes, every 8th view tested")  # fmt: skip
+    registry.add("tandt", f"{collections}:TANDT",
+                 summary="Tanks & Temples: COLMAP, train and truck, every 8th view tested")  # fmt: skip
+    registry.add("db", f"{collections}:DB",
+                 summary="Deep Blending: COLMAP, drjohnson and playroom, every 8th view tested")  # fmt: skip
+    registry.add("bungee", f"{collections}:BUNGEE",
+                 summary="BungeeNeRF: COLMAP or poses_enu.json, the first 31 views tested")  # fmt: skip
+    registry.add("nerf_synthetic", f"{collections}:NERF_SYNTHETIC",
+                 summary="NeRF Synthetic: Blender, eight scenes, own split, white")  # fmt: skip
+    registry.add("dtu", f"{collections}:DTU_SCANS",
+                 summary="DTU: COLMAP with masks and cameras.npz, half size, all views")  # fmt: skip
 
 
 @hookimpl

@@ -61,7 +61,7 @@ def models(draw) -> ColmapModel:
     total = sum(lengths)
     whole = st.integers(0, (1 << 31) - 1)
     points = ColmapPoints(
-        ids=np.array(draw(st.lists(st.integers(0, 1 << 62), min_size=n, max_size=n)), dtype=np.int64),
+        ids=np.array(draw(st.lists(st.integers(0, 1 << 62), min_size=n, max_size=n, unique=True)), dtype=np.int64),
         xyz=np.array(draw(st.lists(reals, min_size=3 * n, max_size=3 * n))).reshape(n, 3),
         rgb=np.array(draw(st.lists(st.integers(0, 255), min_size=3 * n, max_size=3 * n)), np.uint8).reshape(n, 3),
         error=np.array(draw(st.lists(reals, min_size=n, max_size=n))),

@@ -73,14 +73,15 @@ def list_pictures(folder: Path) -> list[str]:
 def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
     """The file of each name: `folder/name`, or the same stem with another picture suffix.
 
-    Raises SceneError that lists the first five missing, and for names that lead out of the folder.
+    Raises SceneError that lists the first five missing, for names that lead out of the folder, and where it is not
+    clear which file is meant: two files of one stem, or one file for two names.
     """
     for name in names:
         if not is_inside(name):
             raise SceneError(
                 f"image name {name!r} leads out of {folder}; the scene files are damaged", path=str(folder)
             )
-    by_stem: dict[str, str] | None = None
+    by_stem: dict[str, list[str]] | None = None
     found: list[Path] = []
     missing: list[str] = []
     for name in names:
@@ -89,16 +90,29 @@ def find_pictures(folder: Path, names: Sequence[str]) -> list[Path]:
             if by_stem is None:
                 by_stem = {}
                 for other in list_pictures(folder):
-                    by_stem.setdefault(os.path.splitext(other)[0], other)
-            fallback = by_stem.get(os.path.splitext(name)[0])
-            if fallback is None:
+                    by_stem.setdefault(os.path.splitext(other)[0], []).append(other)
+            candidates = by_stem.get(os.path.splitext(name)[0], [])
+            if not candidates:
                 missing.append(name)
                 continue
-            path = folder / fallback
+            if len(candidates) > 1:
+                raise SceneError(
+                    f"{folder}: image '{name}' is not there, and {' and '.join(candidates[:3])} could both stand for "
+                    "it; keep one",
+                    path=str(folder),
+                )
+            path = folder / candidates[0]
         found.append(path)
     if missing:
         first = ", ".join(repr(name) for name in missing[:5]) + (", ..." if len(missing) > 5 else "")
         raise SceneError(f"{folder}: {len(missing)} of {len(names)} images are missing: {first}", path=str(folder))
+    served: dict[Path, str] = {}
+    for name, path in zip(names, found, strict=True):
+        if served.setdefault(path, name) != name:
+            raise SceneError(
+                f"{folder}: {path.name} is the only file for two images, '{served[path]}' and '{name}'",
+                path=str(folder),
+            )
     return found
 
 
@@ -132,6 +146,11 @@ def load_composited(path: Path, size: tuple[int, int], background: int) -> NDArr
         pixels = (mixed * 255.0).astype(np.uint8)
     picture = Image.fromarray(pixels)
     return np.asarray(picture if picture.size == size else picture.resize(size, Image.Resampling.BICUBIC))
+
+
+def load_cut_out(path: Path, mask: Path, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """uint8 [H,W,4]: a picture without alpha at `size` = (width, height), opaque where its mask file is set."""
+    return np.dstack([load_picture(path, size, alpha=False), 255 * load_mask(mask, size).astype(np.uint8)])
 
 
 def load_mask(path: Path, size: tuple[int, int]) -> NDArray[np.bool_]:

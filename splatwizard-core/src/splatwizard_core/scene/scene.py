@@ -77,6 +77,8 @@ class Protocol:
     quantize8   renders are rounded to 8 bit before metrics
     masked      pictures of a COLMAP scene were cut out by their alpha
     composite8  pictures with alpha were composited in 8 bit with truncation
+    name        "survey" or "inria" where all of the above is what that named protocol says of a published scene, else
+                "custom"; equal facts are comparable whatever the name, so it is no part of the id
     """
 
     dataset: str
@@ -88,6 +90,7 @@ class Protocol:
     quantize8: bool = True
     masked: bool = False
     composite8: bool = False
+    name: str = "custom"
 
     @property
     def id(self) -> str:
@@ -107,8 +110,9 @@ class Scene:
     train, test views, disjoint unless the split is "all"
     points      start points (SfM, or random for Blender scenes); None if there are none
     protocol    how pictures were chosen, resized and split
-    ground_truth    exact geometry where the scene has it (demo): "points" [P,3], "normals" [P,3],
-                    "depth": view name -> [1,H,W]; otherwise empty
+    ground_truth    geometry that the scene brings. demo: "points" [P,3], "normals" [P,3], "depth": view name ->
+                    [1,H,W]; DTU: "world_mats" and "scale_mats" [n,4,4] float64, n views by name (their product projects
+                    the scene's units to pixels, scale_mats[0] takes them to millimetres); otherwise empty
     warnings    one-line facts the user should see (dropped points, off-centre principal point)
     """
 

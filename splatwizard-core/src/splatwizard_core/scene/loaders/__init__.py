@@ -11,15 +11,12 @@ from typing import cast
 from splatwizard_core.errors import PluginError, SceneError
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.scene.dataset import Dataset, SceneOptions
+from splatwizard_core.scene.families import BENCHMARKS
 from splatwizard_core.scene.images import SUFFIXES
+from splatwizard_core.scene.loaders.locate import locate
 from splatwizard_core.scene.scene import Scene
 
 log = logging.getLogger(__name__)
-
-DATA_VARIABLE = "SPLATWIZARD_DATA"
-
-DATASET_SPLITS = {"bungee": "lod:30", "dtu": "all"}
-"""Collections whose published protocol is not the split of their family."""
 
 
 def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scene:
@@ -28,7 +25,8 @@ def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scen
     demo                the procedural scene; `demo:tiny` is a small one for tests
     a path              a scene folder; the registered family that recognises it best reads it
     family:path         the same, read as that family whatever it looks like (`colmap:scenes/garden`)
-    dataset/scene       a scene below $SPLATWIZARD_DATA; the dataset's name goes into the protocol
+    dataset/scene       a scene below $SPLATWIZARD_DATA: read as that family if one has the dataset's name, else by the
+                        family that recognises it, and the dataset's name goes into the protocol
 
     Raises SceneError in one or two lines: nothing there, no or several families, or what the loader found wrong.
     """
@@ -38,39 +36,20 @@ def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scen
     if separator and family in plugins.datasets and not os.path.exists(spec):
         if family == "demo":
             return _dataset(plugins, "demo").load(Path(rest), options)
-        path, options, collection = _locate(rest, options)
-        return _named(_dataset(plugins, family).load(path, options), collection)
-    path, options, collection = _locate(spec, options)
-    return _named(_dataset(plugins, _recognise(path, plugins)).load(path, options), collection)
+        return _dataset(plugins, family).load(locate(rest)[0], options)
+    path, collection = locate(spec)
+    if collection is not None and collection in plugins.datasets and collection != "demo":
+        return _dataset(plugins, collection).load(path, options)
+    family = _recognise(path, plugins)
+    scene = _dataset(plugins, family).load(path, options)
+    if collection is not None and family not in BENCHMARKS:
+        scene.protocol = replace(scene.protocol, dataset=collection)
+    return scene
 
 
 def _dataset(plugins: PluginManager, family: str) -> Dataset:
     target = plugins.datasets.load(family)
     return cast(Dataset, target() if isinstance(target, type) else target)
-
-
-def _locate(spec: str, options: SceneOptions) -> tuple[Path, SceneOptions, str | None]:
-    """(folder, options with the collection's defaults, name of the collection or None)."""
-    path = Path(os.path.expanduser(spec))
-    if os.path.exists(path):
-        return path, options, None
-    root = os.environ.get(DATA_VARIABLE)
-    if root and not path.is_absolute() and os.path.exists(found := Path(root) / spec):
-        collection = path.parts[0] if len(path.parts) == 2 else None
-        if collection in DATASET_SPLITS and options.split is None:
-            options = replace(options, split=DATASET_SPLITS[collection])
-        return found, options, collection
-    tried = f", nor is {Path(root) / spec}" if root and not path.is_absolute() else ""
-    hint = "" if root else f" (${DATA_VARIABLE} is not set, so dataset/scene names are not looked up)"
-    raise SceneError(
-        f"scene '{spec}' is not there{tried}: give a scene folder, dataset/scene, or demo{hint}", path=spec
-    )
-
-
-def _named(scene: Scene, collection: str | None) -> Scene:
-    if collection is not None:
-        scene.protocol = replace(scene.protocol, dataset=collection)
-    return scene
 
 
 def _recognise(path: Path, plugins: PluginManager) -> str:
@@ -96,7 +75,8 @@ def _unrecognised(path: Path, families: list[str]) -> str:
     if path.is_file():
         return f"{path} is a file, not a scene folder"
     looked_for = (
-        f"sparse/0/cameras.bin or .txt (COLMAP), transforms_train.json (Blender); families asked: {', '.join(families)}"
+        "sparse/0/cameras.bin or .txt (COLMAP), transforms_train.json (Blender), poses_enu.json (BungeeNeRF); "
+        f"families asked: {', '.join(families)}"
     )
     folders = [path, path / "images", path / "input"]
     if any(p.suffix.lower() in SUFFIXES for folder in folders if folder.is_dir() for p in folder.iterdir()):

@@ -7,6 +7,7 @@ import math
 import os
 from collections import ChainMap
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.assemble import assemble_scene
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.families import BLENDER
 from splatwizard_core.scene.images import (
     find_pictures,
     fitted_size,
@@ -26,7 +28,8 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.scene.rules import Rules, of_no_use, settle
+from splatwizard_core.scene.scene import PointCloud, Scene, View
 from splatwizard_core.streams import stream
 
 HALF_CUBE = 1.3  # start points fill [-1.3, 1.3]^3 (3DGS)
@@ -39,36 +42,45 @@ class BlenderDataset:
     """Camera-to-world matrices in OpenGL axes, split by file, white background unless told otherwise."""
 
     def detect(self, path: Path) -> float:
-        """1.0 with transforms_train.json, else 0."""
-        return 1.0 if (path / "transforms_train.json").is_file() else 0.0
+        """0.5 with transforms_train.json, else 0."""
+        return 0.5 if has_blender_layout(path) else 0.0
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read poses and the sizes of the pictures; no pixel is decoded. Raises SceneError in one line."""
-        warnings: list[str] = []
-        train = _read_views(path, "transforms_train.json", options)
-        test: list[View] = []
-        if (path / "transforms_test.json").is_file():
-            test = _read_views(path, "transforms_test.json", options)
-        split = options.split or ("file" if test else f"every{options.test_every}")
-        if not test:
-            warnings.append(f"there is no transforms_test.json: the training views are split by {split}")
-        return assemble_scene(
-            path.resolve().name,
-            train + test,
-            points=random_points(options.init_points, options.seed),
-            protocol=Protocol(
-                "blender",
-                images="rgba",
-                resolution=options.resolution,
-                split=split,
-                background=options.background or "white",
-                principal_point=options.principal_point,
-                composite8=options.legacy_8bit_composite,
-            ),
-            path=str(path),
-            own_split=(train, test),
-            warnings=warnings,
+        return load_blender(path, settle(BLENDER, path.resolve().name, options), options)
+
+
+def has_blender_layout(path: Path) -> bool:
+    """Whether a folder is a Blender scene."""
+    return (path / "transforms_train.json").is_file()
+
+
+def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
+    """The scene of a Blender folder, read by `rules`. Raises SceneError in one line."""
+    warnings: list[str] = []
+    train = _read_views(path, "transforms_train.json", rules)
+    test: list[View] = []
+    if (path / "transforms_test.json").is_file():
+        test = _read_views(path, "transforms_test.json", rules)
+    elif rules.split == "file" and options.split is None:
+        rules = replace(rules, split="every8")
+        warnings.append(f"there is no transforms_test.json: the training views are split by {rules.split}")
+    published = rules.family.views
+    if rules.scene is not None and published is not None and (len(train), len(test)) != published:
+        warnings.append(
+            f"{rules.family.title} has {published[0]} training and {published[1]} test views a scene, this folder "
+            f"{len(train)} and {len(test)}: figures are not comparable with published ones"
         )
+    warnings += of_no_use(options, ("mask_background",), rules.family.name)  # alpha always cuts these pictures out
+    return assemble_scene(
+        path.resolve().name,
+        train + test,
+        points=random_points(options.init_points, options.seed),
+        protocol=replace(rules, masked=False).protocol("rgba"),
+        path=str(path),
+        own_split=(train, test),
+        warnings=warnings,
+    )
 
 
 def random_points(count: int, seed: int) -> PointCloud:
@@ -81,7 +93,7 @@ def random_points(count: int, seed: int) -> PointCloud:
     return PointCloud(xyz, 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255)
 
 
-def _read_views(path: Path, file: str, options: SceneOptions) -> list[View]:
+def _read_views(path: Path, file: str, rules: Rules) -> list[View]:
     where = f"{path / file}"
     data = _read_json(path / file)
     frames = data.get("frames")
@@ -105,15 +117,15 @@ def _read_views(path: Path, file: str, options: SceneOptions) -> list[View]:
             )
         width, height, has_alpha = picture_header(picture)
         fx, fy, cx, cy = _intrinsics(merged, name, where, width, height)
-        if options.principal_point != "file":
+        if rules.principal_point != "file":
             cx, cy = width / 2, height / 2
         R, tau = _pose(frame.get("transform_matrix"), name, where)
-        size = fitted_size(width, height, options.resolution)
+        size = fitted_size(width, height, rules.resolution)
         camera = Camera(width, height, fx, fy, cx, cy, R, tau).resized(*size)
         mask = partial(load_mask, picture, size) if has_alpha else None
         load = partial(load_picture, picture, size)
-        if options.legacy_8bit_composite:
-            load = partial(load_composited, picture, size, 0 if options.background == "black" else 255)
+        if rules.composite8:
+            load = partial(load_composited, picture, size, 0 if rules.background == "black" else 255)
         views.append(View(camera, name, load, mask))
     return views
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 
@@ -13,16 +14,19 @@ from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.assemble import assemble_scene
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.families import COLMAP
 from splatwizard_core.scene.images import (
     find_pictures,
     fitted_size,
     list_pictures,
+    load_cut_out,
     load_mask,
     load_picture,
     picture_header,
 )
 from splatwizard_core.scene.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
-from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.scene.rules import Rules, of_no_use, settle
+from splatwizard_core.scene.scene import PointCloud, Scene, View
 
 PLAIN_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
 RADIAL_FOCALS = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2, "FOV": 2}
@@ -35,78 +39,94 @@ MAX_SIDE = 1 << 24
 """Pixels; wider is a damaged file (text may state any integer, also one that no float can hold)."""
 
 
+MaskFinder = Callable[[Path, Sequence[str]], "list[Path | None]"]
+"""(scene folder, image names) -> the mask file of each image, None where there is none."""
+
+
 class ColmapDataset:
     """A COLMAP sparse model with its pictures; pinhole cameras."""
 
     def detect(self, path: Path) -> float:
-        """1.0 with cameras and images files in sparse/0 or sparse, 0.9 with the cameras alone, else 0."""
-        if path.is_dir() and (model := model_folder(path)) is not None:
-            return 1.0 if _has(model, "images") else 0.9
-        return 0.0
+        """0.5 with cameras and images files in sparse/0 or sparse, 0.45 with the cameras alone, else 0."""
+        model = model_folder(path)
+        if model is None:
+            return 0.0
+        return 0.5 if _has(model, "images") else 0.45
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read poses, points and the sizes of the pictures; no pixel is decoded. Raises SceneError in one line."""
-        folder = model_folder(path)
-        if folder is None:
-            raise SceneError(f"{path}: no sparse/0/cameras.bin (or .txt); run COLMAP first", path=str(path))
-        model = read_model(folder)
-        if not len(model.points):
+        return load_colmap(path, settle(COLMAP, path.resolve().name, options), options)
+
+
+def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskFinder | None = None) -> Scene:
+    """The scene of a COLMAP folder, read by `rules`.
+
+    masks   finds the mask files; None: `mask_files`
+
+    Raises SceneError in one line.
+    """
+    folder = model_folder(path)
+    if folder is None:
+        raise SceneError(f"{path}: no sparse/0/cameras.bin (or .txt); run COLMAP first", path=str(path))
+    model = read_model(folder)
+    if not len(model.points):
+        raise SceneError(
+            f"{folder}: the reconstruction has no 3D points (points3D is empty); run COLMAP's mapper again",
+            path=str(path),
+        )
+    picture_folder = rules.images or "images"
+    images = sorted(model.images.values(), key=lambda image: image.name)
+    if not images:
+        raise SceneError(f"{folder}: no registered image; a scene needs at least 2", path=str(path))
+    names = [image.name for image in images]
+    files = find_pictures(_existing(path, picture_folder), names)
+    warnings = _unused(path / picture_folder, len(images))
+    off_centre = 0.0
+    views = []
+    for image, file, mask in zip(images, files, (masks or mask_files)(path, names), strict=True):
+        if image.camera_id not in model.cameras:
             raise SceneError(
-                f"{folder}: the reconstruction has no 3D points (points3D is empty); run COLMAP's mapper again",
+                f"{folder}: image '{image.name}' refers to camera {image.camera_id}, which is not in cameras",
                 path=str(path),
             )
-        picture_folder = options.images or "images"
-        images = sorted(model.images.values(), key=lambda image: image.name)
-        if not images:
-            raise SceneError(f"{folder}: no registered image; a scene needs at least 2", path=str(path))
-        files = find_pictures(_existing(path, picture_folder), [image.name for image in images])
-        warnings = _unused(path / picture_folder, len(images))
-        masks = mask_files(path, [image.name for image in images])
-        off_centre = 0.0
-        views = []
-        for image, file, mask in zip(images, files, masks, strict=True):
-            if image.camera_id not in model.cameras:
+        intrinsics = model.cameras[image.camera_id]
+        fx, fy, cx, cy = pinhole(intrinsics, path)
+        off_centre = max(off_centre, abs(cx - intrinsics.width / 2), abs(cy - intrinsics.height / 2))
+        if rules.principal_point != "file":
+            cx, cy = intrinsics.width / 2, intrinsics.height / 2
+        R, tau = pose(image)
+        camera = Camera(intrinsics.width, intrinsics.height, fx, fy, cx, cy, R, tau)
+        width, height, has_alpha = picture_header(file)
+        size = fitted_size(width, height, rules.resolution)
+        if mask is None and has_alpha:
+            mask = file
+        load = partial(load_picture, file, size, alpha=has_alpha and rules.masked)
+        if rules.masked and not has_alpha:
+            if mask is None:
                 raise SceneError(
-                    f"{folder}: image '{image.name}' refers to camera {image.camera_id}, which is not in cameras",
+                    f"{path}: mask_background needs a mask for every image, and '{image.name}' has neither alpha nor "
+                    "a file in masks/",
                     path=str(path),
                 )
-            intrinsics = model.cameras[image.camera_id]
-            fx, fy, cx, cy = pinhole(intrinsics, path)
-            off_centre = max(off_centre, abs(cx - intrinsics.width / 2), abs(cy - intrinsics.height / 2))
-            if options.principal_point != "file":
-                cx, cy = intrinsics.width / 2, intrinsics.height / 2
-            R, tau = pose(image)
-            camera = Camera(intrinsics.width, intrinsics.height, fx, fy, cx, cy, R, tau)
-            width, height, has_alpha = picture_header(file)
-            size = fitted_size(width, height, options.resolution)
-            load = partial(load_picture, file, size, alpha=has_alpha and options.mask_background)
-            if mask is None and has_alpha:
-                mask = file
-            # The field of view is that of COLMAP's own size, whatever the size of the file: focal lengths scale along.
-            views.append(
-                View(camera.resized(*size), image.name, load, None if mask is None else partial(load_mask, mask, size))
-            )
-        if off_centre > 1 and options.principal_point != "file":
-            warnings.append(
-                f"the principal point is up to {off_centre:.1f} px off the image centre and is taken as the centre, "
-                "as the 3DGS code does (principal_point = file uses it)"
-            )
-        return assemble_scene(
-            path.resolve().name,
-            views,
-            points=point_cloud(model.points),
-            protocol=Protocol(
-                "colmap",
-                images=picture_folder,
-                resolution=options.resolution,
-                split=options.split or f"every{options.test_every}",
-                background=options.background or "black",
-                principal_point=options.principal_point,
-                masked=options.mask_background,
-            ),
-            path=str(path),
-            warnings=warnings,
+            load = partial(load_cut_out, file, mask, size)
+        # The field of view is that of COLMAP's own size, whatever the size of the file: focal lengths scale along.
+        views.append(
+            View(camera.resized(*size), image.name, load, None if mask is None else partial(load_mask, mask, size))
         )
+    if off_centre > 1 and rules.principal_point != "file":
+        warnings.append(
+            f"the principal point is up to {off_centre:.1f} px off the image centre and is taken as the centre, "
+            "as the 3DGS code does (principal_point = file uses it)"
+        )
+    warnings += of_no_use(options, ("legacy_8bit_composite", "init_points"), rules.family.name)
+    return assemble_scene(
+        path.resolve().name,
+        views,
+        points=point_cloud(model.points),
+        protocol=rules.protocol(),
+        path=str(path),
+        warnings=warnings,
+    )
 
 
 def model_folder(path: Path) -> Path | None:
@@ -158,7 +178,7 @@ def point_cloud(points: ColmapPoints) -> PointCloud:
     return PointCloud(torch.from_numpy(xyz), torch.from_numpy(points.rgb.astype(np.float32) / 255))
 
 
-def mask_files(path: Path, names: list[str]) -> list[Path | None]:
+def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:
     """The mask of each image: masks/NAME.png (COLMAP's way), masks/NAME, or masks/STEM.png; also in mask/."""
     folder = next((path / name for name in ("masks", "mask") if (path / name).is_dir()), None)
     if folder is None:

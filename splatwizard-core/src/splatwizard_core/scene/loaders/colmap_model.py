@@ -7,6 +7,7 @@ bytes that are there before anything is allocated, and damage is a SceneError th
 from __future__ import annotations
 
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NoReturn
@@ -157,6 +158,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
                 if len(params) != MODEL_IDS[name][1]:
                     raise ValueError(f"{name} has {MODEL_IDS[name][1]} parameters, not {len(params)}")
                 camera = ColmapCamera(int(fields[0]), name, int(fields[2]), int(fields[3]), params)
+            _once(camera.id, cameras, "camera", f"{path}, line {number}")
             cameras[camera.id] = camera
         return cameras
     reader = _Bytes(path)
@@ -166,6 +168,7 @@ def read_cameras(path: Path) -> dict[int, ColmapCamera]:
             reader.fail(f"unknown camera model {model} at byte {reader.at - 20}")
         name, n = MODELS[int(model)]
         params = reader.unpack(f"<{n}d", f"the parameters of camera {i}")
+        _once(int(camera_id), cameras, "camera", str(path))
         cameras[int(camera_id)] = ColmapCamera(int(camera_id), name, int(width), int(height), tuple(map(float, params)))
     reader.end()
     return cameras
@@ -192,6 +195,7 @@ def read_images(path: Path) -> dict[int, ColmapImage]:
         rows = np.frombuffer(reader.data, dtype=[("xy", "<f8", 2), ("id", "<i8")], count=n, offset=reader.at)
         reader.at += 24 * n
         q, t = [float(x) for x in pose[:4]], [float(x) for x in pose[4:]]
+        _once(int(image_id), images, "image", str(path))
         images[int(image_id)] = ColmapImage(
             int(image_id), (q[0], q[1], q[2], q[3]), (t[0], t[1], t[2]), int(camera_id), name, rows["xy"], rows["id"]
         )
@@ -219,7 +223,20 @@ def read_points(path: Path) -> ColmapPoints:
     track_start = np.concatenate([np.zeros(1, np.int64), np.cumsum(lengths)])
     element = np.repeat(starts + 51 - 8 * track_start[:-1], lengths) + 8 * np.arange(track_start[-1])
     track = buffer[element[:, None] + np.arange(8)].view("<i4")
+    _each_once(fixed["id"], path)
     return ColmapPoints(fixed["id"], fixed["xyz"], fixed["rgb"], fixed["error"], track_start, track)
+
+
+def _once(found: int, earlier: Mapping[int, object], kind: str, where: str) -> None:
+    """Two records of one id: which of them an image or a track means cannot be known."""
+    if found in earlier:
+        raise SceneError(f"{where}: {kind} id {found} occurs twice; the model is damaged")
+
+
+def _each_once(ids: NDArray[np.int64], path: Path) -> None:
+    unique, counts = np.unique(ids, return_counts=True)
+    if len(unique) != len(ids):
+        raise SceneError(f"{path}: point id {unique[counts > 1][0]} occurs twice; the model is damaged", path=str(path))
 
 
 def write_model(model: ColmapModel, folder: Path, *, text: bool = False) -> None:
@@ -350,6 +367,7 @@ def _read_images_text(path: Path) -> dict[int, ColmapImage]:
                 raise ValueError(f"{len(keypoints)} numbers are not triples of x, y, point id")
             xys = np.array([float(x) for k, x in enumerate(keypoints) if k % 3 != 2]).reshape(-1, 2)
             ids = np.array([int(x) for x in keypoints[2::3]], dtype=np.int64)
+        _once(image_id, images, "image", f"{path}, line {number}")
         images[image_id] = ColmapImage(
             image_id, (q[0], q[1], q[2], q[3]), (t[0], t[1], t[2]), camera_id, name, xys, ids
         )
@@ -373,6 +391,7 @@ def _read_points_text(path: Path) -> ColmapPoints:
                 raise ValueError("a track is pairs of image id and keypoint index")
             track += np.array(fields[8:], dtype=np.int32).reshape(-1, 2).tolist()
             starts.append(len(track))
+    _each_once(np.array(ids, dtype=np.int64), path)
     return ColmapPoints(
         np.array(ids, dtype=np.int64),
         np.array(xyz, dtype=np.float64).reshape(-1, 3),

@@ -7,9 +7,14 @@ from pathlib import Path
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.families import DEMO
 from splatwizard_core.scene.images import fitted_size
+from splatwizard_core.scene.rules import of_no_use, settle
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.scene.synthetic import SIZES, make_scene
+
+NO_USE = ("protocol", "principal_point", "mask_background", "legacy_8bit_composite", "init_points")
+"""Scene options that change nothing here: the pictures are drawn, and the size of the scene says how many points."""
 
 
 class DemoDataset:
@@ -20,22 +25,21 @@ class DemoDataset:
         return 0.0
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """path: `demo` or `tiny`, the name of a size. Raises SceneError for another one."""
+        """path: `demo` or `tiny`, the name of a size. Raises SceneError for another one, ConfigError for `images`."""
         variant = str(path)
         if variant not in SIZES:
             raise SceneError(f"there is no demo scene '{variant}': use demo or demo:tiny")
         size = SIZES[variant]
-        source_size = (size.width, size.height)
-        width, height = fitted_size(size.width, size.height, options.resolution)
-        size = replace(size, width=width, height=height)
-        if options.split is None and options.test_every != SceneOptions.test_every:
-            size = replace(size, test_every=options.test_every)
-        return make_scene(
-            size,
+        rules = settle(replace(DEMO, split=f"every{size.test_every}"), variant, options)
+        width, height = fitted_size(size.width, size.height, rules.resolution)
+        scene = make_scene(
+            replace(size, width=width, height=height),
             name="demo" if variant == "demo" else f"demo-{variant}",
             init_seed=options.seed,
-            background=options.background or "black",
-            split=options.split,
-            source_size=source_size,
-            resolution=options.resolution,
+            background=rules.background,
+            split=rules.split,
+            source_size=(size.width, size.height),
+            resolution=rules.resolution,
         )
+        scene.warnings += of_no_use(options, NO_USE, DEMO.name)
+        return scene

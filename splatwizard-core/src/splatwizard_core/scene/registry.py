@@ -1,0 +1,191 @@
+"""The registry of data sets: what is published where, as plain data (public_data.toml and registries of one's own)."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
+from typing_extensions import Self
+
+from splatwizard_core.errors import ConfigError, UserInputError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+REGISTRY_VARIABLE = "SPLATWIZARD_DATA_REGISTRY"
+PUBLIC = "public"
+"""The name of the registry that ships with the core."""
+
+
+def _folder_name(name: str) -> str:
+    """A name that is one folder or file: nothing that leads elsewhere, nothing that hides it."""
+    if name.startswith(".") or any(c in name for c in "/\\\0") or name != name.strip():
+        raise ValueError(f"'{name}' is no name of a folder or file")
+    return name
+
+
+def _relative(path: str) -> str:
+    parts = path.replace("\\", "/").split("/")
+    if "\0" in path or any(part in ("", ".", "..") for part in parts):
+        raise ValueError(f"'{path}' must be a path inside the scene")
+    return path
+
+
+Name = Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(_folder_name)]
+Relative = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_relative)]
+Address = Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$", max_length=2000)]
+Sha256 = Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{64}$")]
+
+
+class DataFile(BaseModel):
+    """One archive (.zip, .tar, .tar.gz, .tar.bz2, .tar.xz).
+
+    name        what the file is called
+    url         http(s) address; of a page to read if the file is `by_hand`
+    size        exact bytes, None if nobody says
+    about       a published approximate size and who says so
+    sha256      64 hexadecimal digits; None: what is downloaded stays unverified
+    by_hand     no program may fetch it; the user does, and hands it in
+    scenes      which scenes of the data set it holds, each in a folder of its name; empty: all of them
+    into        for files that are not scenes: unpack everything into this folder of the data set
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(_folder_name)]
+    url: Address
+    size: Annotated[int, Field(gt=0)] | None = None
+    about: str | None = None
+    sha256: Sha256 | None = None
+    by_hand: bool = False
+    scenes: tuple[Name, ...] = ()
+    into: Name | None = None
+
+    @property
+    def shown_size(self) -> str:
+        """`1,234 bytes`, the published approximation, or `not known`."""
+        return f"{self.size:,} bytes" if self.size is not None else self.about or "not known"
+
+
+class DataSet(BaseModel):
+    """One data set: scenes below $SPLATWIZARD_DATA/<id>/.
+
+    id, registry    name of the folder; which registry lists it ("public", or a file)
+    title           as papers write it
+    homepage        where its authors describe it and its licence
+    licence         as its authors state it; None: see the homepage
+    note            what a user must know
+    scenes          names of the scenes; empty: not scenes but other files
+    prefix          what may stand before a scene's name in its folder's name ("scan" before DTU's "24")
+    needs           files and folders that every scene has, relative to it
+    views           (train, test) views of every scene, where all have the same number
+    files           what to fetch
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", populate_by_name=True)
+
+    id: Name
+    registry: str = PUBLIC
+    title: str
+    homepage: Address | None = None
+    licence: str | None = None
+    note: str | None = None
+    scenes: tuple[Name, ...] = ()
+    prefix: str = ""
+    needs: tuple[Relative, ...] = ()
+    views: tuple[Annotated[int, Field(ge=1)], Annotated[int, Field(ge=0)]] | None = None
+    files: tuple[DataFile, ...] = Field(default=(), alias="file")
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Self:
+        for file in self.files:
+            unknown = [scene for scene in file.scenes if scene not in self.scenes]
+            if unknown:
+                raise ValueError(f"file '{file.name}' holds scene '{unknown[0]}', which is not one of the data set's")
+            if bool(self.scenes) == (file.into is not None):
+                raise ValueError(f"file '{file.name}': 'into' is for data sets without scenes, and needed there")
+        for what, names in (("scene", self.scenes), ("file", [file.name for file in self.files])):
+            if len(set(names)) != len(names):
+                raise ValueError(f"a {what} is listed twice")
+        return self
+
+    def scenes_of(self, file: DataFile) -> tuple[str, ...]:
+        """The scenes that a file holds."""
+        return file.scenes or self.scenes
+
+    def folder_names(self, scene: str) -> tuple[str, ...]:
+        """The names that the folder of a scene may have, the likeliest first."""
+        return (self.prefix + scene, scene) if self.prefix else (scene,)
+
+
+class Registry(Mapping[str, DataSet]):
+    """Data sets by id, in the order in which they were listed."""
+
+    def __init__(self, datasets: Sequence[DataSet]) -> None:
+        self._datasets = {dataset.id: dataset for dataset in datasets}
+
+    def __getitem__(self, name: str) -> DataSet:
+        """Raises UserInputError with the nearest id."""
+        if name not in self._datasets:
+            near = difflib.get_close_matches(name, self._datasets, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(self._datasets)}"
+            raise UserInputError(f"no data set is called '{name}': {hint}")
+        return self._datasets[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._datasets
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._datasets)
+
+    def __len__(self) -> int:
+        return len(self._datasets)
+
+
+def load_registry(own: str | os.PathLike[str] | None = None) -> Registry:
+    """The public data sets and those of one's own registry, which replaces entries of the same id.
+
+    own     TOML file; None: what $SPLATWIZARD_DATA_REGISTRY names, if anything
+
+    Raises ConfigError that names file, data set and key.
+    """
+    datasets = {d.id: d for d in parse_registry(files(__package__).joinpath("public_data.toml").read_bytes(), PUBLIC)}
+    path = own or os.environ.get(REGISTRY_VARIABLE)
+    if path:
+        named = "" if own else f" (${REGISTRY_VARIABLE})"
+        try:
+            content = Path(path).expanduser().read_bytes()
+        except OSError as error:
+            raise ConfigError(f"registry {path}{named} cannot be read: {error.strerror or error}") from error
+        datasets |= {d.id: d for d in parse_registry(content, str(path))}
+    return Registry(list(datasets.values()))
+
+
+def parse_registry(content: bytes, name: str) -> list[DataSet]:
+    """The data sets of a TOML text. Raises ConfigError that names `name`, the data set and the key."""
+    try:
+        tables: dict[str, Any] = tomllib.loads(content.decode())
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(f"{name} is not valid TOML: {error}") from error
+    entries = tables.pop("dataset", {})
+    if tables or not isinstance(entries, dict) or not all(isinstance(entry, dict) for entry in entries.values()):
+        other = next(iter(tables), "dataset")
+        raise ConfigError(f"{name}: '{other}' is out of place: a registry holds [dataset.NAME] tables only", key=other)
+    found = []
+    for key, entry in entries.items():
+        try:
+            # In this order, so that no entry gives itself another id.
+            found.append(DataSet.model_validate({**entry, "id": key, "registry": name}))
+        except ValidationError as error:
+            first = error.errors()[0]
+            at = ".".join(["dataset", key, *map(str, first["loc"])])
+            raise ConfigError(f"{name}: {at}: {first['msg'].removeprefix('Value error, ')}", key=at) from error
+    return found
