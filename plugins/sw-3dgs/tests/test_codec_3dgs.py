@@ -1,6 +1,7 @@
 """The file of 3DGS: exact to the bit, quantised within stated errors, and safe against strangers."""
 
 import math
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, SplatwizardError, UserInputError
 from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
@@ -156,6 +157,53 @@ def test_coincident_gaussians_all_survive():
     assert torch.equal(found.means, found.means[:1].expand(64, 3))
 
 
+@pytest.mark.parametrize("rate", ["r1", "r6"])
+def test_a_model_without_gaussians_has_a_file(rate):
+    found = decoded(encoded(random_model(0), rate))
+    assert found.num_rows == 0
+    assert found.sh_rest.shape == (0, 15, 3)
+
+
+@pytest.mark.parametrize(("name", "step"), [("log_scales", "scale"), ("sh_dc", "dc"), ("sh_rest", "rest")])
+def test_a_value_beyond_the_lattice_is_an_error_and_is_not_clipped(name, step):
+    model = random_model(10)
+    with torch.no_grad():
+        model.opacity_logits.fill_(0.0)
+        getattr(model, name)[3] = 2e6  # at step 1: two million steps, which is fine
+    found = decoded(encoded(model, "r4", **{f"codec.{step}_step": 1.0}))
+    torch.testing.assert_close(getattr(found, name).max().item(), 2e6, atol=2.0, rtol=0)
+    with pytest.raises(UserInputError, match=rf"'{name}' .*codec\.{step}_step"):
+        encoded(model, "r4", **{f"codec.{step}_step": 1e-6})
+
+
+def test_decoding_takes_less_than_four_times_the_memory_of_the_model():
+    n = 20_000
+    data = encoded(random_model(n), "r3")
+    reader, tool = ContainerReader(data), ThreeDGS(load_plugins(), None)
+    tool.decode(ContainerReader(encoded(random_model(5), "r3")))  # imports are not what is measured
+    tracemalloc.start()
+    model = tool.decode(reader)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    held = sum(p.numel() * 4 for p in model.parameters())
+    assert held == 236 * model.num_rows > 4_000_000
+    assert peak < 4 * held
+
+
+def test_a_few_bytes_never_stand_for_many_gaussians():
+    model = random_model(1)
+    many = GaussianModel(*(p.detach().expand(100_000, *p.shape[1:]) for p in model.parameters()))
+    with pytest.raises(SplatwizardError, match="more than a reader accepts"):
+        encoded(many, "r1", **{"codec.position_bits": 8})
+    # A stranger who writes it all the same is refused before anything is allocated.
+    data = rebuilt(encoded(random_model(30), "r1"), static={"num_gaussians": 200_000})
+    tracemalloc.start()
+    with pytest.raises(BitstreamError, match="may stand for at most"):
+        decoded(data)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+
+
 def rebuilt(data: bytes, *, static=None, sections=None) -> bytes:
     """The same file with other header values or sections, and right checksums."""
     reader = ContainerReader(data)
@@ -212,7 +260,7 @@ def test_a_section_forged_with_a_right_checksum_gives_a_model_or_a_bitstream_err
     [
         ({"mode": "pickled"}, "mode"),
         ({"num_gaussians": 29}, "30"),
-        ({"num_gaussians": 2**31}, "header says"),
+        ({"num_gaussians": 2**31}, "may stand for at most"),
         ({"num_gaussians": -1}, "num_gaussians"),
         ({"max_sh_degree": 1}, "more SH bands"),
         ({"active_sh_degree": 7}, "active_sh_degree"),
@@ -237,7 +285,7 @@ def test_a_hostile_header_is_refused(static, message):
     ("static", "message"),
     [
         ({"num_gaussians": 31}, "shape"),
-        ({"num_gaussians": 0}, "num_gaussians"),
+        ({"num_gaussians": 0}, "shape"),
         ({"max_sh_degree": 2}, "more|active_sh_degree|shape"),
         ({"active_sh_degree": True}, "active_sh_degree"),
     ],

@@ -14,11 +14,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from splatwizard_core.errors import UserInputError
 from sw_3dgs import gauge
 
 BASE_COLUMNS = 10
 MAX_LOGIT = 20.0
-MAX_SYMBOL = 1 << 20
+MAX_SYMBOL = 1 << 30
+
+_STEPS = (
+    ("sh_dc", "dc"),
+    ("opacity_logits", "opacity"),
+    ("log_scales", "scale"),
+    ("quats", "quat"),
+    ("sh_rest", "rest"),
+)
+"""The parts of a row of integers in order: the parameter it stands for, and its step."""
 
 # Rows of an orthonormal transform of RGB: luma, red-blue, green-magenta. Higher SH coefficients of the three channels
 # are strongly correlated in trained scenes; orthonormal, so that one step size means one squared error in all three.
@@ -53,8 +63,8 @@ class Values:
     quats: NDArray[Any]
 
 
-def quantize(values: Values, steps: Steps) -> NDArray[np.int64]:
-    """Integers [N, 10 + 3R], each the nearest one.
+def quantize(values: Values, steps: Steps) -> NDArray[np.int32]:
+    """Integers [N, 10 + 3R], each the nearest one. Raises UserInputError if one is beyond 2^30.
 
     A dead zone around zero, as in video codecs, does not pay: it shrinks the coefficients of all the Gaussians behind a
     pixel in one direction, so their errors add up (a tenth of a step cost 0.05 dB on the demo scene, and saved less
@@ -62,7 +72,7 @@ def quantize(values: Values, steps: Steps) -> NDArray[np.int64]:
     """
     log_scales, quats = gauge.canonical(values.log_scales, values.quats)
     logits = np.clip(np.asarray(values.opacity_logits, np.float64), -MAX_LOGIT, MAX_LOGIT)
-    rest = _to_luma(values.rest).reshape(len(logits), -1) / steps.rest
+    rest = _to_luma(values.rest).reshape(len(logits), 3 * values.rest.shape[1]) / steps.rest
     columns = [
         np.rint(_to_luma(values.dc) / steps.dc),
         np.rint(logits / steps.opacity)[:, None],
@@ -70,7 +80,14 @@ def quantize(values: Values, steps: Steps) -> NDArray[np.int64]:
         np.rint(quats[:, 1:] / steps.quat),
         np.rint(rest),
     ]
-    return np.clip(np.concatenate(columns, axis=1), -MAX_SYMBOL, MAX_SYMBOL).astype(np.int64)
+    for (name, step), column in zip(_STEPS, columns, strict=True):
+        largest = np.abs(column).max(initial=0.0)
+        if not largest <= MAX_SYMBOL:
+            raise UserInputError(
+                f"a value of '{name}' is {largest * getattr(steps, step):.3g}, more than 2^30 quantiser steps: "
+                f"the model has diverged, or codec.{step}_step is too small"
+            )
+    return np.concatenate(columns, axis=1).astype(np.int32)
 
 
 def dequantize(symbols: NDArray[Any], steps: Steps) -> Values:

@@ -27,7 +27,7 @@ def encode(model: GaussianModel, writer: ContainerWriter) -> None:
 
 def decode(reader: ContainerReader) -> GaussianModel:
     """The inverse of `encode`. Raises BitstreamError."""
-    n = reader.integer("num_gaussians", low=1, high=2**32 - 1)
+    n = reader.integer("num_gaussians", low=0, high=2**32 - 1)
     degree = reader.integer("max_sh_degree", low=0, high=3)
     active = reader.integer("active_sh_degree", low=0, high=degree)
     shapes = {name: (n, *tail) for name, tail in TAILS.items()} | {"sh_rest": (n, (degree + 1) ** 2 - 1, 3)}

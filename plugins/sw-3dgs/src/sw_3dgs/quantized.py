@@ -19,7 +19,14 @@ from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.model import GaussianModel, logit
 from splatwizard_core.training.params import Params
 from sw_3dgs.attributes import BASE_COLUMNS, Steps, Values, dequantize, quantize
-from sw_3dgs.band_context import MAX_CLASSES, activity_classes, decode_band, encode_band, suitable_classes
+from sw_3dgs.band_context import (
+    MAX_CLASSES,
+    activity_classes,
+    decode_band,
+    decode_matrix,
+    encode_band,
+    suitable_classes,
+)
 from sw_3dgs.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
@@ -34,6 +41,9 @@ FAINTEST = logit(1 / 255)
 
 SECTIONS = {"color": (0, 3), "opacity": (3, 4), "scales": (4, 7), "quats": (7, 10)}
 """Columns of the attribute matrix by section; SH bands 1 to 3 follow with one section each."""
+
+ROWS_AT_ONCE = 1 << 12
+"""Rows that are dequantised together: intermediate doubles of all rows would outweigh the model several times."""
 
 
 class Layout(Params):
@@ -52,6 +62,11 @@ class Layout(Params):
     scale_step: float = Field(gt=0, le=1e3)
     quat_step: float = Field(gt=0, le=1e3)
     sh_classes: int = Field(ge=1, le=MAX_CLASSES)
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Of the model in float32: 236 a Gaussian at SH degree 3."""
+        return 4 * self.num_gaussians * (14 + 3 * ((self.max_sh_degree + 1) ** 2 - 1))
 
     @property
     def grid(self) -> PositionGrid:
@@ -75,12 +90,14 @@ def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins:
     for band, start, stop in _bands(layout):
         classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
         writer.add(f"sh{band}", encode_band(columns, symbols[:, start:stop], classes, count))
+    writer.allow(layout.decoded_bytes, f"a model of {layout.num_gaussians:,} Gaussians")
 
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     """The model on the lattice. Raises BitstreamError."""
     layout = _layout(reader)
     n = layout.num_gaussians
+    reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
     with reader.decoding("positions") as data:
         cells = plugins.coders.load("octree")().decode(data)
         if cells.shape != (n, 3):
@@ -88,10 +105,10 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
             raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
     columns = plugins.entropy_models.load("columns")()
-    symbols = np.empty((n, BASE_COLUMNS + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int64)
+    symbols = np.empty((n, BASE_COLUMNS + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
     for name, (start, stop) in SECTIONS.items():
         with reader.decoding(name) as data:
-            symbols[:, start:stop] = columns.decode(data, (n, stop - start))
+            symbols[:, start:stop] = decode_matrix(columns, data, n, stop - start)
     for band, start, stop in _bands(layout):
         classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
         with reader.decoding(f"sh{band}") as data:
@@ -105,7 +122,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
 
 def lattice(
     model: GaussianModel, codec: Codec, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
-) -> tuple[Layout, NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:
     """What is coded: the header, grid cells [N,3] in the order of `sort`, and the attribute integers [N,C] likewise."""
     arrays = {
         name: getattr(model, name).detach().cpu().numpy()
@@ -115,7 +132,7 @@ def lattice(
     for array in arrays.values():
         # +inf is a legitimate logit (opacity 1); everything else must be finite to be drawn.
         finite = ~np.isnan(array) if array is arrays["opacity_logits"] else np.isfinite(array)
-        keep &= finite.reshape(len(keep), -1).all(axis=1)
+        keep &= finite.all(axis=tuple(range(1, finite.ndim)))
     if not keep.all():
         log.info("%d of %d Gaussians can never be drawn and are left out", int((~keep).sum()), len(keep))
     arrays = {name: array[keep] for name, array in arrays.items()}
@@ -148,22 +165,23 @@ def lattice(
     return layout, cells[order], quantize(values, layout.steps)
 
 
-def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int64]) -> GaussianModel:
+def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32]) -> GaussianModel:
     """The model that these integers stand for; what the decoder returns."""
-    n = layout.num_gaussians
-    with np.errstate(over="ignore", invalid="ignore"):  # a hostile header may overflow; the caller looks
-        values = dequantize(symbols, layout.steps)
-        means = layout.grid.dequantize(cells)
-    rest = np.zeros((n, (layout.max_sh_degree + 1) ** 2 - 1, 3), dtype=np.float32)
-    rest[:, : values.rest.shape[1]] = values.rest
+    n, grid, steps = layout.num_gaussians, layout.grid, layout.steps
+    tails = {"means": (3,), "dc": (3,), "rest": ((layout.max_sh_degree + 1) ** 2 - 1, 3), "opacity_logits": (),
+             "log_scales": (3,), "quats": (4,)}  # fmt: skip
+    found = {name: np.zeros((n, *tail), dtype=np.float32) for name, tail in tails.items()}
+    for start in range(0, n, ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        with np.errstate(over="ignore", invalid="ignore"):  # a hostile header may overflow; the caller looks
+            values = dequantize(symbols[part], steps)
+            found["means"][part] = grid.dequantize(cells[part])
+        found["rest"][part, : values.rest.shape[1]] = values.rest
+        for name in ("dc", "opacity_logits", "log_scales", "quats"):
+            found[name][part] = getattr(values, name)
+    found["dc"] = found["dc"][:, None, :]
     return GaussianModel(
-        torch.from_numpy(means),
-        torch.from_numpy(values.dc)[:, None, :],
-        torch.from_numpy(rest),
-        torch.from_numpy(values.opacity_logits),
-        torch.from_numpy(values.log_scales),
-        torch.from_numpy(values.quats),
-        active_sh_degree=layout.active_sh_degree,
+        *(torch.from_numpy(array) for array in found.values()), active_sh_degree=layout.active_sh_degree
     )
 
 
@@ -175,7 +193,7 @@ def _bands(layout: Layout) -> list[tuple[int, int, int]]:
     ]
 
 
-def _classes(layout: Layout, band: int, lower: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArray[np.int64], int]:
     """Class of each row for one band, and how many classes; the first band has nothing to go by."""
     if band == 1:
         return np.zeros(len(lower), dtype=np.int64), 1

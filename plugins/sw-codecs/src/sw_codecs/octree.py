@@ -51,7 +51,7 @@ class Octree:
     def encode(self, points: npt.ArrayLike, bits: int) -> bytes:
         """points [N,3] integers, 0 <= p < 2^bits, in Morton order (`sw_codecs.morton.sort`).
 
-        Raises ValueError if they are not, or for more points than a reader accepts (`point_limit`).
+        Raises ValueError if they are not, SplatwizardError for more points than a reader accepts (`point_limit`).
         """
         codes = morton.sorted_codes(points, bits)
         leaves, extra = _without_duplicates(codes)

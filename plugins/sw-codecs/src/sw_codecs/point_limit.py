@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from splatwizard_core.errors import SplatwizardError
+
 MAX_POINTS = 1 << 26
-ALWAYS_ALLOWED = 1 << 20
-POINTS_PER_BYTE = 512  # real scenes have under one point a byte
+ALWAYS_ALLOWED = 1 << 16
+POINTS_PER_BYTE = 64  # real scenes have under one point a byte; 3 million on a grid of 8 bits an axis about 20
 
 
 def point_limit(size: int, max_points: int) -> int:
@@ -13,9 +15,9 @@ def point_limit(size: int, max_points: int) -> int:
 
 
 def check_written(count: int, data: bytes, max_points: int) -> bytes:
-    """`data`, if a reader will accept that it holds `count` points. Raises ValueError otherwise."""
+    """`data`, if a reader will accept that it holds `count` points. Raises SplatwizardError otherwise."""
     if count > point_limit(len(data), max_points):
-        raise ValueError(
+        raise SplatwizardError(
             f"{count:,} points in {len(data):,} bytes: more than a reader accepts (at most {max_points:,}, and at most "
             f"{POINTS_PER_BYTE} a byte above {ALWAYS_ALLOWED:,}); remove duplicates first"
         )

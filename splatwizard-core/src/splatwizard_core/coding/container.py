@@ -33,7 +33,7 @@ import numpy.typing as npt
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
 from splatwizard_core.coding.strict_json import dump_strict, load_strict
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, SplatwizardError
 from splatwizard_core.files import write_atomic
 
 MAGIC = b"SPWZ"
@@ -99,14 +99,14 @@ class ContainerWriter:
         return {name: len(data) for name, data in self._sections.items()}
 
     def allow(self, decoded: int, what: str) -> None:
-        """Raise ValueError if the sections added so far may not stand for `decoded` bytes of `what`.
+        """Raise SplatwizardError if the sections added so far may not stand for `decoded` bytes of `what`.
 
         A method that decodes to far more than it stores calls it at the end of `encode`, so that it writes no file
         which its own `decode` (`ContainerReader.allow`) refuses.
         """
         size = sum(map(len, self._sections.values()))
         if decoded > decoded_limit(size):
-            raise ValueError(
+            raise SplatwizardError(
                 f"{what} of {decoded:,} bytes in {size:,} bytes of file is more than a reader accepts "
                 f"({decoded_limit(size):,}): most of it repeats itself"
             )
