@@ -55,6 +55,22 @@ def register_metrics(registry: Registry) -> None:
                  summary="structural similarity, 11x11 Gaussian window, zero padding", direction="higher")  # fmt: skip
     registry.add("l1", "splatwizard_core.evaluation.image:l1",
                  summary="mean absolute error", direction="lower")  # fmt: skip
+    for name, target, summary in (
+        ("lpips_vgg_3dgs", "VGG_3DGS", "LPIPS, VGG16 fed with 0..1 as the 3DGS code does: the one in most tables"),
+        ("lpips_vgg", "VGG", "LPIPS, VGG16, images mapped to -1..1"),
+        ("lpips_alex", "ALEX", "LPIPS, AlexNet, images mapped to -1..1"),
+    ):
+        registry.add(name, f"splatwizard_core.evaluation.perceptual:{target}", summary=summary, direction="lower",
+                     slow=True)  # fmt: skip
+    registry.add("psnr_channel_mean", "splatwizard_core.evaluation.image:psnr_channel_mean",
+                 summary="mean of the channels' PSNRs, dB: never below psnr", direction="higher",
+                 diagnostic=True)  # fmt: skip
+    registry.add("psnr_unrounded", "splatwizard_core.evaluation.image:psnr",
+                 summary="psnr of the render before it is rounded to 8 bit, dB", direction="higher",
+                 diagnostic=True, unrounded=True)  # fmt: skip
+    registry.add("ssim_valid", "splatwizard_core.evaluation.image:ssim_valid",
+                 summary="ssim without the border: what scikit-image and torchmetrics average", direction="higher",
+                 diagnostic=True)  # fmt: skip
 
 
 @hookimpl

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
@@ -49,19 +51,16 @@ class MemoryMeter:
         self.device = torch.device(device)
         self.kind = "cuda" if self.device.type == "cuda" else "rss"
         self._before = 0
+        self._peak = 0
+        self._peak_reserved = 0
 
     def start(self) -> None:
-        if self.kind == "cuda":
-            torch.cuda.synchronize(self.device)
-            torch.cuda.reset_peak_memory_stats(self.device)
-        else:
-            reset_peak_rss()
-            self._before = rss_bytes()
+        self._peak = self._peak_reserved = 0
+        self._reset()
+        self._before = rss_bytes() if self.kind == "rss" else 0
 
     def peak_bytes(self) -> int:
-        if self.kind == "cuda":
-            return int(torch.cuda.max_memory_allocated(self.device))
-        return max(peak_rss_bytes() - self._before, 0)
+        return max(self._peak, self._peak_now())
 
     def current_bytes(self) -> int:
         """What is held now, above what was there at `start` (CUDA: all that is allocated)."""
@@ -71,4 +70,31 @@ class MemoryMeter:
 
     def peak_reserved_bytes(self) -> int | None:
         """CUDA: peak of the allocator's reserved pool; None on a CPU."""
-        return int(torch.cuda.max_memory_reserved(self.device)) if self.kind == "cuda" else None
+        if self.kind != "cuda":
+            return None
+        return max(self._peak_reserved, int(torch.cuda.max_memory_reserved(self.device)))
+
+    @contextmanager
+    def excluded(self) -> Iterator[None]:
+        """What happens inside does not count: the peak is kept as it is, and starts again from what is left then.
+
+        Where the system cannot reset a resident set's peak (it can on Linux), everything counts.
+        """
+        self._peak = self.peak_bytes()
+        self._peak_reserved = self.peak_reserved_bytes() or 0
+        try:
+            yield
+        finally:
+            self._reset()
+
+    def _reset(self) -> None:
+        if self.kind == "cuda":
+            torch.cuda.synchronize(self.device)
+            torch.cuda.reset_peak_memory_stats(self.device)
+        else:
+            reset_peak_rss()
+
+    def _peak_now(self) -> int:
+        if self.kind == "cuda":
+            return int(torch.cuda.max_memory_allocated(self.device))
+        return max(peak_rss_bytes() - self._before, 0)

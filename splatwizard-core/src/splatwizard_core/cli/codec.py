@@ -100,7 +100,7 @@ def decode(file: str, out: str | None, repeats: int, device: str | None, as_json
     plugins = load_plugins()
     ppl, _, _ = resolve_run_options(None, assignments((), device=device))
     session = open_session(ppl, plugins)
-    model, report = timed_decode(path, plugins, session.device, repeats=repeats)
+    model, report = timed_decode(path, plugins, session.device, repeats=repeats, load_kernels=session.load_kernels)
     facts: dict[str, Any] = report.as_dict()
     if out is not None:
         save_decoded(model, report, Path(out), plugins)

@@ -17,13 +17,22 @@ from splatwizard_core.cli.options import (
     device_option,
     images_option,
     json_option,
+    lpips_option,
     options,
     print_json,
+    repeats_option,
     scene_option,
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import existing, open_session, output_folder, resolve_one, resolve_run_options
+from splatwizard_core.cli.setup import (
+    existing,
+    lpips_folder,
+    open_session,
+    output_folder,
+    resolve_one,
+    resolve_run_options,
+)
 from splatwizard_core.errors import SplatwizardError
 
 if TYPE_CHECKING:
@@ -35,12 +44,15 @@ if TYPE_CHECKING:
 @options(
     scene_option, images_option, config_option, set_option,
     click.option("--metrics", metavar="NAME[,NAME]", help="Which metrics.  [default: every one that is installed]"),
+    lpips_option,
     click.option("--renders", metavar="DIR", help="Keep the rendered test views there as PNG."),
     click.option(
         "--roundtrip", is_flag=True,
         help="Of a run directory: encode it, decode the file in a fresh process, measure that.",
     ),
     click.option("--no-speed", is_flag=True, help="Leave out rendering speed and memory."),
+    repeats_option,
+    click.option("--quiet", is_flag=True, help="Do not warn of metrics that cannot be computed."),
     device_option, seed_option, json_option, debug_option,
 )  # fmt: skip
 def evaluate(
@@ -50,9 +62,12 @@ def evaluate(
     config_file: str | None,
     sets: tuple[str, ...],
     metrics: str | None,
+    lpips_weights: str | None,
     renders: str | None,
     roundtrip: bool,
     no_speed: bool,
+    repeats: int,
+    quiet: bool,
     device: str | None,
     seed: int | None,
     as_json: bool,
@@ -74,6 +89,8 @@ def evaluate(
     plugins = load_plugins()
     for name in wanted or ():
         plugins.metrics.entry(name)
+    asks_lpips = wanted is None or any(name.startswith("lpips") for name in wanted)
+    weights = lpips_folder(lpips_weights, quiet=quiet or not asks_lpips)
     if renders is not None:
         output_folder(renders)
     values = assignments(sets, images=images, device=device, seed=seed)
@@ -114,8 +131,11 @@ def evaluate(
             session.device,
             ppl,
             metrics=wanted,
+            lpips_weights=weights,
             speed=not no_speed,
+            repeats=repeats,
             renders=Path(renders) if renders else None,
+            load_kernels=session.load_kernels,
         )
         size = None if path.is_dir() else path.stat().st_size
     if roundtrip and facts["digest"] != digest:
@@ -137,9 +157,10 @@ def _print(facts: dict[str, Any]) -> None:
         title_justify="left",
         show_header=False,
     )
-    for name, metric in facts["metrics"].items():
+    for name, metric in sorted(facts["metrics"].items(), key=lambda item: item[1]["diagnostic"]):
         shown = "-" if metric["mean"] is None else f"{metric['mean']:.4f}"
-        table.add_row(escape(name), f"{shown}  ({metric['direction']} is better, {len(facts['views'])} views)")
+        kind = "diagnostic" if metric["diagnostic"] else f"{metric['direction']} is better"
+        table.add_row(escape(name), f"{shown}  ({kind}, {len(facts['views'])} views)")
     if facts["file"]["bytes"] is not None:
         table.add_row("bytes", f"{facts['file']['bytes']:,}")
     for name, count in facts["counts"].items():
@@ -151,6 +172,14 @@ def _print(facts: dict[str, Any]) -> None:
         table.add_row(
             "speed", f"{speed['fps']:.1f} frames/s at {width}x{height}, median {speed['latency_ms_median']:.1f} ms"
         )
+        if speed["spread"] is not None:
+            fps = speed["spread"]["fps"]
+            table.add_row(
+                "speed, repeated",
+                f"{fps['n']} times: mean {fps['mean']:.1f}, deviation {fps['std']:.1f}, "
+                f"{fps['min']:.1f} to {fps['max']:.1f} frames/s",
+            )
+        table.add_row("load", f"{speed['load_s']:.2f} s to the first frame, kernels {speed['jit_s']:.2f} s apart")
         table.add_row("peak memory", f"{memory['peak_render_bytes'] / 1e6:,.0f} MB ({memory['kind']})")
     out = console()
     out.print(table)

@@ -46,6 +46,14 @@ device_option = click.option(
 seed_option = click.option(
     "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
 )
+lpips_option = click.option(
+    "--lpips-weights", metavar="DIR",
+    help="Folder with vgg16-397923af.pth and alexnet-owt-7be5be79.pth, for LPIPS.  [default: torch.hub's cache]",
+)  # fmt: skip
+repeats_option = click.option(
+    "--repeats", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
+    help="Measure rendering speed N times; the spread goes into the record.",
+)  # fmt: skip
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")
 resume_option = click.option(

@@ -16,18 +16,23 @@ from splatwizard_core.cli.options import (
     device_option,
     images_option,
     json_option,
+    lpips_option,
     options,
     preset_option,
     print_json,
+    repeats_option,
     resume_option,
     scene_option,
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import method_names, open_session, output_folder, resolve_all, say
+from splatwizard_core.cli.setup import lpips_folder, method_names, open_session, output_folder, resolve_all, say
 
 if TYPE_CHECKING:
     from splatwizard_core.experiments.record import Record
+
+FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
+"""Metrics that stand first in the table, in this order."""
 
 
 @click.command(short_help="train, encode, decode, evaluate, report: one scene")
@@ -46,7 +51,8 @@ if TYPE_CHECKING:
         "--out", default="out", show_default=True, metavar="DIR",
         help="Root of the run directories, DIR/<scene>/<method>/<rate>.",
     ),
-    device_option, seed_option, resume_option, changed_plan_option, json_option, debug_option,
+    device_option, seed_option, lpips_option, repeats_option, resume_option, changed_plan_option, json_option,
+    debug_option,
 )  # fmt: skip
 def run(
     methods: tuple[str, ...],
@@ -59,6 +65,8 @@ def run(
     out: str,
     device: str | None,
     seed: int | None,
+    lpips_weights: str | None,
+    repeats: int,
     resume: bool,
     allow_changed_plan: bool,
     as_json: bool,
@@ -79,12 +87,16 @@ def run(
         preset=preset, config_file=config_file, values=values, scene=scene,
     )  # fmt: skip
     output_folder(out)
+    weights = lpips_folder(lpips_weights)
     session = open_session(resolved[0].ppl, plugins)
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     done: list[tuple[Record, Path]] = []
     for each in resolved:
-        request = RunRequest(each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan)
+        request = RunRequest(
+            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, lpips_weights=weights,
+            repeats=repeats,
+        )  # fmt: skip
         done.append(run_one(session, request))
     if as_json:
         print_json({"runs": [{"directory": str(d), "record": r.model_dump(mode="json")} for r, d in done]})
@@ -99,8 +111,12 @@ def print_results(done: list[tuple[Record, Path]]) -> None:
 
     out = console()
     first = done[0][0]
-    names = list(dict.fromkeys(name for record, _ in done for name in record.metrics))
-    names.sort(key=lambda n: (("psnr", "ssim", "l1").index(n) if n in ("psnr", "ssim", "l1") else 3, n))
+    # A metric that nobody could compute has its reason below, and no column.
+    names = list(dict.fromkeys(
+        name for record, _ in done for name, metric in record.metrics.items()
+        if not metric.diagnostic and (metric.mean is not None or metric.per_view)
+    ))  # fmt: skip
+    names.sort(key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
     table = Table(
         title=f"{escape(first.scene)}: {first.test_views} test views, protocol {escape(first.protocol.id)}",
         title_justify="left",
@@ -123,12 +139,21 @@ def print_results(done: list[tuple[Record, Path]]) -> None:
             f"{record.speed.fps:.1f}",
         )
     out.print(table)
-    for reason in dict.fromkeys(
-        f"{key.split('.')[1]}: {why}" for r, _ in done for key, why in r.unknown.items() if key.startswith("metrics.")
-    ):
-        out.print(escape(reason))
+    for reason, affected in reasons_of_metrics([record for record, _ in done]).items():
+        out.print(escape(f"{', '.join(affected)}: {reason}"), soft_wrap=True)
     for _, directory in done:
         out.print(f"{escape(str(directory))}/metrics.json", soft_wrap=True)
+
+
+def reasons_of_metrics(records: list[Record]) -> dict[str, list[str]]:
+    """Why metrics have no mean -> which ones."""
+    found: dict[str, dict[str, None]] = {}
+    for record in records:
+        for key, why in record.unknown.items():
+            block, _, name = key.partition(".")
+            if block == "metrics":
+                found.setdefault(why, {})[name.removesuffix(".mean")] = None
+    return {why: list(names) for why, names in found.items()}
 
 
 def _heading(metric: str) -> str:

@@ -148,6 +148,23 @@ def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
     return Session(plugins, choose_device(ppl.device, plugins), say)
 
 
+def lpips_folder(folder: str | None, *, quiet: bool = False) -> Path | None:
+    """The folder of --lpips-weights, checked before the work; says it once if LPIPS cannot be computed.
+
+    Raises UserInputError for a folder without weights, or with damaged ones.
+    """
+    from splatwizard_core.evaluation.lpips_weights import check_folder
+    from splatwizard_core.evaluation.perceptual import not_available
+
+    found = None if folder is None else Path(folder).resolve()
+    if found is not None:
+        check_folder(found)
+    warning = None if quiet else not_available(found)
+    if warning is not None:
+        say(f"warning: {warning}")
+    return found
+
+
 def existing(path: str) -> Path:
     """A path that must be there. Raises UserInputError."""
     from splatwizard_core.errors import UserInputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,17 +13,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, CapabilityError, PluginError, SceneError
+from splatwizard_core.errors import BitstreamError, CapabilityError, SceneError
 from splatwizard_core.evaluation.image import prepare_render
+from splatwizard_core.evaluation.metrics import MetricSetup, PreparedMetric, default_metrics, prepare_metrics
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import View
-
-Metric = Callable[[Tensor, Tensor], float]
 
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
 RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}
@@ -37,12 +37,18 @@ class MetricResult:
     per_view    in the order of the views; None where the value is infinite (identical images)
     direction   "higher" or "lower" is better
     reason      why there is no mean, else None
+    diagnostic  computed to tell conventions apart, not for tables
+    made_with   what else the values depend on: versions, weights and their checksums
+    verified    False: `made_with` names something that is not the published one
     """
 
     mean: float | None
     per_view: list[float | None]
     direction: str
     reason: str | None = None
+    diagnostic: bool = False
+    made_with: Mapping[str, str] = field(default_factory=dict)
+    verified: bool = True
 
 
 @dataclass(frozen=True)
@@ -102,6 +108,7 @@ def evaluate(
     options: RasterOptions,
     quantize8: bool = True,
     metrics: Sequence[str] | None = None,
+    lpips_weights: Path | None = None,
     save_to: Path | None = None,
     label: str = "evaluate",
 ) -> EvaluationResult:
@@ -109,24 +116,20 @@ def evaluate(
 
     device      where the model is
     options     as `render_options` makes them; their background is also that of RGBA pictures
-    quantize8   round renders to 8 bit before comparing
+    quantize8   round renders to 8 bit before comparing; a metric declared with `unrounded` never gets rounded ones
     metrics     names from the registry; None: every one that is installed
+    lpips_weights   folder that backbone weights are looked for in first
     save_to     folder for the renders as PNG, named after the views; None: they are not kept
 
     A metric that cannot be imported or says CapabilityError (weights missing, say) is left unknown, with its reason.
-    Raises SceneError without a view.
+    Raises SceneError without a view, UserInputError for weights that are damaged.
     """
     if not views:
         raise SceneError("there is no view to evaluate on")
-    wanted = {name: plugins.metrics.entry(name) for name in (plugins.metrics.names if metrics is None else metrics)}
-    functions: dict[str, Metric] = {}
-    missing: dict[str, str] = {}
-    for name, entry in wanted.items():
-        try:
-            functions[name] = entry.load()
-        except PluginError as error:
-            missing[name] = str(error)
-    values: dict[str, list[float]] = {name: [] for name in wanted}
+    wanted = [plugins.metrics.entry(n) for n in (default_metrics(plugins.metrics) if metrics is None else metrics)]
+    ready, missing = prepare_metrics(wanted, MetricSetup(device, lpips_weights))
+    unrounded = {entry.name for entry in wanted if entry.declared.get("unrounded")}
+    values: dict[str, list[float]] = {entry.name: [] for entry in wanted}
     visible = drawn = 0
     saved: list[str] = []
     pending: list[Future[None]] = []
@@ -137,11 +140,12 @@ def evaluate(
             result = render_view(model, view.camera.to(device), rasterizer, options)
             image = prepare_render(result.image, quantize8=quantize8)
             truth = view.image(options.background, device)
-            for name, function in functions.items():
+            exact = prepare_render(result.image, quantize8=False)
+            for name, metric in ready.items():
                 if name in missing:
                     continue
                 try:
-                    values[name].append(float(function(image, truth)))
+                    values[name].append(float(metric.compute(exact if name in unrounded else image, truth)))
                 except CapabilityError as error:
                     missing[name] = str(error)
             visible += int(result.visible.sum())
@@ -154,23 +158,22 @@ def evaluate(
         written.result()  # a full disk must not pass unseen
     return EvaluationResult(
         views=[v.name for v in views],
-        metrics={
-            name: _summary(values[name], str(entry.declared.get("direction", "higher")), missing.get(name))
-            for name, entry in wanted.items()
-        },
+        metrics={e.name: _summary(e, values[e.name], ready.get(e.name), missing.get(e.name)) for e in wanted},
         visible_gaussians=visible / len(views),
         drawn_gaussians=drawn / len(views),
         renders=saved,
     )
 
 
-def _summary(values: list[float], direction: str, missing: str | None) -> MetricResult:
-    if missing is not None:
-        return MetricResult(None, [], direction, missing)
+def _summary(entry: Entry, values: list[float], ready: PreparedMetric | None, missing: str | None) -> MetricResult:
+    direction = str(entry.declared.get("direction", "higher"))
+    diagnostic = bool(entry.declared.get("diagnostic"))
+    if ready is None or missing is not None:
+        return MetricResult(None, [], direction, missing, diagnostic)
     finite = [v if math.isfinite(v) else None for v in values]
-    if None in finite:
-        return MetricResult(None, finite, direction, "infinite in at least one view (identical images)")
-    return MetricResult(sum(values) / len(values), finite, direction)
+    infinite = "infinite in at least one view (identical images)" if None in finite else None
+    mean = None if infinite else sum(values) / len(values)
+    return MetricResult(mean, finite, direction, infinite, diagnostic, ready.made_with, ready.verified)
 
 
 def png_names(views: Sequence[str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""Image metrics: PSNR, SSIM and L1 of a render against a photograph.
+"""Image metrics: PSNR, SSIM and L1 of a render against a photograph, each in the conventions that the field mixes.
 
 Every metric takes (render, truth), both [3,H,W] floating point in 0..1, and returns a float. Renders are clamped
 (and, by protocol, rounded to 8 bit) before they come here: `prepare_render`.
@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from splatwizard_core.errors import ShapeError
+from splatwizard_core.errors import CapabilityError, ShapeError
 
 WINDOW = 11  # pixels
 SIGMA = 1.5  # pixels
@@ -49,7 +49,10 @@ def psnr(render: Tensor, truth: Tensor) -> float:
 
 
 def psnr_channel_mean(render: Tensor, truth: Tensor) -> float:
-    """Mean of the three channels' PSNRs, dB: never below `psnr`. A diagnostic, some published numbers are made so."""
+    """Mean of the three channels' PSNRs, dB: never below `psnr` (Jensen). A diagnostic: some codes print this one.
+
+    Infinite as soon as one channel is identical.
+    """
     _check(render, truth)
     mse = (render.double() - truth.double()).square().mean(dim=(1, 2))  # [3]
     return float((-10 * torch.log10(mse)).mean())
@@ -68,6 +71,18 @@ def ssim(render: Tensor, truth: Tensor) -> float:
     """
     _check(render, truth)
     return float(ssim_map(render.float(), truth.float()).double().mean())
+
+
+def ssim_valid(render: Tensor, truth: Tensor) -> float:
+    """As `ssim`, but the mean is over the pixels whose whole window lies inside the picture (5 pixels from each edge).
+
+    A diagnostic: scikit-image and torchmetrics average so. Raises CapabilityError if no window fits.
+    """
+    _check(render, truth)
+    half = WINDOW // 2
+    if min(render.shape[1:]) < WINDOW:
+        raise CapabilityError(f"too-small: no window of {WINDOW}x{WINDOW} pixels fits into {list(render.shape)}")
+    return float(ssim_map(render.float(), truth.float())[:, half:-half, half:-half].double().mean())
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:

@@ -2,7 +2,8 @@
 
 All views are drawn once (at least ten frames) before any clock starts. CUDA: rounds over all views until 100 frames
 or 2 s, with one synchronisation at both ends for the throughput, and again with one around every frame for the
-latency. CPU: one round, which gives both. Each frame is consumed. Source: evaluation protocol, FPS.
+latency. CPU: one round, which gives both. Each frame is consumed. The whole may be repeated, for the spread.
+Source: evaluation protocol, FPS.
 """
 
 from __future__ import annotations
@@ -11,14 +12,15 @@ import itertools
 import math
 import statistics
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Generic, TypeVar
 
 import torch
 from torch import Tensor
 
 from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.progress import track
 
 WARMUP_FRAMES = 10
 CUDA_FRAMES = 100
@@ -28,14 +30,28 @@ View = TypeVar("View")
 
 
 @dataclass(frozen=True)
+class Spread:
+    """How much n >= 2 measurements of one thing differ; std is the sample's (n - 1)."""
+
+    n: int
+    mean: float
+    std: float
+    min: float
+    max: float
+
+
+@dataclass(frozen=True)
 class SpeedReport:
     """What was measured.
 
-    fps                 frames / total time, one synchronisation at both ends
-    latency_ms_median, latency_ms_p95   of single frames, synchronised around each
+    fps                 frames / total time, one synchronisation at both ends; over all repeats
+    latency_ms_median, latency_ms_p95   of single frames, synchronised around each; over all repeats
     frames, rounds      behind `fps`; warm-up not counted
+    repeats             how often the measurement was made
     views               different views
     warmup_frames       drawn before
+    first_frame_s       the first frame of all, a part of the warm-up
+    spread              of "fps", "latency_ms_median" and "latency_ms_p95" over the repeats; None for a single one
     peak_bytes          memory over the measured rounds; `memory_kind` says which: "cuda" (allocator) or "rss" (growth)
     peak_reserved_bytes the allocator's pool; None on a CPU
     """
@@ -45,84 +61,128 @@ class SpeedReport:
     latency_ms_p95: float
     frames: int
     rounds: int
+    repeats: int
     views: int
     warmup_frames: int
+    first_frame_s: float
+    spread: dict[str, Spread] | None
     peak_bytes: int
     peak_reserved_bytes: int | None
     memory_kind: str
 
 
-def measure_speed(
-    render: Callable[[View], Tensor], views: Sequence[View], device: torch.device | str, *, max_rounds: int = 1000
-) -> SpeedReport:
-    """Draw `views` by the protocol and report how fast that was.
+class _Frames(Generic[View]):
+    """Draws frames and consumes each, so that none can be left undone."""
 
-    render  one view -> the image, on `device`; gradients are off while it is called
-    views   cameras, already on the device
+    def __init__(self, render: Callable[[View], Tensor], views: Sequence[View], device: torch.device) -> None:
+        self.render, self.views, self.device = render, views, device
+        self.sink: Tensor | None = None
 
-    Raises ValueError without a view.
-    """
-    if not views:
-        raise ValueError("measuring speed needs at least one view")
-    device = torch.device(device)
-    on_cuda = device.type == "cuda"
-    sink = torch.zeros((), device=device)
+    def draw(self, view: View) -> None:
+        total = self.render(view).sum()
+        self.sink = total if self.sink is None else self.sink + total
 
-    def draw(view: View) -> None:
-        sink.add_(render(view).sum())
+    def synchronize(self) -> None:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
 
-    def synchronize() -> None:
-        if on_cuda:
-            torch.cuda.synchronize(device)
+    def throughput(self, rounds: int) -> float:
+        """Seconds for `rounds` over all views, waiting for the device at both ends alone."""
+        self.synchronize()
+        began = time.perf_counter()
+        for _ in range(rounds):
+            for view in self.views:
+                self.draw(view)
+        self.synchronize()
+        return time.perf_counter() - began
 
-    def timed_frames(chosen: Iterator[View]) -> list[float]:
+    def latencies(self, rounds: int) -> list[float]:
+        """Seconds of each frame, waiting for the device around every one."""
         seconds = []
-        for view in chosen:
-            synchronize()
+        for view in itertools.islice(itertools.cycle(self.views), rounds * len(self.views)):
+            self.synchronize()
             began = time.perf_counter()
-            draw(view)
-            synchronize()
+            self.draw(view)
+            self.synchronize()
             seconds.append(time.perf_counter() - began)
         return seconds
 
-    warmup = max(len(views), WARMUP_FRAMES)
-    with torch.no_grad():
-        began = time.perf_counter()
-        for view in itertools.islice(itertools.cycle(views), warmup):
-            draw(view)
-        synchronize()
-        round_seconds = (time.perf_counter() - began) * len(views) / warmup
 
-        meter = MemoryMeter(device)
-        meter.start()
+def measure_speed(
+    render: Callable[[View], Tensor],
+    views: Sequence[View],
+    device: torch.device | str,
+    *,
+    repeats: int = 1,
+    max_rounds: int = 1000,
+) -> SpeedReport:
+    """Draw `views` by the protocol and report how fast that was.
+
+    render      one view -> the image, on `device`; gradients are off while it is called
+    views       cameras, already on the device
+    repeats     measure this often, after one warm-up
+
+    Raises ValueError without a view or a repeat.
+    """
+    if not views or repeats < 1:
+        raise ValueError("measuring speed needs at least one view and one repeat")
+    device = torch.device(device)
+    on_cuda = device.type == "cuda"
+    frames = _Frames(render, views, device)
+    warmup = max(len(views), WARMUP_FRAMES)
+    rounds = 1
+    totals: list[float] = []
+    latencies: list[list[float]] = []
+    meter = MemoryMeter(device)
+    with torch.no_grad(), track("measure speed", total=1 + repeats) as bar:
+        began = time.perf_counter()
+        frames.draw(views[0])
+        frames.synchronize()
+        first_frame_s = time.perf_counter() - began
+        for view in itertools.islice(itertools.cycle(views), 1, warmup):
+            frames.draw(view)
+        frames.synchronize()
+        bar.advance()
         if on_cuda:
+            # The first frame may load kernels, so the length of a round is taken from one that is warm.
+            round_seconds = frames.throughput(1)
             enough = min(math.ceil(CUDA_FRAMES / len(views)), math.ceil(CUDA_SECONDS / max(round_seconds, 1e-6)))
             rounds = max(1, min(enough, max_rounds))
-            began = time.perf_counter()
-            for _ in range(rounds):
-                for view in views:
-                    draw(view)
-            synchronize()
-            total = time.perf_counter() - began
-        else:
-            rounds = 1
-        began = time.perf_counter()
-        latencies = timed_frames(itertools.islice(itertools.cycle(views), rounds * len(views)))
-        if not on_cuda:
-            total = time.perf_counter() - began
-    frames = rounds * len(views)
+            warmup += len(views)
+        meter.start()
+        for _ in range(repeats):
+            if on_cuda:
+                totals.append(frames.throughput(rounds))
+            latencies.append(frames.latencies(rounds))
+            if not on_cuda:
+                totals.append(sum(latencies[-1]))
+            bar.advance()
+    drawn = rounds * len(views)
+    pooled = [seconds for each in latencies for seconds in each]
     return SpeedReport(
-        fps=frames / total,
-        latency_ms_median=1e3 * statistics.median(latencies),
-        latency_ms_p95=1e3 * percentile(latencies, 95),
-        frames=frames,
+        fps=repeats * drawn / sum(totals),
+        latency_ms_median=1e3 * statistics.median(pooled),
+        latency_ms_p95=1e3 * percentile(pooled, 95),
+        frames=repeats * drawn,
         rounds=rounds,
+        repeats=repeats,
         views=len(views),
         warmup_frames=warmup,
+        first_frame_s=first_frame_s,
+        spread=None if repeats == 1 else {
+            "fps": spread([drawn / seconds for seconds in totals]),
+            "latency_ms_median": spread([1e3 * statistics.median(each) for each in latencies]),
+            "latency_ms_p95": spread([1e3 * percentile(each, 95) for each in latencies]),
+        },
         peak_bytes=meter.peak_bytes(),
         peak_reserved_bytes=meter.peak_reserved_bytes(),
         memory_kind=meter.kind,
-    )
+    )  # fmt: skip
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Mean, sample standard deviation, least and largest of at least two values."""
+    return Spread(len(values), statistics.fmean(values), statistics.stdev(values), min(values), max(values))
 
 
 def percentile(values: Sequence[float], percent: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
+from splatwizard_core.evaluation.speed import Spread, spread
 from splatwizard_core.experiments.file_needs import (
     missing_plugin,
     newer_than_installed,
@@ -33,7 +35,9 @@ class DecodeReport:
 
     digest              of the model; equal models have equal digests
     decode_s            median of `decode_runs_s`: from opening the file to a model on the device
-    first_decode_s      of the decode before the timed ones, which loads kernels and what else is imported late
+    decode_spread       how much the timed decodes differ; None for fewer than two
+    first_decode_s      of the decode before the timed ones, which imports what is imported late
+    jit_s               loading (or compiling) the native modules, before all decodes
     peak_bytes          memory growth over the first decode; `memory_kind` says of what
     """
 
@@ -46,7 +50,9 @@ class DecodeReport:
     raster: dict[str, Any]
     decode_s: float
     decode_runs_s: list[float]
+    decode_spread: Spread | None
     first_decode_s: float
+    jit_s: float
     peak_bytes: int
     memory_kind: str
     device: str
@@ -108,9 +114,16 @@ def _method_of(reader: ContainerReader, plugins: PluginManager) -> Any:
 
 
 def timed_decode(
-    path: str | Path, plugins: PluginManager, device: torch.device, *, repeats: int = REPEATS
+    path: str | Path,
+    plugins: PluginManager,
+    device: torch.device,
+    *,
+    repeats: int = REPEATS,
+    load_kernels: Callable[[], None] | None = None,
 ) -> tuple[SplatModel, DecodeReport]:
     """Decode once untimed and `repeats` times timed.
+
+    load_kernels    () -> every native module is loaded or compiled; before everything else, timed apart
 
     Raises SplatwizardError if two decodes give different models.
     """
@@ -123,6 +136,10 @@ def timed_decode(
         return model, reader, time.perf_counter() - began
 
     import_method(path, plugins)
+    began = time.perf_counter()
+    if load_kernels is not None:
+        load_kernels()
+    jit_s = time.perf_counter() - began
     meter = MemoryMeter(device)
     meter.start()
     with track(f"decode {Path(path).name}", total=1 + repeats) as bar:
@@ -150,7 +167,9 @@ def timed_decode(
         raster=reader.raster,
         decode_s=statistics.median(runs) if runs else first,
         decode_runs_s=runs,
+        decode_spread=spread(runs) if len(runs) > 1 else None,
         first_decode_s=first,
+        jit_s=jit_s,
         peak_bytes=peak,
         memory_kind=meter.kind,
         device=str(device),

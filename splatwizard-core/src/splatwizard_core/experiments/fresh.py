@@ -57,9 +57,13 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     return content
 
 
-def decode_fresh(path: Path, device: str) -> dict[str, Any]:
-    """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight."""
+def decode_fresh(path: Path, device: str, *, repeats: int = 3) -> dict[str, Any]:
+    """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight.
+
+    repeats     timed decodes
+    """
     with tempfile.TemporaryDirectory(prefix="sw-decode-") as folder:
         copy = Path(folder) / path.name
         shutil.copyfile(path, copy)
-        return run_fresh(["decode", copy.name, "--device", device, "--json"], cwd=Path(folder), hide_data=True)
+        arguments = ["decode", copy.name, "--device", device, "--repeats", str(repeats), "--json"]
+        return run_fresh(arguments, cwd=Path(folder), hide_data=True)

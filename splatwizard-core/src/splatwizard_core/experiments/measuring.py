@@ -40,21 +40,35 @@ def measure(
     ppl: PipelineParams,
     *,
     metrics: Sequence[str] | None = None,
+    lpips_weights: Path | None = None,
     speed: bool = True,
+    repeats: int = 1,
     renders: Path | None = None,
+    load_kernels: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """Open a model, then its scene, and measure the one on the other. Plain values, as `sw eval --json` prints them.
 
     open_model  () -> the model on `device`, and what it asks of a rasterizer; called first, before any picture is read
     load_scene  () -> the scene
     metrics     names; None: all that are installed
+    lpips_weights   folder that LPIPS' backbones are looked for in first
     speed       also measure speed and memory
+    repeats     how often speed is measured
     renders     folder for the test views as PNG; None: not kept
+    load_kernels    () -> every native module is loaded or compiled; timed apart, before everything else
     """
+    began = time.perf_counter()
+    if load_kernels is not None:
+        load_kernels()
+    jit_s = time.perf_counter() - began
+
     meter = MemoryMeter(device)
     meter.start()
+    began = time.perf_counter()
     model, raster = open_model()
-    decoded_bytes = meter.current_bytes()
+    _synchronize(device)
+    open_s = time.perf_counter() - began
+    decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
     scene = load_scene()
     background = scene.background.to(device)
     options = render_options(raster, background)
@@ -65,8 +79,7 @@ def measure(
     began = time.perf_counter()
     with torch.no_grad():
         model.prepare()
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    _synchronize(device)
     prepare_s = time.perf_counter() - began
     # CUDA's allocator knows all that is held; a resident set only grows by what was measured piece by piece.
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
@@ -75,10 +88,13 @@ def measure(
     speed_views = views if len(views) >= FEWEST_SPEED_VIEWS else _all_views(scene)
     if speed and speed_views:
         cameras = [view.camera.to(device) for view in speed_views]
-        report = measure_speed(lambda c: render_view(model, c, rasterizer, options).image, cameras, device)
+        report = measure_speed(
+            lambda c: render_view(model, c, rasterizer, options).image, cameras, device, repeats=repeats
+        )
     quality = evaluate(
         model, views, rasterizer, plugins,
-        device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics, save_to=renders,
+        device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
+        lpips_weights=lpips_weights, save_to=renders,
         label=f"evaluate on {scene.name}",
     )  # fmt: skip
     found = _describe_scene(scene, quality)
@@ -89,20 +105,43 @@ def measure(
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, ppl.seed),
-        "flags": (["fit"] if scene.protocol.split == "all" else []) + (["rss"] if meter.kind == "rss" else []),
+        "flags": _flags(scene, quality, meter),
     }
     if report is not None:
         facts = asdict(report)
         first = speed_views[0].camera
         peak, reserved, kind = (facts.pop(k) for k in ("peak_bytes", "peak_reserved_bytes", "memory_kind"))
-        found["speed"] = {**facts, "prepare_s": prepare_s, "image_size": [first.width, first.height]}
+        del facts["first_frame_s"]  # a part of load_s
+        found["speed"] = {
+            **facts,
+            "jit_s": jit_s,
+            "prepare_s": prepare_s,
+            "load_s": open_s + prepare_s + report.first_frame_s,
+            "image_size": [first.width, first.height],
+        }
         found["memory"] = {
             "kind": kind,
             "model_bytes": model_bytes,
+            "peak_load_bytes": peak_load,
             "peak_render_bytes": peak if kind == "cuda" else model_bytes + peak,
             "peak_reserved_bytes": reserved,
         }
     return found
+
+
+def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter) -> list[str]:
+    """What a reader of the numbers must know."""
+    told = {
+        "fit": scene.protocol.split == "all",
+        "rss": meter.kind == "rss",
+        "unverified-weights": not all(metric.verified for metric in quality.metrics.values()),
+    }
+    return [name for name, holds in told.items() if holds]
+
+
+def _synchronize(device: torch.device) -> None:
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 def _all_views(scene: Scene) -> list[View]:
@@ -120,7 +159,13 @@ def _describe_scene(scene: Scene, quality: EvaluationResult) -> dict[str, Any]:
         "test_views": len(scene.test),
         "views": quality.views,
         "metrics": {
-            name: {"mean": m.mean, "per_view": m.per_view, "direction": m.direction}
+            name: {
+                "mean": m.mean,
+                "per_view": m.per_view,
+                "direction": m.direction,
+                "diagnostic": m.diagnostic,
+                "made_with": dict(m.made_with),
+            }
             for name, m in quality.metrics.items()
         },
         "visible_gaussians": quality.visible_gaussians,

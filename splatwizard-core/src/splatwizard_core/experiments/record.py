@@ -12,9 +12,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from splatwizard_core.errors import UserInputError
+from splatwizard_core.experiments.record_versions import upgraded
 from splatwizard_core.files import write_atomic
 
-SCHEMA: Literal[1] = 1
+SCHEMA: Literal[2] = 2
 FILE_NAME = "metrics.json"
 
 
@@ -45,6 +46,18 @@ class MetricBlock(Part):
     mean: float | None
     per_view: list[float | None] = Field(description="in the order of `views`; null: infinite (identical images)")
     direction: Literal["higher", "lower"]
+    diagnostic: bool = Field(False, description="computed to tell conventions apart, not for tables")
+    made_with: dict[str, str] = Field({}, description="what else the values depend on: versions, weights, checksums")
+
+
+class SpreadBlock(Part):
+    """How much repeated measurements of one thing differ."""
+
+    n: int = Field(ge=2, description="measurements")
+    mean: float
+    std: float = Field(description="of the sample (n - 1)")
+    min: float
+    max: float
 
 
 class SpeedBlock(Part):
@@ -53,11 +66,15 @@ class SpeedBlock(Part):
     fps: float
     latency_ms_median: float
     latency_ms_p95: float
+    jit_s: float | None = Field(description="loading or compiling native modules, before everything else")
     prepare_s: float = Field(description="view-independent caches, built once, not in `fps`")
-    frames: int
-    rounds: int
+    load_s: float | None = Field(description="from opening the file to the first frame; without `jit_s`")
+    frames: int = Field(description="measured, over all repeats")
+    rounds: int = Field(description="over all views, in each repeat")
+    repeats: int
     views: int
     warmup_frames: int
+    spread: dict[str, SpreadBlock] | None = Field(description="of fps and the latencies over the repeats")
     image_size: tuple[int, int] = Field(description="width, height of the first view drawn")
 
 
@@ -66,6 +83,7 @@ class MemoryBlock(Part):
 
     kind: Literal["cuda", "rss"]
     model_bytes: int = Field(description="held after the model was decoded and prepared")
+    peak_load_bytes: int | None = Field(description="peak from opening the file to the decoded model")
     peak_render_bytes: int = Field(description="peak over the measured frames, the model included")
     peak_reserved_bytes: int | None = None
 
@@ -84,8 +102,9 @@ class TrainBlock(Part):
     stages: list[StageBlock]
     with_pretraining_s: float | None = Field(description="with the training of the scenes it starts from")
     steps: int | None
-    peak_bytes: int | None
+    peak_bytes: int | None = Field(description="over the loop; without evaluation and checkpoints since schema 2")
     memory_kind: Literal["cuda", "rss"] | None
+    pictures_in: str | None = Field(description="where the training pictures lay: host, cuda")
     breakdown_s: dict[str, dict[str, float]] | None = Field(
         description="stage -> part of a step -> seconds, if profiled"
     )
@@ -98,7 +117,9 @@ class CodecBlock(Part):
     encode_s: float | None
     decode_s: float = Field(description="median of the timed decodes")
     decode_runs_s: list[float]
-    first_decode_s: float = Field(description="the untimed decode before them: imports and kernel loading included")
+    decode_spread: SpreadBlock | None
+    first_decode_s: float = Field(description="the untimed decode before them: late imports included")
+    jit_s: float | None = Field(description="loading or compiling native modules, before all decodes")
     peak_decode_bytes: int
     memory_kind: Literal["cuda", "rss"]
 
@@ -115,7 +136,7 @@ class RecordFile(Part):
 class Record(Part):
     """One scene, one method, one rate point, one file."""
 
-    schema_version: Literal[1] = SCHEMA
+    schema_version: Literal[2] = SCHEMA
     method: str
     method_version: int
     distribution: str = Field(description="pip distribution and version that the method comes from")
@@ -151,13 +172,13 @@ class Record(Part):
 
 
 def read_record(path: Path) -> Record:
-    """A record from its file. Raises UserInputError that names the first thing wrong."""
+    """A record from its file, of this schema or an older one. Raises UserInputError that names what is wrong first."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         raise UserInputError(f"{path}: cannot be read: {error}") from error
     try:
-        return Record.model_validate_json(text)
+        return Record.model_validate_json(upgraded(text))
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.experiments.asked import Asked, what_is_asked
 from splatwizard_core.experiments.cache import trained_scene
 from splatwizard_core.experiments.config import SCENE_KEYS, ResolvedConfig, absolute_spec, content_hash
+from splatwizard_core.experiments.decoding import REPEATS
 from splatwizard_core.experiments.encoding import encode
 from splatwizard_core.experiments.fresh import decode_fresh, run_fresh
 from splatwizard_core.experiments.lock import directory_lock
-from splatwizard_core.experiments.record import FILE_NAME, Record, missing_reasons, read_record
+from splatwizard_core.experiments.record import FILE_NAME, SCHEMA, Record, missing_reasons, read_record
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.experiments.training_run import make_method, train, training_key
@@ -27,6 +29,7 @@ from splatwizard_core.files import file_sha256, write_atomic
 ENCODED = "scene.swz"
 CONFIG = "config.toml"
 RENDERS = "renders"
+MEASURING = 2  # what `sw decode` and `sw eval` report; a step that reported less is done again
 OWN_FILES = (CONFIG, "log.jsonl", "checkpoints", ENCODED, FILE_NAME, RENDERS, "steps.json")
 
 
@@ -36,12 +39,16 @@ class RunRequest:
 
     out         root of all run directories
     resume      use what is there; False: discard it
+    lpips_weights   folder that LPIPS' backbones are looked for in first
+    repeats     how often rendering speed is measured; decoding is timed as often, and at least three times
     """
 
     resolved: ResolvedConfig
     out: Path
     resume: bool = True
     allow_changed_plan: bool = False
+    lpips_weights: Path | None = None
+    repeats: int = 1
 
 
 def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
@@ -71,7 +78,7 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
             steps.finish("encode", encode_key, facts)
         training = steps.done("train", train_key) or train_in(session, request, directory).facts
         write_config(directory, resolved)
-        decoded = _decode_step(session, steps, encoded, facts["sha256"])
+        decoded = _decode_step(session, steps, encoded, facts["sha256"], max(REPEATS, request.repeats))
         measured = _evaluate_step(session, steps, request, directory, facts["sha256"])
         if decoded["digest"] != measured["digest"]:
             raise SplatwizardError(
@@ -80,7 +87,7 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
             )
         record = _assemble(session, resolved, training, facts, decoded, measured)
         record.write(directory / FILE_NAME)
-        steps.finish("record", _record_key(session, request), {"sha256": facts["sha256"]})
+        steps.finish("record", _record_key(session, request), {"sha256": facts["sha256"], "asked": measured["asked"]})
     return record, directory
 
 
@@ -140,7 +147,7 @@ def _record_key(session: Session, request: RunRequest) -> str:
     return content_hash(
         [
             absolute_spec(request.resolved.scene_spec), request.resolved.config_hash(), str(session.device),
-            entry.distribution, entry.version, session.plugins.metrics.names,
+            entry.distribution, entry.version, session.plugins.metrics.names, SCHEMA,
         ]
     )  # fmt: skip
 
@@ -150,6 +157,8 @@ def _finished_record(session: Session, directory: Path, steps: StepLog, request:
     facts = steps.done("record", _record_key(session, request))
     encoded = directory / ENCODED
     if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+        return None
+    if not _asked(session, request).is_held_by(facts.get("asked")):
         return None
     try:
         record = read_record(directory / FILE_NAME)
@@ -162,11 +171,11 @@ def _encode_key(train_key: str, resolved: ResolvedConfig) -> str:
     return content_hash([train_key, resolved.config.model_dump(mode="json")])
 
 
-def _decode_step(session: Session, steps: StepLog, encoded: Path, sha256: str) -> dict[str, Any]:
-    key = content_hash([sha256, str(session.device)])
+def _decode_step(session: Session, steps: StepLog, encoded: Path, sha256: str, repeats: int) -> dict[str, Any]:
+    key = content_hash([sha256, str(session.device), MEASURING])
     facts = steps.done("decode", key)
-    if facts is None:
-        facts = decode_fresh(encoded, str(session.device))
+    if facts is None or len(facts["decode_runs_s"]) < repeats:
+        facts = decode_fresh(encoded, str(session.device), repeats=repeats)
         session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {_counted(facts['counts'])}")
         steps.finish("decode", key, facts)
     return facts
@@ -182,14 +191,21 @@ def _evaluate_step(
     resolved = request.resolved
     digest = session.scene_digest(resolved)
     raster = resolved.ppl.raster.model_dump(mode="json")
-    key = content_hash([sha256, digest, str(session.device), raster, session.plugins.metrics.names])
-    facts = steps.done("evaluate", key)
-    if facts is None:
+    key = content_hash([sha256, digest, str(session.device), raster, session.plugins.metrics.names, MEASURING])
+    facts, asked = steps.done("evaluate", key), _asked(session, request)
+    if facts is None or not asked.is_held_by(facts.get("asked")):
         arguments = ["eval", str(directory / ENCODED), "--scene", absolute_spec(request.resolved.scene_spec)]
         arguments += eval_options(resolved, str(session.device))
-        facts = run_fresh([*arguments, "--renders", str(directory / RENDERS), "--json"])
+        arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
+        if request.lpips_weights is not None:
+            arguments += ["--lpips-weights", str(request.lpips_weights)]
+        facts = {**run_fresh(arguments), "asked": asked.as_dict()}
         steps.finish("evaluate", key, facts)
     return facts
+
+
+def _asked(session: Session, request: RunRequest) -> Asked:
+    return what_is_asked(session, repeats=request.repeats, lpips_weights=request.lpips_weights)
 
 
 def eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
@@ -218,6 +234,10 @@ def _assemble(
     unknown["geometry"] = "not asked for"
     if training["breakdown_s"] is None:
         unknown["train.breakdown_s"] = "not profiled (--set profile=stages)"
+    if measured["speed"]["spread"] is None:
+        unknown["speed.spread"] = "measured once (--repeats N)"
+    if training.get("pictures_in") is None:
+        unknown["train.pictures_in"] = "trained by a release that did not note it"
     if training["peak_bytes"] is None:
         unknown["train.peak_bytes"] = "not measured"
     if measured["memory"]["peak_reserved_bytes"] is None:
@@ -242,12 +262,15 @@ def _assemble(
             "encode_s": encoding["encode_s"],
             "decode_s": decoded["decode_s"],
             "decode_runs_s": decoded["decode_runs_s"],
+            "decode_spread": decoded["decode_spread"],
             "first_decode_s": decoded["first_decode_s"],
+            "jit_s": decoded["jit_s"],
             "peak_decode_bytes": decoded["peak_bytes"],
             "memory_kind": decoded["memory_kind"],
         },
         train={
             **{k: training[k] for k in _FROM_TRAINING},
+            "pictures_in": training.get("pictures_in"),
             "with_pretraining_s": training["train_s"] + sum(training["pretraining_s"].values()),
         },
         plan=training["plan"],

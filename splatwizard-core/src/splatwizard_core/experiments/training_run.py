@@ -8,12 +8,14 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.evaluation.evaluate import evaluate, raster_header
+from splatwizard_core.evaluation.metrics import default_metrics
 from splatwizard_core.experiments.config import ResolvedConfig, content_hash
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.scene.images import decode_all
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import train_stages
@@ -148,10 +150,13 @@ def run_stages(
             session.plugins,
             device=session.device,
             options=options,
+            metrics=default_metrics(session.plugins.metrics, on_the_way=True),
             label=f"evaluate at step {step:,}",
         )
         return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}
 
+    if ppl.eval_every:
+        decode_all(scene.test)  # here, so that they do not count as memory of the training
     outcome = train_stages(
         stages,
         create_model,
@@ -181,6 +186,7 @@ def run_stages(
         "steps": outcome.steps,
         "peak_bytes": outcome.peak_memory,
         "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
+        "pictures_in": "host" if scene.train[0].pixels.device.type == "cpu" else scene.train[0].pixels.device.type,
         "breakdown_s": outcome.stage_breakdown,
         "plan": outcome.plan,
         "rasterizers": dict(rasterizer.choices),

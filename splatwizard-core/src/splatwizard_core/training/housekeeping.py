@@ -134,7 +134,8 @@ class Housekeeping:
         trainer.check_losses()
         self._write_lines()
         self._account()
-        self._save(finished)
+        with self.meter.excluded():
+            self._save(finished)
         self._saved_at = trainer.step
 
     def _account(self) -> None:
@@ -148,10 +149,9 @@ class Housekeeping:
     def _evaluate(self, evaluate: Evaluate, step: int) -> None:
         model = self.trainer.model
         synchronize(self.trainer.device)
-        # An evaluation measures memory of its own.
-        self.progress.peak_memory = max(self.progress.peak_memory, self.meter.peak_bytes())
         modes = {module: module.training for module in model.modules()}
-        with rng.preserved(), torch.no_grad():
+        # Peak memory is that of the loop alone; an evaluation measures memory of its own.
+        with self.meter.excluded(), rng.preserved(), torch.no_grad():
             model.eval()
             try:
                 metrics = evaluate(model, step)
