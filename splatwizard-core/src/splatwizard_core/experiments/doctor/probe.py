@@ -222,7 +222,7 @@ def _draw(rasterizer: object, device: str, *, backward: bool) -> None:
     )
     with torch.set_grad_enabled(backward):
         image = rasterizer.render(splats, camera, RasterOptions()).image  # type: ignore[attr-defined]
-    if not bool(torch.isfinite(image).all()) or float(image.max()) < 0.5:
+    if not bool(torch.isfinite(image).all()) or float(image.detach().max()) < 0.5:
         raise SplatwizardError("drew a wrong picture of sixteen white splats")
     if backward:
         image.square().sum().backward()
