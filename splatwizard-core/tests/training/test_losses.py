@@ -169,6 +169,21 @@ def test_the_loss_mixes_l1_and_ssim(request, path, lambda_dssim):
     assert not any(part.requires_grad for part in pack.parts.values())
 
 
+@pytest.mark.parametrize("path", ["kernels", "torch_path"])
+def test_without_padding_the_loss_takes_the_ssim_of_the_inner_windows(request, path):
+    request.getfixturevalue(path)
+    x, y = images(17, 33)
+    x.requires_grad_()
+    pack = photometric_loss(x, y, padding="valid")
+    pack.total.backward()
+    inner = ssim_by_definition(x.detach().double().numpy(), y.double().numpy(), valid=True)
+    assert pack.parts["ssim"].item() == pytest.approx(inner, abs=1e-6)
+    assert pack.total.item() == pytest.approx(0.8 * (x - y).abs().mean().item() + 0.2 * (1 - inner), abs=1e-6)
+    wanted = x.detach().double().requires_grad_()
+    (0.8 * (wanted - y.double()).abs().mean() + 0.2 * (1 - ssim(wanted, y.double(), padding="valid"))).backward()
+    assert (x.grad - wanted.grad).norm() <= 1e-5 * wanted.grad.norm()
+
+
 def test_a_scaled_loss_has_a_scaled_gradient(kernels):
     x, y = images(17, 33)
     _, once = value_and_gradient(x, y)

@@ -53,6 +53,9 @@ class Loss(Params):
     """The photometric loss."""
 
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM; the rest is the weight of L1")
+    ssim_padding: Literal["same", "valid"] = Field(
+        "same", description="zeros beside the image, as published, or SSIM only where its window fits"
+    )
 
 
 class Codec(Params):

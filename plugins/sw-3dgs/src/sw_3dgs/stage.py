@@ -116,4 +116,7 @@ class ThreeDGSStage(Stage):
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)
-        return photometric_loss(result.image, truth, lambda_dssim=self.config.loss.lambda_dssim)
+        settings = self.config.loss
+        return photometric_loss(
+            result.image, truth, lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding
+        )

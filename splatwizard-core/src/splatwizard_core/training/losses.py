@@ -45,29 +45,32 @@ def photometric_loss(
     *,
     lambda_dssim: float = 0.2,
     clamp: bool = False,
+    padding: Padding = "same",
 ) -> LossPack:
-    """The 3DGS loss (1 - lambda) mean|image - target| + lambda (1 - SSIM), zero padding.
+    """The 3DGS loss (1 - lambda) mean|image - target| + lambda (1 - SSIM).
 
     image           [3,H,W] the render, differentiable
     target          [3,H,W] the photograph, 0..1
     lambda_dssim    weight of the SSIM term, 0..1
     clamp           clamp the render to 0..1 first, with no gradient outside (the 2024 code of 3DGS); the paper's
                     code did not
+    padding         of SSIM: "same" as published, zeros beside the image; "valid" as some fast trainers: only where
+                    the window fits
 
     Returns the total and, detached, the parts "l1" and "ssim". Raises ShapeError as `ssim` does.
     Source: 3DGS (arXiv 2308.04079), equation 7.
     """
-    _check(image, target, "same")
+    _check(image, target, padding)
     if clamp:
         image = image.clamp(0.0, 1.0)
     if _fused(image, target):
         total, l1, similarity = _Photometric.apply(  # type: ignore[no-untyped-call]
-            image, target, False, 1.0 - lambda_dssim, -lambda_dssim
+            image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim
         )
         total = total + lambda_dssim
     else:
         l1 = (image - target).abs().mean()
-        similarity = _ssim_torch(image, target, "same")
+        similarity = _ssim_torch(image, target, padding)
         total = (1.0 - lambda_dssim) * l1 + lambda_dssim * (1.0 - similarity)
     return LossPack(total, {"l1": l1.detach(), "ssim": similarity.detach()})
 
