@@ -37,13 +37,15 @@ class ColmapFolder:
     pictures: str = "images"
     sparse: str = "sparse/0"
     nan_pose_of: str | None = None
+    more_cameras: list[ColmapCamera] = field(default_factory=list)
+    """Image i has camera i of [camera, *more_cameras], over and over; its picture has that camera's size."""
 
     def model(self) -> ColmapModel:
         images = {}
         for i, name in enumerate(self.names, 1):
             q = (1.0, 0.0, 0.0, 0.0) if name != self.nan_pose_of else (float("nan"), 0.0, 0.0, 0.0)
             images[i] = ColmapImage(
-                i, q, (-float(i), 0.0, 0.0), self.camera.id, name, np.array([[1.5, 2.5]]), np.array([1])
+                i, q, (-float(i), 0.0, 0.0), self.camera_of(i - 1).id, name, np.array([[1.5, 2.5]]), np.array([1])
             )
         n = self.num_points
         points = ColmapPoints(
@@ -54,14 +56,20 @@ class ColmapFolder:
             track_start=np.arange(n + 1),
             track=np.stack([np.ones(n, np.int32), np.zeros(n, np.int32)], axis=1),
         )
-        return ColmapModel({self.camera.id: self.camera}, images, points)
+        return ColmapModel({camera.id: camera for camera in [self.camera, *self.more_cameras]}, images, points)
+
+    def camera_of(self, index: int) -> ColmapCamera:
+        cameras = [self.camera, *self.more_cameras]
+        return cameras[index % len(cameras)]
 
     def write(self) -> Path:
         write_model(self.model(), self.root / self.sparse, text=self.text)
         for i, name in enumerate(self.names):
             file = self.root / self.pictures / name
             file.parent.mkdir(parents=True, exist_ok=True)
-            Image.new("RGB", self.picture_size, (i, 2 * i, 3 * i)).save(file)
+            camera = self.camera_of(i)
+            size = (camera.width, camera.height) if self.more_cameras else self.picture_size
+            Image.new("RGB", size, (i, 2 * i, 3 * i)).save(file)
         return self.root
 
 

@@ -214,3 +214,28 @@ def test_real_models_come_back_from_both_encodings(test_data, tmp_path):
     original = test_data("mug") / "sparse" / "0" / "images.bin"
     assert (tmp_path / "False" / "images.bin").read_bytes() == original.read_bytes()
     shutil.rmtree(tmp_path / "True")
+
+
+@pytest.mark.parametrize("text", [False, True])
+@pytest.mark.parametrize("part", ["camera", "image", "point"])
+def test_an_id_that_occurs_twice_is_refused(tmp_path, text, part):
+    camera = ColmapCamera(4, "PINHOLE", 8, 6, (5.0, 5.0, 4.0, 3.0))
+    image = ColmapImage(5, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 4, "a.png", np.empty((0, 2)), np.empty(0, np.int64))
+    ids = np.array([6, 6] if part == "point" else [6, 7])
+    points = ColmapPoints(
+        ids,
+        np.zeros((2, 3)),
+        np.zeros((2, 3), np.uint8),
+        np.zeros(2),
+        np.zeros(3, np.int64),
+        np.zeros((0, 2), np.int32),
+    )
+    cameras, images = {4: camera}, {5: image}
+    if part == "camera":
+        cameras[99] = camera  # the writer writes the record's own id
+    if part == "image":
+        images[99] = image
+    write_model(ColmapModel(cameras, images, points), tmp_path, text=text)
+    number = {"camera": 4, "image": 5, "point": 6}[part]
+    with pytest.raises(SceneError, match=rf"{part}s?(3D)?\..*{part} id {number} occurs twice; the model is damaged"):
+        read_model(tmp_path)

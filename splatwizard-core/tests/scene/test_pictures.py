@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -66,6 +69,33 @@ def test_16_bit_grey_keeps_its_upper_byte(tmp_path):
     pixels = load_picture(path)
     assert pixels.dtype == np.uint8
     np.testing.assert_array_equal(pixels, np.repeat(RAMP[..., None], 3, axis=2))
+
+
+def png16(path, array):
+    """A 16-bit PNG with 1 to 4 channels, written by hand: Pillow writes such files in grey only."""
+    height, width, channels = array.shape
+
+    def chunk(kind, content):
+        return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", zlib.crc32(kind + content))
+
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in array)
+    head = struct.pack(">IIBBBBB", width, height, 16, {1: 0, 2: 4, 3: 2, 4: 6}[channels], 0, 0, 0)
+    content = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + content)
+    return path
+
+
+@pytest.mark.parametrize("channels", [1, 2, 3, 4])
+def test_16_bit_pictures_of_any_kind_keep_their_upper_byte(tmp_path, channels):
+    wide = np.arange(6 * 8 * channels, dtype=np.uint16).reshape(6, 8, channels) * 300 + 17
+    path = png16(tmp_path / "a.png", wide)
+    high = (wide >> 8).astype(np.uint8)
+    colour = high[..., : 3 if channels > 2 else 1]
+    np.testing.assert_array_equal(load_picture(path)[..., :3], np.broadcast_to(colour, (6, 8, 3)))
+    assert picture_header(path) == (8, 6, channels in (2, 4))
+    if channels in (2, 4):
+        np.testing.assert_array_equal(load_picture(path)[..., 3], high[..., -1])
+        np.testing.assert_array_equal(load_mask(path, (8, 6)), high[..., -1] >= 128)
 
 
 def test_float_tiff_in_0_to_1_becomes_8_bit(tmp_path):
@@ -137,6 +167,19 @@ def test_postscript_is_no_picture_whatever_its_suffix(tmp_path):
     for read in (picture_header, load_picture, lambda p: load_mask(p, (2, 2))):
         with pytest.raises(SceneError, match="cannot identify image file"):
             read(tmp_path / "a.png")
+
+
+def test_it_must_be_clear_which_file_is_meant(tmp_path):
+    for name in ("a.png", "a.jpg", "b.jpg", "sub/b.jpg"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert find_pictures(tmp_path, ["a.png", "b.JPG", "sub/b.png"]) == [
+        tmp_path / "a.png", tmp_path / "b.jpg", tmp_path / "sub" / "b.jpg"
+    ]  # fmt: skip
+    with pytest.raises(SceneError, match=r"image 'a\.tif' is not there, and a\.jpg and a\.png could both stand for it"):
+        find_pictures(tmp_path, ["a.tif"])
+    with pytest.raises(SceneError, match=r"b\.jpg is the only file for two images, 'b\.png' and 'b\.jpg'"):
+        find_pictures(tmp_path, ["b.png", "b.jpg"])
 
 
 def test_links_in_a_ring_come_to_an_end(tmp_path):

@@ -12,7 +12,7 @@ from splatwizard_core.scene.scene import Scene
 def describe(scene: Scene) -> dict[str, Any]:
     """JSON-able facts; no picture is decoded.
 
-    name, path, dataset, protocol (its id), background      text
+    name, path, dataset, protocol (its id), named_protocol ("survey", "inria", "custom"), background, split     text
     views           {"train": n, "test": n}
     resolutions     [{"width", "height", "views"}], most frequent first
     cameras         {"intrinsics": how many differ, "fov_x_deg": [min, max], "fov_y_deg": [min, max]}
@@ -31,6 +31,7 @@ def describe(scene: Scene) -> dict[str, Any]:
         "path": scene.path,
         "dataset": scene.protocol.dataset,
         "protocol": scene.protocol.id,
+        "named_protocol": scene.protocol.name,
         "background": scene.protocol.background,
         "split": scene.protocol.split,
         "views": {"train": len(scene.train), "test": len(scene.test)},

@@ -114,7 +114,7 @@ BENCHMARKS: Mapping[str, Family] = MappingProxyType(
                 "bungee",
                 "BungeeNeRF",
                 scenes=("amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome", "56Leonard", "Transamerica"),
-                folders=("bungeenerf", "bungee_nerf", "bungee-nerf"),
+                folders=("bungeenerf", "bungee_nerf", "bungee-nerf", "bungee_original"),
                 split="lod:30",  # as Scaffold-GS, HAC and CAT-3DGS run it: the first 31 views are tested
             ),
             Family(
