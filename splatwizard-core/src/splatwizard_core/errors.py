@@ -95,7 +95,25 @@ class NothingToDo(UserInputError):  # noqa: N818 (the specification names it)
 
 
 class RunLockedError(UserInputError):
-    """Another process is writing into this run directory."""
+    """Another process is writing into this run directory, or may be."""
+
+
+class DiskFullError(SplatwizardError):
+    """There is no space for a file; what stood in its place still does.
+
+    path    of the file
+    reason  what the system says
+    wanted, free    bytes, if known
+    """
+
+    def __init__(self, path: str, reason: str, wanted: int | None = None, free: int | None = None) -> None:
+        figures = [f"{wanted:,} bytes wanted"] * (wanted is not None) + [f"{free:,} free"] * (free is not None)
+        told = f" ({', '.join(figures)})" if figures else ""
+        super().__init__(
+            f"{path}: {reason}{told}; nothing half-written was kept. "
+            "Make space and give the same command again: a run goes on from what is there"
+        )
+        self.path, self.reason, self.wanted, self.free = path, reason, wanted, free
 
 
 class NativeBuildError(SplatwizardError):

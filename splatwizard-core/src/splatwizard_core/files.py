@@ -10,31 +10,86 @@ import os
 import re
 import secrets
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from splatwizard_core.errors import DiskFullError
+
 TEMPORARY = r"\.(\d+)-[0-9a-f]{8}\.tmp"
 """What stands after `.NAME` in the name of a temporary file: the process that writes it, and a random part."""
 
+FULL = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "the file may not grow that large here (file system, or `ulimit -f`)",
+}
+YOUNGER_SECONDS = 2.0
+"""By how much a process must be younger than a file to be another one of the same number: clocks count in seconds."""
+
 
 @contextlib.contextmanager
-def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
+def replacing(path: str | os.PathLike[str], *, wanted: int | None = None, durable: bool = False) -> Iterator[Path]:
     """A path beside `path` to write to; when the block ends, that file takes the place of `path`.
 
+    wanted      bytes that will be written, if known, for the message
+    durable     on the disk itself before it takes its place: it holds after a power failure too
+
     If the block raises, `path` holds what it held before and the temporary file is gone. What killed processes left of
-    earlier writes to `path` is removed. Errors of the system (OSError) pass through.
+    earlier writes to `path` is removed. Raises DiskFullError; other errors of the system (OSError) pass through.
     """
     path = Path(path)
     _remove_leftovers(path)
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
-        yield temporary
-        os.replace(temporary, path)
+        with naming_full_disk(path, wanted):
+            yield temporary
+            if durable:
+                _to_disk(temporary)
+            os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
             temporary.unlink()
         raise
+
+
+@contextlib.contextmanager
+def naming_full_disk(path: str | os.PathLike[str], wanted: int | None = None) -> Iterator[None]:
+    """Turn what the system, or a library in another language, says of a full disk into DiskFullError.
+
+    wanted      bytes that the block writes, if known
+    """
+    try:
+        yield
+    except Exception as error:
+        code = full_disk_code(error)
+        if code is None:
+            raise
+        raise DiskFullError(str(path), FULL[code], wanted, _free_bytes(Path(path), code)) from error
+
+
+def full_disk_code(error: BaseException) -> int | None:
+    """The errno if an error says that there is no space, else None."""
+    if isinstance(error, OSError):
+        return error.errno if error.errno in FULL else None
+    told = re.search(r"\(os error (\d+)\)", str(error))  # how libraries written in Rust pass it on
+    return int(told[1]) if told is not None and int(told[1]) in FULL else None
+
+
+def _free_bytes(path: Path, code: int) -> int | None:
+    """What is free where `path` lies; None if that is not what stands in the way, or cannot be asked."""
+    with contextlib.suppress(OSError):
+        return shutil.disk_usage(path.parent).free if code == errno.ENOSPC else None
+    return None
+
+
+def _to_disk(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 @contextlib.contextmanager
@@ -52,7 +107,8 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     temporary.mkdir()
     try:
-        yield temporary
+        with naming_full_disk(path):
+            yield temporary
         os.rename(temporary, path)  # also over an empty folder, never over one that holds something
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -62,7 +118,7 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def write_atomic(path: str | os.PathLike[str], content: str | bytes) -> None:
     """Write text (UTF-8) or bytes so that `path` holds what it held before or all of it, also after a crash."""
     data = content.encode() if isinstance(content, str) else content
-    with replacing(path) as temporary, temporary.open("xb") as file:
+    with replacing(path, wanted=len(data)) as temporary, temporary.open("xb") as file:
         file.write(data)
         file.flush()
         os.fsync(file.fileno())
@@ -82,27 +138,57 @@ def file_sha256(path: Path) -> str:
     return sha.hexdigest()
 
 
+@contextlib.contextmanager
+def scratch_folder(purpose: str) -> Iterator[Path]:
+    """An empty folder among the system's temporary files, removed when the block ends.
+
+    Those of the same purpose that killed processes left are removed too.
+    """
+    base = Path(tempfile.gettempdir()) / f"sw-{purpose}"
+    _remove_leftovers(base)
+    folder = base.with_name(f".{base.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    with naming_full_disk(folder):
+        folder.mkdir(mode=0o700)
+        try:
+            yield folder
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def sweep(folder: Path) -> None:
+    """Remove the temporaries directly in `folder` that killed processes left, whatever they were to become."""
+    _remove_matching(folder, re.compile(r"\..+" + TEMPORARY))
+
+
 def _remove_leftovers(path: Path) -> None:
     """Remove the temporaries of `path` whose process has ended; others may be writing to the same place."""
-    pattern = re.compile(re.escape(f".{path.name}") + TEMPORARY)
+    _remove_matching(path.parent, re.compile(re.escape(f".{path.name}") + TEMPORARY))
+
+
+def _remove_matching(folder: Path, pattern: re.Pattern[str]) -> None:
     with contextlib.suppress(OSError):
-        for name in os.listdir(path.parent):
+        for name in os.listdir(folder):
             match = pattern.fullmatch(name)
-            if match is not None and not _is_running(int(match[1])):
-                left = path.parent / name
-                if left.is_dir() and not left.is_symlink():
-                    shutil.rmtree(left, ignore_errors=True)
-                else:
-                    left.unlink(missing_ok=True)
+            left = folder / name
+            if match is None or _is_writing(int(match[1]), left):
+                continue
+            if left.is_dir() and not left.is_symlink():
+                shutil.rmtree(left, ignore_errors=True)
+            else:
+                left.unlink(missing_ok=True)
 
 
-def _is_running(process: int) -> bool:
-    if os.name != "posix":
-        return True  # signal 0 is no harmless question there
+def _is_writing(process: int, file: Path) -> bool:
+    """Whether the process of this number, if there is one, can be the one that began `file`.
+
+    Numbers come back, in containers at once: a process that is younger than the file is another one.
+    """
+    import psutil
+
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
+        began: float = psutil.Process(process).create_time()
+        return began - YOUNGER_SECONDS < file.stat().st_mtime
+    except (psutil.NoSuchProcess, FileNotFoundError, OverflowError, ValueError):
         return False
-    except (OSError, OverflowError):
+    except (psutil.Error, OSError):
         return True
-    return True

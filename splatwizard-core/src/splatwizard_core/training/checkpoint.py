@@ -1,7 +1,8 @@
 """Checkpoints: a safetensors file of all tensors and a JSON file of everything else, written as a pair. No pickle.
 
 `00-0001000.safetensors` + `00-0001000.json`: stage 0 after step 1000. Both carry the same random pair id; the JSON
-file, renamed into place last, makes the pair valid and holds a CRC-32 of itself and of every tensor.
+file, renamed into place last, makes the pair valid, names the other one and holds a CRC-32 of itself and of every
+tensor. Where the same step is written again, its tensors get another name: at no moment is there half a pair.
 """
 
 from __future__ import annotations
@@ -34,7 +35,9 @@ FORMAT = 1
 TENSOR_KEY = "$tensor"
 SHOWN_CHARACTERS = 40  # of a value that differs
 _NAME = re.compile(r"(\d{2})-(\d{7})\.json")
-_OURS = re.compile(rf"\.?\d{{2}}-\d{{7}}\.(json|safetensors)({TEMPORARY}|\.damaged)?")
+_STEM = r"\d{2}-\d{7}"
+_OURS = re.compile(rf"\.?({_STEM})(-[0-9a-f]{{8}})?\.(json|safetensors)({TEMPORARY}|\.damaged)?")
+_TENSORS = re.compile(rf"({_STEM})(-[0-9a-f]{{8}})?\.safetensors")
 
 
 class DamagedCheckpointError(CheckpointError):
@@ -79,23 +82,32 @@ class CheckpointStore:
         """Write the pair atomically, then remove those that are no longer kept; returns the JSON file's path."""
         self.directory.mkdir(parents=True, exist_ok=True)
         tensors: dict[str, Tensor] = {}
+        pair = secrets.token_hex(16)
+        path = self.directory / f"{checkpoint.stage:02d}-{checkpoint.step:07d}.json"
+        tensor_path = path.with_suffix(".safetensors")
+        if tensor_path.exists():
+            tensor_path = path.with_name(f"{path.stem}-{pair[:8]}.safetensors")
         content = {
             **{f.name: getattr(checkpoint, f.name) for f in fields(Checkpoint) if f.name != "state"},
             "format": FORMAT,
-            "pair": secrets.token_hex(16),
+            "pair": pair,
+            "file": tensor_path.name,
             "plan_digest": plan_digest(checkpoint.plan),
             "state": split_tensors(checkpoint.state, tensors),
             "tensors": {name: _crc(tensor) for name, tensor in tensors.items()},
         }
-        path = self.directory / f"{checkpoint.stage:02d}-{checkpoint.step:07d}.json"
-        tensor_path = path.with_suffix(".safetensors")
         body = json.dumps(content)
         text = json.dumps({"crc": zlib.crc32(body.encode()), "content": content})
-        # The inner file takes its place first: the JSON file makes the pair valid.
-        with replacing(path) as beside, replacing(tensor_path) as tensors_beside:
-            save_file(tensors, tensors_beside, {"pair": content["pair"]})
+        size = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
+        # On the disk itself, since the one before goes. The inner file takes its place first: the JSON file makes the
+        # pair valid.
+        with (
+            replacing(path, wanted=len(text), durable=True) as beside,
+            replacing(tensor_path, wanted=size, durable=True) as tensors_beside,
+        ):
+            save_file(tensors, tensors_beside, {"pair": pair})
             beside.write_text(text)
-        self._prune(checkpoint.stage)
+        self._prune(checkpoint.stage, tensor_path.name)
         return path
 
     def paths(self) -> list[Path]:
@@ -115,7 +127,7 @@ class CheckpointStore:
             except DamagedCheckpointError as error:
                 problem = problem or error
                 log.warning("%s; trying the one before", error)
-                for each in (path, path.with_suffix(".safetensors")):
+                for each in (path, *self.directory.glob(f"{path.stem}*.safetensors")):
                     with contextlib.suppress(OSError):
                         os.replace(each, each.with_name(f"{each.name}.damaged"))
                 continue
@@ -137,23 +149,38 @@ class CheckpointStore:
             f"{self.directory}: the last checkpoint of stage {stage} is missing; start again (--fresh)"
         )
 
+    def identity(self) -> dict[str, Any] | None:
+        """What the newest checkpoint was made from; None if there is none, or none that can be read."""
+        for path in self.paths()[:1]:
+            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+                found = json.loads(path.read_text())["content"]["identity"]
+                return found if isinstance(found, dict) else None
+        return None
+
     def clear(self) -> None:
-        """Remove every checkpoint file of the directory."""
+        """Remove every checkpoint file of the directory, and what was to become one."""
         if self.directory.is_dir():
-            for path in self.directory.iterdir():
+            # What makes a pair valid goes first: a process that ends here leaves no half of one.
+            for path in sorted(self.directory.iterdir(), key=lambda p: p.suffix != ".json"):
                 if _OURS.fullmatch(path.name):
                     path.unlink()
 
-    def _prune(self, stage: int) -> None:
+    def _prune(self, stage: int, tensors: str) -> None:
+        """Remove what is not kept any more; `tensors` is the file of the checkpoint that was just written."""
         by_stage: dict[int, list[Path]] = {}
         for path in self.paths():
             by_stage.setdefault(int(path.name[:2]), []).append(path)
         kept = {
             path.stem for number, paths in by_stage.items() for path in paths[: self.keep if number == stage else 1]
         }
+        written = tensors[: len("00-0000000")]
         for path in self.directory.iterdir():
             # Also what a killed process left half written; what was set aside as damaged stays.
-            if _OURS.fullmatch(path.name) and path.suffix != ".damaged" and path.stem not in kept:
+            match = _OURS.fullmatch(path.name)
+            if match is None or path.suffix == ".damaged":
+                continue
+            replaced = match[1] == written and path.suffix == ".safetensors" and path.name != tensors
+            if match[1] not in kept or replaced or path.suffix == ".tmp":
                 path.unlink()
 
 
@@ -162,7 +189,7 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
     Raises DamagedCheckpointError that says what is wrong, CheckpointError for a format of another version.
     """
-    tensor_path = path.with_suffix(".safetensors")
+    tensor_path = path.with_suffix(".safetensors")  # unless the JSON file says otherwise
     try:
         outer = json.loads(path.read_text())
         content = outer["content"]
@@ -172,6 +199,9 @@ def read_checkpoint(path: Path) -> Checkpoint:
             raise CheckpointError(
                 f"checkpoint {path} has format {content['format']}, this version reads {FORMAT}: start again (--fresh)"
             )
+        if _TENSORS.fullmatch(content.get("file", tensor_path.name)) is None:
+            raise DamagedCheckpointError(f"checkpoint {path} is damaged: it names no file of tensors")
+        tensor_path = path.with_name(content.get("file", tensor_path.name))
         with safe_open(tensor_path, framework="pt") as file:
             if (file.metadata() or {}).get("pair") != content["pair"]:
                 raise DamagedCheckpointError(f"checkpoint {path} and {tensor_path.name} do not belong together")

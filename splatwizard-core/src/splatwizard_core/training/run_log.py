@@ -1,14 +1,19 @@
-"""log.jsonl: one JSON object a line, appended while a run trains; a resumed run takes back what it will do again."""
+"""log.jsonl: one JSON object a line, appended while a run trains; a resumed run takes back what it will do again.
+
+A line is there once its line break is: whoever reads while a run writes passes over what follows the last one.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
 from pathlib import Path
 from types import TracebackType
-from typing import Any, TextIO
+from typing import Any
 
-from splatwizard_core.files import write_atomic
+from splatwizard_core.files import naming_full_disk, write_atomic
 
 
 class RunLog:
@@ -20,7 +25,7 @@ class RunLog:
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
-        self._file: TextIO | None = None
+        self._descriptor: int | None = None
 
     def rewind(self, stage: int, step: int) -> None:
         """Drop the lines after this step of this stage (and a last line that was cut off)."""
@@ -44,20 +49,31 @@ class RunLog:
     def __enter__(self) -> RunLog:
         if self.path is not None:
             self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("a", encoding="utf-8", buffering=1)
+            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._file is not None:
-            self._file.close()
-            self._file = None
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+            self._descriptor = None
 
     def write(self, stage: int, step: int, **content: Any) -> None:
-        """Append one line; a number that is not finite becomes null."""
-        if self._file is not None:
-            self._file.write(json.dumps(_finite({"stage": stage, "step": step, **content})) + "\n")
+        """Append one line; a number that is not finite becomes null. Raises DiskFullError; then no part of it stays."""
+        if self._descriptor is None or self.path is None:
+            return
+        line = (json.dumps(_finite({"stage": stage, "step": step, **content})) + "\n").encode()
+        before = os.fstat(self._descriptor).st_size
+        try:
+            with naming_full_disk(self.path, len(line)):
+                written = 0
+                while written < len(line):  # a disk that is nearly full takes a part first
+                    written += os.write(self._descriptor, line[written:])
+        except BaseException:
+            with contextlib.suppress(OSError):
+                os.ftruncate(self._descriptor, before)
+            raise
 
 
 def _finite(value: Any) -> Any:
