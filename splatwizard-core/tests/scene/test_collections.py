@@ -332,8 +332,10 @@ def test_an_option_that_changes_nothing_is_said_to_be_of_no_use(load, colmap_sce
     assert load("demo:tiny", init_points=7).warnings == [
         "init_points = 7 is of no use for a scene of the family 'demo'"
     ]
-    warnings = load(colmap_scene("mine/a"), legacy_8bit_composite=True).warnings
-    assert warnings == ["legacy_8bit_composite = True is of no use for a scene of the family 'colmap'"]
+    root = colmap_scene("mine/a")
+    for key, value in {"protocol": "inria", "legacy_8bit_composite": True}.items():
+        told = load(root, **{key: value}).warnings
+        assert told == [f"{key} = {value} is of no use for a scene of the family 'colmap'"]
 
 
 def test_two_splits_at_once_are_refused(load):

@@ -103,8 +103,12 @@ def settle(family: Family, folder: str, options: SceneOptions) -> Rules:
     )
 
 
-def of_no_use(options: SceneOptions, keys: Iterable[str], family: str) -> list[str]:
-    """A warning for each of `keys` that was given a value although scenes of the family have no use for it."""
+def of_no_use(options: SceneOptions, keys: Iterable[str], family: Family) -> list[str]:
+    """A warning for each of `keys` that was given a value although scenes of the family have no use for it.
+
+    A named protocol is of no use where nothing is published.
+    """
     defaults = {f.name: f.default for f in fields(SceneOptions)}
+    keys = [*keys] if family.scenes else ["protocol", *keys]
     given = [key for key in keys if getattr(options, key) != defaults[key]]
-    return [f"{key} = {getattr(options, key)} is of no use for a scene of the family '{family}'" for key in given]
+    return [f"{key} = {getattr(options, key)} is of no use for a scene of the family '{family.name}'" for key in given]

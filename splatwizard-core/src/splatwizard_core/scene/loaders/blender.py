@@ -71,7 +71,7 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
             f"{rules.family.title} has {published[0]} training and {published[1]} test views a scene, this folder "
             f"{len(train)} and {len(test)}: figures are not comparable with published ones"
         )
-    warnings += of_no_use(options, ("mask_background",), rules.family.name)  # alpha always cuts these pictures out
+    warnings += of_no_use(options, ("mask_background",), rules.family)  # alpha always cuts these pictures out
     return assemble_scene(
         path.resolve().name,
         train + test,

@@ -118,7 +118,7 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
             f"the principal point is up to {off_centre:.1f} px off the image centre and is taken as the centre, "
             "as the 3DGS code does (principal_point = file uses it)"
         )
-    warnings += of_no_use(options, ("legacy_8bit_composite", "init_points"), rules.family.name)
+    warnings += of_no_use(options, ("legacy_8bit_composite", "init_points"), rules.family)
     return assemble_scene(
         path.resolve().name,
         views,

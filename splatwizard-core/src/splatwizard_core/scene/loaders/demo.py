@@ -13,7 +13,7 @@ from splatwizard_core.scene.rules import of_no_use, settle
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.scene.synthetic import SIZES, make_scene
 
-NO_USE = ("protocol", "principal_point", "mask_background", "legacy_8bit_composite", "init_points")
+NO_USE = ("principal_point", "mask_background", "legacy_8bit_composite", "init_points")
 """Scene options that change nothing here: the pictures are drawn, and the size of the scene says how many points."""
 
 
@@ -41,5 +41,5 @@ class DemoDataset:
             source_size=(size.width, size.height),
             resolution=rules.resolution,
         )
-        scene.warnings += of_no_use(options, NO_USE, DEMO.name)
+        scene.warnings += of_no_use(options, NO_USE, DEMO)
         return scene

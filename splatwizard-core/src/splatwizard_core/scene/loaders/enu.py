@@ -66,7 +66,7 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         f"{POSES} brings no points: {options.init_points:,} random ones are laid where the cameras look, "
         "figures are not comparable with those of the COLMAP layout"
     ]
-    warnings += of_no_use(options, ("principal_point", "mask_background", "legacy_8bit_composite"), rules.family.name)
+    warnings += of_no_use(options, ("principal_point", "mask_background", "legacy_8bit_composite"), rules.family)
     return assemble_scene(
         path.resolve().name,
         views,
