@@ -5,6 +5,7 @@ Everything goes to stderr, so that stdout stays clean for results and `--json`.
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import time
 from collections import deque
@@ -53,7 +54,8 @@ class Bar:
         if now - self._drawn >= self._interval:
             self._drawn = now
             self._mark(now)
-            self._draw()
+            with contextlib.suppress(OSError):  # a terminal that has closed must not end the work
+                self._draw()
 
     @property
     def rate(self) -> float | None:

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import logging
-import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import click
 
-from splatwizard_core.errors import PluginError, SplatwizardError
+from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams
+from splatwizard_core.errors import DiskFullError, PluginError, SplatwizardError
+from splatwizard_core.files import FULL
 
 COMMANDS = {
     "run": "splatwizard_core.cli.run:run",
@@ -59,15 +61,15 @@ class LazyGroup(click.Group):
             raise PluginError(f"command '{taken}' already exists")
         super().add_command(cmd, name)
 
+    def make_context(self, *args: Any, **extra: Any) -> click.Context:
+        with _quiet_about_readers():
+            return super().make_context(*args, **extra)
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a reader that goes away (`sw info x | head`) ends it quietly."""
-        try:
+        with _quiet_about_readers():
             result = super().invoke(ctx)
             sys.stdout.flush()
-        except BrokenPipeError:
-            # Keep the interpreter from complaining when it flushes at its end.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-            raise click.exceptions.Exit(SIGPIPE_STATUS) from None
         return result
 
     def ask_plugins(self) -> None:
@@ -89,6 +91,15 @@ class LazyGroup(click.Group):
             near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
             hint = f"did you mean '{near[0]}'?" if near else "`sw --help` lists all"
             raise click.UsageError(f"no command '{args[0]}': {hint}", ctx) from error
+
+
+@contextlib.contextmanager
+def _quiet_about_readers() -> Iterator[None]:
+    try:
+        yield
+    except BrokenPipeError:
+        abandon_streams()
+        raise click.exceptions.Exit(SIGPIPE_STATUS) from None
 
 
 def _version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
@@ -113,26 +124,28 @@ def cli() -> None:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run `sw` and return its exit status: 0, 2 wrong input, 1 failure, 130 interrupted."""
+    open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in arguments
     logging.basicConfig(level=logging.DEBUG if debug else logging.WARNING, format="%(levelname)s: %(message)s")
     for noisy in ("PIL", "torch", "matplotlib"):
         logging.getLogger(noisy).setLevel(logging.WARNING)
-    try:
-        status = cli.main(args=arguments, prog_name="sw", standalone_mode=False)
-    except BaseException as error:
-        return _report(error, debug=debug)
+    with ended_like_ctrl_c():
+        try:
+            status = cli.main(args=arguments, prog_name="sw", standalone_mode=False)
+        except BaseException as error:
+            return _report(error, debug=debug, fresh="--fresh" in arguments)
     return status if isinstance(status, int) else 0
 
 
-def _report(error: BaseException, *, debug: bool) -> int:
+def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
     if debug and not isinstance(error, (click.ClickException, click.Abort, SystemExit)):
         traceback.print_exception(error)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        _say("interrupted (the same command resumes a run)")
+        _say(f"interrupted (the same command{' without --fresh' if fresh else ''} resumes a run)")
         return 130
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         _say(error.format_message())
@@ -146,6 +159,9 @@ def _report(error: BaseException, *, debug: bool) -> int:
         _say(f"error: {error}")
         return error.exit_status
     if isinstance(error, OSError) and error.strerror is not None:
+        if error.errno in FULL and error.filename is not None:
+            _say(f"error: {DiskFullError(str(error.filename), FULL[error.errno])}")
+            return DiskFullError.exit_status
         at = "" if error.filename is None else f"{error.filename}: "
         _say(f"error: {at}{error.strerror}{'' if debug else ' (a traceback: add --debug)'}")
         return 2 if isinstance(error, PATH_ERRORS) else 1
@@ -156,4 +172,5 @@ def _report(error: BaseException, *, debug: bool) -> int:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
+    with contextlib.suppress(OSError):  # nobody reads it: the exit status must do
+        print(text, file=sys.stderr, flush=True)

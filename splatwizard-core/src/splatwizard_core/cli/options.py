@@ -103,5 +103,11 @@ def console() -> Console:
 
     from rich.console import Console
 
+    class Loud(Console):
+        """Rich would end the process with status 1 where the reader of a pipe has gone; that is for `main` to say."""
+
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
     # A pipe has no width: 80 columns would break tables that are meant to be searched.
-    return Console(highlight=False, width=None if sys.stdout.isatty() else 160)
+    return Loud(highlight=False, width=None if sys.stdout.isatty() else 160)
