@@ -7,6 +7,7 @@ that the user names, then in the cache of torch.hub. The last eight digits of th
 
 from __future__ import annotations
 
+import warnings
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -134,7 +135,9 @@ def read_weights(path: Path, backbone: Backbone) -> Weights:
                 unpacked = sum(entry.file_size for entry in archive.infolist())
             if unpacked > MOST_BYTES:
                 raise refuse(f"it unpacks to {unpacked:,} bytes, more than any such file")
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # what is odd about the file is told below, in one line
+            content = torch.load(path, map_location="cpu", weights_only=True)
     except UserInputError:
         raise
     # Bytes from a stranger: whatever the reader stumbles over, it is the file that is wrong.
