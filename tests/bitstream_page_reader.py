@@ -1,0 +1,588 @@
+"""A decoder for .swz files that was written from docs/bitstream.md and nothing else.
+
+It shares no code with the packages (a test looks), uses Python and numpy, and cares for clarity alone: if it and the
+packages disagree, either the page or the packages are wrong. It trusts its input, beyond the checksums.
+"""
+
+from __future__ import annotations
+
+import bisect
+import heapq
+import json
+import struct
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+MASK = (1 << 64) - 1
+
+
+class PageError(Exception):
+    """The file is not what the page describes."""
+
+
+def check(claim: bool, what: str) -> None:
+    if not claim:
+        raise PageError(what)
+
+
+class Bytes:
+    """Takes fields off the front."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = bytes(data), 0
+
+    def take(self, count: int) -> bytes:
+        check(self.at + count <= len(self.data), "too short")
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def unpack(self, form: str) -> tuple[Any, ...]:
+        return struct.unpack("<" + form, self.take(struct.calcsize("<" + form)))
+
+    def one(self, form: str) -> int:
+        (value,) = self.unpack(form)
+        return int(value)
+
+    def varint(self) -> int:
+        value = shift = 0
+        while True:
+            byte = self.take(1)[0]
+            value |= (byte & 127) << shift
+            shift += 7
+            if byte < 128:
+                return value
+
+    def signed(self) -> int:
+        return unzigzag(self.varint())
+
+    def rest(self) -> bytes:
+        return self.take(len(self.data) - self.at)
+
+    def done(self) -> None:
+        check(self.at == len(self.data), "bytes are left")
+
+
+# 1 Container
+
+
+def container(data: bytes) -> tuple[dict[str, Any], dict[str, bytes]]:
+    """The header and the sections."""
+    file = Bytes(data)
+    check(file.take(4) == b"SPWZ" and file.one("H") == 1, "not version 1 of .swz")
+    raw = file.take(file.one("I"))
+    check(zlib.crc32(raw) == file.one("I"), "header CRC")
+    header = json.loads(raw)
+    check(
+        set(header) | {"requires"} == {"method", "method_version", "requires", "raster", "static", "sections"}, "keys"
+    )
+    sections, expected = {}, 0
+    for name, offset, length, crc in header["sections"]:
+        check(offset == expected, "offset")
+        sections[name] = file.take(length)
+        check(zlib.crc32(sections[name]) == crc, f"CRC of {name}")
+        expected += length
+    file.done()
+    return header, sections
+
+
+DTYPES = dict(enumerate(["u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8", "b1"], 1))
+
+
+def array(section: bytes) -> np.ndarray:
+    data = Bytes(section)
+    dtype, axes = data.unpack("BB")
+    shape = data.unpack("I" * axes)
+    return np.frombuffer(data.rest(), "<" + DTYPES[dtype]).reshape(shape)
+
+
+# 2 Building blocks
+
+
+def unzigzag(code: int) -> int:
+    return code // 2 if code % 2 == 0 else -(code + 1) // 2
+
+
+def raw_bits(data: Bytes, count: int, width: int) -> list[int]:
+    """`count` integers of `width` bits, from the least significant bit up."""
+    stream = int.from_bytes(data.take((count * width + 7) // 8), "little")
+    check(stream >> (count * width) == 0, "padding")
+    return [(stream >> (i * width)) & ((1 << width) - 1) for i in range(count)]
+
+
+def class_e(number: int, m: int) -> int:
+    """How many low bits values of this class have left over."""
+    # Classes from e * 2^m + 2^m to e * 2^m + 2 * 2^m - 1 belong to e, since z >> e has its top bit at 2^m.
+    return max((number >> m) - 1, 0)
+
+
+def class_smallest(number: int, m: int) -> int:
+    e = class_e(number, m)
+    return (number - (e << m)) << e
+
+
+Model = list[int]
+
+
+def cumulative(counts: Sequence[int]) -> Model:
+    """c_0 ... c_K of a table of counts."""
+    factor = float((1 << 24) - len(counts)) / float(sum(counts))
+    found, below = [], 0
+    for i, count in enumerate(counts):
+        found.append(int(float(below) * factor) + i)
+        below += int(count)
+    return [*found, 1 << 24]
+
+
+def bernoulli_model(p: float) -> Model:
+    return [0, int((1.0 - p) * ((1 << 24) - 2)) + 1, 1 << 24]
+
+
+class RangeWords:
+    def __init__(self, data: bytes) -> None:
+        self.words = iter(struct.unpack(f"<{len(data) // 4}I", data))
+        self.low, self.range = 0, MASK
+        self.point = (next(self.words, 0) << 32) + next(self.words, 0)
+
+    def symbol(self, model: Model) -> int:
+        scale = self.range >> 24
+        q = ((self.point - self.low) & MASK) // scale
+        check(q < 1 << 24, "damaged words")
+        s = bisect.bisect_right(model, q) - 1
+        self.low = (self.low + scale * model[s]) & MASK
+        self.range = scale * (model[s + 1] - model[s])
+        if self.range < 1 << 32:
+            self.low = (self.low << 32) & MASK
+            self.range <<= 32
+            self.point = ((self.point << 32) & MASK) + next(self.words, 0)
+        return s
+
+
+class RansWords:
+    def __init__(self, data: bytes) -> None:
+        self.words = list(struct.unpack(f"<{len(data) // 4}I", data))
+        self.state = 0
+        while self.state < 1 << 32 and self.words:
+            self.state = (self.state << 32) + self.words.pop()
+
+    def symbol(self, model: Model) -> int:
+        q = self.state % (1 << 24)
+        s = bisect.bisect_right(model, q) - 1
+        self.state = (self.state >> 24) * (model[s + 1] - model[s]) + q - model[s]
+        if self.state < 1 << 32 and self.words:
+            self.state = (self.state << 32) + self.words.pop()
+        return s
+
+
+def symbols_of(words: RangeWords | RansWords, counts: Sequence[int], n: int) -> list[int]:
+    """n symbols of one table of counts."""
+    positive = [s for s, count in enumerate(counts) if count > 0]
+    check(len(positive) > 0 or n == 0, "empty table")
+    if len(counts) == 1 or len(positive) == 1:
+        return positive * n
+    model = cumulative(counts) if n else []
+    return [words.symbol(model) for _ in range(n)]
+
+
+def symbols_by_table(
+    words: RangeWords | RansWords, tables: Sequence[Sequence[int]], numbers: Sequence[int]
+) -> list[int]:
+    """A symbol for each entry of `numbers`, coded table by table."""
+    found = [0] * len(numbers)
+    for table in sorted(set(numbers)):
+        rows = [i for i, number in enumerate(numbers) if number == table]
+        for i, symbol in zip(rows, symbols_of(words, tables[table], len(rows)), strict=True):
+            found[i] = symbol
+    return found
+
+
+def huffman_codes(counts: Sequence[int]) -> dict[str, int]:
+    """Symbol of each code."""
+    queue = [(np.float32(count), s) for s, count in enumerate(counts)]
+    codes = {s: [(s, "")] for s in range(len(counts))}
+    heapq.heapify(queue)
+    number = len(counts)
+    while len(queue) > 1:
+        (zero, a), (one, b) = heapq.heappop(queue), heapq.heappop(queue)
+        codes[number] = [(s, bit + code) for bit, node in (("0", a), ("1", b)) for s, code in codes.pop(node)]
+        heapq.heappush(queue, (zero + one, number))
+        number += 1
+    return {code: s for s, code in codes[number - 1]}
+
+
+def crc_i32(symbols: Sequence[int]) -> int:
+    return zlib.crc32(np.array(symbols, "<i4").tobytes())
+
+
+def crc_i64(values: Sequence[int]) -> int:
+    return zlib.crc32(np.array(values, "<i8").tobytes())
+
+
+def stored_tables(data: Bytes, lengths: Sequence[int]) -> list[list[int]]:
+    if sum(lengths) == 0:
+        return [[] for _ in lengths]
+    head = data.varint()
+    if head % 2 == 0:
+        meta = list(data.take(head // 2))
+    else:
+        meta = []
+        for _ in range(head // 2):
+            skipped = data.varint()
+            meta += [0] * skipped + [data.take(1)[0]]
+    words = RangeWords(data.take(data.varint()))
+    symbols = symbols_of(words, [class_smallest(code, 3) for code in meta], sum(lengths))
+    check(crc_i32(symbols) == data.one("I"), "CRC of the tables")
+    tables, at = [], 0
+    for length in lengths:
+        code, table = 0, []
+        for symbol in symbols[at : at + length]:
+            code += unzigzag(symbol)
+            table.append(class_smallest(code, 3))
+        tables.append(table)
+        at += length
+    return tables
+
+
+# 3 Entropy coders
+
+
+def coder_chunks(data: bytes, n: int, payload: Callable[[bytes, int, int, int, int], list[int]]) -> list[int]:
+    """All symbols; `payload(bytes, first symbol, count, kmin, kmax)` decodes that of one chunk."""
+    file, found = Bytes(data), []
+    while len(found) < n:
+        count, kmin, kmax, length, crc = file.unpack("IiiII")
+        check(count == min(1 << 20, n - len(found)), "chunk size")
+        content = file.take(length)
+        chunk = [kmin] * count if kmin == kmax else payload(content, len(found), count, kmin, kmax)
+        check(crc_i32(chunk) == crc and min(chunk) == kmin and max(chunk) == kmax, "CRC of a chunk")
+        found += chunk
+    file.done()
+    return found
+
+
+def coder_symbols(coder: str, data: bytes, tables: Sequence[Sequence[int]], numbers: Sequence[int]) -> list[int]:
+    """What `range`, `rans` or `huffman` wrote, given the table of each symbol."""
+
+    def payload(content: bytes, first: int, count: int, kmin: int, kmax: int) -> list[int]:
+        part = numbers[first : first + count]
+        if coder != "huffman":
+            words = RangeWords(content) if coder == "range" else RansWords(content)
+            return symbols_by_table(words, tables, part)
+        trees = [huffman_codes(table) for table in tables]
+        bits = iter(f"{word >> i & 1}" for word in struct.unpack(f"<{len(content) // 4}I", content) for i in range(32))
+        found = []
+        for number in part:
+            code = ""
+            while code not in trees[number]:
+                code += next(bits)
+            found.append(trees[number][code])
+        return found
+
+    return coder_chunks(data, len(numbers), payload)
+
+
+# 4 Entropy models
+
+
+def columns(data: bytes, rows: int, width: int) -> list[list[int]]:
+    """The columns of the matrix."""
+    file = Bytes(data)
+    check(file.unpack("BIH") == (1, rows, width), "head of columns")
+    crc = file.one("I")
+    plans = []
+    for _ in range(width):
+        scheme, p = file.unpack("BB")
+        offset, length = file.signed(), file.varint()
+        first = file.signed() if scheme >= 16 else None
+        gaps = [file.varint() for _ in range(length - 1)] if scheme % 16 == 3 else []
+        plans.append((scheme % 16, p, offset, length, first, gaps))
+    tables = stored_tables(file, [plan[3] for plan in plans if plan[0] != 0])
+    chunks = Bytes(file.take(file.varint()))
+    classes = coded_classes(chunks, tables, rows)
+    chunks.done()
+    found = []
+    for scheme, p, offset, _, first, gaps in plans:
+        if scheme == 0:
+            values = [offset] * rows
+        else:
+            values = column_values(file, next(classes), scheme, p, offset, gaps)
+        if first is not None:
+            above = first
+            for i in range(rows):
+                above += values[i]
+                values[i] = above
+        found.append(values)
+    file.done()
+    check(crc_i64([v for column in found for v in column]) == crc, "CRC of columns")
+    return found
+
+
+def coded_classes(chunks: Bytes, tables: Sequence[Sequence[int]], rows: int) -> Iterator[list[int]]:
+    """The classes of each coded column; a chunk holds up to 2^20 symbols, in pieces of up to 2^20 rows."""
+    found: list[list[int]] = []
+    chunk: list[int] = []
+    words, crc = RangeWords(b""), 0
+    for table in tables:
+        column: list[int] = []
+        for start in range(0, rows, 1 << 20):
+            piece = min(1 << 20, rows - start)
+            if (not found and not column) or len(chunk) + piece > 1 << 20:
+                check(crc_i32(chunk) == crc, "CRC of a chunk of classes")
+                length, crc = chunks.unpack("II")
+                words, chunk = RangeWords(chunks.take(length)), []
+            symbols = symbols_of(words, table, piece)
+            chunk += symbols
+            column += symbols
+        found.append(column)
+    check(crc_i32(chunk) == crc, "CRC of a chunk of classes")
+    return iter(found)
+
+
+def column_values(file: Bytes, classes: list[int], scheme: int, p: int, offset: int, gaps: list[int]) -> list[int]:
+    if scheme == 3:
+        distinct = [offset]
+        for gap in gaps:
+            distinct.append(distinct[-1] + gap)
+        return [distinct[c] for c in classes]
+    if scheme == 1:
+        return [offset + (c << p) + low for c, low in zip(classes, raw_bits(file, len(classes), p), strict=True)]
+    check(scheme == 2, "scheme")
+    values = [class_smallest(c, p) for c in classes]
+    for e in sorted({class_e(c, p) for c in classes} - {0}):
+        rows = [i for i, c in enumerate(classes) if class_e(c, p) == e]
+        for i, low in zip(rows, raw_bits(file, len(rows), e), strict=True):
+            values[i] += low
+    return [unzigzag(value) + offset for value in values]
+
+
+def categorical(data: bytes, size: int, tables: int, numbers: Sequence[int]) -> list[int]:
+    file = Bytes(data)
+    check(file.one("B") == 1, "version")
+    if not numbers:
+        return []
+    stored = [table if any(table) else [1] * size for table in stored_tables(file, [size] * tables)]
+    return coder_symbols("range", file.rest(), stored, numbers)
+
+
+def bernoulli(data: bytes, n: int) -> list[int]:
+    file = Bytes(data)
+    p = min(max(file.varint() / n, 2.0**-24), 1 - 2.0**-24)
+
+    def payload(content: bytes, first: int, count: int, kmin: int, kmax: int) -> list[int]:
+        words, model = RangeWords(content), bernoulli_model(p)
+        return [words.symbol(model) for _ in range(count)]
+
+    return coder_chunks(file.rest(), n, payload)
+
+
+class ExactTables:
+    """The table file of sw-codecs."""
+
+    def __init__(self, data: bytes) -> None:
+        file = Bytes(data)
+        check(file.take(4) == b"SPWT", "magic of the tables")
+        self.version = file.one("H")
+        file.one("I")
+        file.take(128 * 2 + 64 * 4)  # step multipliers and scales: for encoders
+        self.thresholds = file.unpack("63I")
+        self.radius, self.tables = {}, {}
+        for family in ("gaussian", "laplace"):
+            self.radius[family] = file.unpack("64H")
+            self.tables[family] = [
+                [count + 1 for count in file.unpack(f"{2 * radius + 2}H")]
+                for radius in self.radius[family]
+                for _ in range(8)
+            ]
+        self.crc = file.one("I")
+        file.done()
+
+
+def exact(
+    data: bytes, family: str, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
+) -> list[int]:
+    """`gaussian-exact` and `laplace-exact`."""
+    file = Bytes(data)
+    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    centres, numbers = [], []
+    for mu, sigma, m in zip(mean, scale, multiplier, strict=True):
+        eighths = (8 * mu + m // 2) // m
+        centres.append((eighths + 4) // 8)
+        level = bisect.bisect_left(tables.thresholds, (max(sigma, 0) << 12) // m)
+        numbers.append(8 * level + eighths + 4 - 8 * centres[-1])
+
+    found: list[int] = []
+    while len(found) < len(centres):
+        count, _, _, length, crc = file.unpack("IiiII")
+        start = len(found)
+        chunk = Bytes(file.take(length))
+        words = RangeWords(chunk.take(chunk.varint()))
+        part = numbers[start : start + count]
+        entries = symbols_by_table(words, tables.tables[family], part)
+        bits = iter(f"{byte >> i & 1}" for byte in chunk.rest() for i in range(8))
+        values = [0] * count
+        for i in sorted(range(count), key=lambda i: part[i]):  # stable: table by table, in order
+            radius = tables.radius[family][part[i] // 8]
+            values[i] = entries[i] - radius
+            if entries[i] == 2 * radius + 1:
+                negative, zeros = next(bits) == "1", 0
+                while next(bits) == "0":
+                    zeros += 1
+                v = int("1" + "".join(next(bits) for _ in range(zeros)), 2) - 1
+                values[i] = -(v + radius + 1) if negative else v + radius + 1
+        values = [value + centre for value, centre in zip(values, centres[start : start + count], strict=True)]
+        check(crc_i32(values) == crc, "CRC of a chunk")
+        found += values
+    file.done()
+    return found
+
+
+# 5 Positions
+
+
+def points_of(codes: Sequence[int]) -> np.ndarray:
+    """[N,3] from Morton codes."""
+    found = [[sum((code >> 3 * i + axis & 1) << i for i in range(21)) for axis in range(3)] for code in codes]
+    return np.array(found, np.int64).reshape(-1, 3)
+
+
+def octree(data: bytes) -> np.ndarray:
+    file = Bytes(data)
+    version, b = file.unpack("BB")
+    check(version == 1, "version of the octree")
+    n, distinct = file.varint(), file.varint()
+    codes: list[int] = []
+    if distinct:
+        leaves = octree_leaves(file, b, distinct)
+        times = [1] * distinct
+        repeated = file.varint()
+        if repeated:
+            steps, more = columns(file.take(file.varint()), repeated, 2)
+            at = 0
+            for step, extra in zip(steps, more, strict=True):
+                at += step
+                times[at] += extra
+        codes = [leaf for leaf, count in zip(leaves, times, strict=True) for _ in range(count)]
+    check(len(codes) == n and crc_i64(codes) == file.one("I"), "CRC of the points")
+    file.done()
+    return points_of(codes)
+
+
+def octree_leaves(file: Bytes, b: int, distinct: int) -> list[int]:
+    d = file.one("B")
+    actions = [[byte >> 2 * c & 3 for c in range(4)] for byte in file.take(d)]
+    stored = iter(stored_tables(file, [255] * sum(level.count(1) for level in actions)))
+    words = RangeWords(file.take(file.varint()))
+    tables = [[1] * 255 for _ in range(4)]
+    nodes, contexts, coded = [0], [0], []
+    for level in actions:
+        for c in range(4):
+            if level[c] == 0:
+                tables[c] = [1] * 255
+            elif level[c] == 1:
+                tables[c] = next(stored)
+        symbols = symbols_by_table(words, tables, contexts)
+        coded += symbols
+        children, below = [], []
+        for node, symbol in zip(nodes, symbols, strict=True):
+            present = [c for c in range(8) if symbol + 1 >> c & 1]
+            children += [(node << 3) + c for c in present]
+            below += [min(len(present), 4) - 1] * len(present)
+        nodes, contexts = children, below
+    check(crc_i32(coded) == file.one("I") and len(nodes) == distinct, "CRC of the octree")
+    low = 3 * (b - d)
+    return [(node << low) + bits for node, bits in zip(nodes, raw_bits(file, distinct, low), strict=True)]
+
+
+def plain_positions(data: bytes, *, unzstd: Callable[[bytes], bytes] | None = None) -> np.ndarray:
+    """`morton-delta`, or with a decompressor `raw`."""
+    file = Bytes(data)
+    version, b = file.unpack("BB")
+    crc, n = file.one("I"), file.varint()
+    check(version == 1, "version of the positions")
+    if unzstd is None:
+        code, codes = 0, []
+        for high, low in zip(*columns(file.rest(), n, 2), strict=True):
+            code += (high << 48) + low
+            codes.append(code)
+        points = points_of(codes)
+    else:
+        points = np.frombuffer(unzstd(file.rest()), "<u2" if b <= 16 else "<u4").reshape(3, n).T.astype(np.int64)
+        codes = [sum((int(p[a]) >> i & 1) << 3 * i + a for i in range(21) for a in range(3)) for p in points]
+    check(crc_i64(codes) == crc, "CRC of the points")
+    return points
+
+
+# 6 The files of each method
+
+
+def decode(data: bytes) -> dict[str, np.ndarray]:
+    """The parameters of the Gaussians in a file of 3dgs, f32."""
+    header, sections = container(data)
+    check(header["method"] == "3dgs" and header["method_version"] == 1, "not layout 1 of 3dgs")
+    static = header["static"]
+    if static["mode"] == "exact":
+        return {name: array(section) for name, section in sections.items()}
+    check(static["mode"] == "quantized", "mode")
+    return quantized(static, sections)
+
+
+def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    n, active = static["num_gaussians"], static["active_sh_degree"]
+    points = octree(sections["positions"])
+    check(len(points) == n, "number of points")
+    base = {name: np.array(columns(sections[name], n, width), np.float64).reshape(width, n)
+            for name, width in (("color", 3), ("opacity", 1), ("scales", 3), ("quats", 3))}  # fmt: skip
+    rest = np.zeros((n, (static["max_sh_degree"] + 1) ** 2 - 1, 3), np.float32)
+    activity = [0] * n
+    for band in range(1, active + 1):
+        matrix = band_columns(sections[f"sh{band}"], n, band, 1 if band == 1 else static["sh_classes"], activity)
+        activity = [sum(map(abs, row), done) for row, done in zip(zip(*matrix, strict=True), activity, strict=True)]
+        colors = np.array(matrix, np.float64).reshape(2 * band + 1, 3, n) * static["rest_step"]
+        for k, (y, u, v) in enumerate(colors):
+            rest[:, band**2 - 1 + k] = rgb(y, u, v)
+    x, y, z = base["quats"] * static["quat_step"]
+    norm = x * x + y * y + z * z
+    w, long = np.sqrt(np.maximum(1 - norm, 0)), np.sqrt(np.maximum(norm, 1))
+    return {
+        "means": np.stack([coordinates(points[:, a], static, a) for a in range(3)], 1),
+        "sh_dc": rgb(*(base["color"] * static["dc_step"]))[:, None],
+        "sh_rest": rest,
+        "opacity_logits": (base["opacity"][0] * static["opacity_step"]).astype(np.float32),
+        "log_scales": (base["scales"] * static["scale_step"]).T.astype(np.float32),
+        "quats": np.stack([w / long, x / long, y / long, z / long], 1).astype(np.float32),
+    }
+
+
+def coordinates(q: np.ndarray, static: dict[str, Any], axis: int) -> np.ndarray:
+    top = float(static["top"][axis])
+    v = (q + 0.5) * (2 * top * 2.0 ** -static["position_bits"]) - top
+    a = np.abs(v)
+    floor = np.floor(a)
+    u = np.where(a < 1, a, (1 + (a - floor)) * 2.0 ** (floor - 1))
+    u = np.where(v < 0, -u, u)
+    return (u * static["width"][axis] + static["center"][axis]).astype(np.float32)
+
+
+def rgb(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    a, b, c, d = 1 / np.sqrt(3.0), 1 / np.sqrt(2.0), 1 / np.sqrt(6.0), -2 / np.sqrt(6.0)
+    return np.stack([a * y + b * u + c * v, a * y + 0 * u + d * v, a * y - b * u + c * v], 1).astype(np.float32)
+
+
+def band_columns(section: bytes, n: int, band: int, classes: int, activity: list[int]) -> list[list[int]]:
+    """The columns of one SH band, rows of all classes in place."""
+    file, width = Bytes(section), 3 * (2 * band + 1)
+    lengths = file.unpack("I" * classes)
+    limits = [sorted(activity)[n * i // classes] for i in range(1, classes)] if n else []
+    class_of = [bisect.bisect_right(limits, value) for value in activity]
+    found = [[0] * n for _ in range(width)]
+    for number, length in enumerate(lengths):
+        rows = [i for i in range(n) if class_of[i] == number]
+        content = file.take(length)
+        check(bool(rows) == bool(content), "a class and its rows")
+        for column, values in zip(found, columns(content, len(rows), width) if rows else [], strict=False):
+            for i, value in zip(rows, values, strict=True):
+                column[i] = value
+    file.done()
+    return found

@@ -1,0 +1,125 @@
+"""Writes the golden files: small .swz files of each method and rate family, which every later version must decode.
+
+    python tests/golden/make_golden.py
+
+writes what is missing here and never what is there, and adds its facts to golden.json. A deliberate change of a format
+keeps the old files and adds new ones under new names (`_v2`).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.experiments.decoding import decode_model
+from splatwizard_core.experiments.encoding import encode
+from splatwizard_core.experiments.method import create_method
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.plugins import load_plugins
+
+FOLDER = Path(__file__).resolve().parent
+FACTS = FOLDER / "golden.json"
+
+
+def procedural(n: int, degree: int = 3, active: int | None = None) -> GaussianModel:
+    """Scattered values by integer arithmetic alone: the same floats on every machine, with every library version."""
+    drawn = 0
+
+    def values(*shape: int) -> torch.Tensor:
+        """Multiples of 1/2048 in -1 .. 1, their distribution a triangle."""
+        nonlocal drawn
+        i = np.arange(drawn, drawn + int(np.prod(shape)), dtype=np.uint64)
+        drawn += len(i)
+        mixed = i * np.uint64(2654435761) % np.uint64(2**32)
+        mixed ^= (mixed * np.uint64(40503)) >> np.uint64(9)
+        folded = (mixed & np.uint64(2047)).astype(np.int64) - ((mixed >> np.uint64(11)) & np.uint64(2047)).astype(
+            np.int64
+        )
+        return torch.from_numpy((folded / 2048).astype(np.float32).reshape(shape))
+
+    coefficients = (degree + 1) ** 2
+    return GaussianModel(
+        4 * values(n, 3), values(n, 1, 3), values(n, coefficients - 1, 3) / 4, 4 * values(n) + 1, values(n, 3) - 4,
+        values(n, 4), active_sh_degree=active,
+    )  # fmt: skip
+
+
+def coincident() -> GaussianModel:
+    """Forty Gaussians at five places."""
+    model = procedural(40, 1)
+    with torch.no_grad():
+        model.means.copy_(model.means[torch.arange(40) % 5])
+        model.opacity_logits.abs_()
+    return model
+
+
+def orderly() -> GaussianModel:
+    """4,096 Gaussians on a lattice, most of them alike: enough for two classes of SH bands in few bytes."""
+    i = torch.arange(4096)
+    means = torch.stack([i % 16, i // 16 % 16, i // 256], dim=1).float()
+    rest = torch.zeros(4096, 8, 3)
+    rest[::37, :3] = 0.5
+    rest[::37, 3:] = torch.tensor([0.25, -0.5, 1.0])
+    quats = torch.zeros(4096, 4)
+    quats[:, 0] = 1
+    return GaussianModel(means, torch.zeros(4096, 1, 3), rest, torch.ones(4096), torch.full((4096, 3), -2.0), quats)
+
+
+Case = tuple[str, str, dict[str, Any], Callable[[], GaussianModel]]
+CASES: dict[str, Case] = {
+    **{f"3dgs_{rate}_v1": ("3dgs", rate, {}, lambda: procedural(48)) for rate in ("r1", "r2", "r3", "r4", "r5")},
+    "3dgs_exact_v1": ("3dgs", "r6", {}, lambda: procedural(16, 2, 1)),
+    "3dgs_exact_empty_v1": ("3dgs", "r6", {}, lambda: procedural(0)),
+    "3dgs_empty_v1": ("3dgs", "r3", {}, lambda: procedural(0)),
+    "3dgs_one_v1": ("3dgs", "r4", {}, lambda: procedural(1, 0)),
+    "3dgs_dull_v1": ("3dgs", "r5", {}, lambda: procedural(30, 3, 0)),
+    "3dgs_coincident_v1": ("3dgs", "r3", {"codec.position_bits": 9}, coincident),
+    "3dgs_classes_v1": ("3dgs", "r1", {"codec.position_bits": 8}, orderly),
+}
+"""File -> method, rate point, other values of its configuration, model."""
+
+
+def encoded(name: str) -> bytes:
+    """The file as today's code writes it."""
+    method_name, rate, values, model = CASES[name]
+    plugins = load_plugins()
+    rates = plugins.methods.load(method_name).RATES
+    method = create_method(plugins, method_name, {**rates[rate], **values})
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.swz"
+        encode(method, model(), {"antialias": False}, path, torch.device("cpu"))
+        return path.read_bytes()
+
+
+def decoded_facts(data: bytes, name: str) -> dict[str, Any]:
+    """What a file decodes to: SHA-256 over names, shapes and bytes of the parameters, and the state beside them."""
+    model = decode_model(ContainerReader(data, name), load_plugins())
+    sha = hashlib.sha256()
+    for key, parameter in sorted(model.named_parameters()):
+        sha.update(f"{key}{list(parameter.shape)}{parameter.dtype}".encode())
+        sha.update(parameter.detach().numpy().tobytes())
+    return {"parameters": sha.hexdigest(), "rows": model.num_rows, "active_sh_degree": model.active_sh_degree}
+
+
+def main() -> None:
+    facts = json.loads(FACTS.read_text()) if FACTS.exists() else {}
+    for name in CASES:
+        path = FOLDER / f"{name}.swz"
+        if not path.exists():
+            path.write_bytes(encoded(name))
+            file = {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+            facts[name] = {**file, **decoded_facts(path.read_bytes(), name)}
+            print(f"{name}: {file['bytes']:,} bytes, {facts[name]['rows']:,} Gaussians")
+    FACTS.write_text(json.dumps(facts, indent=2) + "\n")
+
+
+if __name__ == "__main__":
+    main()

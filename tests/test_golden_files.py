@@ -1,0 +1,57 @@
+"""The golden files decode to what they always decoded to, and today's encoder still writes them."""
+
+import hashlib
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.plugins import load_plugins
+
+GOLDEN = Path(__file__).parent / "golden"
+ROOT = Path(__file__).parents[1]
+FACTS = json.loads((GOLDEN / "golden.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def maker():
+    spec = importlib.util.spec_from_file_location("make_golden", GOLDEN / "make_golden.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_golden_file_has_its_facts_and_its_recipe(maker):
+    files = {path.stem for path in GOLDEN.glob("*.swz")}
+    assert files == set(FACTS) == set(maker.CASES)
+
+
+def test_every_method_of_the_workspace_has_golden_files(maker):
+    ours = {path.parent.name for path in ROOT.glob("plugins/*/pyproject.toml")}
+    methods = {entry.name for entry in load_plugins().methods if entry.distribution in ours}
+    assert methods == {case[0] for case in maker.CASES.values()}
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_a_golden_file_decodes_to_the_recorded_parameters(maker, name):
+    data = (GOLDEN / f"{name}.swz").read_bytes()
+    facts = dict(FACTS[name])
+    assert (len(data), hashlib.sha256(data).hexdigest()) == (facts.pop("bytes"), facts.pop("sha256")), (
+        "it was rewritten"
+    )
+    assert maker.decoded_facts(data, name) == facts
+
+
+@pytest.mark.parametrize("name", FACTS)
+def test_todays_encoder_writes_the_same_sections_and_the_same_model(maker, name):
+    """If the bytes change on purpose, the old file stays, and a new one is made under a new name (`_v2`)."""
+    fresh, golden = ContainerReader(maker.encoded(name), name), ContainerReader.open(GOLDEN / f"{name}.swz")
+    assert maker.decoded_facts(maker.encoded(name), name)["parameters"] == FACTS[name]["parameters"]
+    assert (fresh.method, fresh.version, fresh.static) == (golden.method, golden.version, golden.static)
+    assert {s: fresh.section(s) for s in fresh.sections} == {s: golden.section(s) for s in golden.sections}
+
+
+def test_golden_files_are_small():
+    assert sum(path.stat().st_size for path in GOLDEN.glob("*.swz")) < 64_000
