@@ -89,6 +89,14 @@ def test_what_the_archive_holds_besides_proves_the_name(mipnerf360, load):
 def test_a_link_is_read_as_what_it_leads_to(mipnerf360, load, tmp_path):
     (tmp_path / "here").symlink_to(mipnerf360())
     assert load(tmp_path / "here").protocol.dataset == "mipnerf360"
+    assert load(tmp_path / "here").name == "garden"
+
+
+def test_a_link_with_a_published_name_goes_by_it(colmap_scene, load, tmp_path):
+    (tmp_path / "tandt").mkdir()
+    (tmp_path / "tandt" / "truck").symlink_to(colmap_scene("blobs/4fe1"))
+    scene = load(tmp_path / "tandt" / "truck")
+    assert (scene.name, scene.protocol.dataset, scene.protocol.name) == ("truck", "tandt", "survey")
 
 
 def test_the_working_directory_is_recognised_too(mipnerf360, load, monkeypatch):

@@ -60,6 +60,11 @@ def test_a_scan_is_recognised_and_read_by_its_rules(scan, load):
     assert scene.warnings == []
 
 
+def test_another_surface_data_set_in_that_layout_is_no_scan(scan, load):
+    assert load(scan("bmvs_bear")).protocol.id == "colmap/images/r-1/every8/black/pp-center/q8"
+    assert "'scan7' is not a published scene of DTU" in load(scan("scan7")).warnings[0]
+
+
 def test_full_size_and_a_split_are_possible_and_said(scan, load):
     scene = load(scan(), resolution=1, split="every5")
     assert scene.protocol.id == "dtu/images/r1/every5/black/pp-center/q8"

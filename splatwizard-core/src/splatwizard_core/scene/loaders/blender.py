@@ -52,7 +52,7 @@ class BlenderDataset:
 
 def has_blender_layout(path: Path) -> bool:
     """Whether a folder is a Blender scene."""
-    return (path / "transforms_train.json").is_file()
+    return os.path.isfile(path / "transforms_train.json")
 
 
 def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:

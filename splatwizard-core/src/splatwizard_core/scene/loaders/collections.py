@@ -25,7 +25,7 @@ class Layout:
     """One way in which a family's scenes lie on disk.
 
     looks_for   for messages
-    own         no other family has this layout: it alone tells the family
+    own         no other family of the core has this layout
     """
 
     is_there: Callable[[Path], bool]
@@ -52,21 +52,22 @@ class Collection:
     def detect(self, path: Path) -> float:
         """How surely a folder is a scene of the collection.
 
-        0.9     a layout that only this family has; or a published scene's name in a folder with the collection's name
+        0.9     a layout that only this family has, with its prefix where it has one ("scan"); or a published scene's
+                name in a folder with the collection's name
         0.8     a published scene's name, and beside the pictures what the collection's archives hold besides
         0       otherwise: a name alone is no proof
         """
-        layout = self._layout(path)
-        if layout is None:
+        there = [layout for layout in self.layouts if layout.is_there(path)]
+        if not there:
             return 0.0
-        if layout.own:
-            return BY_OWN_FILE
         # As it is called, and where a link leads.
         places = [Path(os.path.abspath(path)), Path(os.path.realpath(path))]
+        if any(layout.own for layout in there) and any(p.name.startswith(self.family.prefix) for p in places):
+            return BY_OWN_FILE
         named = [place for place in places if self.family.scene_of(place.name) is not None]
         if any(self.family.is_home(place.parent.name) for place in named):
             return AT_HOME
-        if named and self.family.signs and all((path / sign).exists() for sign in self.family.signs):
+        if named and self.family.signs and all(os.path.exists(path / sign) for sign in self.family.signs):
             return BY_SIGNS
         return 0.0
 
@@ -80,6 +81,7 @@ class Collection:
         folder = path.resolve().name if self.family.scene_of(path.name) is None else path.name
         rules = settle(self.family, folder, options)
         scene = layout.load(path, rules, options)
+        scene.name = folder  # a link goes by its own name where that is the published one
         if rules.scene is None:
             near = self.family.nearest(folder)
             hint = f" (did you mean '{near}'?)" if near else f": {', '.join(self.family.scenes)}"

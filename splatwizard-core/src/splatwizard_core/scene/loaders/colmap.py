@@ -191,7 +191,7 @@ def mask_files(path: Path, names: Sequence[str]) -> list[Path | None]:
 
 
 def _has(folder: Path, part: str) -> bool:
-    return any((folder / f"{part}{suffix}").is_file() for suffix in (".bin", ".txt"))
+    return any(os.path.isfile(folder / f"{part}{suffix}") for suffix in (".bin", ".txt"))
 
 
 def _existing(path: Path, picture_folder: str) -> Path:

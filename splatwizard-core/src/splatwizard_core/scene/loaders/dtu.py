@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import lzma
+import os
 import re
 import zipfile
 import zlib
@@ -29,7 +30,7 @@ CENTRE_TOLERANCE = 0.01  # of the extent: the poses of both files agree to round
 
 def has_dtu_layout(path: Path) -> bool:
     """Whether a folder is a prepared DTU scan."""
-    return model_folder(path) is not None and (path / CAMERAS).is_file()
+    return model_folder(path) is not None and os.path.isfile(path / CAMERAS)
 
 
 def load_dtu(path: Path, rules: Rules, options: SceneOptions) -> Scene:

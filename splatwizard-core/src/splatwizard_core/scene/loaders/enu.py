@@ -9,6 +9,7 @@ whose z is up, the one that stays level is the right one.
 from __future__ import annotations
 
 import json
+import os
 from functools import partial
 from pathlib import Path
 
@@ -31,7 +32,7 @@ DEPTHS = (0.8, 1.2)  # start points lie about the distance at which the cameras'
 
 def has_enu_layout(path: Path) -> bool:
     """Whether a folder is in BungeeNeRF's own layout."""
-    return (path / POSES).is_file()
+    return os.path.isfile(path / POSES)
 
 
 def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
