@@ -6,7 +6,9 @@ from splatwizard_core.plugins import Registry, hookimpl
 @hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("3dgs", "sw_3dgs.method:ThreeDGS",
-                 summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised")  # fmt: skip
+                 summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised",
+                 presets=["paper", "inria", "inria2024", "absgrad", "quick"],
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
 
 
 @hookimpl

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     config_option,
@@ -32,9 +33,12 @@ from splatwizard_core.cli.setup import (
 
 
 @click.command(short_help="a trained model to one file")
-@click.argument("source", metavar="SOURCE")
+@click.argument("source", metavar="SOURCE", shell_complete=complete.files)
 @options(
-    click.option("--out", metavar="FILE", help="The file to write.  [default: scene.swz beside SOURCE]"),
+    click.option(
+        "--out", metavar="FILE", shell_complete=complete.files,
+        help="The file to write.  [default: scene.swz beside SOURCE]",
+    ),
     method_option, rate_option, preset_option, config_option, set_option, device_option, json_option, debug_option,
 )  # fmt: skip
 def encode(
@@ -77,10 +81,10 @@ def encode(
 
 
 @click.command(short_help="a file back to a model, from nothing but itself")
-@click.argument("file", metavar="FILE.swz")
+@click.argument("file", metavar="FILE.swz", shell_complete=complete.files)
 @options(
     click.option(
-        "--out", metavar="FILE",
+        "--out", metavar="FILE", shell_complete=complete.files,
         help="Where to put the decoded model: .safetensors holds its tensors, other suffixes go to an exporter (.ply).",
     ),
     click.option(

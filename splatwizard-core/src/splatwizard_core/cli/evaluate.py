@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     config_option,
@@ -40,12 +41,17 @@ if TYPE_CHECKING:
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")
-@click.argument("file", metavar="FILE")
+@click.argument("file", metavar="FILE", shell_complete=complete.files)
 @options(
     scene_option, images_option, config_option, set_option,
-    click.option("--metrics", metavar="NAME[,NAME]", help="Which metrics.  [default: every one that is installed]"),
+    click.option(
+        "--metrics", metavar="NAME[,NAME]", shell_complete=complete.names("metric"),
+        help="Which metrics.  [default: every one that is installed]",
+    ),
     lpips_option,
-    click.option("--renders", metavar="DIR", help="Keep the rendered test views there as PNG."),
+    click.option(
+        "--renders", metavar="DIR", shell_complete=complete.folders, help="Keep the rendered test views there as PNG."
+    ),
     click.option(
         "--roundtrip", is_flag=True,
         help="Of a run directory: encode it, decode the file in a fresh process, measure that.",

@@ -6,16 +6,18 @@ from pathlib import Path
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import assignments, debug_option, device_option, json_option, options, print_json
 from splatwizard_core.cli.setup import existing_file, open_session, output_file, resolve_run_options
 
 
 @click.command(short_help=".ply and other interchange formats")
-@click.argument("file", metavar="FILE")
-@click.argument("out", metavar="OUT")
+@click.argument("file", metavar="FILE", shell_complete=complete.files)
+@click.argument("out", metavar="OUT", shell_complete=complete.files)
 @options(
     click.option(
-        "--format", "exporter", metavar="NAME", help="Exporter, see `sw list-plugins`.  [default: by the suffix of OUT]"
+        "--format", "exporter", metavar="NAME", shell_complete=complete.names("exporter"),
+        help="Exporter, see `sw list-plugins`.  [default: by the suffix of OUT]",
     ),
     device_option, json_option, debug_option,
 )  # fmt: skip

@@ -7,6 +7,7 @@ from typing import Any
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     console,
@@ -20,7 +21,7 @@ from splatwizard_core.cli.options import (
 
 
 @click.command(short_help="what is in a file or scene")
-@click.argument("path", metavar="PATH")
+@click.argument("path", metavar="PATH", shell_complete=complete.scene_or_file)
 @options(images_option, set_option, json_option, debug_option)
 def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) -> None:
     """What is in PATH: a .swz file (bytes by section), a run directory (its file), a .ply, or a scene (folder, `demo`,

@@ -30,6 +30,7 @@ COMMANDS = {
     "data": "splatwizard_core.cli.data:data",
     "build-kernels": "splatwizard_core.cli.build_kernels:build_kernels",
     "doctor": "splatwizard_core.cli.doctor:doctor",
+    "completion": "splatwizard_core.cli.completion:completion",
 }
 # A path that somebody gave does not fit what is on the disk; a full disk is another matter.
 PATH_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)

@@ -8,35 +8,40 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from splatwizard_core.cli import complete
+
 if TYPE_CHECKING:
     from rich.console import Console
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 scene_option = click.option(
-    "--scene", metavar="SCENE",
+    "--scene", metavar="SCENE", shell_complete=complete.scenes,
     help="A folder (COLMAP, Blender, ...; the format is detected), `demo`, or `dataset/scene` under "
     "$SPLATWIZARD_DATA.  [default: demo]",
 )  # fmt: skip
 images_option = click.option(
-    "--images", metavar="FOLDER",
+    "--images", metavar="FOLDER", shell_complete=complete.image_folders,
     help="Picture folder of a COLMAP scene, such as images_2.  [default: the data set's own]",
 )  # fmt: skip
 method_option = click.option(
-    "--method", "-m", metavar="NAME", help="Method, see `sw list-plugins`.  [default: 3dgs, or what --config says]"
-)
+    "--method", "-m", metavar="NAME", shell_complete=complete.names("method"),
+    help="Method, see `sw list-plugins`.  [default: 3dgs, or what --config says]",
+)  # fmt: skip
 preset_option = click.option(
-    "--preset", metavar="NAME", help="Named values of the method.  [default: paper; quick on the demo scene]"
-)
+    "--preset", metavar="NAME", shell_complete=complete.presets,
+    help="Named values of the method.  [default: paper; quick on the demo scene]",
+)  # fmt: skip
 rate_option = click.option(
-    "--rate", metavar="NAME", help="Rate point: r1 (smallest file) .. rN, or low, default, high.  [default: default]"
-)
+    "--rate", metavar="NAME", shell_complete=complete.rates,
+    help="Rate point: r1 (smallest file) .. rN, or low, default, high.  [default: default]",
+)  # fmt: skip
 config_option = click.option(
     "--config", "config_file", type=click.Path(dir_okay=False), metavar="FILE",
     help="TOML file of values; config.toml of a run directory repeats that run.",
 )  # fmt: skip
 set_option = click.option(
-    "--set", "sets", multiple=True, metavar="KEY=VALUE",
+    "--set", "sets", multiple=True, metavar="KEY=VALUE", shell_complete=complete.nothing,
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
 )  # fmt: skip
 device_option = click.option(
@@ -47,7 +52,7 @@ seed_option = click.option(
     "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
 )
 lpips_option = click.option(
-    "--lpips-weights", metavar="DIR",
+    "--lpips-weights", metavar="DIR", shell_complete=complete.folders,
     help="Folder with vgg16-397923af.pth and alexnet-owt-7be5be79.pth, for LPIPS.  [default: torch.hub's cache]",
 )  # fmt: skip
 repeats_option = click.option(

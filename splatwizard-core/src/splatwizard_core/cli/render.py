@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     config_option,
@@ -22,10 +23,13 @@ from splatwizard_core.cli.setup import existing_file, open_session, output_folde
 
 
 @click.command(short_help="draw an encoded scene as PNG")
-@click.argument("file", metavar="FILE")
+@click.argument("file", metavar="FILE", shell_complete=complete.files)
 @options(
     scene_option, images_option, config_option, set_option,
-    click.option("--out", default="renders", show_default=True, metavar="DIR", help="Folder for the PNG files."),
+    click.option(
+        "--out", default="renders", show_default=True, metavar="DIR", shell_complete=complete.folders,
+        help="Folder for the PNG files.",
+    ),
     click.option(
         "--views", type=click.Choice(["test", "train", "all"]), default="test", show_default=True,
         help="Which cameras of the scene.",

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     changed_plan_option,
@@ -38,17 +39,17 @@ FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
 @click.command(short_help="train, encode, decode, evaluate, report: one scene")
 @options(
     click.option(
-        "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]",
+        "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]", shell_complete=complete.names("method"),
         help="One or more methods; repeatable.  [default: 3dgs, or what --config says]",
     ),
     scene_option, images_option,
     click.option(
-        "--rate", "rates", metavar="NAME[,NAME]",
+        "--rate", "rates", metavar="NAME[,NAME]", shell_complete=complete.rates,
         help="Rate points: r1 (smallest file) .. rN, or low, default, high, all.  [default: default]",
     ),
     preset_option, config_option, set_option,
     click.option(
-        "--out", default="out", show_default=True, metavar="DIR",
+        "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.folders,
         help="Root of the run directories, DIR/<scene>/<method>/<rate>.",
     ),
     device_option, seed_option, lpips_option, repeats_option, resume_option, changed_plan_option, json_option,
@@ -86,8 +87,8 @@ def run(
         plugins, method_names(methods, config_file), rates,
         preset=preset, config_file=config_file, values=values, scene=scene,
     )  # fmt: skip
-    output_folder(out)
     weights = lpips_folder(lpips_weights)
+    output_folder(out)
     session = open_session(resolved[0].ppl, plugins)
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")

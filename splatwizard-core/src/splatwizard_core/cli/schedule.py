@@ -6,6 +6,7 @@ from typing import Any
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     config_option,
@@ -20,7 +21,7 @@ from splatwizard_core.cli.options import (
 
 
 @click.command(short_help="a method's plan as a table")
-@click.argument("method")
+@click.argument("method", shell_complete=complete.names("method"))
 @options(
     preset_option, rate_option, config_option, set_option,
     click.option("--verbose", is_flag=True, help="Also the first and last step and the number of executions."),

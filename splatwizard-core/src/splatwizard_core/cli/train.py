@@ -6,6 +6,7 @@ from pathlib import Path
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import (
     assignments,
     changed_plan_option,
@@ -31,7 +32,7 @@ from splatwizard_core.cli.setup import open_session, output_folder, resolve_one
 @options(
     method_option, scene_option, images_option, rate_option, preset_option, config_option, set_option,
     click.option(
-        "--out", default="out", show_default=True, metavar="DIR",
+        "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.folders,
         help="Root of the run directories, DIR/<scene>/<method>/<rate>; `sw run` with the same options goes on there.",
     ),
     device_option, seed_option, resume_option, changed_plan_option, json_option, debug_option,

@@ -1,0 +1,164 @@
+"""Shell completion: what TAB offers, as the shells ask for it, and at what cost."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import click
+import pytest
+from click.shell_completion import BashComplete
+
+from splatwizard_core.cli import complete
+from splatwizard_core.cli.main import COMMANDS, cli, main
+from splatwizard_core.plugins import load_plugins
+
+
+def offered(line: str, incomplete: str = "") -> list[str]:
+    """What is offered after `sw LINE` for a word that begins with `incomplete`; a type where the shell lists paths."""
+    found = BashComplete(cli, {}, "sw", complete.VARIABLE).get_completions(line.split(), incomplete)
+    return [item.value if item.type == "plain" else f"<{item.type}>" for item in found]
+
+
+@pytest.mark.parametrize(
+    ("line", "incomplete", "wanted"),
+    [
+        ("", "ru", ["run"]),
+        ("", "comp", ["completion"]),
+        ("run", "--meth", ["--method"]),
+        ("data", "syn", ["synth"]),
+        ("run --method", "3", ["3dgs"]),
+        ("run -m", "3", ["3dgs"]),
+        ("schedule", "3d", ["3dgs"]),
+        ("run --rate", "r", ["r1", "r2", "r3", "r4", "r5", "r6"]),
+        ("run --rate", "r1,r2,r", ["r1,r2,r3", "r1,r2,r4", "r1,r2,r5", "r1,r2,r6"]),
+        ("run --rate", "hi", ["high"]),
+        ("run --method nobody --rate", "", ["low", "default", "high", "all"]),
+        ("run --method 3dgs --preset", "in", ["inria", "inria2024"]),
+        ("run --method nobody --preset", "", ["paper", "quick"]),
+        ("train --device", "c", ["cpu", "cuda"]),
+        ("eval x.swz --metrics", "ssim,l1", ["ssim,l1"]),
+        ("data fetch", "dt", ["dtu", "dtu_truth"]),
+        ("data list", "db", ["db"]),
+        ("data fetch", "dtu/2", ["dtu/24"]),
+        ("export a b --format", "pl", ["ply"]),
+        ("decode", "a", ["<file>"]),
+        ("run --out", "a", ["<dir>"]),
+        ("run --scene", "de", ["<dir>", "demo"]),
+        ("info", "de", ["<file>", "demo"]),
+        ("completion", "z", ["zsh"]),
+        ("run --set", "re", []),
+    ],
+)
+def test_names_are_completed(line, incomplete, wanted, monkeypatch):
+    monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
+    assert offered(line, incomplete) == wanted
+
+
+def test_scenes_below_the_data_folder_are_offered_by_dataset(tmp_path, monkeypatch):
+    for name in ("park/tree", "park/bench", "town/square", ".hidden/x"):
+        (tmp_path / name).mkdir(parents=True)
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
+    assert offered("run --scene") == ["<dir>", "demo", "park/bench", "park/tree", "town/square"]
+    assert offered("run --scene", "park/t") == ["<dir>", "park/tree"]
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path / "nowhere"))
+    assert offered("run --scene") == ["<dir>", "demo"]
+
+
+def test_picture_folders_are_those_of_the_scene_on_the_line(tmp_path, monkeypatch):
+    for name in ("images", "images_2", "sparse"):
+        (tmp_path / "park" / "tree" / name).mkdir(parents=True)
+    assert offered(f"run --scene {tmp_path}/park/tree --images") == ["images", "images_2"]
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
+    assert offered("run --scene park/tree --images", "images_") == ["images_2"]
+    assert offered("run --images") == []
+
+
+def test_a_restriction_to_a_plugin_that_is_not_there_offers_nothing_and_says_nothing(monkeypatch, capsys):
+    monkeypatch.setenv("SW_PLUGINS", "no-such-plugin")
+    load_plugins.cache_clear()
+    try:
+        assert offered("run --method") == []
+    finally:
+        load_plugins.cache_clear()
+    assert capsys.readouterr() == ("", "")
+
+
+def commands() -> list[tuple[str, click.Command]]:
+    found = []
+    context = click.Context(cli)
+    for name in COMMANDS:
+        command = cli.get_command(context, name)
+        assert command is not None
+        inner = command.commands.items() if isinstance(command, click.Group) else []
+        found += [(name, command), *((f"{name} {n}", c) for n, c in inner)]
+    return found
+
+
+def test_every_parameter_that_takes_a_word_offers_something_or_says_that_it_cannot():
+    silent = []
+    for name, command in commands():
+        for parameter in command.params:
+            wordless = isinstance(parameter, click.Option) and parameter.is_flag
+            by_type = not isinstance(parameter.type, (click.types.StringParamType, click.types.FuncParamType))
+            if not wordless and not by_type and parameter._custom_shell_complete is None:
+                silent.append(f"{name} {parameter.name}")
+    assert silent == []
+
+
+def test_what_a_method_declares_for_completion_is_what_it_has():
+    for entry in load_plugins().methods:
+        cls = entry.load()
+        assert list(entry.declared["presets"]) == list(cls.PRESETS)
+        assert list(entry.declared["rates"]) == list(cls.RATES)
+
+
+@pytest.mark.parametrize("line", ["run --method ", "run --rate ", "run --scene ", "schedule 3dgs --preset ", ""])
+def test_completion_imports_nothing_heavy(line):
+    code = f"""
+        import os, sys
+        words = {f"sw {line}".split()!r}
+        os.environ |= {{"_SW_COMPLETE": "bash_complete", "COMP_WORDS": " ".join(words) + " "}}
+        os.environ["COMP_CWORD"] = str(len(words))
+        from splatwizard_core.cli.main import main
+        main([])
+        print([m for m in ("torch", "numpy", "scipy", "pydantic", "PIL", "rich") if m in sys.modules], file=sys.stderr)
+    """
+    done = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)], capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stderr == "[]\n"
+    assert done.stdout.startswith(("plain,", "dir,"))
+
+
+@pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
+def test_the_script_of_each_shell_asks_sw(shell, capsys):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert f"{complete.VARIABLE}={shell}_complete" in script
+    if shutil.which(shell):
+        done = subprocess.run([shell, "-n"], input=script, capture_output=True, text=True, timeout=30, check=False)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.skipif(shutil.which("bash") is None, reason="no bash here")
+def test_bash_completes_a_line(tmp_path):
+    """As at a prompt: the function that the script defines fills COMPREPLY."""
+    sw = tmp_path / "sw"
+    sw.write_text(f'#!/bin/sh\nexec {sys.executable} -m splatwizard_core "$@"\n')
+    sw.chmod(0o755)
+    lines = f"""
+        eval "$(sw completion bash)"
+        COMP_WORDS=(sw run --method 3d); COMP_CWORD=3
+        {BashComplete(cli, {}, "sw", complete.VARIABLE).func_name} sw
+        echo "got ${{COMPREPLY[*]}}"
+    """
+    done = subprocess.run(
+        ["bash", "--norc", "-c", textwrap.dedent(lines)], capture_output=True, text=True, timeout=60, check=False,
+        env={**os.environ, "PATH": f"{tmp_path}{os.pathsep}{os.environ['PATH']}"}, cwd=Path(tmp_path),
+    )  # fmt: skip
+    assert done.stdout == "got 3dgs\n", done.stderr
