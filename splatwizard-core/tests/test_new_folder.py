@@ -18,6 +18,12 @@ def interrupted(path: Path) -> None:
         raise KeyboardInterrupt
 
 
+def overtaken(path: Path) -> None:
+    with new_folder(path):
+        path.mkdir()
+        (path / "theirs").write_text("theirs")
+
+
 def test_a_folder_appears_at_the_end_with_all_that_was_written(tmp_path: Path):
     with new_folder(tmp_path / "deep" / "out") as folder:
         (folder / "a").write_text("a")
@@ -41,9 +47,8 @@ def test_what_is_there_is_not_touched(tmp_path: Path):
 
 
 def test_what_appeared_meanwhile_is_not_overwritten(tmp_path: Path):
-    with pytest.raises(OSError), new_folder(tmp_path / "out"):
-        (tmp_path / "out").mkdir()
-        (tmp_path / "out" / "theirs").write_text("theirs")
+    with pytest.raises(OSError):
+        overtaken(tmp_path / "out")
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
     assert (tmp_path / "out" / "theirs").read_text() == "theirs"
 

@@ -16,6 +16,7 @@ from splatwizard_core.cli.docs import generate
 from splatwizard_core.cli.main import COMMANDS, main
 
 REPOSITORY = Path(__file__).resolve().parents[3]
+DATA_COMMANDS = [["data", name] for name in ("fetch", "list", "synth", "undistort", "verify")]
 
 
 def sw(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
@@ -55,7 +56,7 @@ def test_help_and_list_plugins_take_under_half_a_second(arguments: list[str]):
     assert min(taken) < 0.5
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), ["data", "synth"]])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), *DATA_COMMANDS])
 def test_every_command_explains_itself(command: list[str], capsys: pytest.CaptureFixture[str]):
     assert main([*command, "--help"]) == 0
     text = capsys.readouterr().out
@@ -67,7 +68,7 @@ def test_every_option_says_what_it_is_for():
     from splatwizard_core.cli.docs import pages
     from splatwizard_core.cli.main import cli
 
-    assert len(list(pages(cli, "sw", None))) == len(COMMANDS) + 2  # `sw` itself, and `data synth`
+    assert len(list(pages(cli, "sw", None))) == len(COMMANDS) + 1 + len(DATA_COMMANDS)  # 1: `sw` itself
     import click
 
     context = click.Context(cli)

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
-from typing_extensions import Self
 
 from splatwizard_core.errors import ConfigError, UserInputError
 
@@ -105,7 +104,7 @@ class DataSet(BaseModel):
     files: tuple[DataFile, ...] = Field(default=(), alias="file")
 
     @model_validator(mode="after")
-    def _consistent(self) -> Self:
+    def _consistent(self) -> DataSet:
         for file in self.files:
             unknown = [scene for scene in file.scenes if scene not in self.scenes]
             if unknown:
@@ -120,6 +119,12 @@ class DataSet(BaseModel):
     def scenes_of(self, file: DataFile) -> tuple[str, ...]:
         """The scenes that a file holds."""
         return file.scenes or self.scenes
+
+    def check_scene(self, scene: str) -> None:
+        """Raises UserInputError for a scene that the data set does not have."""
+        if scene not in self.scenes:
+            there = ", ".join(self.scenes) or "it holds no scenes"
+            raise UserInputError(f"data set '{self.id}' has no scene '{scene}': {there}")
 
     def folder_names(self, scene: str) -> tuple[str, ...]:
         """The names that the folder of a scene may have, the likeliest first."""
