@@ -23,6 +23,7 @@ COMMANDS = {
     "decode": "splatwizard_core.cli.codec:decode",
     "eval": "splatwizard_core.cli.evaluate:evaluate",
     "render": "splatwizard_core.cli.render:render",
+    "report": "splatwizard_core.cli.report:report",
     "export": "splatwizard_core.cli.export:export",
     "info": "splatwizard_core.cli.info:info",
     "list-plugins": "splatwizard_core.cli.list_plugins:list_plugins",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -31,6 +33,7 @@ from splatwizard_core.cli.setup import lpips_folder, method_names, open_session,
 
 if TYPE_CHECKING:
     from splatwizard_core.experiments.record import Record
+    from splatwizard_core.scene.scene import Scene
 
 FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
 """Metrics that stand first in the table, in this order."""
@@ -93,16 +96,46 @@ def run(
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     done: list[tuple[Record, Path]] = []
+    pages: list[Path] = []
     for each in resolved:
         request = RunRequest(
             each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, lpips_weights=weights,
             repeats=repeats,
         )  # fmt: skip
         done.append(run_one(session, request))
+        pages += page_of_run(done[-1][1], partial(session.scene, each))
+    pages += page_above([directory for _, directory in done])
     if as_json:
         print_json({"runs": [{"directory": str(d), "record": r.model_dump(mode="json")} for r, d in done]})
     else:
+        from rich.markup import escape
+
         print_results(done)
+        for page in pages:
+            console().print(escape(str(page)), soft_wrap=True)
+
+
+def page_of_run(directory: Path, open_scene: Callable[[], Scene]) -> list[Path]:
+    """report.html of a run directory; without jinja2 a line says what to install."""
+    try:
+        from splatwizard_core.experiments.report.after_run import report_run
+    except ModuleNotFoundError as error:
+        if error.name not in ("jinja2", "markupsafe"):
+            raise
+        say("no report.html: it needs jinja2 (pip install 'splatwizard-core[report]')")
+        return []
+    page = report_run(directory, open_scene, say)
+    return [] if page is None else [page]
+
+
+def page_above(directories: list[Path]) -> list[Path]:
+    """The page about all that one command ran, in the folder above; the broadest of all."""
+    try:
+        from splatwizard_core.experiments.report.after_run import report_above
+    except ModuleNotFoundError:
+        return []  # told already
+    page = report_above(directories, say)
+    return [] if page is None else [page]
 
 
 def print_results(done: list[tuple[Record, Path]]) -> None:

@@ -1,0 +1,65 @@
+"""What `sw run` leaves besides the record: the photographs that its page shows, and the page; also above its folder."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+
+from splatwizard_core.errors import SplatwizardError
+from splatwizard_core.experiments.record import FILE_NAME as RECORD
+from splatwizard_core.experiments.report.facts import read_facts
+from splatwizard_core.experiments.report.page import FILE_NAME, write_page
+from splatwizard_core.experiments.report.runs import collect
+from splatwizard_core.experiments.report.truth import keep_truth
+from splatwizard_core.scene.scene import Scene
+
+
+def report_run(directory: Path, open_scene: Callable[[], Scene], say: Callable[[str], None]) -> Path | None:
+    """Write the page of a finished run, unless it is there and newer than its record; its path.
+
+    A page that cannot be made is told in one line (and None): it never makes a finished run fail.
+    """
+    page = directory / FILE_NAME
+    with _told(page, say) as made:
+        if not _is_newer(page, [directory]):
+            facts, _ = read_facts(directory / RECORD)
+            keep_truth(directory, facts, open_scene())
+            write_page(collect([directory]), page)
+        made.append(page)
+    return page if made else None
+
+
+def report_above(directories: Sequence[Path], say: Callable[[str], None]) -> Path | None:
+    """Write the page about several runs into the folder right above all that one command made; None for a single run.
+
+    Whatever else lies in that folder is in it too: earlier rate points and methods of the same scene.
+    """
+    if len(directories) < 2:
+        return None
+    parents = {directory.parent for directory in directories}
+    folder = parents.pop() if len(parents) == 1 else directories[0].parent.parent
+    page = folder / FILE_NAME
+    with _told(page, say) as made:
+        if not _is_newer(page, [path.parent for path in folder.rglob(RECORD)]):
+            write_page(collect([folder]), page)
+        made.append(page)
+    return page if made else None
+
+
+@contextlib.contextmanager
+def _told(page: Path, say: Callable[[str], None]) -> Iterator[list[Path]]:
+    """Turn what keeps a page from being made into a line."""
+    try:
+        yield []
+    except (SplatwizardError, OSError, ValueError) as error:
+        say(f"warning: {page} was not written: {error} (the results are whole; `sw report` makes pages, too)")
+
+
+def _is_newer(page: Path, directories: Sequence[Path]) -> bool:
+    """Whether a page was written after the records that it is about."""
+    try:
+        written = page.stat().st_mtime_ns
+        return all((directory / RECORD).stat().st_mtime_ns <= written for directory in directories)
+    except OSError:
+        return False
