@@ -69,7 +69,10 @@ def register_metrics(registry: Registry) -> None:
                  summary="psnr of the render before it is rounded to 8 bit, dB", direction="higher",
                  diagnostic=True, unrounded=True)  # fmt: skip
     registry.add("ssim_valid", "splatwizard_core.evaluation.image:ssim_valid",
-                 summary="ssim without the border: what scikit-image and torchmetrics average", direction="higher",
+                 summary="ssim without the border, as scikit-image averages", direction="higher",
+                 diagnostic=True)  # fmt: skip
+    registry.add("ssim_reflect", "splatwizard_core.evaluation.image:ssim_reflect",
+                 summary="ssim of the picture mirrored at its edge, as torchmetrics averages", direction="higher",
                  diagnostic=True)  # fmt: skip
 
 

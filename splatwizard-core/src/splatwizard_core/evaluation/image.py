@@ -11,7 +11,7 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, pad
 
 from splatwizard_core.errors import CapabilityError, ShapeError
 
@@ -76,13 +76,30 @@ def ssim(render: Tensor, truth: Tensor) -> float:
 def ssim_valid(render: Tensor, truth: Tensor) -> float:
     """As `ssim`, but the mean is over the pixels whose whole window lies inside the picture (5 pixels from each edge).
 
-    A diagnostic: scikit-image and torchmetrics average so. Raises CapabilityError if no window fits.
+    A diagnostic: what scikit-image averages. Raises CapabilityError if no window fits.
     """
     _check(render, truth)
+    _check_window(render)
     half = WINDOW // 2
-    if min(render.shape[1:]) < WINDOW:
-        raise CapabilityError(f"too-small: no window of {WINDOW}x{WINDOW} pixels fits into {list(render.shape)}")
     return float(ssim_map(render.float(), truth.float())[:, half:-half, half:-half].double().mean())
+
+
+def ssim_reflect(render: Tensor, truth: Tensor) -> float:
+    """As `ssim`, but the picture goes on as its mirror image beyond the edge (which is not repeated).
+
+    A diagnostic: what torchmetrics 1.9 averages, and so the codes that use it (gsplat). Raises CapabilityError if no
+    window fits.
+    """
+    _check(render, truth)
+    _check_window(render)
+    half = WINDOW // 2
+    x, y = (pad(image.float()[None], [half] * 4, mode="reflect")[0] for image in (render, truth))
+    return float(ssim_map(x, y)[:, half:-half, half:-half].double().mean())
+
+
+def _check_window(image: Tensor) -> None:
+    if min(image.shape[1:]) < WINDOW:
+        raise CapabilityError(f"too-small: no window of {WINDOW}x{WINDOW} pixels fits into {list(image.shape)}")
 
 
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:
