@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.training.params import InputFile, OptimizationParams, Params
 
 
 class LearningRates(Params):
@@ -79,7 +79,9 @@ class ThreeDGSConfig(OptimizationParams):
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
     sh_interval: int = Field(1_000, ge=1, description="steps between increases of the active SH degree")
-    init: str = Field("", description="a .ply to start from, with all its SH bands active; empty: the scene's points")
+    init: InputFile = Field(
+        "", description="a .ply to start from, with all its SH bands active; empty: the scene's points"
+    )
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     densify: Densify = Field(Densify(), description="adaptive density control")
     loss: Loss = Field(Loss(), description="photometric loss")

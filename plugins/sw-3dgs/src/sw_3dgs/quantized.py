@@ -99,7 +99,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     n = layout.num_gaussians
     reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
     with reader.decoding("positions") as data:
-        cells = plugins.coders.load("octree")().decode(data)
+        cells = plugins.coders.load("octree")(max_points=n).decode(data)
         if cells.shape != (n, 3):
             raise BitstreamError(f"holds {len(cells):,} points, header says {n:,}")
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:

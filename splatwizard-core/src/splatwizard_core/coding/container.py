@@ -38,7 +38,7 @@ from splatwizard_core.files import write_atomic
 
 MAGIC = b"SPWZ"
 VERSION = 1
-MAX_HEADER = 1 << 20  # 1 MiB; anything longer belongs into a section
+MAX_HEADER = 1 << 19  # 512 KiB; anything longer belongs into a section
 MAX_SECTIONS = 4096
 EXPANSION = 1024
 """Bytes of decoded model that each byte of a file may stand for, and FREE more; real files are below 100."""
