@@ -155,6 +155,13 @@ def scratch_folder(purpose: str) -> Iterator[Path]:
             shutil.rmtree(folder, ignore_errors=True)
 
 
+def remove_folder(path: Path) -> None:
+    """Remove a folder so that at no moment a part of it stands in its place."""
+    away = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    os.replace(path, away)
+    shutil.rmtree(away)
+
+
 def sweep(folder: Path) -> None:
     """Remove the temporaries directly in `folder` that killed processes left, whatever they were to become."""
     _remove_matching(folder, re.compile(r"\..+" + TEMPORARY))

@@ -78,8 +78,6 @@ def test_a_step_is_done_only_under_the_key_it_was_done_with(tmp_path: Path):
     assert again.done("train", "key") == {"seconds": 1.5}
     assert again.done("train", "other") is None
     assert again.done("encode", "key") is None
-    again.forget("train")
-    assert StepLog(tmp_path).done("train", "key") is None
 
 
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"train": 3}', '{"train": {"key": 1}}'])

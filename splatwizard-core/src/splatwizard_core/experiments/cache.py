@@ -11,6 +11,7 @@ from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.experiments.training_run import STEP, holds_training, train, training_key
+from splatwizard_core.files import sweep
 from splatwizard_core.training.params import PipelineParams
 
 FOLDER = ".trained"  # inside the output root: what is trained for a run stays with the runs
@@ -42,7 +43,8 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
     directory = _ordinary_run(out / scene.name / name, key)
     if directory is None:
         directory = out / FOLDER / f"{scene.name}-{name}-{key[:16]}"
-    with directory_lock(directory, wait=True, on_wait=session.say):
+    with directory_lock(directory, wait=True, on_wait=session.say, say=session.say):
+        sweep(directory)
         if StepLog(directory).done(STEP, key) is None:
             session.say(f"{outer.method} starts from a trained {name} scene; none is there yet, so it is trained first")
         found = train(session, resolved, directory, trained=nested)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
 import json
+import os
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,8 +16,18 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.experiments.keys import block_keys, field_at, flatten, nested, set_at, suggest
+from splatwizard_core.experiments.keys import (
+    block_keys,
+    field_at,
+    flatten,
+    input_files,
+    nested,
+    set_at,
+    suggest,
+    value_at,
+)
 from splatwizard_core.experiments.values import parse_text
+from splatwizard_core.files import file_sha256
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams
 
@@ -130,18 +142,42 @@ class ResolvedConfig:
         # The blocks are merged upwards: first come keys of the method, where both have one.
         content |= {key: getattr(self.scene, key) for key in SCENE_KEYS}
         content |= self.ppl.model_dump(mode="json")
-        content |= self.config.model_dump(mode="json")
+        config = self.config.model_dump(mode="json")
+        for key, path in self._input_files().items():
+            set_at(config, key, os.path.abspath(path))
+        content |= config
         return tomli_w.dumps(_spell_none(content))
 
     def training_content(self) -> dict[str, Any]:
-        """Everything that training depends on: not the `codec` block, the device or the rate's name."""
+        """Everything that training depends on: not the `codec` block, the device or the rate's name.
+
+        A file that it reads counts by what it holds.
+        """
+        config = self.config_content()
+        config.pop("codec", None)
         run = self.ppl.model_dump(mode="json", include={"seed", "random_background", "clamp_render", "raster"})
         return {
             "method": self.method,
-            "config": self.config.model_dump(mode="json", exclude={"codec"}),
+            "config": config,
             "pipeline": run,
             "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
         }
+
+    def config_content(self) -> dict[str, Any]:
+        """The method's hyper-parameters, with what its input files hold in place of where they lie."""
+        config = self.config.model_dump(mode="json")
+        for key, digest in self._input_digests.items():
+            set_at(config, key, digest)
+        return config
+
+    def _input_files(self) -> dict[str, str]:
+        """Dotted key of the config -> path, of those that are given and are a file."""
+        paths = {key: str(value_at(self.config, key)) for key in input_files(type(self.config))}
+        return {key: path for key, path in paths.items() if path and os.path.isfile(path)}
+
+    @functools.cached_property
+    def _input_digests(self) -> dict[str, str]:
+        return {key: f"sha256 {file_sha256(Path(path))}" for key, path in self._input_files().items()}
 
     def training_hash(self) -> str:
         """SHA-256 of `training_content`: rate points that differ in the codec alone share it."""

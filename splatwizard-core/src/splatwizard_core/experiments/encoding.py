@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.metadata
 import time
 from collections.abc import Iterable
@@ -19,11 +20,11 @@ from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.training_run import finished_directory, make_method, train, training_key
+from splatwizard_core.experiments.versions import CORE, made_by
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import Entry
 
-CORE = "splatwizard-core"
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """What a decoder may want again; a pruner or a rasterizer has done its work by then."""
 
@@ -31,7 +32,7 @@ NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder"
 def encode(
     method: Method, model: SplatModel, raster: dict[str, Any], path: Path, device: torch.device
 ) -> dict[str, Any]:
-    """Write one file; {"encode_s", "bytes", "sha256"}.
+    """Write one file; {"encode_s", "bytes", "sha256", "made_by"}, the last being versions by distribution.
 
     raster  what the header asks of a rasterizer
     device  where the model is
@@ -52,7 +53,12 @@ def encode(
     seconds = time.perf_counter() - began
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
-    return {"encode_s": seconds, "bytes": size, "sha256": file_sha256(path)}
+    return {
+        "encode_s": seconds,
+        "bytes": size,
+        "sha256": file_sha256(path),
+        "made_by": made_by(method.plugins, loaded),
+    }
 
 
 def requirements(entries: Iterable[Entry]) -> list[Requirement]:
@@ -71,7 +77,7 @@ def requirements(entries: Iterable[Entry]) -> list[Requirement]:
 def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
     """The finished training of a run directory. Raises UserInputError if it is not finished."""
     key = training_key(session, resolved)
-    with directory_lock(directory):
+    with directory_lock(directory, say=session.say):
         if finished_directory(directory, key) is None:
             raise UserInputError(
                 f"{directory} holds no finished training of this configuration: "
@@ -83,7 +89,9 @@ def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -
 def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
     """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
     trained = load_finished(session, resolved, directory)
-    return encode(make_method(session, resolved), trained.model, trained.facts["raster"], target, session.device)
+    inside = target.resolve().parent == directory.resolve()
+    with directory_lock(directory) if inside else contextlib.nullcontext():
+        return encode(make_method(session, resolved), trained.model, trained.facts["raster"], target, session.device)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:

@@ -10,9 +10,10 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.files import scratch_folder
 
 HIDDEN = ("SPLATWIZARD_DATA", "SPLATWIZARD_TEST_DATA")
 
@@ -31,14 +32,11 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     it fails, KeyboardInterrupt if it was interrupted.
     """
     environment = {k: v for k, v in os.environ.items() if not (hide_data and k in HIDDEN)}
-    command = [sys.executable, "-m", "splatwizard_core", *arguments]
+    command = [sys.executable, "-m", "splatwizard_core.experiments.fresh_child", *arguments]
     with tempfile.TemporaryFile("w+") as errors:
         # The display of a terminal must reach it live; anything else is kept for the message.
         live = sys.stderr.isatty()
-        done = subprocess.run(
-            command, cwd=cwd, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE,
-            stderr=None if live else errors, text=True, check=False,
-        )  # fmt: skip
+        done = _ended_with_us(command, cwd, environment, None if live else errors)
         errors.seek(0)
         told = errors.read().strip()
     name = f"sw {arguments[0]}"
@@ -57,13 +55,28 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     return content
 
 
+def _ended_with_us(
+    command: list[str], cwd: Path | None, environment: dict[str, str], errors: IO[str] | None
+) -> subprocess.CompletedProcess[str]:
+    """Run a command that ends when we do: we hold the other end of its input, and the system closes it for us."""
+    theirs, ours = os.pipe()
+    try:
+        return subprocess.run(
+            command, cwd=cwd, env=environment, stdin=theirs, stdout=subprocess.PIPE, stderr=errors, text=True,
+            check=False,
+        )  # fmt: skip
+    finally:
+        os.close(ours)
+        os.close(theirs)
+
+
 def decode_fresh(path: Path, device: str, *, repeats: int = 3) -> dict[str, Any]:
     """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight.
 
     repeats     timed decodes
     """
-    with tempfile.TemporaryDirectory(prefix="sw-decode-") as folder:
-        copy = Path(folder) / path.name
+    with scratch_folder("decode") as folder:
+        copy = folder / path.name
         shutil.copyfile(path, copy)
         arguments = ["decode", copy.name, "--device", device, "--repeats", str(repeats), "--json"]
-        return run_fresh(arguments, cwd=Path(folder), hide_data=True)
+        return run_fresh(arguments, cwd=folder, hide_data=True)

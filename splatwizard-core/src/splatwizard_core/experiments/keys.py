@@ -10,6 +10,8 @@ from typing import Annotated, Any, Union
 
 from pydantic import BaseModel
 
+from splatwizard_core.training.params import ReadsFile
+
 
 def strip(annotation: Any) -> Any:
     """The type inside Annotated[...]."""
@@ -48,6 +50,18 @@ def block_keys(cls: type[BaseModel], prefix: str = "") -> dict[str, str]:
             found |= block_keys(inner, f"{prefix}{name}.")
         else:
             found[prefix + name] = field.description or ""
+    return found
+
+
+def input_files(cls: type[BaseModel], prefix: str = "") -> list[str]:
+    """Dotted keys of the fields that name a file which training reads."""
+    found: list[str] = []
+    for name, field in cls.model_fields.items():
+        inner = block_of(field.annotation)
+        if inner is not None:
+            found += input_files(inner, f"{prefix}{name}.")
+        elif any(isinstance(mark, ReadsFile) for mark in field.metadata):
+            found.append(prefix + name)
     return found
 
 

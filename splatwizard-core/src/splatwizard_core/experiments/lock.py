@@ -1,35 +1,71 @@
-"""One writer per run directory."""
+"""One writer per run directory: a lock that the operating system takes back when its holder ends, however it ends.
+
+The file names its holder and is touched every few seconds. On one machine the system's lock alone decides. Between
+machines it may not: not every network file system shares locks. There a holder that has been silent for a minute and a
+half counts as dead, by the clock of the file system.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import os
+import shlex
 import socket
+import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 from splatwizard_core.errors import RunLockedError
 
 NAME = ".lock"
 POLL_SECONDS = 0.5
+BEAT_SECONDS = 15.0
+SILENT_SECONDS = 90.0
+COMMAND_CHARACTERS = 200  # of the holder's command that are kept
+ADVICE = "wait for it, or choose another directory (--out)"
+_NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
+
+
+@dataclass(frozen=True)
+class Holder:
+    """Who holds a directory.
+
+    boot    identifies the running kernel: holders of one boot share their locks
+    since   ISO 8601, UTC
+    """
+
+    pid: int
+    host: str
+    boot: str
+    since: str
+    command: str
+
+    def __str__(self) -> str:
+        return f"process {self.pid} on {self.host} since {self.since} (`{self.command}`)"
 
 
 @contextlib.contextmanager
 def directory_lock(
-    directory: Path, *, wait: bool = False, on_wait: Callable[[str], None] | None = None
+    directory: Path,
+    *,
+    wait: bool = False,
+    on_wait: Callable[[str], None] | None = None,
+    say: Callable[[str], None] | None = None,
 ) -> Iterator[None]:
     """Hold `directory` (made if needed) for this process while the block runs.
 
     wait        wait for whoever holds it instead of giving up
     on_wait     called once with a sentence about the holder before waiting
+    say         told in a sentence if the holder before ended without letting go
 
-    The operating system lets go of the lock when its holder ends, however it ends: a lock file that a killed run
-    left behind holds nothing. Raises RunLockedError that names process and machine.
+    Raises RunLockedError that names the holder, or says that the file system has no locks.
     """
     directory.mkdir(parents=True, exist_ok=True)
     path = directory / NAME
@@ -37,40 +73,99 @@ def directory_lock(
     try:
         asked = False
         while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            refused = _try(descriptor, directory, path)
+            if refused is None:
                 break
-            except BlockingIOError:
-                holder = describe_holder(path)
-                if not wait:
-                    raise RunLockedError(
-                        f"{directory} is being written by {holder}: wait for it, or choose another --out"
-                    ) from None
-                if on_wait is not None and not asked:
-                    on_wait(f"waiting for {holder}, which writes {directory}")
-                asked = True
-                time.sleep(POLL_SECONDS)
+            fact, advice = refused
+            if not wait:
+                raise RunLockedError(f"{fact}: {advice}")
+            if on_wait is not None and not asked:
+                on_wait(f"waiting: {fact}")
+            asked = True
+            time.sleep(POLL_SECONDS)
+        before = read_holder(path)
+        if before is not None and say is not None:
+            say(f"{before} ended without finishing {directory}; going on from what it left")
         _write_holder(descriptor)
+        ended = threading.Event()
+        beats = threading.Thread(target=_beat, args=(descriptor, ended), name="lock", daemon=True)
+        beats.start()
         try:
             yield
         finally:
+            ended.set()
+            beats.join()  # else it could touch whatever gets the number of the descriptor next
             # The file stays: removing it would let two processes lock two files of the same name.
             os.ftruncate(descriptor, 0)
     finally:
         os.close(descriptor)
 
 
+def _try(descriptor: int, directory: Path, path: Path) -> tuple[str, str] | None:
+    """Take the lock; None if it is ours now, else who holds it, and what to do."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return f"{directory} is being written by {read_holder(path) or 'another process'}", ADVICE
+    except OSError as error:
+        if error.errno in _NO_LOCKS:
+            raise RunLockedError(
+                f"{directory} lies on a file system without locks ({error.strerror}): choose a directory on another"
+            ) from error
+        raise
+    holder = read_holder(path)
+    if holder is None or holder.boot == _boot():
+        return None  # nobody, or one whose lock would be in our way if it were alive
+    silent = _silence(descriptor)
+    if silent >= SILENT_SECONDS:
+        return None
+    fcntl.flock(descriptor, fcntl.LOCK_UN)
+    return (
+        f"{directory} belongs to {holder}, on another machine, which gave its last sign of life {silent:.0f} s ago",
+        f"if it has ended, try again in {SILENT_SECONDS - silent:.0f} s; else {ADVICE}",
+    )
+
+
+def _silence(descriptor: int) -> float:
+    """Seconds since the file was last touched, by the clock that touches it."""
+    last = os.fstat(descriptor).st_mtime_ns
+    os.utime(descriptor)
+    now = os.fstat(descriptor).st_mtime_ns
+    os.utime(descriptor, ns=(last, last))  # our question is no sign of the holder's life
+    return (now - last) / 1e9
+
+
+def _beat(descriptor: int, ended: threading.Event) -> None:
+    while not ended.wait(BEAT_SECONDS):
+        with contextlib.suppress(OSError):
+            os.utime(descriptor)
+
+
 def _write_holder(descriptor: int) -> None:
     since = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    text = json.dumps({"pid": os.getpid(), "host": socket.gethostname(), "since": since})
+    command = shlex.join(["sw" if i == 0 else word for i, word in enumerate(sys.argv)])
+    if len(command) > COMMAND_CHARACTERS:
+        command = f"{command[: COMMAND_CHARACTERS - 3]}..."
+    holder = Holder(os.getpid(), socket.gethostname(), _boot(), since, command)
     os.ftruncate(descriptor, 0)
-    os.pwrite(descriptor, text.encode(), 0)
+    with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, and reading needs no space
+        os.pwrite(descriptor, json.dumps(asdict(holder)).encode(), 0)
 
 
-def describe_holder(path: Path) -> str:
-    """`process 4711 on host since 2026-01-01T12:00:00+00:00`, from the lock file."""
+def read_holder(path: Path) -> Holder | None:
+    """Who wrote a lock file and did not clear it; None for nobody, or one that is just beginning or ending."""
     try:
-        holder: Any = json.loads(path.read_text())
-        return f"process {holder['pid']} on {holder['host']} since {holder['since']}"
-    except (OSError, ValueError, KeyError, TypeError):
-        return "another process"  # it is just beginning or ending
+        told = json.loads(path.read_text())
+        return Holder(
+            int(told["pid"]), *(str(told.get(name, "?")) for name in ("host", "boot", "since", "command"))
+        )  # fmt: skip
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+
+
+def _boot() -> str:
+    """What identifies the running kernel: containers of one machine share it, and so their locks."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return socket.gethostname()

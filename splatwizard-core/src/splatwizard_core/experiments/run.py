@@ -6,7 +6,6 @@ a finished one is not done again.
 
 from __future__ import annotations
 
-import shutil
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -23,14 +22,16 @@ from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.record import FILE_NAME, SCHEMA, Record, missing_reasons, read_record
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.steps import StepLog
-from splatwizard_core.experiments.training_run import make_method, train, training_key
-from splatwizard_core.files import file_sha256, write_atomic
+from splatwizard_core.experiments.training_run import CHECKPOINTS, make_method, train, training_key
+from splatwizard_core.experiments.versions import changes, installed, providers
+from splatwizard_core.files import file_sha256, remove_folder, sweep, write_atomic
 
 ENCODED = "scene.swz"
 CONFIG = "config.toml"
 RENDERS = "renders"
 MEASURING = 2  # what `sw decode` and `sw eval` report; a step that reported less is done again
-OWN_FILES = (CONFIG, "log.jsonl", "checkpoints", ENCODED, FILE_NAME, RENDERS, "steps.json")
+# What says that something is finished goes first when a directory is cleared.
+OWN_FILES = ("steps.json", FILE_NAME, CHECKPOINTS, CONFIG, "log.jsonl", ENCODED, RENDERS, "truth", "report.html")
 
 
 @dataclass(frozen=True)
@@ -58,18 +59,19 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
     """
     resolved = request.resolved
     directory = run_directory(request)
-    with directory_lock(directory):
+    with directory_lock(directory, say=session.say):
         _begin(directory, request)
         steps = StepLog(directory)
-        finished = _finished_record(session, directory, steps, request)
-        if finished is not None:
-            session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
-            return finished, directory
         train_key = training_key(session, resolved)
         encoded = directory / ENCODED
         encode_key = _encode_key(train_key, resolved)
-        facts = steps.done("encode", encode_key)
-        if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+        facts = _encoded(session, steps, encode_key, encoded)
+        if facts is not None:
+            finished = _finished_record(session, directory, steps, request, facts)
+            if finished is not None:
+                session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
+                return finished, directory
+        else:
             trained = train_in(session, request, directory)
             steps = StepLog(directory)  # training has written into it
             method = make_method(session, resolved)
@@ -78,8 +80,8 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
             steps.finish("encode", encode_key, facts)
         training = steps.done("train", train_key) or train_in(session, request, directory).facts
         write_config(directory, resolved)
-        decoded = _decode_step(session, steps, encoded, facts["sha256"], max(REPEATS, request.repeats))
-        measured = _evaluate_step(session, steps, request, directory, facts["sha256"])
+        decoded = _decode_step(session, steps, encoded, facts, max(REPEATS, request.repeats))
+        measured = _evaluate_step(session, steps, request, directory, facts)
         if decoded["digest"] != measured["digest"]:
             raise SplatwizardError(
                 f"{encoded}: the decoding and the evaluating process got different models from the same file; "
@@ -87,14 +89,15 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
             )
         record = _assemble(session, resolved, training, facts, decoded, measured)
         record.write(directory / FILE_NAME)
-        steps.finish("record", _record_key(session, request), {"sha256": facts["sha256"], "asked": measured["asked"]})
+        key = _record_key(session, request, facts)
+        steps.finish("record", key, {"sha256": facts["sha256"], "asked": measured["asked"]})
     return record, directory
 
 
 def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:
     """The training step of a run; `run` with the same request goes on from there."""
     directory = run_directory(request)
-    with directory_lock(directory):
+    with directory_lock(directory, say=session.say):
         _begin(directory, request)
         return train_in(session, request, directory), directory
 
@@ -121,6 +124,9 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
 
 
 def _begin(directory: Path, request: RunRequest) -> None:
+    """Clear what is to be cleared, and what a killed process left half written."""
+    for folder in (directory, directory / CHECKPOINTS, directory / RENDERS):
+        sweep(folder)
     if not request.resume:
         discard(directory)
     if not (directory / CONFIG).exists():
@@ -137,42 +143,70 @@ def discard(directory: Path) -> None:
     for name in OWN_FILES:
         path = directory / name
         if path.is_dir() and not path.is_symlink():
-            shutil.rmtree(path)
+            remove_folder(path)
         else:
             path.unlink(missing_ok=True)
 
 
-def _record_key(session: Session, request: RunRequest) -> str:
-    entry = session.plugins.methods.entry(request.resolved.method)
+def _encode_key(train_key: str, resolved: ResolvedConfig) -> str:
+    return content_hash([train_key, resolved.config_content()])
+
+
+def _encoded(session: Session, steps: StepLog, key: str, encoded: Path) -> dict[str, Any] | None:
+    """The facts of the encode step if its file is there as it was written, and would be written the same today."""
+    facts = steps.done("encode", key)
+    if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+        return None
+    changed = changes(session.plugins, facts.get("made_by"))
+    if changed:
+        session.say(f"{encoded} was made with {', '.join(changed)}: encoding again")
+        return None
+    return facts
+
+
+def _decode_key(session: Session, facts: dict[str, Any]) -> str:
+    return content_hash([facts["sha256"], str(session.device), MEASURING, facts["made_by"]])
+
+
+def _evaluate_key(session: Session, resolved: ResolvedConfig, facts: dict[str, Any]) -> str:
+    used = installed(session.plugins, [*facts["made_by"], *providers(session.plugins, "metric", "rasterizer")])
     return content_hash(
         [
-            absolute_spec(request.resolved.scene_spec), request.resolved.config_hash(), str(session.device),
-            entry.distribution, entry.version, session.plugins.metrics.names, SCHEMA,
+            facts["sha256"], session.scene_digest(resolved), str(session.device),
+            resolved.ppl.raster.model_dump(mode="json"), session.plugins.metrics.names, MEASURING, used,
         ]
     )  # fmt: skip
 
 
-def _finished_record(session: Session, directory: Path, steps: StepLog, request: RunRequest) -> Record | None:
-    """The record of a run that was finished from the same inputs and still is as it was written."""
-    facts = steps.done("record", _record_key(session, request))
-    encoded = directory / ENCODED
-    if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
-        return None
-    if not _asked(session, request).is_held_by(facts.get("asked")):
+def _record_key(session: Session, request: RunRequest, facts: dict[str, Any]) -> str:
+    """What a record was made from: the scene and the versions stand in the keys of the steps before."""
+    resolved = request.resolved
+    return content_hash(
+        [
+            training_key(session, resolved), resolved.config_hash(), _decode_key(session, facts),
+            _evaluate_key(session, resolved, facts), SCHEMA,
+        ]
+    )  # fmt: skip
+
+
+def _finished_record(
+    session: Session, directory: Path, steps: StepLog, request: RunRequest, encoded: dict[str, Any]
+) -> Record | None:
+    """The record of a run that was finished from the same inputs."""
+    facts = steps.done("record", _record_key(session, request, encoded))
+    if facts is None or not _asked(session, request).is_held_by(facts.get("asked")):
         return None
     try:
         record = read_record(directory / FILE_NAME)
     except UserInputError:
         return None  # it is written again
-    return record if record.file.sha256 == facts["sha256"] else None
+    return record if record.file.sha256 == encoded["sha256"] else None
 
 
-def _encode_key(train_key: str, resolved: ResolvedConfig) -> str:
-    return content_hash([train_key, resolved.config.model_dump(mode="json")])
-
-
-def _decode_step(session: Session, steps: StepLog, encoded: Path, sha256: str, repeats: int) -> dict[str, Any]:
-    key = content_hash([sha256, str(session.device), MEASURING])
+def _decode_step(
+    session: Session, steps: StepLog, encoded: Path, encoding: dict[str, Any], repeats: int
+) -> dict[str, Any]:
+    key = _decode_key(session, encoding)
     facts = steps.done("decode", key)
     if facts is None or len(facts["decode_runs_s"]) < repeats:
         facts = decode_fresh(encoded, str(session.device), repeats=repeats)
@@ -186,12 +220,10 @@ def _counted(counts: dict[str, int]) -> str:
 
 
 def _evaluate_step(
-    session: Session, steps: StepLog, request: RunRequest, directory: Path, sha256: str
+    session: Session, steps: StepLog, request: RunRequest, directory: Path, encoding: dict[str, Any]
 ) -> dict[str, Any]:
     resolved = request.resolved
-    digest = session.scene_digest(resolved)
-    raster = resolved.ppl.raster.model_dump(mode="json")
-    key = content_hash([sha256, digest, str(session.device), raster, session.plugins.metrics.names, MEASURING])
+    key = _evaluate_key(session, resolved, encoding)
     facts, asked = steps.done("evaluate", key), _asked(session, request)
     if facts is None or not asked.is_held_by(facts.get("asked")):
         arguments = ["eval", str(directory / ENCODED), "--scene", absolute_spec(request.resolved.scene_spec)]

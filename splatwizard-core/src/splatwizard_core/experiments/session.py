@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
 
 from splatwizard_core.errors import NativeBuildError
 from splatwizard_core.experiments.config import ResolvedConfig
+from splatwizard_core.experiments.file_digests import FileDigests
 from splatwizard_core.experiments.identity import scene_digest
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.native.build import declared_modules, resolve_module
+from splatwizard_core.native.loader import cache_root
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.scene import Scene
@@ -59,7 +63,8 @@ class Session:
         """What identifies the scene's content, computed once."""
         key = (resolved.scene_spec, resolved.scene)
         if key not in self._digests:
-            self._digests[key] = scene_digest(self.scene(resolved))
+            scene = self.scene(resolved)
+            self._digests[key] = scene_digest(scene, FileDigests(_digest_store(scene)))
         return self._digests[key]
 
     def load_kernels(self) -> None:
@@ -83,3 +88,11 @@ class Session:
     def trained(self, key: str) -> TrainedModel | None:
         """The last trained model, if it is the one asked for."""
         return self._last_trained if self._last_trained is not None and self._last_trained.key == key else None
+
+
+def _digest_store(scene: Scene) -> Path | None:
+    """Where checksums of a scene's pictures are remembered; None for one that lies nowhere."""
+    if scene.path is None:
+        return None
+    name = hashlib.sha256(str(Path(scene.path).absolute()).encode()).hexdigest()
+    return cache_root() / "pictures" / f"{name[:16]}.json"

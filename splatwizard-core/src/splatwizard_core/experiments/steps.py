@@ -36,8 +36,3 @@ class StepLog:
         """Remember a finished step."""
         self._steps[step] = {"key": key, "facts": facts}
         write_json(self.path, self._steps)
-
-    def forget(self, step: str) -> None:
-        """The step will be done again."""
-        if self._steps.pop(step, None) is not None:
-            write_json(self.path, self._steps)

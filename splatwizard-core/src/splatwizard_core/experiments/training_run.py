@@ -13,15 +13,18 @@ from splatwizard_core.experiments.config import ResolvedConfig, content_hash
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.experiments.session import Session, TrainedModel
 from splatwizard_core.experiments.steps import StepLog
+from splatwizard_core.experiments.versions import changes, made_by
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
+from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.pipeline import train_stages
 
 CHECKPOINTS = "checkpoints"
 STEP = "train"
+IDENTITY = 2  # raised when checkpoints come to say something else of what they were made from
 
 
 def make_method(session: Session, resolved: ResolvedConfig) -> Method:
@@ -33,7 +36,7 @@ def make_method(session: Session, resolved: ResolvedConfig) -> Method:
 def training_key(session: Session, resolved: ResolvedConfig) -> str:
     """What a training was made from: equal keys mean an interchangeable model."""
     cls = session.plugins.methods.load(resolved.method)
-    return content_hash([resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version])
+    return content_hash([IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version])
 
 
 def train(
@@ -61,22 +64,42 @@ def train(
     home = (finished_directory(directory, key) if resume else None) or directory
     scene = session.scene(resolved)
     steps = StepLog(home)
-    done = steps.done(STEP, key)
+    done = steps.done(STEP, key) if holds_training(home, key) else None
     if done is None:
+        resume = resume and not _is_of_an_older_release(session, home)
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
-    outcome_model, facts = run_stages(
-        session, resolved, scene, home,
-        trained=trained, resume=resume or done is not None, allow_changed_plan=allow_changed_plan,
-        stop_after=stop_after,
-    )  # fmt: skip
+    with session.plugins.recording() as loaded:
+        outcome_model, facts = run_stages(
+            session, resolved, scene, home,
+            trained=trained, resume=resume or done is not None, allow_changed_plan=allow_changed_plan,
+            stop_after=stop_after,
+        )  # fmt: skip
     if done is None:
+        rasterizers = session.plugins.rasterizers
+        served = [rasterizers.entry(name) for name in facts["rasterizers"].values() if name in rasterizers]
+        facts["made_by"] = made_by(session.plugins, [*loaded, *served])
         facts["trained_in"] = resolved.rate
         steps.finish(STEP, key, facts)
     else:
         facts = done  # what was measured when it was trained, not when it was loaded
+        changed = changes(session.plugins, facts.get("made_by"))
+        if changed:
+            session.say(f"{home} was trained with {', '.join(changed)}; it is used as it is (--fresh trains again)")
     found = TrainedModel(outcome_model, key, facts)
     session.remember(found)
     return _share(session, found, directory, resolved) if home != directory else found
+
+
+def _is_of_an_older_release(session: Session, directory: Path) -> bool:
+    """Whether the checkpoints of a directory do not say all that they were made from; told, since they go then."""
+    identity = CheckpointStore(directory / CHECKPOINTS).identity()
+    if identity is None or identity.get("identity") == IDENTITY:
+        return False
+    session.say(
+        f"{directory} was trained by a release that did not note what all pictures and input files hold: "
+        "its checkpoints cannot be trusted to be of this scene, so it is trained again"
+    )
+    return True
 
 
 def _share(session: Session, found: TrainedModel, directory: Path, resolved: ResolvedConfig) -> TrainedModel:
@@ -102,7 +125,9 @@ def finished_directory(directory: Path, key: str) -> Path | None:
 def holds_training(directory: Path, key: str) -> bool:
     """Whether a run directory holds this training, finished, with its own checkpoints."""
     facts = StepLog(directory).done(STEP, key)
-    return facts is not None and "checkpoints" not in facts and (directory / CHECKPOINTS).is_dir()
+    if facts is None or "checkpoints" in facts:
+        return False
+    return bool(CheckpointStore(directory / CHECKPOINTS).paths())
 
 
 def run_stages(
@@ -167,8 +192,9 @@ def run_stages(
         # The content besides its key, so that a refused resume can say what differs.
         identity={
             **resolved.training_content(),
+            "identity": IDENTITY,
             "method_version": method.version,
-            "scene_digest": session.scene_digest(resolved),
+            "scene content": session.scene_digest(resolved),
         },
         trained=frozen,
         stop_after=stop_after,
@@ -189,7 +215,7 @@ def run_stages(
         "pictures_in": "host" if scene.train[0].pixels.device.type == "cpu" else scene.train[0].pixels.device.type,
         "breakdown_s": outcome.stage_breakdown,
         "plan": outcome.plan,
-        "rasterizers": dict(rasterizer.choices),
+        "rasterizers": outcome.rasterizers,
         "raster": raster_header(last.raster_options(last.iterations, background)),
     }
     return outcome.model, facts

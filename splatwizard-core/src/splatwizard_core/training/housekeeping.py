@@ -35,12 +35,14 @@ class Progress:
     stage_steps     stage name -> steps done
     breakdown       stage name -> seconds per stage of a step, where they are timed
     peak_memory     bytes
+    rasterizers     features asked for -> who served them
     """
 
     stage_seconds: dict[str, float] = field(default_factory=dict)
     stage_steps: dict[str, int] = field(default_factory=dict)
     breakdown: dict[str, dict[str, float]] = field(default_factory=dict)
     peak_memory: int = 0
+    rasterizers: dict[str, str] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:
@@ -140,6 +142,7 @@ class Housekeeping:
 
     def _account(self) -> None:
         """Bring the accumulated figures up to date."""
+        self.progress.rasterizers |= getattr(self.trainer.rasterizer, "choices", {})
         self.progress.stage_seconds[self.name] = self.clock.seconds
         self.progress.stage_steps[self.name] = self.trainer.step
         self.progress.peak_memory = max(self.progress.peak_memory, self.meter.peak_bytes())

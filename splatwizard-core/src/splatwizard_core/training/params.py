@@ -1,8 +1,16 @@
 """Typed configuration: what belongs to the run, and what belongs to the method."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+
+class ReadsFile:
+    """Marks a field that names a file: what the file holds, not where it lies, tells two trainings apart."""
+
+
+InputFile = Annotated[str, ReadsFile()]
+"""The type of a field for the path of a file that training reads; empty for none."""
 
 FULL_RUN_ITERATIONS = 30_000
 """The run length that published plans are written for."""

@@ -47,6 +47,7 @@ class TrainOutcome:
     peak_memory     bytes above what was there before (CPU: resident set; CUDA: allocator, absolute)
     stage_breakdown stage name -> seconds in pre, render, loss, backward, post, optimize; None: not profiled
     plan            of each stage: name, steps, and its tasks as printed
+    rasterizers     features asked for -> who served them
     """
 
     model: SplatModel
@@ -56,6 +57,7 @@ class TrainOutcome:
     peak_memory: int
     stage_breakdown: dict[str, dict[str, float]] | None
     plan: list[dict[str, Any]]
+    rasterizers: dict[str, str]
 
 
 @dataclass
@@ -254,6 +256,7 @@ def train_stages(
         progress.peak_memory,
         progress.breakdown or None,
         plans,
+        dict(progress.rasterizers),
     )
 
 
