@@ -5,7 +5,8 @@ import time
 import pytest
 import torch
 
-from splatwizard_core.evaluation.speed import WARMUP_FRAMES, measure_speed, percentile
+from splatwizard_core.evaluation import speed
+from splatwizard_core.evaluation.speed import WARMUP_FRAMES, measure_speed, percentile, spread
 
 
 class SleepyRenderer:
@@ -63,12 +64,107 @@ def test_memory_on_a_cpu_is_flagged_and_sees_a_large_frame():
     report = measure_speed(render, [0, 1], "cpu")
     assert report.memory_kind == "rss"
     assert report.peak_reserved_bytes is None
-    assert report.peak_bytes >= 0
+    assert report.peak_bytes >= 50e6
 
 
 def test_no_view_is_refused():
     with pytest.raises(ValueError, match="at least one view"):
         measure_speed(lambda v: torch.zeros(3, 1, 1), [], "cpu")
+    with pytest.raises(ValueError, match="one repeat"):
+        measure_speed(lambda v: torch.zeros(3, 1, 1), [0], "cpu", repeats=0)
+
+
+def test_repeats_are_measured_after_one_warm_up_and_give_the_spread():
+    renderer = SleepyRenderer(seconds=0.004)
+    report = measure_speed(renderer, list(range(10)), "cpu", repeats=3)
+    measured = [renderer.took[10 * k : 10 * k + 10] for k in (1, 2, 3)]
+    assert len(renderer.took) == 40
+    assert (report.repeats, report.rounds, report.frames, report.warmup_frames) == (3, 1, 30, 10)
+    assert report.fps == pytest.approx(30 / sum(map(sum, measured)), rel=0.05)
+    each = [10 / sum(run) for run in measured]
+    fps = report.spread["fps"]
+    assert (fps.n, fps.mean) == (3, pytest.approx(sum(each) / 3, rel=0.05))
+    assert (fps.min, fps.max) == (pytest.approx(min(each), rel=0.05), pytest.approx(max(each), rel=0.05))
+    assert fps.min <= report.fps <= fps.max
+    assert set(report.spread) == {"fps", "latency_ms_median", "latency_ms_p95"}
+
+
+def test_a_single_measurement_has_no_spread():
+    assert measure_speed(lambda v: torch.zeros(3, 1, 1), [0], "cpu").spread is None
+
+
+def test_the_spread_is_that_of_a_sample():
+    found = spread([1.0, 2.0, 4.0])
+    assert (found.n, found.min, found.max, found.mean) == (3, 1.0, 4.0, pytest.approx(7 / 3))
+    assert found.std == pytest.approx((((4 / 3) ** 2 + (1 / 3) ** 2 + (5 / 3) ** 2) / 2) ** 0.5)
+
+
+def test_the_first_frame_is_timed_apart():
+    renderer = SleepyRenderer(seconds=0.0, first=0.020)
+    report = measure_speed(renderer, [0], "cpu")
+    assert report.first_frame_s == pytest.approx(renderer.took[0], rel=0.05)
+
+
+class FakeGpu:
+    """A device that works behind the host's back, on a clock of its own: no test waits, every value is exact.
+
+    launch, work    seconds of the host and of the device for one frame
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, launch: float, work: float, first: float = 0.0) -> None:
+        self.launch, self.work, self.first = launch, work, first
+        self.now = self.busy_until = 0.0
+        self.frames = self.synchronized = self.resets = 0
+        self.frames_at_reset: list[int] = []
+        monkeypatch.setattr(speed.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(torch.cuda, "synchronize", self.synchronize)
+        monkeypatch.setattr(torch.cuda, "reset_peak_memory_stats", self.reset)
+        monkeypatch.setattr(torch.cuda, "max_memory_allocated", lambda device: 1000 + self.frames)
+        monkeypatch.setattr(torch.cuda, "max_memory_reserved", lambda device: 5000)
+
+    def synchronize(self, device: torch.device) -> None:
+        assert device.type == "cuda"
+        self.now = max(self.now, self.busy_until)
+        self.synchronized += 1
+
+    def reset(self, device: torch.device) -> None:
+        self.frames_at_reset.append(self.frames)
+
+    def __call__(self, view: int) -> torch.Tensor:
+        self.now += self.launch
+        self.busy_until = max(self.busy_until, self.now) + self.work + (self.first if self.frames == 0 else 0.0)
+        self.frames += 1
+        return torch.ones(3, 2, 2)
+
+
+def test_on_cuda_throughput_waits_at_both_ends_and_latency_around_each_frame(monkeypatch):
+    gpu = FakeGpu(monkeypatch, launch=0.001, work=0.004, first=3.0)
+    report = measure_speed(gpu, list(range(20)), "cuda")
+    # Launches hide behind the device's work, all but the first.
+    assert report.rounds == 5  # 100 frames are enough
+    assert report.frames == 100
+    assert report.fps == pytest.approx(100 / (0.001 + 100 * 0.004))
+    assert report.latency_ms_median == pytest.approx(5.0)
+    assert report.latency_ms_p95 == pytest.approx(5.0)
+    assert report.first_frame_s == pytest.approx(3.005)
+    assert report.warmup_frames == 40  # all views once, and a round that tells how long one takes
+    assert gpu.frames == 40 + 100 + 100
+
+
+def test_on_cuda_two_seconds_are_enough_for_slow_frames(monkeypatch):
+    gpu = FakeGpu(monkeypatch, launch=0.0, work=0.25)
+    report = measure_speed(gpu, [0, 1, 2, 3], "cuda")
+    assert (report.rounds, report.frames) == (2, 8)  # 2 rounds of 1 s
+    assert report.fps == pytest.approx(4.0)
+
+
+def test_on_cuda_peak_memory_is_that_of_the_measured_rounds(monkeypatch):
+    gpu = FakeGpu(monkeypatch, launch=0.0, work=0.01)
+    report = measure_speed(gpu, list(range(10)), "cuda", repeats=2)
+    assert gpu.frames_at_reset == [report.warmup_frames]  # once, after the warm-up, outside what is timed
+    assert report.frames == 200
+    assert (report.memory_kind, report.peak_bytes, report.peak_reserved_bytes) == ("cuda", 1000 + gpu.frames, 5000)
+    assert report.spread["fps"].std == pytest.approx(0.0, abs=1e-9)
 
 
 def test_percentiles_are_interpolated():
