@@ -107,7 +107,8 @@ class DiskFullError(SplatwizardError):
     """
 
     def __init__(self, path: str, reason: str, wanted: int | None = None, free: int | None = None) -> None:
-        figures = [f"{wanted:,} bytes wanted"] * (wanted is not None) + [f"{free:,} free"] * (free is not None)
+        known = (("bytes wanted", wanted), ("free", free))
+        figures = [f"{count:,} {what}" for what, count in known if count is not None]
         told = f" ({', '.join(figures)})" if figures else ""
         super().__init__(
             f"{path}: {reason}{told}; nothing half-written was kept. "
