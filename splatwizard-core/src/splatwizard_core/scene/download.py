@@ -22,7 +22,7 @@ from splatwizard_core.errors import CapabilityError, FetchError
 from splatwizard_core.files import write_json
 from splatwizard_core.progress import Bar, track
 
-CHUNK_BYTES = 1 << 18
+CHUNK_BYTES = 1 << 15  # what a broken connection costs at most
 ATTEMPTS = 6  # in a row without one new byte; with the pauses below that is half a minute of silence
 PAUSE_SECONDS = 1.0  # before the second attempt; doubled for each further one
 TIMEOUT_SECONDS = 30.0  # without a byte
@@ -173,7 +173,7 @@ class _Transfer:
                         f"{self.url}: {error}; {self._have():,} bytes are kept, the same command goes on from there",
                         address=self.url,
                     ) from error
-                self.on_notice(f"{error} at {self._have():,} bytes: going on from there")
+                self.on_notice(f"{error}: going on from {self._have():,} bytes")
                 self.pause(PAUSE_SECONDS * 2 ** (failures - 1))
                 continue
             self.path.replace(self.target)
@@ -209,11 +209,13 @@ class _Transfer:
         if status is not None and status not in RETRIED:
             reason = getattr(error.response, "reason", "") or ""
             raise FetchError(f"{self.url}: the server answers {status} {reason}".rstrip(), address=self.url) from error
-        from requests.exceptions import InvalidSchema, InvalidURL, MissingSchema, TooManyRedirects
+        from requests.exceptions import ChunkedEncodingError, InvalidSchema, InvalidURL, MissingSchema, TooManyRedirects
 
         if isinstance(error, (InvalidSchema, InvalidURL, MissingSchema, TooManyRedirects)):
             raise FetchError(f"{self.url}: {error}", address=self.url) from error
-        text = f"the server answers {status}" if status is not None else _first_words(error)
+        broken = isinstance(error, ChunkedEncodingError)
+        text = f"the server answers {status}" if status is not None else "" if broken else _first_words(error)
+        text = text or "the connection broke"
         raise _Broken(text) from error
 
     def _have(self) -> int:
@@ -246,7 +248,7 @@ class _Transfer:
             changed = self.part.total is not None and total is not None and total != self.part.total
             if match is None or int(match[1]) != start or changed:
                 self._discard()
-                raise _Broken("the server sent another part than asked for; starting over")
+                raise _Broken("the server sent another part than asked for, starting over")
         else:
             if start:
                 self.on_notice(f"{self.url}: the server cannot resume this file (or it changed): from the beginning")
@@ -337,5 +339,5 @@ def _first_words(error: BaseException) -> str:
         inner = next((a for a in (getattr(error, "reason", None), *error.args) if isinstance(a, BaseException)), None)
         if inner is None:
             text = re.sub(r"<[^>]*>:? ?|HTTPS?Connection(?:Pool)?\([^)]*\):? ?", "", str(error))
-            return (text.strip() or type(error).__name__)[:200]
+            return text.strip()[:200]
         error = inner
