@@ -48,9 +48,7 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
     except importlib.metadata.PackageNotFoundError:
         return PluginError(f"{problem}: {requirement.command} (the package that the file names)")
     if requirement.is_newer_than(have):
-        return PluginError(
-            f"{problem}; {requirement.distribution} is {have}, the file needs more: {requirement.command}"
-        )
+        return PluginError(f"{problem}; {requirement.distribution} {have} is too old: {requirement.command}")
     if not mine:
         return PluginError(f"{problem}: {requirement.distribution} {have} is there, but SW_PLUGINS leaves it out")
     return PluginError(f"{problem}: {requirement.distribution} {have} no longer provides it")
