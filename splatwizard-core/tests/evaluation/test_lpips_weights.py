@@ -171,7 +171,9 @@ def test_a_damaged_file_is_an_error_where_it_was_named_and_missing_where_it_was_
         load_weights("alex", tmp_path)
     empty_hub.mkdir(parents=True)
     (empty_hub / ALEX.file_name).write_bytes(b"no")
-    with pytest.raises(CapabilityError, match=r"^weights-missing"):
+    with pytest.raises(
+        CapabilityError, match=r"^weights-missing: alexnet-\S+ in the cache of torch\.hub does not hold"
+    ):
         load_weights("alex", None)
 
 

@@ -113,7 +113,9 @@ def load_weights(net: str, folder: Path | None) -> Weights:
     except UserInputError as error:
         if folder is not None and path.parent == folder:
             raise
-        raise CapabilityError(f"weights-missing: {error}", missing=[backbone.file_name]) from error
+        # It becomes a reason in the record, which names no folder of this machine.
+        told = str(error).replace(str(path), f"{path.name} in the cache of torch.hub")
+        raise CapabilityError(f"weights-missing: {told}", missing=[backbone.file_name]) from error
 
 
 def read_weights(path: Path, backbone: Backbone) -> Weights:

@@ -1,0 +1,34 @@
+"""Peak memory of a training is that of its loop."""
+
+import numpy as np
+import pytest
+
+from splatwizard_core.memory import reset_peak_rss
+from splatwizard_core.training.checkpoint import CheckpointStore
+from splatwizard_core.training.params import PipelineParams
+
+MEGABYTE = 1 << 20
+PART = 200 * MEGABYTE  # far above what the toy training takes
+
+pytestmark = pytest.mark.skipif(not reset_peak_rss(), reason="this system cannot reset a resident set's peak")
+
+
+def touch(*_: object) -> None:
+    """Memory that is there for a moment."""
+    np.ones(PART, dtype=np.uint8)
+
+
+def test_what_the_loop_takes_counts(toy):
+    assert toy.train(iterations=4, on_step=touch).peak_memory >= PART
+
+
+def test_an_evaluation_on_the_way_does_not(toy):
+    outcome = toy.train(iterations=6, evaluate=touch, ppl=PipelineParams(eval_every=2))
+    assert outcome.peak_memory < PART / 2
+
+
+def test_writing_a_checkpoint_does_not(toy, tmp_path, monkeypatch: pytest.MonkeyPatch):
+    write = CheckpointStore.write
+    monkeypatch.setattr(CheckpointStore, "write", lambda self, saved: (touch(), write(self, saved)))
+    outcome = toy.train(iterations=6, directory=tmp_path, ppl=PipelineParams(checkpoint_every=2))
+    assert outcome.peak_memory < PART / 2
