@@ -252,6 +252,22 @@ def test_too_little_space_is_said_before_a_byte_is_written(site: Site, target: P
     assert download(site.url(PATH), target, room_for=lambda size: size, sha256=SHA256).verified
 
 
+def test_a_disk_that_fills_meanwhile_keeps_what_came(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch):
+    written = module._Sink.write
+
+    def write(sink, block):
+        if sink.file.tell() >= CUT:
+            raise OSError(28, "No space left on device")
+        return written(sink, block)
+
+    monkeypatch.setattr(module._Sink, "write", write)
+    with pytest.raises(FetchError, match=f"the disk is full; {CUT:,} bytes are kept"):
+        download(site.url(PATH), target)
+    monkeypatch.undo()
+    download(site.url(PATH), target, sha256=SHA256)
+    assert starts(site) == [0, CUT]
+
+
 def test_progress_and_time_left_are_shown(
     site: Site, target: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):

@@ -170,6 +170,13 @@ def test_equal_names_are_refused(kind: str, tmp_path: Path):
         unpack_whole(tmp_path / "a", tmp_path / "data")
 
 
+@pytest.mark.parametrize("files", [{"x": b"1", "x/y": b"2"}, {"x/y": b"2", "x": b"1"}])
+def test_a_file_that_is_also_a_folder_is_refused(files: dict[str, bytes], tmp_path: Path):
+    with pytest.raises(FetchError, match="a file and a folder at once"):
+        unpack_whole(make_tar(tmp_path / "a.tar", files), tmp_path / "data")
+    assert os.listdir(tmp_path) == ["a.tar"]
+
+
 @pytest.mark.parametrize("kind", ["zip", "tar.gz", "tar.xz"])
 def test_bombs_are_refused_before_anything_is_written(kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "GRACE_BYTES", 1 << 16)

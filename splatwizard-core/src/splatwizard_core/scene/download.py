@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from splatwizard_core.errors import CapabilityError, FetchError
-from splatwizard_core.files import write_json
+from splatwizard_core.files import full_disk_code, write_json
 from splatwizard_core.progress import Bar, track
 
 CHUNK_BYTES = 1 << 15  # what a broken connection costs at most
@@ -176,6 +176,14 @@ class _Transfer:
                 self.on_notice(f"{error}: going on from {self._have():,} bytes")
                 self.pause(PAUSE_SECONDS * 2 ** (failures - 1))
                 continue
+            except OSError as error:
+                if full_disk_code(error) is None:
+                    raise
+                raise FetchError(
+                    f"{self.path}: the disk is full; {self._have():,} bytes are kept, make space and give the same "
+                    "command again",
+                    address=self.url,
+                ) from error
             self.path.replace(self.target)
             self.note.unlink(missing_ok=True)
             return

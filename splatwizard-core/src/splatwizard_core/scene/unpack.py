@@ -120,10 +120,14 @@ def _new_folder(target: Path) -> Iterator[Path]:
 
 def _write(stream: IO[bytes], target: Path, member: Member, archive: Path, count: Callable[[int], None]) -> str:
     """Copy exactly the bytes that the archive announced; returns their SHA-256."""
-    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        opened = target.open("xb")
+    except (FileExistsError, NotADirectoryError) as error:
+        raise FetchError(f"{archive}: '{'/'.join(member.parts)}' is a file and a folder at once; refused") from error
     sha = hashlib.sha256()
     left = member.size
-    with stream, target.open("xb") as file:
+    with stream, opened as file:
         while block := stream.read(min(BLOCK_BYTES, left + 1)):
             left -= len(block)
             if left < 0:
