@@ -12,8 +12,10 @@ import torch
 import zstandard
 
 from splatwizard_core.cli.main import main
+from splatwizard_core.coding import container, strict_json
 from splatwizard_core.experiments.decoding import open_model
 from splatwizard_core.plugins import load_plugins
+from sw_codecs import column_plan, point_limit
 
 TESTS = Path(__file__).parent
 CODECS = TESTS.parent / "plugins" / "sw-codecs"
@@ -52,6 +54,28 @@ def test_the_reader_shares_no_code_with_the_packages():
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_it_decodes_the_golden_files(path):
     assert_page_agrees(path)
+
+
+def test_the_page_names_every_header_value_and_section():
+    text = (TESTS.parent / "docs" / "bitstream.md").read_text()
+    for path in GOLDEN:
+        header, sections = page.container(path.read_bytes())
+        for name in (*header, *header["static"], *sections):
+            assert f"`{name}`" in text, f"{path.stem}: {name}"
+
+
+def test_the_page_states_the_caps_of_the_code():
+    text = (TESTS.parent / "docs" / "bitstream.md").read_text()
+    assert f"at most {container.MAX_HEADER:,} |" in text
+    assert (
+        f"{container.MAX_HEADER >> 10} KiB, {strict_json.MAX_DEPTH} levels, {container.MAX_SECTIONS:,} sections" in text
+    )
+    assert f"{container.FREE >> 20} MiB + {container.EXPANSION:,} for each byte of the file" in text
+    points = (
+        f"above 2^{point_limit.ALWAYS_ALLOWED.bit_length() - 1} at most {point_limit.POINTS_PER_BYTE} for each byte"
+    )
+    assert text.count(points) == 2
+    assert f"{column_plan.MAX_TABLE:,} entries a column" in text
 
 
 @pytest.fixture(scope="module")

@@ -84,3 +84,22 @@ def test_a_plugin_is_chosen_by_its_entry_point_or_its_distribution(installed, na
 def test_a_plugin_that_is_chosen_but_not_installed_is_an_error_that_names_those_that_are(installed):
     with pytest.raises(PluginError, match=r"SW_PLUGINS names 'sw-4dgs', .*there are: 3dgs, other"):
         PluginManager(installed, only={"sw-4dgs", "sw-3dgs"})
+
+
+def test_what_a_block_loads_is_recorded_by_name_and_only_there(manager_of):
+    manager = manager_of(one=adds("sum"), other=adds("total"))
+    manager.metrics.load("sum")
+    with manager.recording() as outer:
+        manager.metrics.load("total")
+        with manager.recording() as inner:
+            manager.metrics.load("sum")
+            manager.metrics.load("sum")
+    manager.metrics.load("total")
+    assert [(e.kind, e.name) for e in outer] == [("metric", "total"), ("metric", "sum"), ("metric", "sum")]
+    assert [e.name for e in inner] == ["sum", "sum"]
+
+
+def test_a_name_that_is_not_there_is_a_fact_of_the_error(manager_of):
+    with pytest.raises(PluginError) as caught:
+        manager_of(one=adds("sum")).metrics.load("product")
+    assert (caught.value.kind, caught.value.name) == ("metric", "product")
