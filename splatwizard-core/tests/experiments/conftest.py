@@ -98,8 +98,54 @@ class Student(Toy):
         return [StudentStage(self.config)]
 '''
 
+DEATH = """
+import os
+import sys
+
+WRITES = ("os.rename", "os.remove", "os.rmdir", "os.mkdir", "os.truncate")
+OPENED_TO_WRITE = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+
+
+def die_before_a_write(when, notes):
+    '''Kill this process, and of a child its parent first, before the n-th time that it changes what is on a disk.
+
+    when    COMMAND:N, such as run:7; N = 0: never. Or COMMAND:TEXT: the first time that the line about it holds TEXT
+    notes   path of a file that gets a line for each such time
+    '''
+    command, _, count = when.partition(":")
+    mine = sys.argv[1]
+    if mine != command and count != "0":
+        return
+    left = int(count) if count.isdigit() else -1
+    lines = os.open(notes, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+
+    def watch(event, arguments):
+        nonlocal left
+        if event == "open":
+            if str(arguments[0]).startswith(("/dev/", "/proc/")) or not (arguments[2] or 0) & OPENED_TO_WRITE:
+                return
+        elif event not in WRITES:
+            return
+        line = f"{mine} {event} {arguments[0]}"
+        os.write(lines, f"{line}\\n".encode())
+        left -= 1
+        if left == 0 or (left < 0 and count in line and not count.isdigit()):
+            if mine in ("decode", "eval"):
+                os.kill(os.getppid(), 9)
+            os.kill(os.getpid(), 9)
+
+    sys.addaudithook(watch)
+"""
+
 PLUGIN = """
+import os
+
 from splatwizard_core.plugins import hookimpl
+
+if "TOY_DEATH" in os.environ:
+    import toy_death
+
+    toy_death.die_before_a_write(os.environ["TOY_DEATH"], os.environ["TOY_WRITES"])
 
 
 @hookimpl
@@ -131,6 +177,7 @@ def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     site = tmp_path_factory.mktemp("site")
     (site / "toy_method.py").write_text(TOY)
     (site / "toy_plugin.py").write_text(PLUGIN)
+    (site / "toy_death.py").write_text(DEATH)
     info = site / "sw_toy-0.1.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-toy\nVersion: 0.1\n")

@@ -7,10 +7,9 @@ import os
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.files import scratch_folder
@@ -33,12 +32,9 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     """
     environment = {k: v for k, v in os.environ.items() if not (hide_data and k in HIDDEN)}
     command = [sys.executable, "-m", "splatwizard_core.experiments.fresh_child", *arguments]
-    with tempfile.TemporaryFile("w+") as errors:
-        # The display of a terminal must reach it live; anything else is kept for the message.
-        live = sys.stderr.isatty()
-        done = _ended_with_us(command, cwd, environment, None if live else errors)
-        errors.seek(0)
-        told = errors.read().strip()
+    # The display of a terminal must reach it live; anything else is kept for the message.
+    done = _ended_with_us(command, cwd, environment, None if sys.stderr.isatty() else subprocess.PIPE)
+    told = (done.stderr or "").strip()
     name = f"sw {arguments[0]}"
     if done.returncode == 130:
         raise KeyboardInterrupt
@@ -56,7 +52,7 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
 
 
 def _ended_with_us(
-    command: list[str], cwd: Path | None, environment: dict[str, str], errors: IO[str] | None
+    command: list[str], cwd: Path | None, environment: dict[str, str], errors: int | None
 ) -> subprocess.CompletedProcess[str]:
     """Run a command that ends when we do: we hold the other end of its input, and the system closes it for us."""
     theirs, ours = os.pipe()

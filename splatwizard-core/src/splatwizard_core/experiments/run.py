@@ -125,7 +125,7 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
 
 def _begin(directory: Path, request: RunRequest) -> None:
     """Clear what is to be cleared, and what a killed process left half written."""
-    for folder in (directory, directory / CHECKPOINTS, directory / RENDERS):
+    for folder in (directory, *(path for path in map(directory.joinpath, OWN_FILES) if path.is_dir())):
         sweep(folder)
     if not request.resume:
         discard(directory)
