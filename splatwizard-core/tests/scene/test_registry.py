@@ -115,6 +115,13 @@ def test_a_registry_that_is_not_there_is_named_with_its_variable(monkeypatch: py
         load_registry()
 
 
+def test_the_registry_that_the_page_shows_is_valid():
+    page = (Path(__file__).parents[3] / "docs" / "datasets.md").read_text("utf-8")
+    (shown,) = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)
+    (dataset,) = parse_registry(shown.encode(), "docs/datasets.md")
+    assert (dataset.id, dataset.scenes) == ("atrium", ("stairs", "fountain"))
+
+
 def test_what_is_on_disk_is_told_by_names(tmp_path: Path):
     lab = parse_registry(OWN.encode(), "own.toml")[0]
     states = []
@@ -131,6 +138,12 @@ def test_what_is_on_disk_is_told_by_names(tmp_path: Path):
         ("present", "present", "present"),
     ]
     assert scene_presence(tmp_path, lab, "desk").path == tmp_path / "lab" / "desk"
+
+
+def test_the_two_archives_of_bungee_fill_one_folder(tmp_path: Path):
+    known = load_registry()
+    for name, scene in (("bungee", "rome"), ("bungee_original", "56Leonard")):
+        assert scene_presence(tmp_path, known[name], scene).path == tmp_path / "bungee" / scene
 
 
 @pytest.mark.parametrize("where", ["dtu/scan24", "dtu/24", "DTU/scan24"])

@@ -223,7 +223,7 @@ def _verify_one(job: tuple[str, Path, DataSet | None, bool], plugins: Any, *, ch
         name,
         path,
         plugins,
-        family=dataset.id,
+        family=dataset.folder,
         needs=dataset.needs,
         views=dataset.views,
         recorded=None if receipt is None else receipt["files"],

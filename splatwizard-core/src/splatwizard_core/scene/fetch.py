@@ -33,7 +33,7 @@ class Job:
 
     def target(self, root: Path) -> Path:
         """The folder that the scenes, or the archive's content, go to."""
-        home = root / self.dataset.id
+        home = root / self.dataset.folder
         return home if self.file.into is None else home / self.file.into
 
 

@@ -59,18 +59,18 @@ def scene_presence(root: Path, dataset: DataSet, scene: str) -> ScenePresence:
                 receipt = read_receipt(home, name)
                 verified = None if receipt is None else bool(receipt["archive"].get("verified"))
                 return ScenePresence(scene, path, "partly" if lacking else "present", lacking, verified)
-    return ScenePresence(scene, root / dataset.id / names[0], "missing")
+    return ScenePresence(scene, root / dataset.folder / names[0], "missing")
 
 
 def homes(root: Path, dataset: DataSet) -> list[Path]:
-    """The folders that hold scenes of the data set: <id>, and the names under which it is otherwise unpacked."""
-    family = BENCHMARKS.get(dataset.id)
+    """The folders that hold scenes of the data set: its own, and the names under which it is otherwise unpacked."""
+    family = BENCHMARKS.get(dataset.folder)
     try:
         there = sorted(entry.name for entry in os.scandir(root) if entry.is_dir() and not entry.name.startswith("."))
     except OSError:
         return []
-    others = [name for name in there if family is not None and name != dataset.id and family.is_home(name)]
-    return [root / name for name in ([dataset.id] if dataset.id in there else []) + others]
+    others = [name for name in there if family is not None and name != dataset.folder and family.is_home(name)]
+    return [root / name for name in ([dataset.folder] if dataset.folder in there else []) + others]
 
 
 def dataset_state(root: Path, dataset: DataSet, scenes: list[ScenePresence]) -> State:
@@ -79,7 +79,7 @@ def dataset_state(root: Path, dataset: DataSet, scenes: list[ScenePresence]) -> 
         states: list[State] = [scene.state for scene in scenes]
     else:
         states = [
-            "present" if file.into is not None and (root / dataset.id / file.into).is_dir() else "missing"
+            "present" if file.into is not None and (root / dataset.folder / file.into).is_dir() else "missing"
             for file in dataset.files
         ]
     if all(state == "present" for state in states):

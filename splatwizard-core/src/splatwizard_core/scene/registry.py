@@ -75,9 +75,10 @@ class DataFile(BaseModel):
 
 
 class DataSet(BaseModel):
-    """One data set: scenes below $SPLATWIZARD_DATA/<id>/.
+    """One data set: scenes below $SPLATWIZARD_DATA/<folder>/.
 
-    id, registry    name of the folder; which registry lists it ("public", or a file)
+    id, registry    its name; which registry lists it ("public", or a file)
+    folder          where its scenes lie, the id unless it shares a folder with another one
     title           as papers write it
     homepage        where its authors describe it and its licence
     licence         as its authors state it; None: see the homepage
@@ -93,6 +94,7 @@ class DataSet(BaseModel):
 
     id: Name
     registry: str = PUBLIC
+    folder: Name = ""
     title: str
     homepage: Address | None = None
     licence: str | None = None
@@ -105,6 +107,8 @@ class DataSet(BaseModel):
 
     @model_validator(mode="after")
     def _consistent(self) -> DataSet:
+        if not self.folder:
+            object.__setattr__(self, "folder", self.id)
         for file in self.files:
             unknown = [scene for scene in file.scenes if scene not in self.scenes]
             if unknown:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.families import BENCHMARKS
-
-DATA_VARIABLE = "SPLATWIZARD_DATA"
+from splatwizard_core.scene.presence import DATA_VARIABLE
 
 
 def locate(spec: str) -> tuple[Path, str | None]:
