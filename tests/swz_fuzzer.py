@@ -213,23 +213,15 @@ class Tally:
     problems: list[str] = field(default_factory=list)
 
 
-def attempt(
-    decode: Callable[[], tuple[str, int]],
-    label: str,
-    limit: int,
-    tally: Tally,
-    *,
-    plugins_may_miss: bool = False,
-    measure_memory: bool = True,
-) -> None:
-    """Run `decode() -> (outcome, bytes it holds)`; count the outcome, and note as problems what must not be.
+def attempt(decode: Callable[[], str], label: str, limit: int, tally: Tally, *, plugins_may_miss: bool = False) -> None:
+    """Run `decode() -> outcome`; count the outcome, and note as problems what must not be.
 
     limit   bytes by which the resident set may grow
     """
-    before = rss_bytes() if measure_memory and reset_peak_rss() else None
+    before = rss_bytes() if reset_peak_rss() else None
     began = time.process_time()
     try:
-        outcome, _ = decode()
+        outcome = decode()
     except BitstreamError as error:
         outcome = "refused"
         if "\n" in str(error) or len(str(error)) > 1000:

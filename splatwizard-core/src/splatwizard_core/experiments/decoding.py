@@ -78,7 +78,7 @@ def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
         raise BitstreamError(
             f"{reader.name}: version {reader.version} of the layout of '{reader.method}' is newer than "
             f"{method_class.version}, which {entry.distribution} {entry.version} reads: upgrade it with "
-            f"{upgrade_command(reader, entry.distribution)}"
+            f"{upgrade_command(reader, entry.distribution, entry.version)}"
         )
     try:
         with torch.no_grad():

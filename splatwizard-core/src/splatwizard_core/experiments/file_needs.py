@@ -38,7 +38,9 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
             problem += f" (or does not load: {', '.join(broken)}, see `sw list-plugins`)"
         return PluginError(f"{problem}: {cure}")
     if kind not in plugins.registries:
-        return PluginError(f"{reader.name} needs a {kind}, which splatwizard-core does not know: {_core(reader)}")
+        core = "splatwizard-core"
+        command = upgrade_command(reader, core, importlib.metadata.version(core))
+        return PluginError(f"{reader.name} needs a {kind}, which {core} does not know: {command}")
     mine = [p for p in plugins.plugins if same_distribution(p.distribution, requirement.distribution)]
     failed = next((p for p in mine if p.error is not None), None)
     if failed is not None:
@@ -66,10 +68,10 @@ def newer_than_installed(reader: ContainerReader, plugins: PluginManager) -> lis
     return found
 
 
-def upgrade_command(reader: ContainerReader, distribution: str) -> str:
+def upgrade_command(reader: ContainerReader, distribution: str, installed: str) -> str:
     """How to get a version of `distribution` that reads the file."""
     for requirement in reader.requires:
-        if same_distribution(requirement.distribution, distribution):
+        if same_distribution(requirement.distribution, distribution) and requirement.is_newer_than(installed):
             return requirement.command
     return f"pip install --upgrade {distribution}"
 
@@ -77,7 +79,3 @@ def upgrade_command(reader: ContainerReader, distribution: str) -> str:
 def same_distribution(one: str, other: str) -> bool:
     """Distribution names are compared without case, and with `-`, `_` and `.` alike (PEP 503)."""
     return re.sub(r"[-_.]+", "-", one).lower() == re.sub(r"[-_.]+", "-", other).lower()
-
-
-def _core(reader: ContainerReader) -> str:
-    return upgrade_command(reader, "splatwizard-core")
