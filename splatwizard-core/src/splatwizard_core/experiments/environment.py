@@ -38,6 +38,7 @@ def describe_environment(plugins: PluginManager, device: torch.device, seed: int
             "compute_capability": f"{properties.major}.{properties.minor}",
             "cuda": torch.version.cuda,
             "driver": _driver(),
+            "clock_mhz": _clock(device),
         }
     return found
 
@@ -51,6 +52,14 @@ def cpu_name() -> str:
     except OSError:
         pass
     return platform.processor() or platform.machine()
+
+
+def _clock(device: torch.device) -> int | None:
+    """The SM clock now, MHz; None where the packages that read it are not installed."""
+    try:
+        return int(torch.cuda.clock_rate(device))
+    except (ImportError, RuntimeError, OSError):
+        return None
 
 
 def _driver() -> str | None:

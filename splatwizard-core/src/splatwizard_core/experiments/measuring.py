@@ -134,6 +134,7 @@ def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter) -> list[
     told = {
         "fit": scene.protocol.split == "all",
         "rss": meter.kind == "rss",
+        "infinite": any(None in metric.per_view for metric in quality.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in quality.metrics.values()),
     }
     return [name for name, holds in told.items() if holds]

@@ -1,0 +1,77 @@
+"""docs/protocol.md names every metric, every field of the record and every flag, as they are."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel
+
+from splatwizard_core.evaluation.lpips_weights import BACKBONES
+from splatwizard_core.experiments import measuring, record
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.scene.scene import Protocol
+
+PAGE = (Path(__file__).resolve().parents[1] / "docs" / "protocol.md").read_text(encoding="utf-8")
+BLOCKS = {
+    "codec": record.CodecBlock, "speed": record.SpeedBlock, "memory": record.MemoryBlock, "train": record.TrainBlock,
+    "file": record.RecordFile, "metrics": record.MetricBlock,
+}  # fmt: skip
+
+
+def row(first: str) -> str:
+    """The line of a table whose first cell has `first`."""
+    found = [line for line in PAGE.splitlines() if re.match(rf"\| [^|]*`{re.escape(first)}`[^|]*\|", line)]
+    assert found, f"no table row for {first}"
+    return "\n".join(found)
+
+
+def core_metrics() -> list[str]:
+    return [entry.name for entry in load_plugins().metrics if entry.distribution == "splatwizard-core"]
+
+
+def test_every_metric_has_its_row_with_direction_and_kind():
+    for name in core_metrics():
+        declared = load_plugins().metrics.entry(name).declared
+        assert declared["direction"] in row(name)
+        assert ("*diagnostic.*" in row(name)) == bool(declared.get("diagnostic")), name
+
+
+def test_no_row_describes_a_metric_that_is_not_there():
+    section = PAGE.partition("## 3 Image metrics")[2].partition("\n## ")[0].partition("Diagnostics are")[0]
+    assert re.findall(r"^\| `(\w+)` \|", section, re.M) == list(
+        dict.fromkeys(re.findall(r"^\| `(\w+)` \|", section, re.M))
+    )
+    assert set(re.findall(r"^\| `(\w+)` \|", section, re.M)) == set(core_metrics())
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_every_field_of_a_block_is_in_its_row_and_nothing_else(block: str):
+    model: type[BaseModel] = BLOCKS[block]
+    cells = row(block).split("|")
+    named = re.findall(r"`(\w+)`", cells[2])
+    assert set(named) == set(model.model_fields)
+
+
+def test_every_field_of_the_record_has_a_row():
+    for name in record.Record.model_fields:
+        assert row(name)
+
+
+def test_the_schema_and_the_flags_are_the_ones_that_are_written():
+    assert f"schema {record.SCHEMA}" in PAGE
+    source = Path(measuring.__file__).read_text()
+    flags = re.findall(r'"([a-z-]+)": ', source.partition("told = {")[2].partition("}")[0])
+    assert flags
+    assert set(re.findall(r"`([\w-]+)`", row("flags").split("|")[2])) == set(flags)
+
+
+def test_the_example_of_an_id_is_what_a_scene_of_that_kind_gets():
+    assert f"    {Protocol('mipnerf360').id}\n" in PAGE
+    assert Protocol("x", masked=True, composite8=True).id.endswith("/masked/composite8")
+
+
+def test_the_files_of_weights_are_named_as_they_are_looked_for():
+    for backbone in BACKBONES.values():
+        assert backbone.address in row(backbone.file_name)
