@@ -83,7 +83,8 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 
 @pytest.fixture
-def site(archive: bytes) -> Iterator[Site]:
+def site(archive: bytes, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with running_site() as running:
         running.files = {"/lab.zip": archive, "/loose.zip": archive, "/truth.zip": archive}
         running.etags["/lab.zip"] = '"1"'

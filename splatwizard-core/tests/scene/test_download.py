@@ -31,7 +31,8 @@ CUT = 32 * module.CHUNK_BYTES  # whole chunks, so that nothing of what came is l
 
 
 @pytest.fixture
-def site() -> Iterator[Site]:
+def site(monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with running_site() as running:
         running.files[PATH] = CONTENT
         running.etags[PATH] = '"first"'

@@ -208,6 +208,25 @@ def test_no_pixel_of_a_black_border_is_left(model: str, tmp_path: Path):
         assert np.asarray(Image.open(tmp_path / "out" / "images" / name)).min() >= GREY - 1
 
 
+@pytest.mark.parametrize("model", ["OPENCV", "SIMPLE_RADIAL_FISHEYE"])
+def test_pictures_cameras_and_key_points_are_those_of_colmaps_own_undistorter(model: str, tmp_path: Path):
+    import pycolmap
+
+    scene = write_scene(tmp_path / "in", model)
+    undistort_scene(scene, tmp_path / "ours")
+    options = pycolmap.UndistortCameraOptions()
+    options.blank_pixels = 0
+    theirs = tmp_path / "theirs"
+    pycolmap.undistort_images(theirs, scene / "sparse" / "0", scene / "images", undistort_options=options)
+    ours, expected = read_model(tmp_path / "ours" / "sparse" / "0"), read_model(theirs / "sparse")
+    assert ours.cameras == expected.cameras
+    by_name = {image.name: image for image in expected.images.values()}
+    for image in ours.images.values():
+        assert np.abs(image.xys - by_name[image.name].xys).max() < 1e-9
+        pixels, others = (np.asarray(Image.open(f / "images" / image.name)) for f in (tmp_path / "ours", theirs))
+        assert (pixels == others).all()
+
+
 def test_a_scene_taken_for_pinhole_would_miss_its_dots(tmp_path: Path):
     """The oracle can fail: with the coefficients struck out, points and dots lie pixels apart."""
     scene = write_scene(tmp_path / "in", "SIMPLE_RADIAL")

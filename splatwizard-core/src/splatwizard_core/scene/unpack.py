@@ -22,6 +22,7 @@ from typing import IO, Any
 
 from splatwizard_core.errors import FetchError
 from splatwizard_core.files import new_folder
+from splatwizard_core.progress import track
 from splatwizard_core.scene.download import byte_progress
 from splatwizard_core.scene.images import is_inside
 
@@ -169,8 +170,10 @@ def _members(archive: Path) -> list[Member]:
     members: list[Member] = []
     seen: set[tuple[str, ...]] = set()
     total = 0
-    with _damage_named(archive), _opened(archive) as contents:
+    label = f"check {archive.name}"  # of a compressed tar, this reads it all
+    with _damage_named(archive), _opened(archive) as contents, track(label, unit="files") as bar:
         for member, _ in contents:
+            bar.advance()
             if member.parts in seen:
                 raise FetchError(f"{archive}: '{'/'.join(member.parts)}' is in it twice; refused")
             seen.add(member.parts)
@@ -210,9 +213,9 @@ def _zip_contents(archive: Path, opened: zipfile.ZipFile) -> Contents:
     for info in opened.infolist():
         kind = stat.S_IFMT(info.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise FetchError(f"{archive}: '{info.filename}' is a link or a device; refused")
+            raise FetchError(f"{archive}: {info.filename!r} is a link or a device; refused")
         if info.flag_bits & 1:
-            raise FetchError(f"{archive}: '{info.filename}' is encrypted; refused")
+            raise FetchError(f"{archive}: {info.filename!r} is encrypted; refused")
         parts = _parts(archive, info.filename)
         if not info.is_dir() and not _is_junk(parts):
             yield Member(parts, info.file_size), lambda info=info: opened.open(info)  # type: ignore[misc]
@@ -221,7 +224,7 @@ def _zip_contents(archive: Path, opened: zipfile.ZipFile) -> Contents:
 def _tar_contents(archive: Path, opened: tarfile.TarFile) -> Contents:
     for info in opened:
         if not (info.isreg() or info.isdir()) or info.issparse() or info.size < 0:
-            raise FetchError(f"{archive}: '{info.name}' is a link, a device or a sparse file; refused")
+            raise FetchError(f"{archive}: {info.name!r} is a link, a device or a sparse file; refused")
         parts = _parts(archive, info.name)
         if not info.isdir() and not _is_junk(parts):
             yield Member(parts, info.size), lambda info=info: _tar_stream(opened, info)  # type: ignore[misc]

@@ -112,7 +112,7 @@ def _read_views(path: Path, file: str, rules: Rules) -> list[View]:
         if any(_number(merged.get(key, 0), key, name, where) for key in DISTORTION_KEYS):
             raise SceneError(
                 f"{where}: image '{name}' has lens distortion ({', '.join(DISTORTION_KEYS)}); "
-                f"sw data undistort {path} OUT writes an undistorted copy",
+                "undistort its pictures and strike the coefficients out (sw data undistort does it for COLMAP scenes)",
                 path=str(path),
             )
         width, height, has_alpha = picture_header(picture)
