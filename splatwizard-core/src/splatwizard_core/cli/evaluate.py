@@ -157,6 +157,8 @@ def _print(facts: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
+    from splatwizard_core.evaluation.metrics import short_reason
+
     name = Path(facts["file"]["path"]).name
     table = Table(
         title=f"{escape(name)} on {escape(facts['scene'])}, protocol {escape(facts['protocol']['id'])}",
@@ -190,4 +192,4 @@ def _print(facts: dict[str, Any]) -> None:
     out = console()
     out.print(table)
     for name, reason in facts["unknown"].items():
-        out.print(escape(f"{name}: {reason}"))
+        out.print(escape(f"{name.removeprefix('metrics.').removesuffix('.mean')}: {short_reason(reason)}"))

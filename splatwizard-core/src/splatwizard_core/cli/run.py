@@ -181,12 +181,14 @@ def print_results(done: list[tuple[Record, Path]]) -> None:
 
 def reasons_of_metrics(records: list[Record]) -> dict[str, list[str]]:
     """Why metrics have no mean -> which ones."""
+    from splatwizard_core.evaluation.metrics import short_reason
+
     found: dict[str, dict[str, None]] = {}
     for record in records:
         for key, why in record.unknown.items():
             block, _, name = key.partition(".")
             if block == "metrics":
-                found.setdefault(why, {})[name.removesuffix(".mean")] = None
+                found.setdefault(short_reason(why), {})[name.removesuffix(".mean")] = None
     return {why: list(names) for why, names in found.items()}
 
 

@@ -24,6 +24,10 @@ Metric = Callable[[Tensor, Tensor], float]
 """(render [3,H,W], truth [3,H,W]), both in 0..1 on one device -> the value."""
 
 
+MISSING = ("weights-missing", "package-missing")
+"""How the reason begins where something has to be brought; commands tell how, once, before the work."""
+
+
 @dataclass
 class MetricSetup:
     """What metrics may use to get ready.
@@ -111,3 +115,8 @@ def metric_identities(registry: Registry, setup: MetricSetup) -> dict[str, str |
             identity = target.identity(setup)
             found[entry.name] = None if identity is None else f"{found[entry.name]}, {identity}"
     return found
+
+
+def short_reason(reason: str) -> str:
+    """Why a metric has no value, for a table below a warning that has told how to mend it."""
+    return next((word for word in MISSING if reason.startswith(word)), reason)

@@ -1,0 +1,66 @@
+"""Speed, memory and LPIPS where there is a GPU: the clock of the harness against CUDA's own, the CPU's values."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from lpips_backbones import write_backbones
+
+from splatwizard_core.cli.main import main
+from splatwizard_core.evaluation.metrics import MetricSetup
+from splatwizard_core.evaluation.speed import measure_speed
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device"),
+]
+
+
+def test_throughput_is_that_of_cudas_own_events():
+    device = torch.device("cuda")
+    a = torch.randn(4096, 4096, device=device)
+
+    def render(view: int) -> torch.Tensor:
+        return a @ a
+
+    report = measure_speed(render, list(range(10)), device)
+    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+    begin.record()
+    for _ in range(report.frames):
+        render(0).sum()
+    end.record()
+    torch.cuda.synchronize()
+    assert report.fps == pytest.approx(1e3 * report.frames / begin.elapsed_time(end), rel=0.05)
+    assert report.latency_ms_median >= 0.95 * 1e3 / report.fps
+    assert report.memory_kind == "cuda"
+    assert report.peak_bytes >= 2 * 4096 * 4096 * 4  # the factor and the product
+    assert report.peak_reserved_bytes >= report.peak_bytes
+
+
+def test_lpips_on_a_gpu_equals_the_cpus(tmp_path: Path):
+    if importlib.util.find_spec("lpips") is None:
+        pytest.skip("LPIPS is the extra splatwizard-core[lpips]")
+    from splatwizard_core.evaluation.perceptual import ALEX, VGG, VGG_3DGS
+
+    write_backbones(tmp_path)
+    generator = torch.Generator().manual_seed(0)
+    render, truth = torch.rand(2, 3, 64, 80, generator=generator)
+    for form in (VGG_3DGS, VGG, ALEX):
+        values = []
+        for device in ("cpu", "cuda"):
+            compute = form.prepare(MetricSetup(torch.device(device), tmp_path)).compute
+            values.append(compute(render.to(device), truth.to(device)))
+        assert values[1] == pytest.approx(values[0], rel=5e-3)  # TF32 convolutions
+
+
+def test_an_evaluation_on_cuda_reports_the_allocators_memory(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    out = ["--scene", "demo:tiny", "--rate", "r6", "--set", "iterations=10", "--out", str(tmp_path)]
+    assert main(["run", *out, "--device", "cuda"]) == 0
+    record = json.loads((tmp_path / "demo-tiny" / "3dgs" / "r6" / "metrics.json").read_text())
+    assert record["memory"]["kind"] == record["train"]["memory_kind"] == record["codec"]["memory_kind"] == "cuda"
+    assert "rss" not in record["flags"]
+    assert record["memory"]["peak_reserved_bytes"] >= record["memory"]["peak_render_bytes"] > 0
+    assert record["speed"]["frames"] >= 100 or record["speed"]["rounds"] * 8 / record["speed"]["fps"] >= 1.9
+    assert record["environment"]["gpu"]["name"]
