@@ -144,8 +144,9 @@ def _series(series: Series, x: Axis, y: Axis) -> Markup:
             label = Markup("")
             if point.label:
                 below = py < TOP + 16
-                label = Markup('<text class="point-label" x="{}" y="{}" text-anchor="middle">{}</text>').format(
-                    0, 16 if below else -9, point.label
+                # Curves rise and flatten: above and to the left of a point is free, but for those at the upper edge.
+                label = Markup('<text class="point-label" x="{}" y="{}" text-anchor="{}">{}</text>').format(
+                    0 if below else -4, 17 if below else -6, "middle" if below else "end", point.label
                 )
             parts.append(
                 Markup(

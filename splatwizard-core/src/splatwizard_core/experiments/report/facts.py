@@ -132,7 +132,7 @@ class RunFacts(Facts):
     date: Text | None = None
 
 
-OTHER_SCHEMA = f"record of schema {{}}, this release writes {SCHEMA}: what only one of them has is shown as –"
+OTHER_SCHEMA = f"record of schema {{}}, this release writes {SCHEMA}: a dash may stand for what only one has"
 INDISPENSABLE = ("schema_version", "method", "scene", "protocol", "file", "metrics")
 
 

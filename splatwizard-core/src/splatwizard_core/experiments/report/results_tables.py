@@ -25,13 +25,13 @@ def metric_names(runs: Iterable[Run], *, diagnostic: bool = False) -> list[str]:
 
 def missing_metrics(runs: Iterable[Run]) -> list[str]:
     """Why metrics have no value, one line for each reason."""
-    reasons: dict[str, None] = {}
+    reasons: dict[str, dict[str, None]] = {}
     for run in runs:
-        for name, metric in run.facts.metrics.items():
-            if metric.mean is None:
+        for name in numbers.ordered_metrics(run.facts.metrics):
+            if run.mean(name) is None:
                 why = run.facts.unknown.get(f"metrics.{name}.mean", "the record gives no reason")
-                reasons[f"{numbers.heading(name)}: {why}"] = None
-    return list(reasons)
+                reasons.setdefault(why, {})[numbers.heading(name)] = None
+    return [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
 
 
 def runs_table(runs: Sequence[Run]) -> Table:
@@ -93,15 +93,22 @@ def means_table(table: DatasetTable) -> Table:
 
 def means_notes(table: DatasetTable) -> list[str]:
     """What a reader of the means must know: what is missing, and which protocols they come from."""
-    notes = []
+    lacking: dict[tuple[str, tuple[str, ...], bool], list[str]] = {}
     for r in table.rows:
         if r.missing:
-            kind = "has no mean" if r.size is None else "is a mean over what is there"
-            name = f"{r.variant} {r.rate or ''}".strip()
-            notes.append(f"{name} {kind}: {', '.join(r.missing)} missing.")
+            lacking.setdefault((r.variant, r.missing, r.size is None), []).append(r.rate or "")
+    notes = []
+    for (variant, missing, unknown), rates in lacking.items():
+        kind = "no mean" if unknown else "mean of what is there"
+        name = f"{variant} {', '.join(filter(None, rates))}".strip()
+        notes.append(f"{name}: {kind}, {_some(missing)} missing.")
     if len(table.protocols) > 1:
         notes.append(f"The scenes use different picture folders: {'; '.join(table.protocols)}.")
     return notes
+
+
+def _some(names: Sequence[str], most: int = 6) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def bd_table(table: BdTable) -> Table:

@@ -109,7 +109,12 @@ def _order(run: Run) -> tuple[object, ...]:
 def _tell_apart(runs: list[Run]) -> tuple[list[Run], list[str]]:
     """Name what one name would mix: presets of a method, then folders; of what still is equal, the newest stays."""
     for distinguish in (_by_preset, _by_root):
-        clashing = {runs[i].facts.method for group in _clashes(runs) for i in group}
+        clashing = {
+            runs[i].facts.method
+            for group in _clashes(runs)
+            if len({distinguish(runs[j]) for j in group}) > 1
+            for i in group
+        }
         runs = [replace(run, variant=distinguish(run)) if run.facts.method in clashing else run for run in runs]
     dropped: set[int] = set()
     notes = []
