@@ -52,6 +52,10 @@ class FetchError(SplatwizardError):
         self.address = address
 
 
+class ArchiveError(FetchError):
+    """An archive is damaged or hostile, or does not hold what it should."""
+
+
 class ShapeError(UserInputError):
     """A tensor does not have the shape, dtype or device that a function documents."""
 

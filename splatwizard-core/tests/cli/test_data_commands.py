@@ -235,7 +235,9 @@ def test_wrong_input_is_one_line_and_asks_nobody(arguments, status, message, dat
 def test_a_page_in_place_of_the_archive_is_told(data: Path, site: Site, capsys):
     site.files["/loose.zip"] = b"<html>Sign in</html>"
     assert main(["data", "fetch", "loose", "-y"]) == 1
-    assert "a web page in its place?" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "a web page in its place" in said
+    assert "delete it to download it again" in said
     assert not (data / "loose" / "desk").exists()
 
 

@@ -173,6 +173,7 @@ def _alone(root: Path) -> Iterator[None]:
 
 def _fetch_one(root: Path, jobs: list[Job], local: Path | None, keep: bool) -> list[dict[str, Any]]:
     """One archive, and all that is wanted of it."""
+    from splatwizard_core.errors import ArchiveError
     from splatwizard_core.scene.download import check_file, download
     from splatwizard_core.scene.fetch import archive_path, unpack_job
 
@@ -190,7 +191,12 @@ def _fetch_one(root: Path, jobs: list[Job], local: Path | None, keep: bool) -> l
             room_for=lambda size: 2 * size if whole else size,
             on_notice=say,
         )
-    done = [_facts(job, archive, unpack_job(root, job, archive)) for job in jobs]
+    try:
+        done = [_facts(job, archive, unpack_job(root, job, archive)) for job in jobs]
+    except ArchiveError as error:
+        if local is not None:
+            raise
+        raise ArchiveError(f"{error}; it is kept, delete it to download it again", address=file.url) from error
     if local is None and not keep:
         archive.path.unlink()
     return done

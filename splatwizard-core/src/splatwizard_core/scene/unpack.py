@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
-from splatwizard_core.errors import FetchError
+from splatwizard_core.errors import ArchiveError, FetchError
 from splatwizard_core.files import new_folder
 from splatwizard_core.progress import track
 from splatwizard_core.scene.download import byte_progress
@@ -125,7 +125,7 @@ def _write(stream: IO[bytes], target: Path, member: Member, archive: Path, count
         target.parent.mkdir(parents=True, exist_ok=True)
         opened = target.open("xb")
     except (FileExistsError, NotADirectoryError) as error:
-        raise FetchError(f"{archive}: '{'/'.join(member.parts)}' is a file and a folder at once; refused") from error
+        raise ArchiveError(f"{archive}: '{'/'.join(member.parts)}' is a file and a folder at once; refused") from error
     sha = hashlib.sha256()
     left = member.size
     with stream, opened as file:
@@ -137,7 +137,7 @@ def _write(stream: IO[bytes], target: Path, member: Member, archive: Path, count
             sha.update(block)
             count(len(block))
     if left:
-        raise FetchError(f"{archive}: '{'/'.join(member.parts)}' is not as long as announced: the archive is damaged")
+        raise ArchiveError(f"{archive}: '{'/'.join(member.parts)}' is not as long as announced: the archive is damaged")
     return sha.hexdigest()
 
 
@@ -155,12 +155,12 @@ def _find_scene(
     found = [root for root, held in inside.items() if all(need in held for need in wanted)]
     if not found:
         what = f" with {', '.join(needs)}" if needs else ""
-        raise FetchError(f"{archive}: holds no folder '{names[0]}'{what} (scene '{scene}')")
+        raise ArchiveError(f"{archive}: holds no folder '{names[0]}'{what} (scene '{scene}')")
     top = min(map(len, found))
     topmost = [root for root in found if len(root) == top]
     if len(topmost) > 1:
         shown = " and ".join("/".join(root) for root in topmost[:2])
-        raise FetchError(f"{archive}: {shown} could both be scene '{scene}'; unpack the right one by hand")
+        raise ArchiveError(f"{archive}: {shown} could both be scene '{scene}'; unpack the right one by hand")
     return topmost[0]
 
 
@@ -175,17 +175,17 @@ def _members(archive: Path) -> list[Member]:
         for member, _ in contents:
             bar.advance()
             if member.parts in seen:
-                raise FetchError(f"{archive}: '{'/'.join(member.parts)}' is in it twice; refused")
+                raise ArchiveError(f"{archive}: '{'/'.join(member.parts)}' is in it twice; refused")
             seen.add(member.parts)
             members.append(member)
             total += member.size
             if total > limit or len(members) > MAX_MEMBERS:
-                raise FetchError(
+                raise ArchiveError(
                     f"{archive}: {len(members):,} files of {total:,} bytes so far, from an archive of "
                     f"{archive.stat().st_size:,}: a decompression bomb; refused"
                 )
     if not members:
-        raise FetchError(f"{archive}: holds no file")
+        raise ArchiveError(f"{archive}: holds no file")
     return members
 
 
@@ -202,8 +202,8 @@ def _opened(archive: Path) -> Iterator[Contents]:
         try:
             opened_tar = tarfile.open(archive, tarinfo=_TarInfo)  # noqa: SIM115 (closed below)
         except tarfile.TarError as error:
-            raise FetchError(
-                f"{archive} is no zip or tar archive, or it is damaged ({error}); a web page in its place?"
+            raise ArchiveError(
+                f"{archive} is no zip or tar archive, or damaged ({error}): perhaps a web page in its place"
             ) from error
         with opened_tar:
             yield _tar_contents(archive, opened_tar)
@@ -213,9 +213,9 @@ def _zip_contents(archive: Path, opened: zipfile.ZipFile) -> Contents:
     for info in opened.infolist():
         kind = stat.S_IFMT(info.external_attr >> 16)
         if kind not in (0, stat.S_IFREG, stat.S_IFDIR):
-            raise FetchError(f"{archive}: {info.filename!r} is a link or a device; refused")
+            raise ArchiveError(f"{archive}: {info.filename!r} is a link or a device; refused")
         if info.flag_bits & 1:
-            raise FetchError(f"{archive}: {info.filename!r} is encrypted; refused")
+            raise ArchiveError(f"{archive}: {info.filename!r} is encrypted; refused")
         parts = _parts(archive, info.filename)
         if not info.is_dir() and not _is_junk(parts):
             yield Member(parts, info.file_size), lambda info=info: opened.open(info)  # type: ignore[misc]
@@ -224,7 +224,7 @@ def _zip_contents(archive: Path, opened: zipfile.ZipFile) -> Contents:
 def _tar_contents(archive: Path, opened: tarfile.TarFile) -> Contents:
     for info in opened:
         if not (info.isreg() or info.isdir()) or info.issparse() or info.size < 0:
-            raise FetchError(f"{archive}: {info.name!r} is a link, a device or a sparse file; refused")
+            raise ArchiveError(f"{archive}: {info.name!r} is a link, a device or a sparse file; refused")
         parts = _parts(archive, info.name)
         if not info.isdir() and not _is_junk(parts):
             yield Member(parts, info.size), lambda info=info: _tar_stream(opened, info)  # type: ignore[misc]
@@ -251,7 +251,7 @@ class _TarInfo(tarfile.TarInfo):
 def _parts(archive: Path, name: str) -> tuple[str, ...]:
     """A member's path. Raises FetchError if it leads out of the folder it is unpacked to."""
     if not is_inside(name) or ":" in name.split("/")[0] or not name.isprintable():
-        raise FetchError(f"{archive}: {name!r} leads out of the folder or cannot be a file name; refused")
+        raise ArchiveError(f"{archive}: {name!r} leads out of the folder or cannot be a file name; refused")
     return tuple(part for part in name.split("/") if part not in ("", "."))
 
 
@@ -261,14 +261,14 @@ def _is_junk(parts: tuple[str, ...]) -> bool:
 
 @contextlib.contextmanager
 def _damage_named(archive: Path) -> Iterator[None]:
-    """What the decoders raise on damage becomes a FetchError; a full disk stays what it is."""
+    """What the decoders raise on damage becomes an ArchiveError; a full disk stays what it is."""
     try:
         yield
     except (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, struct.error) as error:
-        raise FetchError(f"{archive}: damaged or incomplete ({error})") from error
+        raise ArchiveError(f"{archive}: damaged or incomplete ({error})") from error
     except (NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
-        raise FetchError(f"{archive}: cannot be unpacked ({error})") from error
+        raise ArchiveError(f"{archive}: cannot be unpacked ({error})") from error
     except OSError as error:
         if error.errno is None:  # gzip and bzip2 report damage so
-            raise FetchError(f"{archive}: damaged or incomplete ({error})") from error
+            raise ArchiveError(f"{archive}: damaged or incomplete ({error})") from error
         raise
