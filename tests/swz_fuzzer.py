@@ -25,7 +25,10 @@ import numpy as np
 from splatwizard_core.errors import BitstreamError, PluginError
 from splatwizard_core.memory import peak_rss_bytes, reset_peak_rss, rss_bytes
 
-INTEGERS = (0, 1, 2, 3, 7, 127, 128, 255, 256, 4095, 65_535, 65_536, 2**20, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**62)
+INTEGERS = (
+    0, 1, 2, 3, 7, 127, 128, 255, 256, 4095, 4096, 65_535, 65_536, 2**20, 2**24, 2**31 - 1, 2**31, 2**32 - 1, 2**60,
+    2**61 + 2, 2**62, 2**63 - 1, 2**64 - 1,
+)  # fmt: skip
 VALUES = (
     *INTEGERS, -1, -(2**31), 0.0, 0.5, -1.5, 1e-300, 1e300, 3.5e38, True, None, "", "x", [], {}, [0] * 3, [1e38] * 3,
     {"a": [1]},

@@ -7,6 +7,7 @@ prints what came of them (SPLATWIZARD_FUZZ_FILES sets another number).
 import contextlib
 import importlib.util
 import os
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +18,9 @@ from hypothesis import strategies as st
 from swz_fuzzer import Mutator, Parts, Tally, attempt, blind, open_handles
 
 from splatwizard_core.coding.container import ContainerReader, decoded_limit
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, PluginError
 from splatwizard_core.experiments.decoding import open_model
+from splatwizard_core.memory import reset_peak_rss
 from splatwizard_core.plugins import load_plugins
 from sw_codecs.exact_tables import exact_tables
 
@@ -116,6 +118,31 @@ def test_a_few_hundred_hostile_files(tmp_path, blind_seeds, payloads):
     assert tally.problems == []
     assert tally.outcomes["refused"] > 300
     assert tally.outcomes["decoded"] > 10  # the mutations are not all caught at the door
+
+
+def test_the_harness_sees_what_it_looks_for():
+    def crash():
+        raise KeyError("section")
+
+    def flood():
+        return "decoded" if np.ones(5 << 20).all() else ""  # 40 MB
+
+    def hang():
+        began = time.process_time()
+        while time.process_time() < began + 1.05:
+            pass
+        return "decoded"
+
+    def miss():
+        raise PluginError("no plugin")
+
+    tally = Tally()
+    faults = [crash, *([flood] if reset_peak_rss() else []), hang, miss]  # not every system tells a peak of memory
+    for number, fault in enumerate(faults, 1):
+        attempt(fault, fault.__name__, 4 << 20, tally)
+        assert [problem.partition(":")[0] for problem in tally.problems[number - 1 :]] == [fault.__name__]
+    attempt(miss, "miss", 4 << 20, tally, plugins_may_miss=True)
+    assert len(tally.problems) == len(faults)
 
 
 @pytest.mark.slow
