@@ -162,7 +162,7 @@ def test_an_error_nobody_foresaw_is_one_line_and_status_1(
     [
         (FileNotFoundError(2, "No such file or directory", "a/b"), 2, "a/b: No such file or directory"),
         (PermissionError(13, "Permission denied", "a/b"), 2, "a/b: Permission denied"),
-        (OSError(28, "No space left on device"), 1, "No space left on device"),
+        (OSError(5, "Input/output error"), 1, "Input/output error"),
     ],
 )
 def test_what_the_system_refuses_is_one_line_without_its_python_name(

@@ -161,8 +161,9 @@ def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
         _say(f"error: {error}")
         return error.exit_status
     if isinstance(error, OSError) and error.strerror is not None:
-        if error.errno in FULL and error.filename is not None:
-            _say(f"error: {DiskFullError(str(error.filename), FULL[error.errno])}")
+        if error.errno in FULL:
+            # What did not go through our own writing may not say where.
+            _say(f"error: {DiskFullError(str(error.filename or 'a file'), FULL[error.errno])}")
             return DiskFullError.exit_status
         at = "" if error.filename is None else f"{error.filename}: "
         _say(f"error: {at}{error.strerror}{'' if debug else ' (a traceback: add --debug)'}")

@@ -85,7 +85,7 @@ class CheckpointStore:
         pair = secrets.token_hex(16)
         path = self.directory / f"{checkpoint.stage:02d}-{checkpoint.step:07d}.json"
         tensor_path = path.with_suffix(".safetensors")
-        if tensor_path.exists():
+        if path.exists():
             tensor_path = path.with_name(f"{path.stem}-{pair[:8]}.safetensors")
         content = {
             **{f.name: getattr(checkpoint, f.name) for f in fields(Checkpoint) if f.name != "state"},
@@ -101,12 +101,17 @@ class CheckpointStore:
         size = sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())
         # On the disk itself, since the one before goes. The inner file takes its place first: the JSON file makes the
         # pair valid.
-        with (
-            replacing(path, wanted=len(text), durable=True) as beside,
-            replacing(tensor_path, wanted=size, durable=True) as tensors_beside,
-        ):
-            save_file(tensors, tensors_beside, {"pair": pair})
-            beside.write_text(text)
+        try:
+            with (
+                replacing(path, wanted=len(text), durable=True) as beside,
+                replacing(tensor_path, wanted=size, durable=True) as tensors_beside,
+            ):
+                save_file(tensors, tensors_beside, {"pair": pair})
+                beside.write_text(text)
+        except BaseException:
+            if _names(path) != tensor_path.name:  # a Ctrl-C may have come when all was done
+                tensor_path.unlink(missing_ok=True)
+            raise
         self._prune(checkpoint.stage, tensor_path.name)
         return path
 
@@ -182,6 +187,14 @@ class CheckpointStore:
             replaced = match[1] == written and path.suffix == ".safetensors" and path.name != tensors
             if match[1] not in kept or replaced or path.suffix == ".tmp":
                 path.unlink()
+
+
+def _names(path: Path) -> str | None:
+    """The file of tensors that a JSON file names; None if there is none."""
+    try:
+        return str(json.loads(path.read_text())["content"]["file"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
 
 
 def read_checkpoint(path: Path) -> Checkpoint:

@@ -1,0 +1,104 @@
+"""What a shell does to the streams of a command, and what systems send to end it."""
+
+import errno
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatwizard_core.cli.main import main
+from splatwizard_core.cli.streams import ended_like_ctrl_c
+from splatwizard_core.coding.container import ContainerWriter
+
+SW = f"{shlex.quote(sys.executable)} -m splatwizard_core"
+
+
+def in_shell(line: str) -> subprocess.CompletedProcess[str]:
+    """A line of bash, with the status of the first command of a pipe."""
+    return subprocess.run(
+        ["bash", "-c", f"set -o pipefail; {line}"], capture_output=True, text=True, timeout=120, check=False
+    )
+
+
+@pytest.fixture
+def encoded(tmp_path: Path) -> str:
+    writer = ContainerWriter("toy", 1)
+    writer.add("means", b"12345")
+    writer.write(tmp_path / "x.swz")
+    return shlex.quote(str(tmp_path / "x.swz"))
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&-", ">&- 2>&- <&-"])
+@pytest.mark.parametrize("command", ["info {file}", "list-plugins --json", "--help"])
+def test_closed_streams_are_no_error(command: str, closed: str, encoded: str):
+    done = in_shell(f"{SW} {command.format(file=encoded)} {closed}")
+    assert done.returncode == 0
+    assert done.stderr == ""
+
+
+def test_an_error_with_closed_streams_still_has_its_status(tmp_path: Path):
+    done = in_shell(f"{SW} info {shlex.quote(str(tmp_path))}/absent.swz >&- 2>&-")
+    assert (done.returncode, done.stdout, done.stderr) == (2, "", "")
+
+
+def test_a_closed_stream_is_not_taken_by_the_next_file(encoded: str, tmp_path: Path):
+    """Else what is printed to stdout lands in the first file that was opened."""
+    out = tmp_path / "out"
+    done = in_shell(f"cd {shlex.quote(str(tmp_path))} && {SW} data synth {out} --size tiny >&-")
+    assert done.returncode == 0, done.stderr
+    assert (out / "sparse" / "0" / "cameras.bin").stat().st_size > 0
+    written = b"".join(p.read_bytes() for p in out.rglob("*") if p.is_file())
+    assert b"views" not in written
+
+
+@pytest.mark.parametrize("command", ["info {file}", "list-plugins", "list-plugins --json", "--help", "run --help"])
+def test_a_reader_that_stops_reading_ends_a_command_quietly(command: str, encoded: str):
+    # The reader is gone before anything is written.
+    done = in_shell(f"(exec 3>&1; {SW} {command.format(file=encoded)}; echo $? >&2) | true")
+    assert done.stderr.strip() == "141"
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_a_request_to_end_does_what_ctrl_c_does(number: signal.Signals):
+    before = signal.getsignal(number)
+    with pytest.raises(KeyboardInterrupt), ended_like_ctrl_c():
+        os.kill(os.getpid(), number)
+    assert signal.getsignal(number) is before
+
+
+def test_nohup_is_left_alone():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with ended_like_ctrl_c():
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            os.kill(os.getpid(), signal.SIGHUP)
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_an_interrupted_fresh_run_says_how_to_go_on(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+):
+    def interrupt(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("splatwizard_core.cli.setup.resolve_all", interrupt)
+    assert main(["train", "--scene", "demo:tiny", "--fresh", "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().err.lstrip() == "interrupted (the same command without --fresh resumes a run)\n"
+
+
+def test_a_full_disk_is_told_also_where_a_library_met_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "/scratch/x")
+
+    monkeypatch.setattr("splatwizard_core.cli.list_plugins.gather", full)
+    assert main(["list-plugins"]) == 1
+    told = capsys.readouterr().err
+    assert told.startswith("error: /scratch/x: the disk is full; nothing half-written was kept")
+    assert len(told.splitlines()) == 1
