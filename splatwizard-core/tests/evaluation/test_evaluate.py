@@ -87,6 +87,25 @@ def test_identical_images_make_psnr_null_with_its_reason():
     assert result.metrics["l1"].mean == 0.0
 
 
+def test_a_render_that_is_not_finite_is_not_taken_for_a_perfect_one():
+    result = run(views(0, 9), background=math.nan)
+    assert result.metrics["psnr"].per_view == [None, None]
+    assert "not a number" in (result.metrics["psnr"].reason or "")
+
+
+def test_a_metric_for_unrounded_renders_gets_them(monkeypatch: pytest.MonkeyPatch):
+    plugins = Metrics(l1=f"{IMAGE}:l1")
+    plugins.metrics.add("l1_unrounded", f"{IMAGE}:l1", summary="", direction="lower", unrounded=True, diagnostic=True)
+    result = evaluate(
+        FlatModel(), views(0), FlatRasterizer(), plugins,  # type: ignore[arg-type]
+        device=torch.device("cpu"), options=RasterOptions(background=torch.full((3,), 0.3)),
+    )  # fmt: skip
+    assert result.metrics["l1_unrounded"].mean == pytest.approx((0.6 + 0.3 + 0.3) / 3, abs=1e-7)
+    assert result.metrics["l1"].mean == pytest.approx((153 + 76 + 76) / 255 / 3, abs=1e-7)
+    assert result.metrics["l1_unrounded"].diagnostic
+    assert not result.metrics["l1"].diagnostic
+
+
 def no_weights(render: torch.Tensor, truth: torch.Tensor) -> float:
     raise CapabilityError("weights missing")
 

@@ -28,13 +28,16 @@ from splatwizard_core.scene.scene import View
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
 RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}
 
+INFINITE = "infinite in at least one view (identical images)"
+NOT_A_NUMBER = "not a number in at least one view (the render holds values that are not finite)"
+
 
 @dataclass(frozen=True)
 class MetricResult:
     """One metric over the views.
 
     mean        over the views; None if unknown, or infinite
-    per_view    in the order of the views; None where the value is infinite (identical images)
+    per_view    in the order of the views; None where the value is not finite
     direction   "higher" or "lower" is better
     reason      why there is no mean, else None
     diagnostic  computed to tell conventions apart, not for tables
@@ -171,9 +174,13 @@ def _summary(entry: Entry, values: list[float], ready: PreparedMetric | None, mi
     if ready is None or missing is not None:
         return MetricResult(None, [], direction, missing, diagnostic)
     finite = [v if math.isfinite(v) else None for v in values]
-    infinite = "infinite in at least one view (identical images)" if None in finite else None
-    mean = None if infinite else sum(values) / len(values)
-    return MetricResult(mean, finite, direction, infinite, diagnostic, ready.made_with, ready.verified)
+    reason = None
+    if any(math.isnan(v) for v in values):
+        reason = NOT_A_NUMBER
+    elif None in finite:
+        reason = INFINITE
+    mean = None if reason else sum(values) / len(values)
+    return MetricResult(mean, finite, direction, reason, diagnostic, ready.made_with, ready.verified)
 
 
 def png_names(views: Sequence[str]) -> list[str]:

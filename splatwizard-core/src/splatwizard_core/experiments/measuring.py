@@ -11,6 +11,8 @@ from typing import Any
 import torch
 
 from splatwizard_core.evaluation.evaluate import (
+    INFINITE,
+    NOT_A_NUMBER,
     EvaluationResult,
     evaluate,
     png_names,
@@ -134,7 +136,8 @@ def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter) -> list[
     told = {
         "fit": scene.protocol.split == "all",
         "rss": meter.kind == "rss",
-        "infinite": any(None in metric.per_view for metric in quality.metrics.values()),
+        "infinite": any(metric.reason == INFINITE for metric in quality.metrics.values()),
+        "not-a-number": any(metric.reason == NOT_A_NUMBER for metric in quality.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in quality.metrics.values()),
     }
     return [name for name, holds in told.items() if holds]

@@ -44,7 +44,7 @@ class MetricBlock(Part):
     """One image metric over the test views."""
 
     mean: float | None
-    per_view: list[float | None] = Field(description="in the order of `views`; null: infinite (identical images)")
+    per_view: list[float | None] = Field(description="in the order of `views`; null: not finite, as `unknown` says")
     direction: Literal["higher", "lower"]
     diagnostic: bool = Field(False, description="computed to tell conventions apart, not for tables")
     made_with: dict[str, str] = Field({}, description="what else the values depend on: versions, weights, checksums")
