@@ -262,6 +262,31 @@ def test_other_files_are_refused(tmp_path, data):
         ContainerReader.open(path)
 
 
+def test_an_opened_file_is_in_memory_once(tmp_path):
+    writer = ContainerWriter("m", 1)
+    for i in range(4):
+        writer.add(f"s{i}", bytes(1 << 20))
+    size = writer.write(tmp_path / "x.swz")
+    tracemalloc.start()
+    reader = ContainerReader.open(tmp_path / "x.swz")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert reader.size == size
+    assert peak < 1.1 * size
+
+
+def test_what_a_file_may_stand_for_is_bounded_by_its_size():
+    writer = small_file()
+    data = writer.to_bytes()
+    reader = ContainerReader(data)
+    reader.allow(container.decoded_limit(len(data)), "a model")
+    with pytest.raises(BitstreamError, match="claims a model of"):
+        reader.allow(container.decoded_limit(len(data)) + 1, "a model")
+    writer.allow(container.FREE, "a model")
+    with pytest.raises(SplatwizardError, match="more than a reader accepts"):
+        writer.allow(container.decoded_limit(len(data)), "a model")  # the header does not count, to be sure
+
+
 def test_missing_files_and_folders_are_bitstream_errors(tmp_path):
     for path in (tmp_path, tmp_path / "nothing.swz"):
         with pytest.raises(BitstreamError, match="no such file"):
