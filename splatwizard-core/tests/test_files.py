@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import subprocess
@@ -10,13 +11,28 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_core.files import file_sha256, replacing, write_atomic, write_json
+from splatwizard_core.errors import DiskFullError
+from splatwizard_core.files import (
+    file_sha256,
+    remove_folder,
+    replacing,
+    scratch_folder,
+    sweep,
+    write_atomic,
+    write_json,
+)
 
 
 def interrupted_write(path: Path) -> None:
     with replacing(path) as temporary:
         temporary.write_text("half")
         raise KeyboardInterrupt
+
+
+def failed_write(path: Path, error: Exception) -> None:
+    with replacing(path, wanted=12_345) as temporary:
+        temporary.write_text("half")
+        raise error
 
 
 @pytest.mark.parametrize("content", ["text, ä\n", b"\x00\xff"])
@@ -73,6 +89,93 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path):
         assert set(os.listdir(tmp_path)) == {"x", outer.name, of_another}
     assert path.read_text() == "outer"
     assert set(os.listdir(tmp_path)) == {"x", of_another}
+
+
+def test_a_process_that_is_younger_than_a_file_did_not_begin_it(tmp_path: Path):
+    """In a container every process may have the same number as the one that was killed."""
+    ours, older = (tmp_path / f".x.{os.getpid()}-0123456{i}.tmp" for i in range(2))
+    for file in (ours, older):
+        file.write_text("half")
+    os.utime(older, (0, 0))
+    write_atomic(tmp_path / "x", "text")
+    assert set(os.listdir(tmp_path)) == {"x", ours.name}
+
+
+def test_a_sweep_takes_what_was_to_become_anything(tmp_path: Path):
+    for name in (".a.json.1-01234567.tmp", ".b.2-01234567.tmp", "kept.tmp", ".kept", ".a.json.tmp"):
+        (tmp_path / name).write_text("half")
+        os.utime(tmp_path / name, (0, 0))
+    (tmp_path / ".c.3-01234567.tmp").mkdir()
+    (tmp_path / ".c.3-01234567.tmp" / "inside").write_text("half")
+    os.utime(tmp_path / ".c.3-01234567.tmp", (0, 0))
+    sweep(tmp_path)
+    assert set(os.listdir(tmp_path)) == {"kept.tmp", ".kept", ".a.json.tmp"}
+    sweep(tmp_path / "absent")
+
+
+def test_a_scratch_folder_goes_and_takes_those_of_killed_processes_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    program = (
+        "import os, signal, sys, tempfile\nfrom splatwizard_core.files import scratch_folder\n"
+        "tempfile.tempdir = sys.argv[1]\n"
+        "with scratch_folder('test') as f:\n    (f / 'x').touch()\n    os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    subprocess.run([sys.executable, "-c", program, str(tmp_path)], check=False, timeout=60)
+    assert len(os.listdir(tmp_path)) == 1
+    with scratch_folder("test") as folder:
+        assert os.listdir(tmp_path) == [folder.name]
+        assert list(folder.iterdir()) == []
+        (folder / "y").touch()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_is_removed_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    folder = tmp_path / "x"
+    folder.mkdir()
+    (folder / "a").touch()
+
+    def killed(path: Path) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("shutil.rmtree", killed)
+    with pytest.raises(KeyboardInterrupt):
+        remove_folder(folder)
+    assert not folder.exists()
+    monkeypatch.undo()
+    (left,) = tmp_path.iterdir()
+    os.utime(left, (0, 0))
+    sweep(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [
+        (OSError(errno.ENOSPC, "No space left on device"), "the disk is full"),
+        (OSError(errno.EDQUOT, "Disk quota exceeded"), "the disk quota is used up"),
+        (OSError(errno.EFBIG, "File too large"), "the file may not grow that large here"),
+        (RuntimeError("I/O error: No space left on device (os error 28)"), "the disk is full"),
+    ],
+)
+def test_a_full_disk_names_the_file_and_what_was_wanted(tmp_path: Path, error: Exception, reason: str):
+    path = tmp_path / "x"
+    path.write_text("before")
+    with pytest.raises(DiskFullError) as told:
+        failed_write(path, error)
+    assert str(told.value).startswith(f"{path}: {reason}")
+    assert "(12,345 bytes wanted" in str(told.value)
+    assert told.value.__cause__ is error
+    assert path.read_text() == "before"
+    assert os.listdir(tmp_path) == ["x"]
+
+
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), ValueError("os error 28")])
+def test_other_errors_are_not_taken_for_a_full_disk(tmp_path: Path, error: Exception):
+    with pytest.raises(type(error)) as told:
+        failed_write(tmp_path / "x", error)
+    assert told.value is error
 
 
 def test_sha256_of_a_file(tmp_path: Path):

@@ -1,15 +1,20 @@
 """Locks and finished steps of a run directory."""
 
+import errno
+import fcntl
 import json
 import os
+import re
 import subprocess
 import sys
 import textwrap
+import time
 from pathlib import Path
 
 import pytest
 
 from splatwizard_core.errors import RunLockedError
+from splatwizard_core.experiments import lock
 from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.steps import StepLog
 
@@ -50,6 +55,94 @@ def test_the_lock_of_a_killed_process_is_free(tmp_path: Path, holder: subprocess
     assert str(holder.pid) in (tmp_path / "run" / ".lock").read_text()  # it had no chance to clean up
     with directory_lock(tmp_path / "run"):
         assert json.loads((tmp_path / "run" / ".lock").read_text())["pid"] == os.getpid()
+
+
+def test_who_ended_without_letting_go_is_told_once(tmp_path: Path, holder: subprocess.Popen[str]):
+    holder.kill()
+    holder.wait()
+    said: list[str] = []
+    for _ in range(2):
+        with directory_lock(tmp_path / "run", say=said.append):
+            pass
+    (line,) = said
+    assert line.startswith(f"process {holder.pid} on ")
+    assert "ended without finishing" in line
+
+
+def test_the_holder_says_what_it_was_called_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(sys, "argv", ["/somewhere/bin/sw", "run", "--scene", "my garden"])
+    with (
+        directory_lock(tmp_path),
+        pytest.raises(RunLockedError, match=r"\(`sw run --scene 'my garden'`\): wait for it, or choose"),
+        directory_lock(tmp_path),
+    ):
+        pass
+
+
+def on_another_machine(path: Path, seconds_ago: float) -> None:
+    """A lock file as a holder elsewhere leaves it on a file system that does not share locks."""
+    told = {
+        "pid": 77,
+        "host": "elsewhere",
+        "boot": "another",
+        "since": "2026-01-01T12:00:00+00:00",
+        "command": "sw run",
+    }
+    path.write_text(json.dumps(told))
+    then = time.time() - seconds_ago
+    os.utime(path, (then, then))
+
+
+def test_a_holder_on_another_machine_that_gave_a_sign_of_life_is_believed(tmp_path: Path):
+    on_another_machine(tmp_path / ".lock", 20)
+    for _ in range(2):  # asking is no sign of life
+        with pytest.raises(RunLockedError) as told, directory_lock(tmp_path):
+            pass
+        assert re.search(
+            r"belongs to process 77 on elsewhere since .*, on another machine, which gave its last sign of life "
+            r"2\d s ago: if it has ended, try again in (6|7)\d s; else wait for it",
+            str(told.value),
+        )
+
+
+def test_a_holder_on_another_machine_that_fell_silent_is_dead(tmp_path: Path):
+    on_another_machine(tmp_path / ".lock", 100)
+    said: list[str] = []
+    with directory_lock(tmp_path, say=said.append):
+        assert json.loads((tmp_path / ".lock").read_text())["pid"] == os.getpid()
+    assert said[0].startswith("process 77 on elsewhere")
+    assert (tmp_path / ".lock").read_text() == ""
+
+
+def test_a_holder_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(lock, "BEAT_SECONDS", 0.01)
+    path = tmp_path / ".lock"
+    with directory_lock(tmp_path):
+        os.utime(path, (0, 0))
+        deadline = time.monotonic() + 10
+        while path.stat().st_mtime < 1 and time.monotonic() < deadline:
+            time.sleep(0.01)
+        assert path.stat().st_mtime > 1
+    os.utime(path, (0, 0))
+    time.sleep(0.05)
+    assert path.stat().st_mtime == 0, "it ended with the lock"
+
+
+def test_a_file_system_without_locks_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with pytest.raises(RunLockedError, match="file system without locks"), directory_lock(tmp_path):
+        pass
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", "null", '{"pid": "x"}', '{"pid": 3}', "\0\0"])
+def test_a_lock_file_that_says_nothing_holds_nothing(tmp_path: Path, content: str):
+    (tmp_path / ".lock").write_text(content)
+    os.utime(tmp_path / ".lock", (0, 0))
+    with directory_lock(tmp_path):
+        pass
 
 
 def test_waiting_says_for_whom_and_gets_the_lock(tmp_path: Path, holder: subprocess.Popen[str]):

@@ -1,14 +1,16 @@
 """The checkpoint pair: what goes in comes out, and what is damaged is never taken for good."""
 
+import errno
 import json
 import os
+import zlib
 
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from splatwizard_core.errors import CheckpointError
+from splatwizard_core.errors import CheckpointError, DiskFullError
 from splatwizard_core.training.checkpoint import (
     Checkpoint,
     CheckpointStore,
@@ -101,6 +103,68 @@ def test_a_failed_write_leaves_the_old_one_and_no_rest(tmp_path, monkeypatch):
         store.write(make(200))
     assert {p.name for p in tmp_path.iterdir()} == before
     assert store.newest().step == 100
+
+
+@pytest.mark.parametrize("failing", [1, 2])
+def test_a_disk_that_is_full_leaves_no_tensors_without_their_checkpoint(tmp_path, monkeypatch, failing):
+    """Of the two files, whichever meets it."""
+    store, replace, calls = CheckpointStore(tmp_path), os.replace, []
+
+    def full(source, target):
+        calls.append(target)
+        if len(calls) == failing:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", full)
+    with pytest.raises(DiskFullError, match="bytes wanted"):
+        store.write(make(200))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_step_that_is_written_again_is_whole_at_every_moment(tmp_path, monkeypatch):
+    store, replace = CheckpointStore(tmp_path), os.replace
+    store.write(make(100))
+    seen = []
+
+    def look(source, target):
+        seen.append(read_checkpoint(tmp_path / "00-0000100.json").finished)
+        replace(source, target)
+        seen.append(read_checkpoint(tmp_path / "00-0000100.json").finished)
+
+    monkeypatch.setattr(os, "replace", look)
+    store.write(make(100, finished=True))
+    assert seen == [False, False, False, True]
+    assert len(list(tmp_path.iterdir())) == 2, "the tensors before are gone"
+    store.write(make(200))
+    assert {p.name for p in tmp_path.iterdir()} == {"00-0000200.json", "00-0000200.safetensors"}
+
+
+def test_a_checkpoint_names_no_file_elsewhere(tmp_path):
+    path = CheckpointStore(tmp_path).write(make())
+    content = json.loads(path.read_text())["content"] | {"file": "../00-0000100.safetensors"}
+    path.write_text(json.dumps({"crc": zlib.crc32(json.dumps(content).encode()), "content": content}))
+    with pytest.raises(DamagedCheckpointError, match="names no file of tensors"):
+        read_checkpoint(path)
+
+
+def test_a_checkpoint_of_before_that_names_no_file_is_read(tmp_path):
+    path = CheckpointStore(tmp_path).write(make())
+    content = json.loads(path.read_text())["content"]
+    del content["file"]
+    path.write_text(json.dumps({"crc": zlib.crc32(json.dumps(content).encode()), "content": content}))
+    assert same(read_checkpoint(path).state, make().state)
+
+
+def test_the_identity_of_the_newest_is_read_without_its_tensors(tmp_path):
+    store = CheckpointStore(tmp_path, keep=2)
+    assert store.identity() is None
+    store.write(make(100, identity={"method": "old"}))
+    store.write(make(200))
+    (tmp_path / "00-0000200.safetensors").unlink()
+    assert store.identity() == {"method": "toy", "config": {"iterations": 200}}
+    (tmp_path / "00-0000200.json").write_text("{")
+    assert store.identity() is None
 
 
 def test_only_the_newest_stay(tmp_path):
