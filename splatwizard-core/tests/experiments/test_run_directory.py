@@ -15,13 +15,17 @@ import pytest
 
 from splatwizard_core.errors import RunLockedError
 from splatwizard_core.experiments import lock
+from splatwizard_core.experiments.cache import FOLDER
 from splatwizard_core.experiments.lock import directory_lock
+from splatwizard_core.experiments.run import OWN_FILES
 from splatwizard_core.experiments.steps import StepLog
+from splatwizard_core.training.params import PipelineParams
 
 HOLD = """
     import sys, time
     from pathlib import Path
-    from splatwizard_core.experiments.lock import directory_lock
+    from splatwizard_core.experiments.cache import FOLDER
+from splatwizard_core.experiments.lock import directory_lock
     with directory_lock(Path(sys.argv[1])):
         print("held", flush=True)
         time.sleep(60)
@@ -177,3 +181,17 @@ def test_a_step_is_done_only_under_the_key_it_was_done_with(tmp_path: Path):
 def test_a_damaged_step_log_means_that_nothing_is_done(tmp_path: Path, content: str):
     (tmp_path / "steps.json").write_text(content)
     assert StepLog(tmp_path).done("train", "key") is None
+
+
+def test_the_page_about_run_directories_says_what_is():
+    page = Path(__file__).resolve().parents[3] / "docs" / "runs.md"
+    if not page.exists():
+        pytest.skip("no docs here: the package is tested alone")
+    text = page.read_text(encoding="utf-8")
+    for name in (*OWN_FILES, lock.NAME, FOLDER):
+        assert name in text, name
+    for step in ("train", "encode", "decode", "evaluate", "record"):
+        assert f"\n| {step} |" in text
+    assert f"touches the file every {lock.BEAT_SECONDS:.0f} s" in text
+    assert f"silent for {lock.SILENT_SECONDS:.0f} s" in text
+    assert f"`checkpoint_every`, {PipelineParams().checkpoint_every} steps" in text
