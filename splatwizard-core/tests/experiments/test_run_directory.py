@@ -24,8 +24,7 @@ from splatwizard_core.training.params import PipelineParams
 HOLD = """
     import sys, time
     from pathlib import Path
-    from splatwizard_core.experiments.cache import FOLDER
-from splatwizard_core.experiments.lock import directory_lock
+    from splatwizard_core.experiments.lock import directory_lock
     with directory_lock(Path(sys.argv[1])):
         print("held", flush=True)
         time.sleep(60)
