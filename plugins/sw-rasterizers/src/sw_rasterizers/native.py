@@ -1,4 +1,4 @@
-"""The native module: which sources the kernels are compiled from."""
+"""The native module: which sources the kernels are compiled from, and whether they can run here."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from splatwizard_core.native import NativeModule
 MODULE = NativeModule(
     name="sw_rasterizers",
     package="sw_rasterizers",
-    sources=("csrc/binding.cpp",),
+    sources=("csrc/binding.cpp", "csrc/binding_cuda.cpp"),
     kernels=(
         "csrc/cpu/blend_backward.cpp",
         "csrc/cpu/project.cpp",
@@ -15,7 +15,16 @@ MODULE = NativeModule(
         "csrc/cpu/blend.cpp",
         "csrc/cpu/bin.cpp",
     ),
-    headers=("csrc/*.h", "csrc/cpu/*.h"),
+    headers=("csrc/*.h", "csrc/cpu/*.h", "csrc/cuda/*.h"),
+    cuda_sources=(
+        "csrc/cuda/sort.cu",
+        "csrc/cuda/blend_backward.cu",
+        "csrc/cuda/blend.cu",
+        "csrc/cuda/project_backward.cu",
+        "csrc/cuda/project.cu",
+        "csrc/cuda/emit.cu",
+        "csrc/cuda/shade.cu",
+    ),
     # Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square
     # roots and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written.
     cflags=("-fno-math-errno", "-fno-trapping-math"),
@@ -25,5 +34,10 @@ MODULE = NativeModule(
 
 
 def unavailable() -> str | None:
-    """Why the compiled rasterizers cannot run here, or None; compiles nothing."""
+    """Why the compiled rasterizers cannot run on this CPU, or None; compiles nothing."""
     return MODULE.available()
+
+
+def unavailable_on_cuda() -> str | None:
+    """Why the compiled rasterizers cannot run on a GPU here, or None; compiles nothing."""
+    return MODULE.available(cuda=True)

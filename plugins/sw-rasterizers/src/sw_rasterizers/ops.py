@@ -41,6 +41,17 @@ class Flag(enum.IntFlag):
 
 
 @dataclass
+class _Drawn:
+    """What the forward op returns; `saved` is for the backward pass."""
+
+    image: Tensor
+    radii: Tensor
+    alpha: Tensor
+    median: Tensor
+    saved: list[Tensor]
+
+
+@dataclass
 class Call:
     """Everything of one call that is not a tensor to differentiate by, and where its by-products go.
 
@@ -63,6 +74,8 @@ class Call:
     absgrad2d: GradBuffer | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     counts: list[int] = field(default_factory=list)
+    channels: tuple[int, int] = (3, 0)  # colours and features, for the backward pass on CUDA
+    drawn: _Drawn | None = None  # on its way from one node to the next
 
     def settings(self) -> tuple[Any, ...]:
         return self.camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, int(self.flags)
@@ -75,22 +88,19 @@ def camera_numbers(cam: Camera) -> list[float]:
 
 
 class _Rasterize(torch.autograd.Function):
-    """(call, dummy, *INPUTS) -> image [C,H,W], radii [N] int32, alpha [0 or 1,H,W], median depth [0 or 1,H,W]."""
+    """On the CPU: (call, dummy, *INPUTS) -> image [C,H,W], radii [N] int32, alpha and median depth [0 or 1,H,W]."""
 
     @staticmethod
     def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor, ...]:
         tensors = [None if x is None else x.detach().contiguous() for x in inputs]
-        image, radii, alpha, median, saved, call.counts, seconds = torch.ops.sw_rasterizers.render(
-            *tensors, call.visible, call.background, *call.settings()
-        )
-        call.seconds.update(zip(FORWARD_STAGES, seconds, strict=True))
+        drawn = _draw(call, tensors)
         ctx.call = call
-        ctx.mark_non_differentiable(radii)
+        ctx.mark_non_differentiable(drawn.radii)
         ctx.set_materialize_grads(False)
         # All state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
         ctx.present = [x is not None for x in tensors]
-        ctx.save_for_backward(*(x for x in tensors if x is not None), *saved)
-        return image, radii, alpha, median
+        ctx.save_for_backward(*(x for x in tensors if x is not None), *drawn.saved)
+        return drawn.image, drawn.radii, drawn.alpha, drawn.median
 
     @staticmethod
     @torch.autograd.function.once_differentiable
@@ -108,25 +118,115 @@ class _Rasterize(torch.autograd.Function):
             *tensors, call.visible, call.background, *call.settings(), stored, image.contiguous(),
             _nonempty(alpha), _nonempty(median), wanted,
         )  # fmt: skip
-        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=True))
-        for buffer, value in ((call.grad2d, found[-2]), (call.absgrad2d, found[-1])):
-            if buffer is not None:
-                buffer.set(value)
-        return (None, None, *(g if want else None for g, want in zip(found, wanted[: len(INPUTS)], strict=False)))
+        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
+        return _hand_out(call, found, wanted)
+
+
+class _Project(torch.autograd.Function):
+    """On CUDA, first of two nodes: (call, dummy, *INPUTS) -> a stand-in [N, sums of a Gaussian] without memory.
+
+    Its gradient is what `_Blend` sums up over the pixels. Two nodes, because what `_Blend` kept is then freed before
+    this one allocates the gradients of the inputs.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, call: Call, dummy: Tensor | None, *inputs: Tensor | None) -> Tensor:
+        tensors = [None if x is None else x.detach().contiguous() for x in inputs]
+        call.drawn = _draw(call, tensors)
+        ctx.call = call
+        ctx.set_materialize_grads(False)
+        ctx.present = [x is not None for x in tensors]
+        call.drawn.saved, flags = call.drawn.saved[:-1], call.drawn.saved[-1]
+        ctx.save_for_backward(*(x for x in tensors if x is not None), flags)
+        means = tensors[0]
+        assert means is not None
+        sums = 6 + _channels(tensors, call.flags) + 2 * (Flag.ABSGRAD in call.flags) + (Flag.MEDIAN_DEPTH in call.flags)
+        call.channels = _color_channels(tensors), _feature_channels(tensors)
+        return means.new_empty(1, 1).expand(means.shape[0], sums)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, rows: Tensor) -> tuple[Tensor | None, ...]:
+        call: Call = ctx.call
+        *stored, flags = ctx.saved_tensors
+        tensors = [stored.pop(0) if present else None for present in ctx.present]
+        wanted = [*ctx.needs_input_grad[2:], call.grad2d is not None, call.absgrad2d is not None]
+        found, seconds = torch.ops.sw_rasterizers.project_backward(
+            *tensors, *call.settings(), flags, rows.contiguous(), wanted
+        )
+        call.seconds.update(zip(BACKWARD_STAGES[1:], seconds, strict=False))
+        return _hand_out(call, found, wanted)
+
+
+class _Blend(torch.autograd.Function):
+    """On CUDA, second of two nodes: (call, stand-in) -> the outputs of `_Rasterize`."""
+
+    @staticmethod
+    def forward(ctx: Any, call: Call, stand_in: Tensor) -> tuple[Tensor, ...]:
+        drawn = call.drawn
+        assert drawn is not None
+        call.drawn = None
+        ctx.call, ctx.gaussians = call, stand_in.shape[0]
+        ctx.mark_non_differentiable(drawn.radii)
+        ctx.set_materialize_grads(False)
+        ctx.save_for_backward(*drawn.saved)
+        return drawn.image, drawn.radii, drawn.alpha, drawn.median
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, _, alpha, median = grads
+        call: Call = ctx.call
+        saved = list(ctx.saved_tensors)
+        if image is None:
+            colors, features = call.channels
+            depths = (Flag.INVERSE_DEPTH in call.flags) + (Flag.ACCUMULATED_DEPTH in call.flags)
+            image = saved[0].new_zeros(colors + depths + features, call.height, call.width)
+        rows, seconds = torch.ops.sw_rasterizers.blend_backward(
+            saved, call.background, call.camera, call.width, call.height, ctx.gaussians, *call.channels,
+            int(call.flags), image.contiguous(), _nonempty(alpha), _nonempty(median),
+        )  # fmt: skip
+        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
+        return None, rows
+
+
+def _hand_out(call: Call, found: list[Tensor], wanted: list[bool]) -> tuple[Tensor | None, ...]:
+    """Gradients in the order of a node's inputs; the statistics go into their buffers."""
+    for buffer, value in ((call.grad2d, found[-2]), (call.absgrad2d, found[-1])):
+        if buffer is not None:
+            buffer.set(value)
+    return (None, None, *(g if want else None for g, want in zip(found, wanted[: len(INPUTS)], strict=False)))
+
+
+def _draw(call: Call, tensors: list[Tensor | None]) -> _Drawn:
+    image, radii, alpha, median, saved, call.counts, seconds = torch.ops.sw_rasterizers.render(
+        *tensors, call.visible, call.background, *call.settings()
+    )
+    call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # on CUDA only if counting
+    return _Drawn(image, radii, alpha, median, saved)
 
 
 def _nonempty(x: Tensor | None) -> Tensor | None:
     return None if x is None or x.numel() == 0 else x.contiguous()
 
 
+def _color_channels(tensors: list[Tensor | None]) -> int:
+    colors = tensors[INPUTS.index("colors")]
+    return 3 if colors is None else colors.shape[1]
+
+
+def _feature_channels(tensors: list[Tensor | None]) -> int:
+    features = tensors[INPUTS.index("features")]
+    return 0 if features is None else features.shape[1]
+
+
 def _channels(tensors: list[Tensor | None], flags: Flag) -> int:
-    colors, features = tensors[INPUTS.index("colors")], tensors[INPUTS.index("features")]
     depths = (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
-    return (3 if colors is None else colors.shape[1]) + depths + (0 if features is None else features.shape[1])
+    return _color_channels(tensors) + depths + _feature_channels(tensors)
 
 
 def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw one view. Differentiable by every tensor of INPUTS; all contiguous CPU tensors of one dtype.
+    """Draw one view. Differentiable by every tensor of INPUTS; all of one dtype and device.
 
     Returns the channels [C + depths + E, H, W] (colours over the background, then inverse and accumulated depth if
     flagged, then features), radii [N] int32, alpha [1,H,W] or [0,H,W], median depth likewise.
@@ -140,6 +240,13 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
             dummy = torch.empty(0, requires_grad=True)  # statistics are wanted even if no input needs a gradient
         if dummy is not None or any(x is not None and x.requires_grad for x in inputs):
             call.flags |= Flag.SAVE
+    means = tensors["means"]
+    assert means is not None
+    if Flag.SAVE not in call.flags:
+        drawn = _draw(call, [None if x is None else x.detach().contiguous() for x in inputs])
+        return drawn.image, drawn.radii, drawn.alpha, drawn.median
+    if means.is_cuda:
+        return _Blend.apply(call, _Project.apply(call, dummy, *inputs))  # type: ignore[no-any-return]
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
 
 

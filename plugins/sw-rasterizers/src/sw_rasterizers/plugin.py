@@ -14,11 +14,13 @@ def register_rasterizers(registry: Registry) -> None:
     registry.add(
         "standard",
         "sw_rasterizers.standard:StandardRasterizer",
-        summary="compiled 3DGS rasterizer, CPU, vectorised and multi-threaded",
-        devices=["cpu"],
+        summary="compiled 3DGS rasterizer: CPU, vectorised and multi-threaded, and CUDA",
+        devices=["cpu", "cuda"],
         dtypes=["float32", "float64"],
         features=STANDARD_FEATURES,
         available="sw_rasterizers.native:unavailable",
+        # Sums over pixels are atomic there: their order, and so their last bits, vary from run to run.
+        on={"cuda": {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}},
         exactness="exact",
         speed=50,
         native="sw_rasterizers.native:MODULE",

@@ -1,4 +1,4 @@
-"""The standard 3DGS rasterizer on compiled kernels."""
+"""The standard 3DGS rasterizer on compiled kernels, on the CPU and on CUDA."""
 
 from __future__ import annotations
 
@@ -28,13 +28,14 @@ from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_ra
 
 
 class StandardRasterizer:
-    """Standard 3DGS with complete gradients; float32, and float64 for checking.
+    """Standard 3DGS with complete gradients; float32, on the CPU also float64 for checking.
 
     Profile "3dgs" draws the exact support of every splat, alpha >= 1/255 wherever it reaches, as the reference does.
     Profile "dgr-exact" also cuts each splat at the original's square of 16x16 tiles (3 sigma) and takes over the
     original's gradients through the clamps of alpha and of the Jacobian.
 
-    count   also count evaluated and blended pixel-splat pairs into the statistics; slow, for benchmarks
+    count   also count evaluated and blended pixel-splat pairs into the statistics, and on CUDA measure the stages;
+            slow, for benchmarks
     """
 
     info: RasterizerInfo = declared_info(plugin.register_rasterizers, "standard")
@@ -107,6 +108,8 @@ class StandardRasterizer:
             check_offered(self.info, Feature.INDEXED_GEOM)
         if g.scales is not None and g.scales.shape[1] == 2:
             check_offered(self.info, Feature.SURFEL)
+        if g.means.dtype == torch.float64:
+            check_offered(self.info.on(g.means.device.type), Feature.FLOAT64)
         check_placement(self.info, g)
         return visible_radii(g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam)
 

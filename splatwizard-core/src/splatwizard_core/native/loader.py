@@ -125,12 +125,18 @@ class NativeModule:
             raise NativeBuildError("; ".join(problems))
         return self._session.loaded is not None
 
-    def available(self) -> str | None:
-        """Why `load` would fail, or None. Compiles nothing: a compiler that is there is taken to work."""
-        if self._session.loaded is not None:
-            return None
+    def available(self, *, cuda: bool = False) -> str | None:
+        """Why `load` would fail, or with `cuda` give no CUDA kernels; or None.
+
+        Compiles nothing: a compiler that is there is taken to work.
+        """
         if self._session.error is not None:
             return str(self._session.error)
+        missing = self._without_cuda() if cuda else None
+        if missing is not None:
+            return missing
+        if self._session.loaded is not None:
+            return None
         if _disabled():
             return "native code is switched off by SPLATWIZARD_NATIVE=0"
         try:
@@ -280,9 +286,13 @@ class NativeModule:
         return [*(root / s for s in (*self.sources, *self.kernels, *cuda)), *headers, *shared]
 
     def _with_cuda(self) -> bool:
-        import torch
+        return self._without_cuda() is None
 
-        return bool(self.cuda_sources) and torch.version.cuda is not None and toolchain.find_nvcc() is not None
+    def _without_cuda(self) -> str | None:
+        """Why a build here holds no CUDA kernels, or None."""
+        if not self.cuda_sources:
+            return f"module '{self.name}' has no CUDA kernels"
+        return toolchain.cuda_mismatch()
 
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), self._with_cuda()

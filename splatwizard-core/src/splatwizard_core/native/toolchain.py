@@ -6,6 +6,7 @@ and waits for ever on the lock of a dead process. What is left to know is the tw
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 import re
@@ -85,6 +86,41 @@ def find_nvcc() -> str | None:
             return str(Path(home) / "bin" / "nvcc")
     default = Path("/usr/local/cuda/bin/nvcc")
     return shutil.which("nvcc") or (str(default) if default.is_file() else None)
+
+
+@functools.cache
+def nvcc_version(nvcc: str) -> tuple[int, int] | None:
+    """(major, minor) of a CUDA compiler, None if it does not say."""
+    try:
+        result = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=False)
+    except OSError:
+        return None
+    found = re.search(r"release (\d+)\.(\d+)", result.stdout)
+    return None if found is None else (int(found[1]), int(found[2]))
+
+
+def cuda_mismatch() -> str | None:
+    """Why CUDA kernels for this torch cannot be compiled here, or None."""
+    import torch
+
+    wanted = torch.version.cuda
+    if wanted is None:
+        return "this torch is built without CUDA: install a CUDA build of torch"
+    nvcc = find_nvcc()
+    if nvcc is None:
+        return (
+            f"no CUDA compiler was found (looked for nvcc in $CUDA_HOME, $CUDA_PATH, the PATH and /usr/local/cuda): "
+            f"install the CUDA {wanted.partition('.')[0]} toolkit"
+        )
+    version = nvcc_version(nvcc)
+    if version is None:
+        return f"{nvcc} does not run: correct $CUDA_HOME"
+    if version[0] != int(wanted.partition(".")[0]):
+        return (
+            f"torch is built for CUDA {wanted}, {nvcc} is of CUDA {version[0]}.{version[1]}: install a toolkit of CUDA "
+            f"{wanted.partition('.')[0]} and point CUDA_HOME at it, or install torch for CUDA {version[0]}"
+        )
+    return None
 
 
 def cuda_architectures() -> list[str]:

@@ -16,7 +16,7 @@ PROFILES = ("3dgs", "dgr-exact")
 def check_request(info: RasterizerInfo, g: GaussianInputs, opt: RasterOptions) -> None:
     """Raise ShapeError, CapabilityError or ConfigError unless a standard rasterizer can draw `g` with `opt`."""
     g.validate()
-    check_offered(info, required_features(g, opt))
+    check_offered(info.on(g.means.device.type), required_features(g, opt))
     if opt.profile not in PROFILES:
         raise ConfigError(
             f"rasterizer '{info.name}' knows no profile '{opt.profile}'; one of {', '.join(PROFILES)}",

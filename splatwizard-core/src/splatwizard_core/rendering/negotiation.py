@@ -20,6 +20,7 @@ from splatwizard_core.plugins.registry import Entry, Registry
 from splatwizard_core.rendering.adapters import AdaptedRasterizer, adapted_requirements
 from splatwizard_core.rendering.rasterizer import (
     AccumOutput,
+    DeviceInfo,
     Feature,
     Rasterizer,
     RasterizerInfo,
@@ -46,6 +47,7 @@ def info_from_entry(entry: Entry) -> RasterizerInfo:
     declared = entry.declared
     features = frozenset(declared.get("features", ()))
     unknown = sorted(features - {f.name for f in Feature})
+    per_device = declared.get("on", {})
     if unknown:
         raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} declares unknown features {unknown}")
     min_cc = declared.get("min_cc")
@@ -60,8 +62,13 @@ def info_from_entry(entry: Entry) -> RasterizerInfo:
             exactness=declared.get("exactness", "exact"),
             speed=int(declared.get("speed", 0)),
             min_cc=None if min_cc is None else (int(min_cc[0]), int(min_cc[1])),
+            needs=frozenset(declared.get("needs", ())),
+            per_device={
+                device: DeviceInfo(frozenset(there.get("lacks", ())), there.get("available"), there.get("speed"))
+                for device, there in per_device.items()
+            },
         )
-    except (TypeError, ValueError, IndexError) as error:
+    except (TypeError, ValueError, IndexError, AttributeError) as error:
         raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} is declared wrongly: {error}") from error
 
 
@@ -201,9 +208,9 @@ class NegotiatedRasterizer:
     def _installed(self) -> list[tuple[Entry, RasterizerInfo]]:
         """What this device, the user's lists and the accepted exactness leave."""
         if self._forced is not None:
-            return [(entry, info) for entry, info in self._readable if entry.name == self._forced]
+            return [(entry, info.on(self.device.type)) for entry, info in self._readable if entry.name == self._forced]
         return [
-            (entry, info)
+            (entry, info.on(self.device.type))
             for entry, info in self._readable
             if self.device.type in info.devices and entry.name not in self._forbid and info.exactness in self._exactness
         ]
@@ -226,7 +233,7 @@ class NegotiatedRasterizer:
         needs = adapted_requirements(wanted, missing) if missing else wanted
         if needs is None or not needs <= info.features:
             return None
-        if any(combo <= needs for combo in info.combos_forbidden):
+        if not info.needs <= needs or any(combo <= needs for combo in info.combos_forbidden):
             return None
         preferred = len(self._prefer) - self._prefer.index(entry.name) if entry.name in self._prefer else 0
         fast = info.speed > 0
@@ -253,11 +260,12 @@ class NegotiatedRasterizer:
     def _nothing(self, wanted: frozenset[str], unavailable: list[tuple[str, str]]) -> CapabilityError:
         asked = " + ".join(sorted(wanted)) or "plain rendering"
         message = f"no rasterizer offers {asked} on {self.device.type}"
-        infos = [info for _, info in self._readable]
+        infos = [i.on(self.device.type) if self.device.type in i.devices else i for _, i in self._readable]
         near = sorted(infos, key=lambda i: (len(wanted - i.features), -i.speed, i.name))[:3]
         lacks = [
             f"{i.name} ({'/'.join(sorted(i.devices))})"
             + (f" lacks {', '.join(sorted(wanted - i.features))}" if wanted - i.features else "")
+            + (f" draws nothing without {', '.join(sorted(i.needs - wanted))}" if i.needs - wanted else "")
             + (" is forbidden" if i.name in self._forbid else "")
             + (f" is {i.exactness}" if i.exactness not in self._exactness else "")
             for i in near

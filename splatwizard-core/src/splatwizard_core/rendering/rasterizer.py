@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import enum
-from collections.abc import Iterable
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
 from torch import Tensor
@@ -197,6 +197,15 @@ class AccumOutput:
 
 
 @dataclass(frozen=True)
+class DeviceInfo:
+    """How a rasterizer differs on one device: features it lacks there, another probe, another speed."""
+
+    lacks: frozenset[str] = frozenset()
+    available: str | None = None
+    speed: int | None = None
+
+
+@dataclass(frozen=True)
 class RasterizerInfo:
     """What a rasterizer declares of itself in its registry entry; readable without torch or a compiler.
 
@@ -205,6 +214,8 @@ class RasterizerInfo:
     exactness       "exact", "tight" (differs only by the classic clipping), "approx-fp16", "approx-uint8"
     speed           rank within a device, higher is faster
     min_cc          lowest CUDA compute capability
+    needs           features that every request must hold: a rasterizer of surfels draws nothing else
+    per_device      device -> what is different there; see `on`
     """
 
     name: str
@@ -216,6 +227,21 @@ class RasterizerInfo:
     exactness: str = "exact"
     speed: int = 0
     min_cc: tuple[int, int] | None = None
+    needs: frozenset[str] = frozenset()
+    per_device: Mapping[str, DeviceInfo] = field(default_factory=dict)
+
+    def on(self, device: str) -> RasterizerInfo:
+        """What it declares for one device kind ("cpu", "cuda")."""
+        here = self.per_device.get(device)
+        if here is None:
+            return self
+        return replace(
+            self,
+            features=self.features - here.lacks,
+            available=here.available or self.available,
+            speed=self.speed if here.speed is None else here.speed,
+            per_device={},
+        )
 
 
 @runtime_checkable
@@ -325,6 +351,12 @@ def check_offered(info: RasterizerInfo, required: Feature) -> None:
             f"rasterizer '{info.name}' does not offer {', '.join(sorted(missing))}; "
             "`sw list-plugins` shows which one does",
             missing=missing,
+        )
+    if not info.needs <= wanted:
+        raise CapabilityError(
+            f"rasterizer '{info.name}' draws nothing without {', '.join(sorted(info.needs - wanted))}; "
+            "`sw list-plugins` shows which one draws the rest",
+            missing=frozenset(),
         )
     for combo in info.combos_forbidden:
         if combo <= wanted:

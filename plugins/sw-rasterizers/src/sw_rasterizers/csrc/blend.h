@@ -13,7 +13,7 @@ namespace sw {
 // the ridge of a needle-shaped splat, its value there is 0, hence the minimum.
 template <class V>
 SW_HD V log2_alpha(V dx, V dy, V a, V b, V c, V level) {
-  return minimum(level, dx * (a * dx + b * dy) + (c * dy * dy + level));
+  return at_most(dx * (a * dx + b * dy) + (c * dy * dy + level), level);
 }
 
 // Front to back: takes alpha (0 where the splat is skipped), updates the transmittance, returns the weight alpha T,
@@ -32,7 +32,7 @@ SW_HD V composite(V alpha, V& transmittance) {
 // Returns dL/dalpha; `weight` receives alpha T. With alpha = 0 nothing changes.
 template <class V>
 SW_HD V composite_backward(V alpha, V phi, V& transmittance, V& behind, V& weight) {
-  const V gain = constant<V>(1) / (constant<V>(1) - alpha);
+  const V gain = reciprocal(constant<V>(1) - alpha);
   transmittance *= gain;
   weight = alpha * transmittance;
   const V gradient = transmittance * phi - behind * gain;

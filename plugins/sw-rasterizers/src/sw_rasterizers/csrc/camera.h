@@ -35,8 +35,8 @@ struct View {
     return view;
   }
 
-  int tiles_x() const { return (width + kTile - 1) / kTile; }
-  int tiles_y() const { return (height + kTile - 1) / kTile; }
+  SW_HD int tiles_x() const { return (width + kTile - 1) / kTile; }
+  SW_HD int tiles_y() const { return (height + kTile - 1) / kTile; }
 };
 
 }  // namespace sw

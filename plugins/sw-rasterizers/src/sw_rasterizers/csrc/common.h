@@ -82,6 +82,30 @@ SW_HD V clamp(V x, V low, V high) {
   return minimum(maximum(x, low), high);
 }
 
+// The smaller of the two; NaN if x is.
+template <class V>
+SW_HD V at_most(V x, V limit) {
+  return select(limit < x, limit, x);
+}
+template <class V>
+SW_HD V reciprocal(V x) {
+  return constant<V>(1) / x;
+}
+#if defined(__CUDA_ARCH__)
+#if __CUDA_ARCH__ >= 800
+SW_HD float at_most(float x, float limit) {  // one instruction; fminf would drop a NaN
+  float y;
+  asm("min.NaN.f32 %0, %1, %2;" : "=f"(y) : "f"(x), "f"(limit));
+  return y;
+}
+#endif
+SW_HD float reciprocal(float x) {  // within 1 ulp; the exact division takes ten instructions
+  float y;
+  asm("rcp.approx.ftz.f32 %0, %1;" : "=f"(y) : "f"(x));
+  return y;
+}
+#endif
+
 // 0 for finite x, NaN otherwise: sums of it test many values at once.
 template <class V>
 SW_HD V finite_probe(V x) {

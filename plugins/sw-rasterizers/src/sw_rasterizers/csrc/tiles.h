@@ -46,37 +46,61 @@ SW_HD void pixel_span(S low_edge, S high_edge, int low, int high, int* first, in
   *last = to_int(round_down(high_edge - S(0.5)), low - 1, high);
 }
 
+// The tiles of an ellipse's bounding box, and the pixels of it whose centres lie in the box; empty: no tile.
+struct TileBox {
+  TileRange tiles;
+  int i0, i1, j0, j1;  // pixels, inclusive
+};
+
+template <class S>
+SW_HD TileBox tile_box(const Ellipse<S>& e, int width, int height) {
+  TileBox box;
+  pixel_span(e.u - e.hx, e.u + e.hx, 0, width - 1, &box.i0, &box.i1);
+  pixel_span(e.v - e.hy, e.v + e.hy, 0, height - 1, &box.j0, &box.j1);
+  if (box.i0 > box.i1 || box.j0 > box.j1)
+    box.tiles = {0, 0, 0, 0};
+  else
+    box.tiles = {box.i0 / kTile, box.i1 / kTile + 1, box.j0 / kTile, box.j1 / kTile + 1};
+  return box;
+}
+
+// Tiles [first, last) of one row of tiles that the ellipse touches; `box` is its tile_box, `inverse_hy` 1 / e.hy.
+template <class S>
+SW_HD void slab_span(const Ellipse<S>& e, const TileBox& box, S inverse_hy, int row, int* first, int* last) {
+  const int first_row = row * kTile > box.j0 ? row * kTile : box.j0;
+  const int last_row = row * kTile + kTile - 1 < box.j1 ? row * kTile + kTile - 1 : box.j1;
+  const S low = S(first_row) + S(0.5) - e.v, high = S(last_row) + S(0.5) - e.v;
+  const S rl = low * inverse_hy, rh = high * inverse_hy;
+  const S half_low = e.wx * square_root(maximum(S(0), S(1) - rl * rl));
+  const S half_high = e.wx * square_root(maximum(S(0), S(1) - rh * rh));
+  const S right = low <= e.tip && e.tip <= high ? e.hx : maximum(e.lean * low + half_low, e.lean * high + half_high);
+  const S left =
+      low <= -e.tip && -e.tip <= high ? -e.hx : minimum(e.lean * low - half_low, e.lean * high - half_high);
+  int i0, i1;
+  // Extents that overflow make the slab's ends NaN (infinity times 0): the comparisons then choose the ellipse's own.
+  pixel_span(e.u + maximum(left, -e.hx), e.u + minimum(right, e.hx), box.i0, box.i1, &i0, &i1);
+  *first = i0 / kTile;
+  *last = i0 > i1 ? *first : i1 / kTile + 1;
+}
+
 // Calls visit(tile_x, tile_y) for each tile, rows top to bottom, left to right. Returns the number of calls.
 template <class S, class Visit>
 SW_HD int tight_tiles(const Ellipse<S>& e, int width, int height, Visit&& visit) {
-  int i0, i1, j0, j1;
-  pixel_span(e.u - e.hx, e.u + e.hx, 0, width - 1, &i0, &i1);
-  pixel_span(e.v - e.hy, e.v + e.hy, 0, height - 1, &j0, &j1);
-  if (i0 > i1 || j0 > j1) return 0;
-  const int row0 = j0 / kTile, row1 = j1 / kTile;
-  const int column0 = i0 / kTile, column1 = i1 / kTile;
-  int count = 0;
+  const TileBox box = tile_box(e, width, height);
+  const TileRange& tiles = box.tiles;
+  if (tiles.count() == 0) return 0;
   // A box in one tile that the image border does not cut: most splats of a trained scene.
-  if (row0 == row1 && column0 == column1 && e.u >= S(0) && e.v >= S(0) && e.u <= S(width) && e.v <= S(height)) {
-    visit(column0, row0);
+  if (tiles.count() == 1 && e.u >= S(0) && e.v >= S(0) && e.u <= S(width) && e.v <= S(height)) {
+    visit(tiles.x0, tiles.y0);
     return 1;
   }
   const S inverse_hy = S(1) / e.hy;
-  for (int ty = row0; ty <= row1; ++ty) {
-    const int first_row = ty * kTile > j0 ? ty * kTile : j0;
-    const int last_row = ty * kTile + kTile - 1 < j1 ? ty * kTile + kTile - 1 : j1;
-    const S low = S(first_row) + S(0.5) - e.v, high = S(last_row) + S(0.5) - e.v;
-    const S rl = low * inverse_hy, rh = high * inverse_hy;
-    const S half_low = e.wx * square_root(maximum(S(0), S(1) - rl * rl));
-    const S half_high = e.wx * square_root(maximum(S(0), S(1) - rh * rh));
-    const S right = low <= e.tip && e.tip <= high ? e.hx : maximum(e.lean * low + half_low, e.lean * high + half_high);
-    const S left =
-        low <= -e.tip && -e.tip <= high ? -e.hx : minimum(e.lean * low - half_low, e.lean * high - half_high);
+  int count = 0;
+  for (int ty = tiles.y0; ty < tiles.y1; ++ty) {
     int first, last;
-    // Extents that overflow make the slab's ends NaN (infinity times 0): the comparisons then choose the ellipse's own.
-    pixel_span(e.u + maximum(left, -e.hx), e.u + minimum(right, e.hx), i0, i1, &first, &last);
-    if (first > last) continue;
-    for (int tx = first / kTile; tx <= last / kTile; ++tx, ++count) visit(tx, ty);
+    slab_span(e, box, inverse_hy, ty, &first, &last);
+    count += last - first;
+    for (int tx = first; tx < last; ++tx) visit(tx, ty);
   }
   return count;
 }

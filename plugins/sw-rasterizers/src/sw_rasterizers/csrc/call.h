@@ -1,0 +1,55 @@
+// What one call of the rasterizer is about: the Gaussians, how they are drawn, where their gradients go. The same
+// for the CPU and the CUDA kernels; all pointers are of one device.
+#pragma once
+
+#include <cstdint>
+
+#include "common.h"
+
+namespace sw {
+
+template <class S>
+struct Gaussians {
+  int64_t count = 0;
+  const S* means = nullptr;
+  const S* opacities = nullptr;
+  const S* scales = nullptr;  // with quats, or cov3d alone
+  const S* quats = nullptr;
+  const S* cov3d = nullptr;
+  const S* sh_dc = nullptr;  // row i at sh_dc + i * sh_dc_stride; the rest likewise: dense and split are one case
+  const S* sh_rest = nullptr;
+  int64_t sh_dc_stride = 0, sh_rest_stride = 0;
+  int sh_degree = 0;          // active
+  const S* colors = nullptr;  // instead of SH
+  int color_channels = 3;
+  const S* features = nullptr;
+  int feature_channels = 0;
+  const uint8_t* visible = nullptr;
+};
+
+struct Settings {
+  double scale_modifier = 1, eps2d = 0.3;
+  bool antialias = false, clamp_color = true;
+  bool tight = true;               // exact tile coverage, else 3DGS' squares
+  bool pass_clamp = false;         // gradient passes through the clamp of alpha
+  bool original_jacobian = false;  // gradient of the Jacobian's clamp as in the original kernels
+  bool inverse_depth = false, accumulated_depth = false, median_depth = false;
+  bool detach_features = false;
+  bool absgrad = false;
+  int threads = 1;
+};
+
+// Channels of the composited image: colours, then inverse depth, accumulated depth, then features.
+struct Channels {
+  int colors, inverse, accumulated, features;
+  SW_HD int total() const { return colors + inverse + accumulated + features; }
+};
+
+template <class S>
+struct Gradients {  // null: not asked for
+  S *means, *opacities, *scales, *quats, *cov3d, *sh_dc, *sh_rest, *colors, *features;
+  int64_t sh_dc_stride, sh_rest_stride;
+  S *grad2d, *absgrad2d;  // [N][2], NDC units
+};
+
+}  // namespace sw

@@ -1,0 +1,234 @@
+// Backward compositing: a block of 4 warps a tile, a warp an 8 x 8 quarter of it, two pixels a lane.
+//
+// Pixels are walked back to front. For each splat that reaches the quarter a warp forms the sums over its 64 pixels
+// with shuffles and adds them to the Gaussian's row, one atomic instruction for all sums. Because the conic is
+// constant, moments of v = dL/dsigma are enough; the derivatives are put together in project_backward.
+#include "../blend.h"
+#include "kernels.h"
+#include "splat.h"
+
+namespace sw::cuda {
+namespace {
+
+constexpr int kWarps = 4, kThreads = kWarps * kWarp, kWords = kThreads / kWarp;
+constexpr int kPixels = 2;  // a lane: its pixel in each of the warp's two boxes
+
+template <int kColors>
+struct Pixel {
+  float transmittance, behind;
+  int last;
+  float gradient[kColors];
+};
+
+// Adds values[0..kCount) over the lanes; a lane ends up with the total of the value `spread_index` tells. Each step
+// halves the number of values a lane holds, so that 9 values take 12 shuffles and not 45.
+template <int kCount, int kStep = kWarp / 2>
+__device__ __forceinline__ float spread_sums(const float* values) {
+  if constexpr (kStep == 0) {
+    return values[0];
+  } else if constexpr (kCount == 1) {
+    const float sum = values[0] + __shfl_xor_sync(kAllLanes, values[0], kStep);
+    return spread_sums<1, kStep / 2>(&sum);
+  } else {
+    constexpr int kKept = (kCount + 1) / 2;
+    const bool upper = lane_index() & kStep;
+    float kept[kKept];
+#pragma unroll
+    for (int i = 0; i < kKept; ++i) {
+      const float low = values[i], high = kKept + i < kCount ? values[kKept + i] : 0.f;
+      kept[i] = (upper ? high : low) + __shfl_xor_sync(kAllLanes, upper ? low : high, kStep);
+    }
+    return spread_sums<kKept, kStep / 2>(kept);
+  }
+}
+
+// -1: another lane has the same total.
+template <int kCount, int kStep = kWarp / 2>
+__device__ __forceinline__ int spread_index(int lane) {
+  if constexpr (kStep == 0) {
+    return 0;
+  } else {
+    constexpr int kKept = (kCount + 1) / 2;
+    const int in_half = spread_index<kKept, kStep / 2>(lane);
+    if (in_half < 0) return -1;
+    if constexpr (kCount == 1) return lane & kStep ? -1 : in_half;
+    const int index = lane & kStep ? kKept + in_half : in_half;
+    return index < kCount ? index : -1;
+  }
+}
+
+struct Chunk {  // the channels of one launch
+  int first, count;
+  int geometry;       // how many of them influence alpha
+  bool alpha;
+};
+
+template <bool kGeneral, bool kAbsgrad>
+__global__ void __launch_bounds__(kThreads)
+    backward_kernel(View<float> view, Splats splats, TileLists lists, Image image, ImageGradient gradient, Chunk chunk,
+                    float clamp_limit, Rows rows) {
+  constexpr int kColors = kGeneral ? kMaxChunk : 3, kAt = kMomentSums + kColors;
+  constexpr int kSums = kAt + (kAbsgrad ? 2 : 0);
+  __shared__ float4 shape[2][kThreads];
+  __shared__ float blue[kThreads];
+  __shared__ int gaussian[kThreads];
+  __shared__ float colors[kGeneral ? kThreads : 1][kGeneral ? kMaxChunk : 1];
+  __shared__ unsigned words[kBoxes][kWords];
+  __shared__ unsigned block_last;
+
+  const int tile = int(blockIdx.x), tiles_x = view.tiles_x();
+  const int begin = lists.start[tile];
+  if (begin == lists.start[tile + 1]) return;
+  const int x0 = tile % tiles_x * kTile, y0 = tile / tiles_x * kTile;
+  const int first_box = warp_index() / kBoxColumns * kPixels * kBoxColumns + warp_index() % kBoxColumns;
+  const int x = x0 + first_box % kBoxColumns * kBoxWidth + lane_index() % kBoxWidth;
+  const int y = y0 + first_box / kBoxColumns * kBoxHeight + lane_index() / kBoxWidth;
+  const int64_t size = int64_t(view.width) * view.height;
+  const float centre_x = float(x) + 0.5f, centre_y = float(y) + 0.5f;
+
+  Pixel<kColors> pixel[kPixels];
+#pragma unroll
+  for (int p = 0; p < kPixels; ++p) {
+    Pixel<kColors>& state = pixel[p];
+    state = {1.f, 0.f, 0, {}};
+    const int row = y + p * kBoxHeight;
+    if (x >= view.width || row >= view.height) continue;
+    const int64_t at = int64_t(row) * view.width + x;
+    state.transmittance = image.transmittance[at], state.last = image.last[at];
+    float behind = chunk.alpha ? -gradient.alpha[at] : 0.f;
+#pragma unroll
+    for (int k = 0; k < kColors; ++k) {
+      if (kGeneral && k >= chunk.count) break;
+      const int channel = chunk.first + k;
+      state.gradient[k] = gradient.image[channel * size + at];
+      if (image.background != nullptr && channel < image.color_channels)
+        behind += state.gradient[k] *
+                  image.background[image.background_is_image ? channel * size + at : int64_t(channel)];
+    }
+    state.behind = state.transmittance * behind;
+  }
+  // How many pairs from the front matter to the warp, and to the block.
+  const int warp_last = int(warp_max(unsigned(max(pixel[0].last, pixel[1].last))));
+  if (threadIdx.x == 0) block_last = 0;
+  __syncthreads();
+  if (lane_index() == 0) atomicMax(&block_last, unsigned(warp_last));
+  __syncthreads();
+
+  const int index = spread_index<kSums>(lane_index());
+  // Column of the row: the moments, this chunk's channels, absgrad behind all channels; -1: nothing to add.
+  const int column = index < 0 ? -1
+                     : index < kMomentSums ? index
+                     : index < kAt ? (index - kMomentSums < chunk.count ? chunk.first + index : -1)
+                                   : kMomentSums + rows.channels + index - kAt;
+
+  for (int stop = int(block_last); stop > 0; stop -= kThreads) {  // list positions [stop - kThreads, stop)
+    unsigned mask = 0;
+    const int position = stop - 1 - int(threadIdx.x);
+    if (position >= 0) {
+      const int slot = lists.splat[begin + position];
+      const float4 s0 = splats.shape[2 * int64_t(slot)], s1 = splats.shape[2 * int64_t(slot) + 1];
+      const float2 tail = splats.tail[slot];
+      mask = box_mask(s0.x, s0.y, s0.z, s0.w, s1.x, s1.y, x0, y0);
+      shape[0][threadIdx.x] = s0, shape[1][threadIdx.x] = s1;
+      blue[threadIdx.x] = tail.x, gaussian[threadIdx.x] = __float_as_int(tail.y);
+      if constexpr (kGeneral)
+        for (int k = 0; k < kMaxChunk; ++k)
+          colors[threadIdx.x][k] =
+              k < chunk.count ? splats.channels[int64_t(slot) * image.channels + chunk.first + k] : 0.f;
+    }
+#pragma unroll
+    for (int b = 0; b < kBoxes; ++b) {
+      const unsigned word = __ballot_sync(kAllLanes, mask >> b & 1);
+      if (lane_index() == b) words[b][warp_index()] = word;
+    }
+    __syncthreads();
+
+    for (int w = 0; w < kWords; ++w) {
+      const unsigned reached[kPixels] = {words[first_box][w], words[first_box + kBoxColumns][w]};
+      unsigned word = reached[0] | reached[1];
+      const int skipped = stop - warp_last - w * kWarp;  // entries at positions that no pixel of the warp got to
+      if (skipped > 0) word = skipped < kWarp ? word & (kAllLanes << skipped) : 0;
+      for (; word != 0; word &= word - 1) {
+        const int bit = __ffs(int(word)) - 1, k = w * kWarp + bit, at = stop - 1 - k;
+        const float4 s0 = shape[0][k], s1 = shape[1][k];
+        const float dx = s0.x - centre_x;
+        float color[kColors];
+        if constexpr (kGeneral) {
+#pragma unroll
+          for (int channel = 0; channel < kMaxChunk; ++channel) color[channel] = colors[k][channel];
+        } else {
+          color[0] = s1.z, color[1] = s1.w, color[2] = blue[k];
+        }
+        float sums[kSums] = {};
+        float v0 = 0.f, vy = 0.f, vyy = 0.f;
+        bool any_touched = false;
+#pragma unroll
+        for (int p = 0; p < kPixels; ++p) {
+          if (!(reached[p] >> bit & 1)) continue;
+          Pixel<kColors>& state = pixel[p];
+          const float dy = s0.y - (centre_y + float(p * kBoxHeight));
+          const float power = log2_alpha(dx, dy, s0.z, s0.w, s1.x, s1.y);
+          const bool touched = power >= float(kLog2AlphaMin) && state.last > at;
+          if (!__any_sync(kAllLanes, touched)) continue;
+          any_touched = true;
+          const float unclamped = touched ? exp_2(power) : 0.f;
+          float phi = 0.f, weight;
+#pragma unroll
+          for (int channel = 0; channel < kColors; ++channel)
+            if (!kGeneral || channel < chunk.geometry) phi += color[channel] * state.gradient[channel];
+          const float alpha_gradient = composite_backward(fminf(float(kAlphaMax), unclamped), phi,
+                                                          state.transmittance, state.behind, weight);
+#pragma unroll
+          for (int channel = 0; channel < kColors; ++channel)
+            sums[kMomentSums + channel] += weight * state.gradient[channel];
+          // The clamp at 0.99 stops the gradient, unless it is asked to pass: then the unclamped alpha stands in front.
+          const float moment = unclamped <= clamp_limit ? -(unclamped * alpha_gradient) : 0.f;
+          const float along_y = moment * dy;
+          v0 += moment, vy += along_y, vyy += along_y * dy;
+          if constexpr (kAbsgrad) {  // A = -Ka log2(e)/2 and so on: back to natural units
+            sums[kAt] += float(kLn2) * fabsf(2.f * s0.z * dx * moment + s0.w * along_y);
+            sums[kAt + 1] += float(kLn2) * fabsf(s0.w * dx * moment + 2.f * s1.x * along_y);
+          }
+        }
+        if (!any_touched) continue;
+        sums[0] = v0, sums[1] = v0 * dx, sums[2] = vy, sums[3] = sums[1] * dx, sums[4] = vy * dx, sums[5] = vyy;
+        const float total = spread_sums<kSums>(sums);
+        if (column >= 0) atomicAdd(rows.base + int64_t(gaussian[k]) * rows.stride + column, total);
+      }
+    }
+    __syncthreads();
+  }
+}
+
+// The median depth is the depth of one splat: its pixel's gradient goes straight to that Gaussian.
+__global__ void median_kernel(int64_t pixels, const int32_t* median_splat, const float* gradient, Rows rows,
+                              int column) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < pixels && median_splat[i] >= 0) atomicAdd(rows.base + median_splat[i] * rows.stride + column, gradient[i]);
+}
+
+}  // namespace
+
+void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
+                    const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
+                    cudaStream_t stream) {
+  const unsigned tiles = unsigned(view.tiles_x()) * unsigned(view.tiles_y());
+  const float clamp_limit = pass_clamp ? 3e38f : float(kAlphaMax);
+  const auto kernel = general ? (rows.absgrad ? backward_kernel<true, true> : backward_kernel<true, false>)
+                              : (rows.absgrad ? backward_kernel<false, true> : backward_kernel<false, false>);
+  const int step = general ? kMaxChunk : 3, geometry = image.channels - detached;
+  for (int first = 0; first < image.channels; first += step) {
+    const int count = general && image.channels - first < kMaxChunk ? image.channels - first : step;
+    const int influence = geometry - first < 0 ? 0 : (geometry - first < count ? geometry - first : count);
+    const Chunk chunk{first, count, influence, first == 0 && gradient.alpha != nullptr};
+    kernel<<<tiles, kThreads, 0, stream>>>(view, splats, lists, image, gradient, chunk, clamp_limit, rows);
+  }
+  if (gradient.median != nullptr) {
+    constexpr int kBlock = 256;
+    const int64_t pixels = int64_t(view.width) * view.height;
+    median_kernel<<<unsigned(ceil_div(pixels, kBlock)), kBlock, 0, stream>>>(
+        pixels, image.median_splat, gradient.median, rows, row_length(rows.channels, rows.absgrad, true) - 1);
+  }
+}
+
+}  // namespace sw::cuda

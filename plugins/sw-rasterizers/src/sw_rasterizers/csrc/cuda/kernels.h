@@ -1,0 +1,131 @@
+// The CUDA kernels: plain pointers, sizes and a stream, no torch. binding_cuda.cpp owns the memory. float32 only.
+//
+//   project            N Gaussians -> splats of the drawn ones, compact and in index order; counts their tiles
+//   shade              colours of the splats
+//   depth_order        splats, nearest first (radix sort)
+//   emit               one (tile, splat) pair for every tile that a splat touches, in depth order
+//   sort_pairs         pairs by tile; stable, so front to back within a tile
+//   find_tiles         where each tile's pairs start
+//   blend              pairs -> image
+//   blend_backward     dL/dimage -> a row of sums for every Gaussian that was drawn
+//   project_backward   rows of sums -> gradients of the inputs
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include <cstddef>
+#include <cstdint>
+
+#include "../call.h"
+#include "../camera.h"
+
+namespace sw::cuda {
+
+// What the host must know before it can allocate; on the device while it is being counted. All zeros at the start.
+struct Counters {
+  unsigned long long pairs;
+  unsigned splats, visible, invalid, bad_colors;
+  unsigned project_ticket, project_done, emit_ticket, padding;
+  unsigned long long evaluated, blended;
+};
+
+// The same for the host, in pinned memory: written by the last block of `project`.
+struct Published {
+  int64_t splats, pairs, visible, invalid;
+};
+
+// Splats as blended: log2 alpha = A dx^2 + B dx dy + C dy^2 + level, 40 bytes each.
+struct Splats {
+  float4* shape;  // [2 a splat]: u, v, A, B; C, level, red, green
+  float2* tail;   // blue; index of the Gaussian, as bits
+  float* channels;  // [channels] a splat instead of the three colours, or null
+};
+
+// What else is known of a splat until the pairs are emitted.
+struct SplatWork {
+  uint32_t* depth;   // bits of tz: positive, so they order like the number
+  float2* extent;    // half width and half height of the cut-off ellipse, pixels
+  int32_t* radius;   // classic profile: bounding radius
+  int32_t* tiles;    // tiles touched
+  int32_t* order;    // 0, 1, 2, ...
+};
+
+// drawn: bit 3 of a Gaussian's flags; bits 0 to 2: that colour was clamped at 0.
+constexpr uint8_t kDrawn = 8;
+
+constexpr int kMaxChunk = 8;  // channels that one launch of the general blend kernels composites
+
+// Row of sums of a Gaussian: v, v dx, v dy, v dx^2, v dx dy, v dy^2 with v = dL/dsigma, then weight x gradient per
+// channel, then with absgrad |dL/du|, |dL/dv|, then with median depth dL/dtz.
+constexpr int kMomentSums = 6;
+inline int row_length(int channels, bool absgrad, bool median) {
+  return kMomentSums + channels + (absgrad ? 2 : 0) + (median ? 1 : 0);
+}
+
+struct Rows {
+  float* base;     // row of Gaussian n at base + n * stride
+  int64_t stride;
+  int channels;
+  bool absgrad, median;
+};
+
+struct Image {  // what the forward pass writes, and the backward pass reads again
+  int channels, color_channels;
+  float* image;             // [channels][H][W]
+  const float* background;  // [colors] or [colors][H][W], or null
+  bool background_is_image;
+  float* alpha;          // [H][W], 1 - transmittance, or null
+  float* transmittance;  // [H][W], or null
+  int32_t* last;         // [H][W] 1-based list position of the last blended splat, or null
+  float* median;         // [H][W] depth, or null
+  int32_t* median_splat;  // [H][W] Gaussian of the median depth, -1 if none; or null
+};
+
+struct ImageGradient {
+  const float* image;   // [channels][H][W]
+  const float* alpha;   // [H][W] or null
+  const float* median;  // [H][W] or null
+};
+
+struct TileLists {
+  const int32_t* start;  // [tiles + 1]
+  const int32_t* splat;  // [pairs]
+};
+
+constexpr int kProjectThreads = 256, kEmitThreads = 256;
+
+void project(const View<float>& view, const Gaussians<float>& g, const Settings& settings, const Splats& splats,
+             const SplatWork& work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
+             Published* published, cudaStream_t stream);
+void shade(const View<float>& view, const Gaussians<float>& g, const Settings& settings, const Splats& splats,
+           int32_t* radii, uint8_t* flags, Counters* counters, cudaStream_t stream);
+void fill_channels(const Gaussians<float>& g, const Channels& channels, const Splats& splats, const SplatWork& work,
+                   int32_t* radii, uint8_t* flags, Counters* counters, cudaStream_t stream);
+void visible_radii(const View<float>& view, const Gaussians<float>& g, const Settings& settings, int32_t* radii,
+                   cudaStream_t stream);
+
+// Sorts `order` by `depth`. `scratch` null: only returns the bytes needed there. The result lies in `order` or in
+// `order_scratch`.
+size_t depth_order(void* scratch, size_t bytes, int count, uint32_t* depth, uint32_t* depth_scratch, int32_t* order,
+                   int32_t* order_scratch, int32_t** sorted, uint32_t** sorted_depth, cudaStream_t stream);
+// Keys are uint16_t (`wide` false) or uint32_t. `compact` null: the values are splats as they are; else the splats are
+// also copied into depth order and the values count there.
+void emit(const View<float>& view, const Settings& settings, int count, const int32_t* order, const Splats& splats,
+          const SplatWork& work, const Splats* compact, int channels, void* keys, bool wide, int32_t* values,
+          Counters* counters, uint64_t* states, cudaStream_t stream);
+size_t sort_pairs(void* scratch, size_t bytes, int count, int key_bits, bool wide, void* keys, void* keys_scratch,
+                  int32_t* values, int32_t* values_scratch, void** sorted_keys, int32_t** sorted_values,
+                  cudaStream_t stream);
+void find_tiles(int count, int tiles, const void* keys, bool wide, int32_t* start, cudaStream_t stream);
+
+void blend(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
+           bool general, Counters* counters, const uint32_t* depth, cudaStream_t stream);
+// The last `detached` channels do not influence the geometry; `pass_clamp`: the gradient passes the clamp of alpha.
+void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
+                    const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
+                    cudaStream_t stream);
+void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
+                      const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
+                      cudaStream_t stream);
+
+}  // namespace sw::cuda

@@ -1,0 +1,195 @@
+// Projection: culls and projects all Gaussians, and gives those that are drawn a number, in index order.
+//
+// One thread a Gaussian. Numbers come from a prefix sum over the grid within the same launch; equal depths are
+// later drawn in the order of these numbers, so they may not depend on timing.
+#include "gather.h"
+#include "kernels.h"
+#include "splat.h"
+
+namespace sw::cuda {
+namespace {
+
+struct Screened {  // a projected Gaussian, and whether it is drawn
+  Projection<float> p;
+  float opacity, radius;
+  bool valid;   // all values are finite
+  bool inside;  // in the depth range, with an extent
+};
+
+template <bool kCov3d>
+__device__ __forceinline__ Screened screen(const View<float>& view, const Gaussians<float>& g, float scale_modifier,
+                                           float eps2d, bool antialias, int64_t n) {
+  Screened s;
+  Geometry<float> in;
+  load_geometry<kCov3d>(g, n, in);
+  s.opacity = g.opacities != nullptr ? g.opacities[n] : 1.f;
+  float probe = finite_probe(s.opacity);
+#pragma unroll
+  for (int k = 0; k < 3; ++k) probe += finite_probe(in.mean[k]);
+  if constexpr (kCov3d) {
+#pragma unroll
+    for (int k = 0; k < 6; ++k) probe += finite_probe(in.cov[k]);
+  } else {
+#pragma unroll
+    for (int k = 0; k < 3; ++k) probe += finite_probe(in.scale[k]);
+#pragma unroll
+    for (int k = 0; k < 4; ++k) probe += finite_probe(in.quat[k]);
+  }
+  s.valid = probe == 0.f;
+  Projection<float>& p = s.p;
+  project<kCov3d>(view, scale_modifier, eps2d, antialias, in, p);
+  const float derived = finite_probe(p.u) + finite_probe(p.v) + finite_probe(p.det) + finite_probe(p.ka) +
+                        finite_probe(p.kb) + finite_probe(p.kc);
+  s.inside = s.valid && derived == 0.f && p.t[2] > view.near && p.t[2] < view.far && p.det > 0.f && p.c00 > 0.f &&
+             p.c11 > 0.f && s.opacity >= 0.f;
+  s.radius = bounding_radius(p);
+  return s;
+}
+
+__device__ __forceinline__ int32_t classic_radius(const View<float>& view, const Screened& s) {
+  const bool seen =
+      s.inside && classic_tiles(s.p.u, s.p.v, s.radius, view.tiles_x(), view.tiles_y()).count() > 0;
+  return seen ? to_int(s.radius, 0, 1 << 30) : 0;
+}
+
+// Tiles that an ellipse touches; by all lanes of a warp, `wanted` where there is one to count.
+__device__ __forceinline__ int count_tiles(const View<float>& view, bool wanted, const Ellipse<float>& ellipse) {
+  int tiles = 0, rows = 0;
+  if (wanted) {
+    const TileBox box = tile_box(ellipse, view.width, view.height);
+    rows = box.tiles.y1 - box.tiles.y0;
+    if (rows <= kOwnRows) tiles = tight_tiles(ellipse, view.width, view.height, [](int, int) {});
+  }
+  for (unsigned left = __ballot_sync(kAllLanes, rows > kOwnRows); left != 0; left &= left - 1) {
+    const int owner = __ffs(int(left)) - 1;
+    const Ellipse<float> e = from_lane(ellipse, owner);
+    const TileBox box = tile_box(e, view.width, view.height);
+    int count = 0;
+    for (int row = box.tiles.y0 + lane_index(); row < box.tiles.y1; row += kWarp) {
+      int first, last;
+      slab_span(e, box, 1.f / e.hy, row, &first, &last);
+      count += last - first;
+    }
+    count = int(warp_sum(unsigned(count)));
+    if (lane_index() == owner) tiles = count;
+  }
+  return tiles;
+}
+
+template <bool kCov3d, bool kTight>
+__global__ void __launch_bounds__(kProjectThreads)
+    project_kernel(View<float> view, Gaussians<float> g, float scale_modifier, float eps2d, bool antialias,
+                   Splats splats, SplatWork work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
+                   Published* published) {
+  __shared__ unsigned scratch[kWarp + 1];
+  __shared__ unsigned block_number, base;
+  if (threadIdx.x == 0) block_number = atomicAdd(&counters->project_ticket, 1u);
+  __syncthreads();
+  const int64_t n = int64_t(block_number) * kProjectThreads + threadIdx.x;
+  const bool asked = n < g.count && (g.visible == nullptr || g.visible[n]);
+
+  bool invalid = false;
+  int32_t radius = 0, tiles = 0;
+  float level = 0.f, a = 0.f, b = 0.f, c = 0.f;
+  float2 extent = make_float2(0.f, 0.f);
+  Ellipse<float> ellipse = {};
+  bool reaches = false;  // alpha is above 1/255 somewhere
+  Screened s;
+  if (asked) {
+    s = screen<kCov3d>(view, g, scale_modifier, eps2d, antialias, n);
+    invalid = !s.valid;
+    radius = classic_radius(view, s);
+  }
+  if (radius > 0) {
+    const Projection<float>& p = s.p;
+    level = log_2(fmaxf(s.opacity * p.rho, 1e-30f));
+    const float cutoff = cutoff_of(level);
+    reaches = cutoff > kCutoffShift;
+    if (reaches) {
+      const float two_ln2_cutoff = cutoff * float(2 * kLn2);
+      a = float(-0.5 * kLog2e) * p.ka, b = float(-kLog2e) * p.kb, c = float(-0.5 * kLog2e) * p.kc;
+      extent = make_float2(square_root(two_ln2_cutoff * p.c00), square_root(two_ln2_cutoff * p.c11));
+      if constexpr (kTight)
+        ellipse = ellipse_of(p.u, p.v, a, b, c, level, extent);
+      else
+        tiles = classic_tiles(p.u, p.v, float(radius), view.tiles_x(), view.tiles_y()).count();
+    }
+  }
+  if constexpr (kTight) tiles = count_tiles(view, reaches, ellipse);
+  const bool drawn = tiles > 0;
+  if (n < g.count) {
+    radii[n] = radius;
+    if (flags != nullptr) flags[n] = drawn ? kDrawn : 0;
+  }
+
+  unsigned block_drawn;
+  const unsigned position = block_prefix(drawn, scratch, &block_drawn);
+  const unsigned visible = warp_sum(radius > 0), bad = warp_sum(invalid);
+  unsigned long long pairs = unsigned(tiles);
+  for (int step = kWarp / 2; step > 0; step /= 2) pairs += __shfl_xor_sync(kAllLanes, pairs, step);
+  if (lane_index() == 0) {
+    if (pairs > 0) atomicAdd(&counters->pairs, pairs);
+    if (visible > 0) atomicAdd(&counters->visible, visible);
+    if (bad > 0) atomicAdd(&counters->invalid, bad);
+  }
+  if (warp_index() == 0) {
+    const unsigned before = look_back(states, int(block_number), block_drawn);
+    if (lane_index() == 0) base = before;
+  }
+  __syncthreads();
+  if (drawn) {
+    const unsigned slot = base + position;
+    splats.shape[2 * slot] = make_float4(s.p.u, s.p.v, a, b);
+    splats.shape[2 * slot + 1] = make_float4(c, level, 0.f, 0.f);
+    splats.tail[slot] = make_float2(0.f, __int_as_float(int(n)));
+    work.depth[slot] = __float_as_uint(s.p.t[2]);
+    work.extent[slot] = extent;
+    work.tiles[slot] = tiles;
+    work.order[slot] = int32_t(slot);
+    if constexpr (!kTight) work.radius[slot] = radius;
+  }
+  if (threadIdx.x == 0) {
+    if (block_number == gridDim.x - 1) counters->splats = base + block_drawn;
+    __threadfence();
+    if (atomicAdd(&counters->project_done, 1u) == gridDim.x - 1) {  // all counts are in
+      __threadfence();
+      const volatile Counters* all = counters;
+      published->splats = all->splats, published->pairs = int64_t(all->pairs);
+      published->visible = all->visible, published->invalid = all->invalid;
+      __threadfence_system();
+    }
+  }
+}
+
+template <bool kCov3d>
+__global__ void __launch_bounds__(kProjectThreads)
+    radii_kernel(View<float> view, Gaussians<float> g, float scale_modifier, float eps2d, int32_t* radii) {
+  const int64_t n = int64_t(blockIdx.x) * kProjectThreads + threadIdx.x;
+  if (n >= g.count) return;
+  int32_t radius = 0;
+  if (g.visible == nullptr || g.visible[n])
+    radius = classic_radius(view, screen<kCov3d>(view, g, scale_modifier, eps2d, false, n));
+  radii[n] = radius;
+}
+
+}  // namespace
+
+void project(const View<float>& view, const Gaussians<float>& g, const Settings& settings, const Splats& splats,
+             const SplatWork& work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
+             Published* published, cudaStream_t stream) {
+  const auto kernel = g.cov3d != nullptr ? (settings.tight ? project_kernel<true, true> : project_kernel<true, false>)
+                                         : (settings.tight ? project_kernel<false, true> : project_kernel<false, false>);
+  const unsigned blocks = unsigned(ceil_div(g.count, kProjectThreads));
+  kernel<<<blocks, kProjectThreads, 0, stream>>>(view, g, float(settings.scale_modifier), float(settings.eps2d),
+                                                 settings.antialias, splats, work, radii, flags,
+                                                 counters, states, published);
+}
+
+void visible_radii(const View<float>& view, const Gaussians<float>& g, const Settings& settings, int32_t* radii,
+                   cudaStream_t stream) {
+  const auto kernel = g.cov3d != nullptr ? radii_kernel<true> : radii_kernel<false>;
+  kernel<<<unsigned(ceil_div(g.count, kProjectThreads)), kProjectThreads, 0, stream>>>(
+      view, g, float(settings.scale_modifier), float(settings.eps2d), radii);
+}
+
+}  // namespace sw::cuda

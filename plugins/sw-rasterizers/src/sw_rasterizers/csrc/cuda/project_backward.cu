@@ -1,0 +1,167 @@
+// From the rows of sums to the gradients of the inputs.
+//
+// One thread a Gaussian; those that were not drawn get zeros, so no gradient needs to be cleared before. The projection
+// is computed again, which is cheaper than to have stored it.
+#include "../sh.h"
+#include "gather.h"
+#include "kernels.h"
+
+namespace sw::cuda {
+namespace {
+
+constexpr int kThreads = 128, kWarps = kThreads / kWarp;
+constexpr int kFactors = kMaxBasis + 3;  // a Gaussian's basis and colour gradient; odd: no bank conflicts
+
+// dL/dsh_k = B_k dL/dcolour: the rows of 32 Gaussians as one run of consecutive values, by the whole warp.
+__device__ __forceinline__ void write_sh_rows(float* base, int64_t first, int rows, int floats, int first_basis,
+                                              const float* factors) {
+  float* to = base + first * floats;
+  const int length = rows * floats;
+  const bool aligned = reinterpret_cast<uintptr_t>(to) % sizeof(float4) == 0;
+  int row = 0, in_row = 4 * lane_index();
+  for (int at = 4 * lane_index(); at < length; at += 4 * kWarp, in_row += 4 * kWarp) {
+    float values[4];
+#pragma unroll
+    for (int i = 0; i < 4; ++i) {
+      if (i > 0) ++in_row;
+      while (in_row >= floats) in_row -= floats, ++row;
+      const float* of = factors + (row < rows ? row : 0) * kFactors;
+      const int k = first_basis + in_row / 3;
+      values[i] = k < kMaxBasis ? of[k] * of[kMaxBasis + in_row % 3] : 0.f;
+    }
+    in_row -= 3;  // may go below 0: then the row before is meant, and the step ahead makes up for it
+    if (aligned && at + 4 <= length) {
+      *reinterpret_cast<float4*>(to + at) = make_float4(values[0], values[1], values[2], values[3]);
+    } else {
+      for (int i = 0; i < 4 && at + i < length; ++i) to[at + i] = values[i];
+    }
+  }
+}
+
+template <bool kCov3d>
+__global__ void __launch_bounds__(kThreads)
+    project_backward_kernel(View<float> view, Gaussians<float> g, Settings settings, Channels channels,
+                            const uint8_t* flags, Rows rows, Gradients<float> out) {
+  __shared__ float staged[kWarps * kWarp * kRestFloats];
+  const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = n - lane_index();
+  if (first >= g.count) return;
+  const bool exists = n < g.count;
+  const int flag = exists ? flags[n] : 0;
+  const bool drawn = flag & kDrawn, shaded = g.sh_dc != nullptr;
+  float* shared = staged + warp_index() * kWarp * kRestFloats;
+  const int degree = shaded ? g.sh_degree : 0, active = (degree + 1) * (degree + 1);
+  const bool through_direction = degree > 0 && out.means != nullptr;
+  const float* rest = shared;
+  if (through_direction) rest = stage_rest(g, n, drawn, rest_floats(degree), shared);
+
+  GeometryGradient<float> result = {};
+  float color[3] = {}, basis[kMaxBasis] = {}, screen[2] = {}, absolute_screen[2] = {};
+  float direction[3] = {0.f, 0.f, 1.f}, inverse_length = 0.f;
+  if (drawn) {
+    const float* row = rows.base + n * rows.stride;
+    float sum[kMomentSums];
+#pragma unroll
+    for (int k = 0; k < kMomentSums; ++k) sum[k] = row[k];
+    int at = kMomentSums;
+    for (int k = 0; k < channels.colors; ++k, ++at) {
+      if (k < 3) color[k] = row[at];
+      if (out.colors != nullptr) out.colors[n * channels.colors + k] = row[at];
+    }
+    Geometry<float> in;
+    load_geometry<kCov3d>(g, n, in);
+    const float opacity = g.opacities[n];
+    Projection<float> p;
+    project<kCov3d>(view, float(settings.scale_modifier), float(settings.eps2d), settings.antialias, in, p);
+    ScreenGradient<float> grad;
+    grad.depth = 0.f;
+    if (channels.inverse) grad.depth -= row[at++] / (p.t[2] * p.t[2]);
+    if (channels.accumulated) grad.depth += row[at++];
+    for (int k = 0; k < channels.features; ++k, ++at)
+      if (out.features != nullptr) out.features[n * channels.features + k] = row[at];
+    if (rows.absgrad) absolute_screen[0] = row[at++], absolute_screen[1] = row[at++];
+    if (rows.median) grad.depth += row[at];
+    grad.u = p.ka * sum[1] + p.kb * sum[2];
+    grad.v = p.kb * sum[1] + p.kc * sum[2];
+    grad.ka = 0.5f * sum[3], grad.kb = sum[4], grad.kc = 0.5f * sum[5];
+    grad.opacity = -sum[0] / (opacity * p.rho);  // the sum of -v is that of alpha dL/dalpha
+    screen[0] = grad.u, screen[1] = grad.v;
+    project_backward<kCov3d>(view, float(settings.scale_modifier), float(settings.eps2d), settings.antialias,
+                             settings.original_jacobian, in, p, opacity, grad, result);
+    if (shaded) {
+#pragma unroll
+      for (int k = 0; k < 3; ++k)
+        if (flag >> k & 1) color[k] = 0.f;
+      basis[0] = float(kSH0);
+      if (degree > 0) {
+        inverse_length = view_direction(view, in.mean, direction);
+        sh_basis(degree, direction[0], direction[1], direction[2], basis);
+      }
+    }
+  } else if (exists) {
+    for (int k = 0; out.colors != nullptr && k < channels.colors; ++k) out.colors[n * channels.colors + k] = 0.f;
+    for (int k = 0; out.features != nullptr && k < channels.features; ++k)
+      out.features[n * channels.features + k] = 0.f;
+  }
+
+  if (through_direction) {
+    async_wait();
+    __syncwarp();
+    if (drawn) {
+      float dx[kMaxBasis], dy[kMaxBasis], dz[kMaxBasis], slope[3] = {};
+      sh_basis_gradient(degree, direction[0], direction[1], direction[2], dx, dy, dz);
+#pragma unroll
+      for (int k = 1; k < kMaxBasis; ++k) {
+        if (k >= active) break;
+        const float* sh = rest + 3 * (k - 1);
+        const float along = sh[0] * color[0] + sh[1] * color[1] + sh[2] * color[2];
+        slope[0] += dx[k] * along, slope[1] += dy[k] * along, slope[2] += dz[k] * along;
+      }
+      const float radial = dot3(direction, slope);
+#pragma unroll
+      for (int j = 0; j < 3; ++j) result.mean[j] += (slope[j] - direction[j] * radial) * inverse_length;
+    }
+  }
+
+  if (exists) {
+    if (out.means != nullptr) store_row<3>(out.means, n, result.mean);
+    if (out.opacities != nullptr) out.opacities[n] = result.opacity;
+    if constexpr (kCov3d) {
+      if (out.cov3d != nullptr) store_row<6>(out.cov3d, n, result.cov);
+    } else {
+      if (out.scales != nullptr) store_row<3>(out.scales, n, result.scale);
+      if (out.quats != nullptr) store_row<4>(out.quats, n, result.quat);
+    }
+    // NDC units: pixel gradient times half the image size.
+    const float half[2] = {0.5f * view.width, 0.5f * view.height};
+    const auto ndc = [&](float* to, const float* pixels) {
+      reinterpret_cast<float2*>(to)[n] = make_float2(half[0] * pixels[0], half[1] * pixels[1]);
+    };
+    if (out.grad2d != nullptr) ndc(out.grad2d, screen);
+    if (out.absgrad2d != nullptr) ndc(out.absgrad2d, absolute_screen);
+  }
+  if (out.sh_dc == nullptr && out.sh_rest == nullptr) return;
+
+  __syncwarp();  // the coefficients have been read: their place is free
+  float* mine = shared + lane_index() * kFactors;
+#pragma unroll
+  for (int k = 0; k < kMaxBasis; ++k) mine[k] = basis[k];
+#pragma unroll
+  for (int k = 0; k < 3; ++k) mine[kMaxBasis + k] = color[k];
+  __syncwarp();
+  const int count = int(min(int64_t(kWarp), g.count - first));
+  const bool dense = out.sh_dc != nullptr && out.sh_dc_stride > 3;
+  if (out.sh_dc != nullptr) write_sh_rows(out.sh_dc, first, count, int(out.sh_dc_stride), 0, shared);
+  if (!dense && out.sh_rest != nullptr)
+    write_sh_rows(out.sh_rest, first, count, int(out.sh_rest_stride), 1, shared);
+}
+
+}  // namespace
+
+void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
+                      const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
+                      cudaStream_t stream) {
+  const auto kernel = g.cov3d != nullptr ? project_backward_kernel<true> : project_backward_kernel<false>;
+  kernel<<<unsigned(ceil_div(g.count, kThreads)), kThreads, 0, stream>>>(view, g, settings, channels, flags, rows, out);
+}
+
+}  // namespace sw::cuda

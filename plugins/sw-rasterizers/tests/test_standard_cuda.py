@@ -1,0 +1,105 @@
+"""The standard rasterizer on a GPU: the same facts as on the CPU, and agreement with the CPU's kernels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from splatwizard_core.errors import CapabilityError
+from splatwizard_core.gaussians.inputs import SH
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.rendering.reference import ReferenceRasterizer
+from splatwizard_core.testing.raster_gradients import GRADIENT_CASES, applies, check_against, outputs, run
+from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
+from splatwizard_core.testing.rasterizer_checks import checks_for
+from sw_rasterizers.native import unavailable_on_cuda
+from sw_rasterizers.standard import StandardRasterizer
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"),
+    pytest.mark.skipif(unavailable_on_cuda() is not None, reason=str(unavailable_on_cuda())),
+]
+INFO = StandardRasterizer.info.on("cuda")
+CASES = [case for case in GRADIENT_CASES if applies(case, INFO)] if torch.cuda.is_available() else []
+ALL_DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})
+MANY = RasterCase("many", n=3000, width=203, height=150, spread=2.0, scale=(0.01, 0.25), degree=3)
+"""Fills 13 x 10 tiles, the last ones partial, with lists longer than a stage of the kernels."""
+
+
+@pytest.mark.parametrize("check", checks_for(INFO), ids=str)
+def test_facts_of_every_rasterizer(check):
+    check(StandardRasterizer(), "cuda")
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda c: c.name)
+@pytest.mark.parametrize("seed", [1, 2])
+def test_values_and_gradients_are_those_of_the_reference(case, seed):
+    check_against(StandardRasterizer(), ReferenceRasterizer(), case, seed, "cuda")
+
+
+def split(g):
+    sh = g.sh.dense
+    return replace(g, sh=SH(dc=sh[:, :1].clone(), rest=sh[:, 1:].clone(), active_degree=g.sh.active_degree))
+
+
+@pytest.mark.parametrize(
+    ("form", "options", "changes"),
+    [
+        ("dense", RasterOptions(grad2d=True, absgrad=True), {}),
+        ("split", RasterOptions(clamp_grad="pass", scale_modifier=1.4, eps2d=0.1, background=torch.rand(3)), {}),
+        ("split", RasterOptions(alpha=True, depth=ALL_DEPTHS, grad2d=True, absgrad=True, antialias=True), {}),
+        ("dense", RasterOptions(profile="dgr-exact", grad2d=True), {}),
+        ("dense", RasterOptions(), {"features": 11}),
+        ("dense", RasterOptions(features_detach_geometry=True), {"features": 11}),
+        ("colors", RasterOptions(alpha=True), {"color": "colors", "channels": 10}),
+        ("colors", RasterOptions(), {"color": "colors", "geometry": "cov3d"}),
+        ("dense", RasterOptions(), {"degree": 3, "active_degree": 1}),
+        ("split", RasterOptions(), {"degree": 1, "active_degree": 0}),
+    ],
+    ids=["plain", "pass", "everything", "dgr-exact", "features", "detached", "ten-colors", "cov3d", "bands", "dc"],
+)
+def test_many_splats_equal_the_kernels_of_the_cpu(form, options, changes):
+    """Tolerances of specs for unfiltered scenes: a cut may flip on rounding, in few places and by little."""
+    g, cam = draw_scene(replace(MANY, **changes), 3, torch.float32)
+    g.opacities[:50] = 1.0  # the clamp of alpha is active somewhere
+    if form == "split":
+        g = split(g)
+    rasterizer = StandardRasterizer()
+    expected, wanted = run(rasterizer, g, cam, options)
+    actual, found = run(rasterizer, cast_inputs(g, torch.float32, "cuda"), cam, options)
+    difference = (actual.radii.cpu() - expected.radii).abs()
+    assert int(difference.max()) <= 1
+    assert float((difference > 0).float().mean()) <= 1e-4
+    reference = outputs(expected)
+    for name, x in outputs(actual).items():
+        scale = max(1.0, float(reference[name].detach().abs().max()))
+        error = (x.detach().cpu() - reference[name].detach()).abs() / scale
+        # Median depth is one splat's: it may jump where T crosses 1/2 on rounding.
+        assert float((error > 2e-5).float().mean()) <= 1e-4, name
+        assert name == "depth median" or float(error.max()) <= 0.012, name
+    pairs = {name: (x, wanted[name]) for name, x in found.items()}
+    for name in ("grad2d", "absgrad2d"):
+        if getattr(expected, name) is not None:
+            pairs[name] = (getattr(actual, name).value, getattr(expected, name).value)
+    for name, (a, b) in pairs.items():
+        error = float((a.cpu().double() - b.double()).norm() / b.double().norm().clamp(min=1e-30))
+        assert error <= 1e-3, f"gradient of {name}: relative error {error:.3g}"
+
+
+def test_float64_is_refused():
+    g, cam = draw_scene(RasterCase(), 1)
+    with pytest.raises(CapabilityError, match="FLOAT64"):
+        StandardRasterizer().render(cast_inputs(g, device="cuda"), cam, RasterOptions())
+
+
+def test_no_state_is_kept_without_gradient():
+    g, cam = draw_scene(MANY, 3, torch.float32)
+    moved = cast_inputs(g, device="cuda")
+    with torch.no_grad():
+        StandardRasterizer().render(moved, cam, RasterOptions())
+        before = torch.cuda.memory_allocated()
+        result = StandardRasterizer().render(moved, cam, RasterOptions())
+    assert torch.cuda.memory_allocated() - before <= 2 * (result.image.nbytes + result.radii.nbytes) + 4096
