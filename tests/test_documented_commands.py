@@ -1,0 +1,93 @@
+"""Every command that README.md and docs/guide.md show runs as written.
+
+A training command gets `--set iterations=20` added, so that the pages can be run in a test; `path/to/garden` and
+`path/to/data` become a small photographed scene and a folder of data sets. Nothing else is changed.
+"""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from splatwizard_core.cli.main import main
+
+ROOT = Path(__file__).parent.parent
+STEPS = "20"
+TRAINING = ("run", "train")
+
+
+def commands(page: Path) -> list[str]:
+    """The lines of the page's indented blocks, without trailing comments."""
+    lines = [line[4:] for line in page.read_text("utf-8").splitlines() if line.startswith("    ") and line.strip()]
+    return [line.split("  #")[0].split(" # ")[0].strip() for line in lines]
+
+
+def sw_arguments(command: str) -> list[str] | None:
+    """What follows `sw` in the command, None if it is another program's."""
+    words = shlex.split(command)
+    return words[1:] if words[0] in ("sw", ".venv/bin/sw") else None
+
+
+@pytest.fixture(scope="module")
+def working_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a small photographed scene at path/to/garden and a root of data sets at path/to/data."""
+    folder = tmp_path_factory.mktemp("documented")
+    garden = folder / "path" / "to" / "garden"
+    garden.parent.mkdir(parents=True)
+    assert main(["data", "synth", str(garden), "--size", "tiny"]) == 0
+    (folder / "path" / "to" / "data").mkdir()
+    return folder
+
+
+def documented(page: str) -> list[str]:
+    shown = [command for command in commands(ROOT / page) if sw_arguments(command) is not None]
+    assert len(shown) >= 4, f"{page} shows hardly any command: has its layout changed?"
+    return shown
+
+
+@pytest.mark.parametrize("page", ["README.md", "docs/guide.md"])
+def test_every_sw_command_of_the_page_succeeds_in_the_order_of_the_page(
+    page: str, working_directory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(working_directory)
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(working_directory / "path" / "to" / "data"))
+    shutil.rmtree(working_directory / "out", ignore_errors=True)
+    for command in documented(page):
+        arguments = sw_arguments(command)
+        assert arguments is not None
+        if arguments[0] in TRAINING:
+            arguments += ["--set", f"iterations={STEPS}"]
+        status = main(arguments)
+        assert status == 0, f"{page}: `{command}` ended with status {status}: {capsys.readouterr().err[-600:]}"
+
+
+def test_the_make_targets_of_the_readme_exist() -> None:
+    targets = [command.split()[1] for command in commands(ROOT / "README.md") if command.startswith("make ")]
+    assert {"demo", "test"} <= set(targets)
+    for target in targets:
+        dry = subprocess.run(["make", "-n", target], cwd=ROOT, capture_output=True, text=True, check=False)
+        assert dry.returncode == 0, dry.stderr
+
+
+def test_the_python_scripts_of_the_pages_take_the_options_that_are_shown() -> None:
+    for page in ("README.md", "docs/guide.md"):
+        for command in commands(ROOT / page):
+            words = shlex.split(command)
+            if words[0].endswith("python") and words[1].endswith(".py"):
+                script = ROOT / words[1]
+                shown = subprocess.run(
+                    [sys.executable, str(script), "--help"],
+                    capture_output=True,
+                    text=True,
+                    check=False,
+                    env={**os.environ, "COLUMNS": "200"},
+                )
+                assert shown.returncode == 0, shown.stderr
+                for option in (word for word in words[2:] if word.startswith("--")):
+                    assert option in shown.stdout, f"{page}: {words[1]} has no {option}"
