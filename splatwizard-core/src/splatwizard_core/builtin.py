@@ -9,7 +9,7 @@ def register_rasterizers(registry: Registry) -> None:
     registry.add(
         "reference",
         "splatwizard_core.rendering.reference:ReferenceRasterizer",
-        summary="pure-torch oracle of standard 3DGS: any device, float64, slow",
+        summary="pure-torch oracle of 3DGS and 2DGS: any device, float64, slow",
         devices=["cpu", "cuda"],
         dtypes=["float32", "float64"],
         features=[
@@ -17,7 +17,15 @@ def register_rasterizers(registry: Registry) -> None:
             "SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM", "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM",
             "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T",
             "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_PIXEL_WEIGHT",
-            "SCORE_GRAD_SQ", "FLOAT64",
+            "SCORE_GRAD_SQ", "FLOAT64", "SURFEL", "NORMALS", "DISTORTION",
+        ],
+        # Surfels have a low-pass of their own, and the scores are those of ellipsoids.
+        combos_forbidden=[
+            ["SURFEL", other]
+            for other in (
+                "ANTIALIAS", "ABSGRAD", "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND",
+                "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_GRAD_SQ",
+            )
         ],
         exactness="exact",
         speed=0,

@@ -11,7 +11,7 @@ from splatwizard_core import builtin
 from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry
-from splatwizard_core.rendering.rasterizer import Feature, RasterizerInfo, RasterOptions, ScoreSpec
+from splatwizard_core.rendering.rasterizer import Feature, RasterizerInfo, RasterOptions, ScoreSpec, check_offered
 from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.testing.raster_scenes import RasterCase, draw_scene, with_tensors
 
@@ -159,8 +159,8 @@ def test_environment_takes_one_rasterizer_or_fails(plugins, scene, monkeypatch):
     rasterizer = NegotiatedRasterizer(plugins, device="cpu")
     rasterizer.render(*scene, RasterOptions())
     assert rasterizer.choices == {"plain": "odd"}
-    with pytest.raises(CapabilityError, match="NORMALS"):
-        rasterizer.render(*scene, RasterOptions(normals=True))
+    with pytest.raises(CapabilityError, match="FISHER"):
+        rasterizer.render(*scene, RasterOptions(fisher=True))
 
 
 def test_approximate_results_must_be_accepted(plugins, scene):
@@ -188,18 +188,18 @@ def test_other_devices_are_not_candidates(plugins, scene):
 
 
 def test_an_error_names_what_is_missing_and_who_is_near(plugins, scene):
-    plugins.install("gpu", "NORMALS", devices=["cuda"])
-    plugins.install("absent", "NORMALS", available="negotiation_fakes:not_here")
+    plugins.install("gpu", "FISHER", devices=["cuda"])
+    plugins.install("absent", "FISHER", available="negotiation_fakes:not_here")
     rasterizer = NegotiatedRasterizer(plugins, device="cpu", forbid=["reference"])
     with pytest.raises(CapabilityError) as caught:
-        rasterizer.render(*scene, RasterOptions(normals=True, alpha=True))
+        rasterizer.render(*scene, RasterOptions(fisher=True, alpha=True))
     message = str(caught.value)
-    assert "no rasterizer offers ALPHA_MAP + NORMALS on cpu" in message
+    assert "no rasterizer offers ALPHA_MAP + FISHER on cpu" in message
     assert "gpu (cuda) lacks ALPHA_MAP" in message
-    assert "reference (cpu/cuda) lacks NORMALS is forbidden" in message
+    assert "reference (cpu/cuda) lacks FISHER is forbidden" in message
     assert caught.value.missing == {"ALPHA_MAP"}
     with pytest.raises(CapabilityError, match="Not usable here: absent: needs a GPU"):
-        rasterizer.render(*scene, RasterOptions(normals=True))
+        rasterizer.render(*scene, RasterOptions(fisher=True))
 
 
 def warnings(caplog):
@@ -400,8 +400,8 @@ def test_an_entry_that_cannot_be_read_harms_no_other(plugins, scene, caplog, dec
     for _ in range(2):
         rasterizer = NegotiatedRasterizer(plugins, device="cpu")
         rasterizer.render(*scene, RasterOptions())
-        with pytest.raises(CapabilityError, match="NORMALS"):
-            rasterizer.render(*scene, RasterOptions(normals=True))
+        with pytest.raises(CapabilityError, match="FISHER"):
+            rasterizer.render(*scene, RasterOptions(fisher=True))
     assert rasterizer.choices == {"plain": "reference"}
     assert len([w for w in warnings(caplog) if name in w]) == 1
     with pytest.raises(PluginError, match=name):
@@ -415,7 +415,21 @@ def test_unknown_option_values_are_refused(scene):
 
 
 def test_negotiated_info_is_the_union(plugins):
-    plugins.install("fast", "NORMALS")
+    plugins.install("fast", "FISHER")
     info = NegotiatedRasterizer(plugins, device="cpu").info
-    assert {"NORMALS", "BACKWARD"} <= info.features
+    assert {"FISHER", "BACKWARD"} <= info.features
     assert info.features <= {f.name for f in Feature}
+
+
+def test_a_rasterizer_of_surfels_is_never_taken_for_anything_else(plugins, scene):
+    flat = plugins.install("flat", "SURFEL", "BACKWARD", needs=["SURFEL"], speed=99)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu", prefer=["flat"])
+    g, cam = scene
+    rasterizer.render(g, cam, RasterOptions())
+    rasterizer.render(replace(g, scales=g.scales[:, :2]), cam, RasterOptions())
+    rasterizer.render(replace(g, scales=g.scales[:, :2]), cam, RasterOptions(normals=True))
+    assert rasterizer.choices == {"plain": "reference", "SURFEL": "flat", "NORMALS+SURFEL": "reference"}
+    with pytest.raises(CapabilityError, match="'flat' draws nothing without SURFEL"):
+        check_offered(flat.info, Feature.BACKWARD)
+    with pytest.raises(CapabilityError, match=r"flat \(cpu\) draws nothing without SURFEL"):
+        NegotiatedRasterizer(plugins, device="cpu", forbid=["reference"]).render(g, cam, RasterOptions())

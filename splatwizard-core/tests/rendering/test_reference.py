@@ -7,6 +7,7 @@ from splatwizard_core import builtin
 from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
 from splatwizard_core.plugins.registry import Registry
 from splatwizard_core.rendering import compositing
+from splatwizard_core.rendering.projection import rotation_matrices
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
 from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.testing.naive_rasterizer import naive_render
@@ -30,7 +31,17 @@ def test_fact(check):
     check(REFERENCE, "cpu")
 
 
-@pytest.mark.parametrize("case", GRADIENT_CASES, ids=lambda c: c.name)
+QUICK = {"surfels-low-pass"}
+"""Of the surfels, whose many outputs make finite differences of pure torch slow; the kernels' are all checked."""
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(c, marks=[pytest.mark.slow] if c.geometry == "surfels" and c.name not in QUICK else [], id=c.name)
+        for c in GRADIENT_CASES
+    ],
+)
 def test_gradients_are_finite_differences(case):
     assert applies(case, REFERENCE.info)
     check_gradients(REFERENCE, case)
@@ -45,7 +56,9 @@ def test_float32_equals_float64(case):
 def test_values_and_gradients_equal_the_naive_loop(case):
     g, cam = margin_scene(case, 2)
     channels = case.channels if case.color == "colors" else 3
-    options = case.raster_options(alpha=True, depth=DEPTHS, background=torch.linspace(0.1, 0.9, channels).double())
+    flat = case.geometry == "surfels"
+    background = torch.linspace(0.1, 0.9, channels).double()
+    options = case.raster_options(alpha=True, depth=DEPTHS, background=background, normals=flat, distortion=flat)
     gradients = []
     for render in (naive_render, REFERENCE.render):
         leaves = {k: v.clone().requires_grad_() for k, v in g.tensors().items() if v.is_floating_point()}
@@ -54,6 +67,8 @@ def test_values_and_gradients_equal_the_naive_loop(case):
         maps += [result.depth[m].reshape(1, cam.height, cam.width) for m in sorted(DEPTHS)]
         if case.features:
             maps.append(result.features)
+        if flat:
+            maps += [result.normals, result.distortion.reshape(1, cam.height, cam.width)]
         drawn = torch.cat(maps)
         weights = torch.randn(drawn.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
         gradients.append([drawn.detach(), *torch.autograd.grad((drawn * weights).sum(), list(leaves.values()))])
@@ -85,6 +100,14 @@ def test_gradient_cases_show_what_their_names_say():
     outside = ((t[:, :2] / t[:, 2:]).abs() > limits).any(dim=1)
     assert any(bool(outside[p.index]) and int(p.blended.sum()) > 100 for p in result.pairs)
     assert all(float(p.raw.max()) < 0.2 for p in _trace("antialias-floor")[2].pairs)  # opacity 20 to 40 times 0.005
+    stops = [int((p.tried & ~p.blended).sum()) for p in _trace("surfels-stop")[2].pairs]
+    assert sum(stops) > 0
+    clamped = [int((p.blended & (p.raw > 0.99)).sum()) for p in _trace("surfels-alpha-clamp")[2].pairs]
+    assert sum(clamped) > 5
+    g, cam, _ = _trace("surfels-behind")
+    axes = (cam.R @ rotation_matrices(g.quats))[:, 2, :2] * g.scales
+    reach = (g.means @ cam.R.T + cam.tau)[:, 2] - 3 * axes.norm(dim=1)
+    assert float(reach.min()) < 0  # the 3-sigma circle of one reaches behind the camera
 
 
 @pytest.mark.parametrize("clamp_grad", ["exact", "pass"])
@@ -162,9 +185,13 @@ def test_dgr_profile_differentiates_the_clamped_jacobian_as_the_original():
 
 def test_what_is_not_offered_is_refused():
     g, cam = draw_scene(RasterCase(), 0)
-    with pytest.raises(CapabilityError, match="does not offer NORMALS") as caught:
-        REFERENCE.render(g, cam, RasterOptions(normals=True))
-    assert caught.value.missing == {"NORMALS"}
+    with pytest.raises(CapabilityError, match="does not offer FISHER") as caught:
+        REFERENCE.render(g, cam, RasterOptions(fisher=True))
+    assert caught.value.missing == {"FISHER"}
+    with pytest.raises(CapabilityError, match="normals and distortion of surfels only"):
+        REFERENCE.render(g, cam, RasterOptions(normals=True, distortion=True))
+    with pytest.raises(CapabilityError, match="ANTIALIAS and SURFEL together"):
+        REFERENCE.render(*draw_scene(RasterCase(geometry="surfels"), 0), RasterOptions(antialias=True))
     with pytest.raises(ConfigError, match="gsplat"):
         REFERENCE.render(g, cam, RasterOptions(profile="gsplat"))
     with pytest.raises(ShapeError, match="background"):

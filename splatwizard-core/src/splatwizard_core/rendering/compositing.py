@@ -6,7 +6,7 @@ so the result does not depend on the size of the tiles.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,17 +44,12 @@ class TileLists:
 
 
 @torch.no_grad()
-def tile_lists(p: Projection, order: Tensor, width: int, height: int, tile: int, *, classic: bool) -> TileLists:
-    """Lists of depth ranks (positions in `order`). Raises RuntimeError beyond 2^31 pairs.
+def tile_lists(rect: Tensor, width: int, height: int, tile: int) -> TileLists:
+    """Lists of depth ranks. Raises RuntimeError beyond 2^31 pairs.
 
-    classic  the square 3-sigma rectangle of the original instead of the box around the exact support
+    rect    [V,4] int64 tiles x0, y0, x1, y1 of each splat, x0 <= x < x1, in depth order
     """
     columns, rows = -(-width // tile), -(-height // tile)
-    if classic:
-        assert tile == CLASSIC_TILE
-        rect = p.rect[order]
-    else:
-        rect = _support_rectangles(p, tile, columns, rows)[order]
     x0, y0, x1, y1 = rect.unbind(1)
     across = x1 - x0
     sizes = across * (y1 - y0)
@@ -63,24 +58,41 @@ def tile_lists(p: Projection, order: Tensor, width: int, height: int, tile: int,
         raise RuntimeError(
             f"{total} (Gaussian, tile) pairs in one view; the limit is 2^31: the scales are far too large"
         )
-    ranks = torch.repeat_interleave(torch.arange(len(order), device=order.device), sizes)
-    within = torch.arange(total, device=order.device) - (torch.cumsum(sizes, 0) - sizes)[ranks]
+    ranks = torch.repeat_interleave(torch.arange(len(rect), device=rect.device), sizes)
+    within = torch.arange(total, device=rect.device) - (torch.cumsum(sizes, 0) - sizes)[ranks]
     tiles = (y0[ranks] + within // across[ranks]) * columns + x0[ranks] + within % across[ranks]
     tiles, by_tile = torch.sort(tiles, stable=True)
     counts = torch.bincount(tiles, minlength=columns * rows)
     return TileLists(tile, (columns, rows), ranks[by_tile], torch.cumsum(counts, 0) - counts, counts)
 
 
-def _support_rectangles(p: Projection, tile: int, columns: int, rows: int) -> Tensor:
-    """[V,4] tiles that hold a pixel centre inside the box around sigma <= ln(255 opacity); empty where faint."""
-    level = 2 * torch.log(255 * p.opacity.detach())
+@torch.no_grad()
+def support_rectangles(p: Projection, width: int, height: int, tile: int, *, classic: bool) -> Tensor:
+    """[V,4] tiles that hold a pixel centre inside the box around sigma <= ln(255 opacity); empty where faint.
+
+    classic  the square 3-sigma rectangle of the original instead
+    """
+    if classic:
+        assert tile == CLASSIC_TILE
+        return p.rect
+    level = log_cutoff(p.opacity)
     extent = torch.sqrt(level.clamp(min=0)[:, None] * p.cov2d[:, [0, 2]])
-    extent = extent * 1.001 + 0.01  # rounding must not lose a pixel; each pixel tests exactly
-    limit = p.cov2d.new_tensor([columns, rows])
-    u = p.u.detach() - 0.5
-    first = torch.floor((u - extent) / tile).clamp(min=0)
-    last = torch.minimum(torch.floor((u + extent) / tile) + 1, limit)
-    last = torch.where((level >= 0)[:, None], torch.maximum(first, last), first)
+    u = p.u.detach()
+    return box_rectangles(u - extent, u + extent, level >= 0, width, height, tile)
+
+
+def log_cutoff(opacity: Tensor) -> Tensor:
+    """2 ln(255 opacity): the squared distance in standard deviations at which alpha falls to 1/255; no gradient."""
+    return 2 * torch.log(opacity.detach() / ALPHA_MIN)
+
+
+def box_rectangles(low: Tensor, high: Tensor, drawn: Tensor, width: int, height: int, tile: int) -> Tensor:
+    """[V,4] tiles that hold a pixel centre in the boxes low..high [V,2]; empty where not `drawn` [V]."""
+    limit = low.new_tensor([-(-width // tile), -(-height // tile)])
+    slack = (high - low) * 0.0005 + 0.01  # rounding must not lose a pixel; each pixel tests exactly
+    first = torch.floor((low - 0.5 - slack) / tile).clamp(min=0)
+    last = torch.minimum(torch.floor((high - 0.5 + slack) / tile) + 1, limit)
+    last = torch.where(drawn[:, None], torch.maximum(first, last), first)
     return torch.cat([torch.minimum(first, limit), torch.minimum(last, limit)], dim=1).long()
 
 
@@ -159,7 +171,18 @@ def evaluate(
         alpha = raw + (alpha - raw).detach()
     tried = valid[:, None] & (sigma >= 0) & (alpha >= ALPHA_MIN)
     alpha = torch.where(tried, alpha, 0)
+    passed, alive, weight, T_after, done_after = transmit(alpha, T, done)
+    return Terms(
+        dx, dy, alpha, passed[..., :-1], weight, alive, raw > ALPHA_MAX, rows[..., 8:], opacity,
+        T_after, done_after, done,
+    )  # fmt: skip
 
+
+def transmit(alpha: Tensor, T: Tensor, done: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Light through a chunk, front to back: alpha [B,P,L] (0 where skipped), T and done [B,P] in front of it.
+
+    Returns T before each splat and after the last one [B,P,L+1], alive and weight [B,P,L], T and done [B,P] behind it.
+    """
     # A skipped pair multiplies T by exactly 1, so the first product below the limit is the splat that stops the
     # pixel, and all after it are below as well: the comparison latches by itself.
     after = T[..., None] * torch.cumprod(1 - alpha, dim=-1)
@@ -167,10 +190,13 @@ def evaluate(
     alive = (after >= T_MIN) & ~done[..., None]
     weight = torch.where(alive, alpha * passed[..., :-1], 0)
     T_after = passed.gather(-1, alive.sum(dim=-1, keepdim=True)).squeeze(-1)
-    return Terms(
-        dx, dy, alpha, passed[..., :-1], weight, alive, raw > ALPHA_MAX, rows[..., 8:], opacity,
-        T_after, done | ~alive.all(dim=-1), done,
-    )  # fmt: skip
+    return passed, alive, weight, T_after, done | ~alive.all(dim=-1)
+
+
+def last_above_half(blended: Tensor, before: Tensor) -> Tensor:
+    """[B,P] 1-based position of the last blended splat that more than half the light reaches; 0: none."""
+    at = torch.arange(1, before.shape[-1] + 1, device=before.device)
+    return torch.where(blended & (before > 0.5), at, 0).amax(dim=-1)
 
 
 @dataclass
@@ -230,6 +256,72 @@ def evaluated(splats: Splats, lists: TileLists, batch: Batch) -> Iterator[tuple[
             return
 
 
+State = tuple[Tensor | None, ...]
+"""What a pixel accumulates, each [B,P] or [B,P,D]; all zero in front of the first splat."""
+Blend = Callable[..., tuple[Tensor, ...]]
+"""(packed, ids, valid, centres, T, done, *state) -> (T, done, number of blended pairs, *state): one chunk."""
+
+
+@dataclass
+class Drawn:
+    """Per pixel: T [H,W] and the final state, each [D,H,W] (None where it was None); counters of pairs."""
+
+    T: Tensor
+    state: list[Tensor | None]
+    n_evaluated: int
+    n_blended: int
+
+
+def draw_batches(
+    blend: Blend, widths: list[int | None], packed: Tensor, lists: TileLists, width: int, height: int
+) -> Drawn:
+    """Run `blend` over the chunks of every tile, front to back.
+
+    widths   per entry of the state its number of channels, 0 for a plain [B,P], None for an entry that is not kept
+    """
+    pixels = lists.tile**2
+    recompute = torch.is_grad_enabled() and int(lists.counts.sum()) * pixels > KEEP_ELEMENTS
+    parts: list[tuple[Tensor, State]] = []
+    tiles: list[Tensor] = []
+    n_evaluated, n_blended = 0, 0
+    for batch in batches(lists, width, height, packed.dtype):
+        T = packed.new_ones(batch.outside.shape)
+        state: State = tuple(
+            None if n is None else packed.new_zeros(*T.shape, *([n] if n else [])) for n in widths
+        )  # fmt: skip
+        done = batch.outside
+        for ids, valid in chunks(batch, lists):
+            arguments = (packed, ids, valid, batch.centres, T, done, *state)
+            if recompute:
+                T, done, blended, *rest = checkpoint(blend, *arguments, use_reentrant=False, preserve_rng_state=False)
+            else:
+                T, done, blended, *rest = blend(*arguments)
+            state = tuple(rest)
+            n_evaluated += int(valid.sum()) * pixels
+            n_blended += int(blended)
+            if bool(done.all()):
+                break
+        parts.append((T, state))
+        tiles.append(batch.tiles)
+
+    where = torch.cat(tiles)
+
+    def assemble(drawn: list[Tensor], empty: float) -> Tensor:
+        """Tiles [.,P] or [.,P,D] -> [1 or D,H,W]; tiles without a splat hold `empty`."""
+        values = torch.cat(drawn)
+        columns, rows = lists.grid
+        full = values.new_full((columns * rows, *values.shape[1:]), empty).index_copy(0, where, values)
+        full = full.reshape(rows, columns, lists.tile, lists.tile, *(values.shape[2:] or (1,)))
+        image = full.permute(4, 0, 2, 1, 3).flatten(3, 4).flatten(1, 2)
+        return image[:, :height, :width]
+
+    finished: list[Tensor | None] = [
+        None if n is None else assemble([x for _, state in parts if (x := state[i]) is not None], 0.0)
+        for i, n in enumerate(widths)
+    ]
+    return Drawn(assemble([T for T, _ in parts], 1.0)[0], finished, n_evaluated, n_blended)
+
+
 @dataclass
 class Composite:
     """Pixels: channels [D,H,W] without background, T [H,W], median depth [H,W] or None; counters of pairs."""
@@ -243,66 +335,28 @@ class Composite:
 
 def composite(splats: Splats, lists: TileLists, width: int, height: int) -> Composite:
     """Blend every tile; differentiable in `splats.packed` and `splats.depth`."""
-    pixels, attached = lists.tile**2, splats.num_channels - splats.detached
-    recompute = torch.is_grad_enabled() and int(lists.counts.sum()) * pixels > KEEP_ELEMENTS
+    attached = splats.num_channels - splats.detached
 
     def blend(
-        packed: Tensor, depth: Tensor | None, ids: Tensor, valid: Tensor, centres: Tensor, T: Tensor, done: Tensor,
+        packed: Tensor, ids: Tensor, valid: Tensor, centres: Tensor, T: Tensor, done: Tensor,
         total: Tensor, median: Tensor | None,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor | None, Tensor]:  # fmt: skip
+    ) -> tuple[Any, ...]:  # fmt: skip
         terms = evaluate(splats, packed, ids, valid, centres, T, done)
         sums = [torch.bmm(terms.weight, terms.channels[..., :attached])]
         if splats.detached:
             sums.append(torch.bmm(terms.weight.detach(), terms.channels[..., attached:]))
         blended = terms.weight > 0
-        if depth is not None and ids.shape[1]:
+        if splats.depth is not None and ids.shape[1]:
             assert median is not None
-            last = torch.where(
-                blended & (terms.before > 0.5), torch.arange(1, ids.shape[1] + 1, device=ids.device), 0
-            ).amax(dim=-1)  # [B,P] 1-based, 0: none
-            z = depth[ids].gather(1, (last - 1).clamp(min=0))
+            last = last_above_half(blended, terms.before)
+            z = splats.depth[ids].gather(1, (last - 1).clamp(min=0))
             median = torch.where(last > 0, z, median)
-        return total + torch.cat(sums, dim=-1), terms.T, terms.done, median, blended.sum()
+        return terms.T, terms.done, blended.sum(), total + torch.cat(sums, dim=-1), median
 
-    parts: list[tuple[Tensor, Tensor, Tensor | None]] = []
-    tiles: list[Tensor] = []
-    n_evaluated, n_blended = 0, 0
-    for batch in batches(lists, width, height, splats.packed.dtype):
-        T = splats.packed.new_ones(batch.outside.shape)
-        total = splats.packed.new_zeros(*T.shape, splats.num_channels)
-        median = None if splats.depth is None else torch.zeros_like(T)
-        done = batch.outside
-        for ids, valid in chunks(batch, lists):
-            arguments = (splats.packed, splats.depth, ids, valid, batch.centres, T, done, total, median)
-            if recompute:
-                total, T, done, median, blended = checkpoint(
-                    blend, *arguments, use_reentrant=False, preserve_rng_state=False
-                )
-            else:
-                total, T, done, median, blended = blend(*arguments)
-            n_evaluated += int(valid.sum()) * pixels
-            n_blended += int(blended)
-            if bool(done.all()):
-                break
-        parts.append((total, T, median))
-        tiles.append(batch.tiles)
-
-    where = torch.cat(tiles)
-
-    def assemble(drawn: list[Tensor], empty: float) -> Tensor:
-        """Tiles [.,P,D] -> [D,H,W]; tiles without a splat hold `empty`."""
-        values = torch.cat(drawn)
-        columns, rows = lists.grid
-        full = values.new_full((columns * rows, *values.shape[1:]), empty).index_copy(0, where, values)
-        full = full.reshape(rows, columns, lists.tile, lists.tile, -1)
-        image = full.permute(4, 0, 2, 1, 3).flatten(3, 4).flatten(1, 2)
-        return image[:, :height, :width]
-
-    medians = [m[..., None] for _, _, m in parts if m is not None]
+    widths = [splats.num_channels, None if splats.depth is None else 0]
+    drawn = draw_batches(blend, widths, splats.packed, lists, width, height)
+    channels, median = drawn.state
+    assert channels is not None
     return Composite(
-        assemble([c for c, _, _ in parts], 0.0),
-        assemble([T[..., None] for _, T, _ in parts], 1.0)[0],
-        assemble(medians, 0.0)[0] if medians else None,
-        n_evaluated,
-        n_blended,
-    )
+        channels, drawn.T, None if median is None else median[0], drawn.n_evaluated, drawn.n_blended
+    )  # fmt: skip

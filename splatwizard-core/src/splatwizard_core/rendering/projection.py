@@ -19,7 +19,7 @@ LAMBDA_FLOOR = 0.1
 COMP_FLOOR = 2.5e-5
 """Floor under the root of the antialias factor: 0.005 squared."""
 CLASSIC_TILE = 16
-_MAX_RADIUS = 2**30
+MAX_RADIUS = 2**30
 
 
 @dataclass
@@ -122,7 +122,7 @@ def _add_low_pass(c: Tensor, eps2d: float) -> Tensor:
     return c + c.new_tensor([eps2d, 0.0, eps2d])
 
 
-def _finite_rows(g: GaussianInputs, geometry_only: bool) -> Tensor:
+def finite_rows(g: GaussianInputs, geometry_only: bool) -> Tensor:
     """[N] bool: every value that belongs to the row is finite."""
 
     def finite(x: Tensor) -> Tensor:
@@ -145,7 +145,7 @@ def _finite_rows(g: GaussianInputs, geometry_only: bool) -> Tensor:
     return ok
 
 
-def _tile_rectangle(u: Tensor, radius: Tensor, cam: Camera) -> Tensor:
+def tile_rectangle(u: Tensor, radius: Tensor, cam: Camera) -> Tensor:
     """The classic square of 16x16 tiles, [V,4] int64, in the pixel frame of the original (centres at integers)."""
     p = u - 0.5
     grid = p.new_tensor([-(-cam.width // CLASSIC_TILE), -(-cam.height // CLASSIC_TILE)])
@@ -163,7 +163,7 @@ def _cull(
     A Gaussian whose classic tile rectangle is empty is culled in every profile, so radii > 0 says what is drawn.
     """
     n = len(g)
-    finite = _finite_rows(g, geometry_only)
+    finite = finite_rows(g, geometry_only)
     keep = finite if g.visible is None else finite & g.visible
     if not geometry_only:
         keep = keep & (g.opacities >= 0)
@@ -181,12 +181,12 @@ def _cull(
     largest = mid + torch.sqrt((mid * mid - det).clamp(min=LAMBDA_FLOOR))
     radius = torch.ceil(RADIUS_SIGMA * torch.sqrt(largest))
     ok = (det > 0) & torch.isfinite(det) & torch.isfinite(radius) & torch.isfinite(u * u).all(dim=1)
-    rect = _tile_rectangle(torch.where(ok[:, None], u, 0), torch.where(ok, radius, 0), cam)
+    rect = tile_rectangle(torch.where(ok[:, None], u, 0), torch.where(ok, radius, 0), cam)
     ok &= (rect[:, 2] > rect[:, 0]) & (rect[:, 3] > rect[:, 1])
 
     rows, rect, radius = rows[ok], rect[ok], radius[ok]
     radii = torch.zeros(n, dtype=torch.int32, device=g.means.device)
-    radii[rows] = radius.clamp(1, _MAX_RADIUS).to(torch.int32)
+    radii[rows] = radius.clamp(1, MAX_RADIUS).to(torch.int32)
     return rows, rect, radii, n - int(finite.sum())
 
 

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from splatwizard_core import builtin
 from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.gaussians.spherical_harmonics import view_colors
-from splatwizard_core.rendering.checks import check_request, checked_background
-from splatwizard_core.rendering.compositing import Splats, composite, tile_lists
+from splatwizard_core.rendering.checks import check_request
+from splatwizard_core.rendering.compositing import Splats, composite, support_rectangles, tile_lists
 from splatwizard_core.rendering.negotiation import declared_info
 from splatwizard_core.rendering.projection import CLASSIC_TILE, Projection, project, visible_radii
 from splatwizard_core.rendering.rasterizer import (
@@ -26,11 +25,13 @@ from splatwizard_core.rendering.rasterizer import (
     RenderResult,
 )
 from splatwizard_core.rendering.scores import merge_scores, score_dtype, view_scores
+from splatwizard_core.rendering.shading import background_image, splat_colors
+from splatwizard_core.rendering.surfels import are_surfels, check_ellipsoids, draw_surfels, visible_surfel_radii
 from splatwizard_core.scene.camera import Camera
 
 
 class ReferenceRasterizer:
-    """Standard 3DGS in pure torch: float32 and float64, CPU and CUDA, bounded memory, slow.
+    """3DGS and 2DGS (two scales a Gaussian) in pure torch: float32 and float64, CPU and CUDA, bounded memory, slow.
 
     classic_tiles   also cut each splat at the original's square of 16x16 tiles (3 sigma). The default draws the exact
                     support, alpha >= 1/255, wherever it reaches. Profile "dgr-exact" implies it, and takes over the
@@ -52,13 +53,18 @@ class ReferenceRasterizer:
         cam = cam.to(g.means.device, g.means.dtype)
         quirks = opt.profile == "dgr-exact"
         classic = self.classic_tiles or quirks
+        if are_surfels(g):
+            pass_clamp = quirks or opt.clamp_grad == "pass"
+            return draw_surfels(g, cam, opt, tile=self.tile, classic=classic, pass_clamp=pass_clamp)
+        check_ellipsoids(self.info.name, opt)
         p = project(g, cam, opt, dgr_gradient=quirks)
         order = torch.argsort(p.depth.detach(), stable=True)  # ties by index: rows ascend
         tile = CLASSIC_TILE if classic else self.tile
-        lists = tile_lists(p, order, cam.width, cam.height, tile, classic=classic)
+        rect = support_rectangles(p, cam.width, cam.height, tile, classic=classic)
+        lists = tile_lists(rect[order], cam.width, cam.height, tile)
 
         u, grad2d, absgrad2d, probe = _watch_screen_gradient(p, g, cam, opt)
-        colors = _colors(g, p.rows, cam, opt)
+        colors = splat_colors(g, p.rows, cam, opt)
         depths = self._depth_channels(p, opt)
         channels = [colors, *depths.values()]
         if g.features is not None:
@@ -76,7 +82,7 @@ class ReferenceRasterizer:
         drawn = composite(splats, lists, cam.width, cam.height)
 
         num_colors = colors.shape[1]
-        background = _background(opt, num_colors, cam, g.means)
+        background = background_image(opt, num_colors, cam, g.means)
         alpha = 1 - drawn.T[None]
         depth = {name: drawn.channels[num_colors + i][None] for i, name in enumerate(depths)}
         if "expected" in opt.depth:
@@ -114,7 +120,8 @@ class ReferenceRasterizer:
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
         g.validate()
-        return visible_radii(g, cam.to(g.means.device, g.means.dtype), RasterOptions())
+        cam = cam.to(g.means.device, g.means.dtype)
+        return visible_surfel_radii(g, cam) if are_surfels(g) else visible_radii(g, cam, RasterOptions())
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
@@ -135,24 +142,6 @@ class ReferenceRasterizer:
         if "inverse" in opt.depth:
             channels["inverse"] = 1 / p.depth[:, None]
         return channels
-
-
-def _colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) -> Tensor:
-    """[V,C]: precomputed colours as they are, or spherical harmonics seen from the camera."""
-    if g.colors is not None:
-        return g.colors[rows]
-    assert g.sh is not None
-    return view_colors(g.sh.to_dense()[rows], g.means[rows], cam.center, g.sh.active_degree, clamp=opt.clamp_color)
-
-
-def _background(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor:
-    """[C,H,W]."""
-    background = checked_background(opt, channels, cam, like)
-    if background is None:
-        return like.new_zeros(channels, cam.height, cam.width)
-    if background.ndim == 1:
-        return background[:, None, None].expand(channels, cam.height, cam.width)
-    return background
 
 
 def _watch_screen_gradient(

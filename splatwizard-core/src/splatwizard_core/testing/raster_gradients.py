@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -19,6 +22,7 @@ from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, marg
 
 DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})
 
+FLAT: dict[str, Any] = {"geometry": "surfels", "width": 12, "height": 10}
 GRADIENT_CASES = (
     RasterCase("colors", color="colors"),
     RasterCase("four-channels", color="colors", channels=4),
@@ -41,6 +45,12 @@ GRADIENT_CASES = (
     RasterCase("stop", color="colors", n=9, opacity=(0.7, 0.95), scale=(0.7, 1.2), width=12, height=10),
     RasterCase("off-centre", color="colors", principal=(5.0, -3.0)),
     RasterCase("modifier", color="colors", options={"scale_modifier": 1.3}),
+    RasterCase("surfels", n=3, degree=1, active_degree=1, principal=(2.0, -1.0), options={"scale_modifier": 1.3},
+               **FLAT),
+    RasterCase("surfels-low-pass", color="colors", n=5, scale=(0.02, 0.2), spread=0.8, **FLAT),
+    RasterCase("surfels-alpha-clamp", color="colors", n=3, opacity=(1.1, 1.7), scale=(0.3, 0.6), **FLAT),
+    RasterCase("surfels-stop", color="colors", n=8, opacity=(0.93, 0.985), scale=(0.8, 1.4), spread=0.5, **FLAT),
+    RasterCase("surfels-behind", color="colors", n=3, scale=(1.2, 3.0), opacity=(0.2, 0.6), **FLAT),
 )  # fmt: skip
 """Every path that has a derivative of its own."""
 
@@ -54,10 +64,13 @@ def _options(case: RasterCase, info: RasterizerInfo, cam: Camera, dtype: torch.d
     offered = {"inverse": "DEPTH_INVERSE", "accumulated": "DEPTH_ACCUM", "expected": "DEPTH_EXPECTED",
                "median": "DEPTH_MEDIAN"}  # fmt: skip
     channels = case.channels if case.color == "colors" else 3
+    flat = case.geometry == "surfels"
     return case.raster_options(
         background=_background(channels, cam.height, cam.width, dtype),
         alpha="ALPHA_MAP" in info.features,
         depth=frozenset(m for m in DEPTHS if offered[m] in info.features),
+        normals=flat and "NORMALS" in info.features,
+        distortion=flat and "DISTORTION" in info.features,
     )
 
 
@@ -65,7 +78,7 @@ def applies(case: RasterCase, info: RasterizerInfo) -> bool:
     """Whether the rasterizer declares what this case needs."""
     g, cam = margin_scene(case, 1)
     needed = feature_names(required_features(g, _options(case, info, cam, torch.float64))) - {"FLOAT64"}
-    return needed <= info.features
+    return info.needs <= needed <= info.features
 
 
 def outputs(result: RenderResult) -> dict[str, Tensor]:
@@ -73,8 +86,9 @@ def outputs(result: RenderResult) -> dict[str, Tensor]:
     found = {"image": result.image, **{f"depth {m}": d for m, d in result.depth.items()}}
     if result.alpha is not None:
         found["alpha"] = result.alpha
-    if result.features is not None:
-        found["features"] = result.features
+    for name in ("features", "normals", "distortion"):
+        if (x := getattr(result, name)) is not None:
+            found[name] = x
     return found
 
 
@@ -129,10 +143,8 @@ def check_against(
     g, cam = margin_scene(case, seed)
     options = _options(case, rasterizer.info, cam, torch.float64)
     if "BACKWARD" in rasterizer.info.features:
-        options = case.raster_options(
-            background=options.background, alpha=options.alpha, depth=options.depth, grad2d=True,
-            absgrad="ABSGRAD" in rasterizer.info.features,
-        )  # fmt: skip
+        absgrad = "ABSGRAD" in rasterizer.info.features and case.geometry != "surfels"
+        options = replace(options, grad2d=True, absgrad=absgrad)
     expected, expected_gradients = run(oracle, g, cam, options)
     single = cast_inputs(g, torch.float32, device)
     actual, gradients = run(rasterizer, single, cam.to(device, torch.float32), options)

@@ -23,7 +23,8 @@ class RasterCase:
     """What a random scene looks like.
 
     color       "sh" (dense), "split" (dc + rest), "indexed" (codebook), "colors" ([N,C])
-    geometry    "scales" (with unnormalised quats), "cov3d", "indexed" (codebook with scale factors)
+    geometry    "scales" (with unnormalised quats), "surfels" (two scales), "cov3d", "indexed" (codebook with scale
+                factors)
     spread      half width of the cloud at the camera's distance of 4; above 2.5 the Jacobian clamp is active
     opacity     (lowest, highest)
     """
@@ -70,7 +71,7 @@ def draw_scene(case: RasterCase, seed: int, dtype: torch.dtype = torch.float64) 
         S = covariances(scales, quats)
         g.cov3d = torch.stack([S[:, 0, 0], S[:, 0, 1], S[:, 0, 2], S[:, 1, 1], S[:, 1, 2], S[:, 2, 2]], dim=1)
     else:
-        g.scales, g.quats = scales, quats
+        g.scales, g.quats = scales[:, :2] if case.geometry == "surfels" else scales, quats
     if case.geometry == "indexed":
         g.geom_indices = torch.randint(rows, (n,), generator=generator)
         g.scale_factors = rand(n, low=0.7, high=1.4)

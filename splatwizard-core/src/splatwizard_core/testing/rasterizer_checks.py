@@ -1,4 +1,4 @@
-"""Facts that hold for every rasterizer of standard 3DGS: closed forms, invariances, culling, broken inputs, scores.
+"""Facts that hold for every rasterizer of 3DGS or 2DGS: closed forms, invariances, culling, broken inputs, scores.
 
 A package tests its rasterizer with
 
@@ -55,10 +55,10 @@ def check(*needs: str) -> Callable[[CheckFunction], CheckFunction]:
 
 
 def checks_for(info: RasterizerInfo) -> list[Check]:
-    """Every check whose needs `info` declares."""
-    for module in ("raster_closed_forms", "raster_robustness", "raster_scores"):  # each adds its own to the list
+    """Every check whose needs `info` declares, and that asks for what `info` cannot do without."""
+    for module in ("raster_closed_forms", "raster_robustness", "raster_scores", "raster_surfels"):  # each adds its own
         importlib.import_module(f"splatwizard_core.testing.{module}")
-    return [c for c in _CHECKS if c.needs <= info.features]
+    return [c for c in _CHECKS if info.needs <= c.needs <= info.features]
 
 
 def front_camera(width: int = 64, height: int = 64, **changes: float) -> Camera:

@@ -1,0 +1,29 @@
+"""The colour of each drawn splat, and of what is behind all of them."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.gaussians.spherical_harmonics import view_colors
+from splatwizard_core.rendering.checks import checked_background
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.scene.camera import Camera
+
+
+def splat_colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) -> Tensor:
+    """[V,C]: precomputed colours as they are, or spherical harmonics seen from the camera."""
+    if g.colors is not None:
+        return g.colors[rows]
+    assert g.sh is not None
+    return view_colors(g.sh.to_dense()[rows], g.means[rows], cam.center, g.sh.active_degree, clamp=opt.clamp_color)
+
+
+def background_image(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor:
+    """[C,H,W]."""
+    background = checked_background(opt, channels, cam, like)
+    if background is None:
+        return like.new_zeros(channels, cam.height, cam.width)
+    if background.ndim == 1:
+        return background[:, None, None].expand(channels, cam.height, cam.width)
+    return background
