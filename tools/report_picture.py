@@ -26,7 +26,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("page", type=Path, help="report.html")
     parser.add_argument("out", type=Path, help="PNG to write")
-    parser.add_argument("--size", type=int, nargs=2, default=(1200, 1540), metavar=("W", "H"), help="pixels")
+    parser.add_argument("--size", type=int, nargs=2, default=(1200, 1960), metavar=("W", "H"), help="pixels")
     args = parser.parse_args()
     browser = next(filter(None, map(shutil.which, BROWSERS)), None)
     if browser is None:

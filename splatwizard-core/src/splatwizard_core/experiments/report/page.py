@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 
@@ -32,6 +32,11 @@ from splatwizard_core.experiments.report.truth import EVEN_VIEWS, SceneOpener, T
 from splatwizard_core.files import write_atomic
 
 FILE_NAME = "report.html"
+PICTURES = "Renders beside the ground truth"
+BYTES = "Bytes by section"
+VIEWS = "Scores view by view"
+SHORT = {PICTURES: "Pictures", BYTES: "Bytes", VIEWS: "Views"}
+"""Headings, and what stands for them in the contents."""
 
 
 @dataclass(frozen=True)
@@ -144,19 +149,17 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     sections = []
     if options.pictures:
         gallery = single_gallery(run, Truth([run], options.opener), PictureBudget())
-        sections.append(
-            Section("pictures", "Renders beside the ground truth", [Part(gallery=gallery)], short="Pictures")
-        )
+        sections.append(Section("pictures", PICTURES, [Part(gallery=gallery)], short=SHORT[PICTURES]))
     views = plots.view_charts([run])
     parts = [Part(charts=views)] if views is not None else [Part(text="The record holds no scores of single views.")]
     table = plots.views_table([run])
     parts += [Part(table=table, folded="All scores")] if table is not None else []
     missing = tables.missing_metrics([run])
     parts += [Part(text="Not known: " + "; ".join(missing) + ".")] if missing else []
-    sections.append(Section("views", "Scores view by view", parts, short="Views"))
+    sections.append(Section("views", VIEWS, parts, short=SHORT[VIEWS]))
     table = plots.single_sections_table(run)
     part = Part(table=table) if table is not None else Part(text="The record lists no sections of the file.")
-    sections.append(Section("bytes", "Bytes by section", [part], short="Bytes"))
+    sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
     sections.append(_training("training", "Training", [run], tables.breakdown_table(facts)))
     sections.append(Section("cost", "Time and memory", [Part(table=tables.cost_table(facts))]))
     if facts.geometry:
@@ -196,8 +199,21 @@ def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
     for number, ((scene, protocol), group) in enumerate(places.items()):
         title = scene if scenes.count(scene) == 1 else f"{scene}, {protocol}"
         parts = _place_parts(group, style_of, views, budget, options)
-        sections.append(Section(f"scene-{number}", title, parts, f"Protocol {protocol}.", title))
+        if len(places) == 1:  # what would be sub-headings under a lonely heading
+            sections += _as_sections(parts, f"Results on {scene}", f"Protocol {protocol}.")
+        else:
+            sections.append(Section(f"scene-{number}", title, parts, f"Protocol {protocol}.", title))
     sections.append(_provenance(runs))
+    return sections
+
+
+def _as_sections(parts: Sequence[Part], title: str, text: str) -> list[Section]:
+    """A section for every part with a heading; those without one belong to the section before them."""
+    sections = [Section("results", title, [], text, "Results")]
+    for part in parts:
+        if part.heading:
+            sections.append(Section(f"part-{len(sections)}", part.heading, [], short=SHORT.get(part.heading, "")))
+        sections[-1].parts.append(replace(part, heading=""))
     return sections
 
 
@@ -211,19 +227,19 @@ def _place_parts(
         parts.append(Part("Rate and distortion", charts=charts))
     if options.pictures:
         if budget.spent:
-            parts.append(Part("Pictures", "Left out: the page holds as many pictures as it may."))
+            parts.append(Part(PICTURES, "Left out: the page holds as many pictures as it may."))
         else:
             gallery = scene_gallery(runs, views, Truth(runs, options.opener), budget)
-            parts.append(Part("Renders beside the ground truth", gallery=gallery))
+            parts.append(Part(PICTURES, gallery=gallery))
     bars = plots.section_bars(runs)
     if bars is not None:
-        parts.append(Part("Bytes by section", charts=bars))
+        parts.append(Part(BYTES, charts=bars))
         parts.append(Part(table=plots.sections_table(runs), folded="Bytes as a table"))
     curves, missing = plots.training_charts(runs)
     parts.append(Part("Training", charts=curves, text=_sentence(missing)))
     by_view = plots.view_charts(runs)
     if by_view is not None:
-        parts.append(Part("Scores view by view", charts=by_view))
+        parts.append(Part(VIEWS, charts=by_view))
         parts.append(Part(table=plots.views_table(runs), folded="All scores"))
     return parts
 

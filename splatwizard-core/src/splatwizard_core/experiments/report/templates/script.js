@@ -84,7 +84,7 @@
       rightTag.textContent = b.dataset.name;
       const w = Number(b.getAttribute("width")), h = Number(b.getAttribute("height"));
       stage.style.aspectRatio = `${w} / ${h}`;
-      stage.style.width = range.style.width = `min(100%, ${Math.min(960, 3 * w)}px, ${(78 * w / h).toFixed(2)}vh)`;
+      stage.style.width = range.style.width = `min(100%, ${Math.round(Math.min(960, 3 * w, 640 * w / h))}px, ${(78 * w / h).toFixed(2)}vh)`;
       place();
     };
     const change = () => {
