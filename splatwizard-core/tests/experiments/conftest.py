@@ -196,6 +196,7 @@ def toy_plugins(toy_site: Path):
         patch.setenv("SW_PLUGINS", "toy")
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(toy_site), os.environ.get("PYTHONPATH", "")])))
         patch.setenv("SPLATWIZARD_DATA", str(toy_site))
+        patch.setenv("SPLATWIZARD_CACHE", str(toy_site / "cache"))
         # Sixty Gaussians are no work to share, and waiting threads take the cores from the other tests.
         patch.setenv("OMP_NUM_THREADS", "1")
         threads = torch.get_num_threads()

@@ -84,6 +84,17 @@ class Life:
     def directory(self) -> Path:
         return self.folder / "out" / "demo-tiny" / "toy" / "r2"
 
+    def interrupt(self, after: float) -> int:
+        """Press Ctrl-C, which all processes at a terminal get, after some seconds; the exit status."""
+        process = self.start()
+        try:
+            _, told = process.communicate(timeout=after)
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGINT)
+            _, told = process.communicate(timeout=60)
+        self.log.append(told)
+        return process.returncode
+
     def start(self, death: str | None = None) -> subprocess.Popen[str]:
         temporary = self.folder / "tmp"
         temporary.mkdir(parents=True, exist_ok=True)
@@ -92,7 +103,7 @@ class Life:
             environment |= {"TOY_DEATH": death, "TOY_WRITES": str(self.folder / "writes")}
         return subprocess.Popen(
             [sys.executable, "-m", "splatwizard_core", *RUN, "--out", str(self.folder / "out")],
-            env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
+            env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, start_new_session=True,
         )  # fmt: skip
 
     def live(self, death: str | None = None, *, after: float | None = None) -> int:
@@ -218,6 +229,21 @@ def test_a_run_that_is_killed_anywhere_comes_to_the_same(point: int, undisturbed
     else:
         # One slice of its time for each point, so that all of it is met.
         life.live(after=undisturbed.seconds * (point + 2 * dice.random()) / POINTS)
+    assert life.live() == 0, life.log
+    assert life.left() == []
+    assert outcome(life.directory) == undisturbed.outcome
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("point", range(6))
+def test_ctrl_c_anywhere_is_one_line_and_comes_to_the_same(point: int, undisturbed: Undisturbed, tmp_path: Path):
+    dice = random.Random(SEED - point)
+    life = Life(tmp_path)
+    # The first half second is Python's own start, which knows no better than a traceback.
+    status = life.interrupt(0.5 + (undisturbed.seconds - 0.5) * (point + dice.random()) / 6)
+    assert status in (0, 130), life.log
+    assert "Traceback" not in life.log[-1]
+    assert ("interrupted (the same command resumes a run)" in life.log[-1]) == (status == 130)
     assert life.live() == 0, life.log
     assert life.left() == []
     assert outcome(life.directory) == undisturbed.outcome

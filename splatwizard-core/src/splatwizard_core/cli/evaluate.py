@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import tempfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -35,6 +34,7 @@ from splatwizard_core.cli.setup import (
     resolve_run_options,
 )
 from splatwizard_core.errors import SplatwizardError
+from splatwizard_core.files import scratch_folder
 
 if TYPE_CHECKING:
     from splatwizard_core.gaussians.splat_model import SplatModel
@@ -119,7 +119,7 @@ def evaluate(
             from splatwizard_core.experiments.encoding import encode_directory
             from splatwizard_core.experiments.fresh import decode_fresh
 
-            path = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "scene.swz"
+            path = stack.enter_context(scratch_folder("roundtrip")) / "scene.swz"
             encode_directory(session, resolved, Path(file), path)
             digest = decode_fresh(path, str(session.device))["digest"]
             open_model = opener(path, plugins, session.device)
