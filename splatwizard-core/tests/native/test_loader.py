@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -396,6 +397,51 @@ def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, t
     toolchain.Toolchain().compile([job], tmp_path / "log")
     assert job.output.stat().st_size > 0
     assert (package.folder / "value.h") in toolchain.read_dependencies(Path(f"{job.output}.d"))
+
+
+@pytest.mark.parametrize(
+    ("torchs", "nvcc", "message"),
+    [
+        (None, (13, 0), "this torch is built without CUDA"),
+        ("13.0", None, "no CUDA compiler was found .* install the CUDA 13 toolkit"),
+        ("12.8", (13, 0), r"torch is built for CUDA 12.8, .*nvcc is of CUDA 13.0: install a toolkit of CUDA 12"),
+        ("13.0", (13, 2), None),
+    ],
+)
+def test_a_cuda_toolkit_that_does_not_fit_torch_is_named(package, monkeypatch, torchs, nvcc, message):
+    import torch
+
+    module = package.module(cuda_sources=("fill.cu",))
+    monkeypatch.setattr(torch.version, "cuda", torchs)
+    monkeypatch.setattr(toolchain, "find_nvcc", lambda: None if nvcc is None else "/opt/cuda/bin/nvcc")
+    monkeypatch.setattr(toolchain, "nvcc_version", lambda _: nvcc)
+    package.write("fill.cu", CUDA_KERNEL)
+    reason = module.available(cuda=True)
+    if message is None:
+        assert reason is None
+    else:
+        assert reason is not None
+        assert re.search(message, reason)
+    assert module.state()["target"] == ("cpu" if message else "cuda")
+
+
+@needs_compiler
+def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch):
+    import torch
+
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",))
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(toolchain, "find_nvcc", lambda: None)
+    library = module._library(module.prebuilt_folder, "portable", True)
+    library.parent.mkdir()
+    library.write_bytes(b"not looked into")
+    facts = {"sha256": file_sha256(library), "architectures": ["8.0", "9.0"]}
+    library.with_suffix(".json").write_text(json.dumps(facts))
+    for gpu, suits in (((9, 0), True), ((8, 6), True), ((7, 5), False), ((10, 0), False)):
+        monkeypatch.setattr(toolchain, "gpus", lambda gpu=gpu: [gpu])
+        assert (library in module._existing()) == suits
+        assert (module.available(cuda=True) is None) == suits
 
 
 def test_an_unknown_march_is_refused(package):

@@ -1,8 +1,9 @@
-"""Native modules: C++ (later CUDA) sources that ship with a package, found prebuilt, cached, or compiled on first use.
+"""Native modules: C++ and CUDA sources that ship with a package, found prebuilt, cached, or compiled on first use.
 
 A module registers its ops with TORCH_LIBRARY in one thin binding file; after `load()` they are at torch.ops.<name>.
 Environment: SPLATWIZARD_CACHE (where builds go), SPLATWIZARD_NATIVE=0 (do without native code),
-SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, MAX_JOBS.
+SPLATWIZARD_BUILD_TIMEOUT (seconds to wait for another process's build), CXX, CUDA_HOME, TORCH_CUDA_ARCH_LIST (compute
+capabilities to build for, as "8.0;9.0"; without it those of the GPUs here), MAX_JOBS.
 """
 
 from __future__ import annotations
@@ -132,9 +133,12 @@ class NativeModule:
         """
         if self._session.error is not None:
             return str(self._session.error)
-        missing = self._without_cuda() if cuda else None
-        if missing is not None:
-            return missing
+        if cuda and not self._holds_cuda(self._session.loaded or next(self._existing(), None)):
+            if self._session.loaded is not None:
+                return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
+            missing = self._without_cuda()
+            if missing is not None:
+                return missing
         if self._session.loaded is not None:
             return None
         if _disabled():
@@ -161,7 +165,7 @@ class NativeModule:
             "state": state,
             "loaded": self._session.loaded is not None,
             "path": None if path is None else str(path),
-            "target": "cuda" if self._with_cuda() else "cpu",
+            "target": "cuda" if (self._with_cuda() if path is None else self._holds_cuda(path)) else "cpu",
         }
 
     def is_built(self, march: str, folder: Path | None = None) -> bool:
@@ -210,20 +214,25 @@ class NativeModule:
         """Where builds for this user go."""
         return cache_root() / "native"
 
-    def key(self, march: str) -> str:
-        """Digest of all that the binary depends on: torch, CUDA or cpu, ABI, CPU if native, flags, the sources."""
+    def key(self, march: str, cuda: bool | None = None, *, any_gpu: bool = False) -> str:
+        """Digest of all that the binary depends on: torch, CUDA or cpu, ABI, CPU if native, flags, the sources.
+
+        cuda        with CUDA kernels or without; None: as a build here would be
+        any_gpu     leave the GPUs' architectures out: a binary in a package says itself which ones it holds
+        """
         import torch
 
+        cuda = self._with_cuda() if cuda is None else cuda
         digest = hashlib.sha256()
         facts: list[object] = [
             self.name, str(torch.__version__), toolchain.common_flags(), platform.system(), platform.machine(), march,
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "",
             self.cflags, self.ldflags,
         ]  # fmt: skip
-        if self._with_cuda():
-            facts += [torch.version.cuda, toolchain.cuda_architectures(), self.cuda_cflags]
+        if cuda:
+            facts += [torch.version.cuda, () if any_gpu else toolchain.cuda_architectures(), self.cuda_cflags]
         digest.update(repr(facts).encode())
-        for path in self._files():
+        for path in self._files(cuda):
             try:
                 content = path.read_bytes()
             except OSError as error:
@@ -260,16 +269,28 @@ class NativeModule:
 
     def _existing(self) -> Iterator[Path]:
         """Undamaged libraries for this machine and these sources, best first."""
-        return (library for library in self._places() if _intact(library))
+        return (library for library in self._places() if _intact(library) and self._suits_gpus(library))
 
     def _places(self) -> Iterator[Path]:
         """Where a library for this machine and these sources may be, best first."""
-        for folder in (self.prebuilt_folder, self.cache_folder):
-            for march in MARCHES:
-                yield self._library(folder, march)
+        # One without CUDA only where none with it can be built: else an old build would hide the GPU for ever.
+        for cuda in (True,) if self._with_cuda() else (True, False) if self._wants_cuda() else (False,):
+            for folder in (self.prebuilt_folder, self.cache_folder):
+                for march in MARCHES:
+                    yield self._library(folder, march, cuda)
 
-    def _library(self, folder: Path, march: str) -> Path:
-        return folder / f"{self.name}-{self.key(march)}.so"
+    def _library(self, folder: Path, march: str, cuda: bool | None = None) -> Path:
+        return folder / f"{self.name}-{self.key(march, cuda, any_gpu=folder == self.prebuilt_folder)}.so"
+
+    def _holds_cuda(self, library: Path | None) -> bool:
+        return library is not None and self._wants_cuda() and bool(_facts(library).get("architectures"))
+
+    def _suits_gpus(self, library: Path) -> bool:
+        """Whether the library's CUDA kernels run on every GPU here: same major capability, no higher minor one."""
+        held = [tuple(map(int, a.split("."))) for a in _facts(library).get("architectures") or ()]
+        return not held or all(
+            any(major == of[0] and minor >= of[1] for of in held) for major, minor in toolchain.gpus()
+        )
 
     def _root(self) -> Path:
         spec = importlib.util.find_spec(self.package)
@@ -277,16 +298,21 @@ class NativeModule:
             raise NativeBuildError(f"native module '{self.name}': package '{self.package}' is not a folder on disk")
         return Path(next(iter(spec.submodule_search_locations)))
 
-    def _files(self) -> list[Path]:
+    def _files(self, with_cuda: bool) -> list[Path]:
         """All files that the binary is made from, in a fixed order."""
         root = self._root()
-        cuda = self.cuda_sources if self._with_cuda() else ()
+        cuda = self.cuda_sources if with_cuda else ()
         headers = [p for pattern in self.headers for p in (sorted(root.glob(pattern)) or [root / pattern])]
         shared = sorted(toolchain.SHARED_INCLUDE.rglob("*.h"))
         return [*(root / s for s in (*self.sources, *self.kernels, *cuda)), *headers, *shared]
 
     def _with_cuda(self) -> bool:
         return self._without_cuda() is None
+
+    def _wants_cuda(self) -> bool:
+        import torch
+
+        return bool(self.cuda_sources) and torch.version.cuda is not None
 
     def _without_cuda(self) -> str | None:
         """Why a build here holds no CUDA kernels, or None."""
@@ -334,7 +360,13 @@ class NativeModule:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
             self._check_headers(jobs)
             seconds = round(time.monotonic() - started, 1)
-            facts = {"sha256": file_sha256(built), "seconds": seconds, "compiler": tools.version(), "march": march}
+            facts = {
+                "sha256": file_sha256(built),
+                "seconds": seconds,
+                "compiler": tools.version(),
+                "march": march,
+                "architectures": toolchain.cuda_architectures() if self._with_cuda() else [],
+            }
             os.replace(built, library)
             write_json(library.with_suffix(".json"), facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
@@ -342,7 +374,7 @@ class NativeModule:
     def _check_headers(self, jobs: list[Job]) -> None:
         """A header of the package that is not declared would let a stale build pass for a fresh one."""
         root = self._root().resolve()
-        known = {p.resolve() for p in self._files()}
+        known = {p.resolve() for p in self._files(self._with_cuda())}
         for job in jobs:
             for path in toolchain.read_dependencies(Path(f"{job.output}.d")):
                 resolved = path.resolve()
@@ -380,12 +412,20 @@ def _timeout() -> float:
         return BUILD_TIMEOUT
 
 
+def _facts(library: Path) -> dict[str, Any]:
+    """What the build wrote down of a library; empty if that cannot be read."""
+    try:
+        facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
 def _intact(library: Path) -> bool:
     """Whether the file is what the build wrote. A truncated library may load and crash the process later."""
     try:
-        facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
-        return isinstance(facts, dict) and facts.get("sha256") == file_sha256(library)
-    except (OSError, ValueError):
+        return _facts(library).get("sha256") == file_sha256(library)
+    except OSError:
         return False
 
 

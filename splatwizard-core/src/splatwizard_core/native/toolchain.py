@@ -124,16 +124,20 @@ def cuda_mismatch() -> str | None:
 
 
 def cuda_architectures() -> list[str]:
-    """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and newer."""
-    import torch
-
+    """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and 9.0."""
     listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     if listed:
         return sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
-    if torch.cuda.is_available():
-        found = {torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())}
-        return sorted(f"{major}.{minor}" for major, minor in found)
-    return ["8.0"]
+    return [f"{major}.{minor}" for major, minor in gpus()] or ["8.0", "9.0"]
+
+
+def gpus() -> list[tuple[int, int]]:
+    """Compute capabilities of the GPUs that torch sees, each once, in order."""
+    import torch
+
+    if not torch.cuda.is_available():
+        return []
+    return sorted({torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())})
 
 
 def cpu_identity() -> str:

@@ -3,7 +3,6 @@
 #ifdef SW_WITH_CUDA
 
 #include <ATen/core/Tensor.h>
-#include <ATen/cuda/CUDAEvent.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>
@@ -14,6 +13,7 @@
 #include <algorithm>
 #include <bit>
 #include <tuple>
+#include <utility>
 #include <vector>
 
 #include "binding.h"
@@ -27,19 +27,43 @@ using namespace sw::cuda;  // NOLINT
 // The state that blend_backward needs; the flags of the Gaussians, for project_backward, come behind it.
 enum Saved { kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kSavedCount };
 
+class Event {
+ public:
+  explicit Event(bool timed) {
+    C10_CUDA_CHECK(cudaEventCreateWithFlags(&event_, timed ? cudaEventDefault : cudaEventDisableTiming));
+  }
+  ~Event() {
+    if (event_ != nullptr) C10_CUDA_CHECK_WARN(cudaEventDestroy(event_));
+  }
+  Event(Event&& other) noexcept : event_(std::exchange(other.event_, nullptr)) {}
+  Event& operator=(Event&&) = delete;
+
+  void record(cudaStream_t stream) { C10_CUDA_CHECK(cudaEventRecord(event_, stream)); }
+  void wait() const { C10_CUDA_CHECK(cudaEventSynchronize(event_)); }
+  double seconds_to(const Event& later) const {
+    float milliseconds = 0;
+    C10_CUDA_CHECK(cudaEventElapsedTime(&milliseconds, event_, later.event_));
+    return 1e-3 * milliseconds;
+  }
+
+ private:
+  cudaEvent_t event_ = nullptr;
+};
+
 // Seconds between marks, measured on the device; only where they are asked for, since reading them waits.
 struct StageClock {
   bool on;
-  std::vector<at::cuda::CUDAEvent> events;
+  cudaStream_t stream;
+  std::vector<Event> events;
   void mark() {
     if (!on) return;
-    events.emplace_back(cudaEventDefault);
-    events.back().record();
+    events.emplace_back(true);
+    events.back().record(stream);
   }
   std::vector<double> seconds() {
     std::vector<double> out;
-    if (on) events.back().synchronize();
-    for (size_t i = 1; i < events.size(); ++i) out.push_back(1e-3 * events[i - 1].elapsed_time(events[i]));
+    if (on) events.back().wait();
+    for (size_t i = 1; i < events.size(); ++i) out.push_back(events[i - 1].seconds_to(events[i]));
     return out;
   }
 };
@@ -82,7 +106,7 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   const auto make = [&](at::IntArrayRef shape) { return at::empty(shape, real); };
   const auto make_as = [&](at::IntArrayRef shape, at::ScalarType type) { return at::empty(shape, real.dtype(type)); };
   const auto bytes = [&](size_t count) { return make_as({int64_t(count)}, at::kByte); };
-  StageClock clock{count_work, {}};
+  StageClock clock{count_work, stream, {}};
   clock.mark();
 
   const int64_t project_blocks = (n + kProjectThreads - 1) / kProjectThreads;
@@ -105,19 +129,19 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   Splats splats = splats_of(shape, tail, channel_rows);
   const SplatWork work{data<uint32_t>(depth), data<float2>(extent), data<int32_t>(radius), data<int32_t>(tile_counts),
                        data<int32_t>(order)};
-  at::cuda::CUDAEvent counted(cudaEventDisableTiming), colored(cudaEventDisableTiming);
+  Event counted(false), colored(false);
   if (n > 0) {
     project(view, g, settings, splats, work, data<int32_t>(radii), data<uint8_t>(flags), counters, states, published,
             stream);
-    counted.record();
+    counted.record(stream);
     if (g.colors == nullptr || g.color_channels == 3)
       shade(view, g, settings, splats, data<int32_t>(radii), data<uint8_t>(flags), counters, stream);
     if (general)
       fill_channels(g, channels, splats, work, data<int32_t>(radii), data<uint8_t>(flags), counters, stream);
     C10_CUDA_CHECK(cudaMemcpyAsync(after, counters, sizeof(Counters), cudaMemcpyDeviceToHost, stream));
-    colored.record();
+    colored.record(stream);
     C10_CUDA_KERNEL_LAUNCH_CHECK();
-    counted.synchronize();  // the colours are still being computed
+    counted.wait();  // the colours are still being computed
   }
   const int64_t used = published->splats, count = published->pairs;
   TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
@@ -186,7 +210,7 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
 
-  if (n > 0) colored.synchronize();  // long past by now
+  if (n > 0) colored.wait();  // long past by now
   int64_t evaluated = -1, blended = -1;
   if (count_work) {
     Counters now{};
@@ -241,7 +265,7 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   const c10::cuda::CUDAGuard guard(image_gradient.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto view = View<float>::from(camera.data(), int(width), int(height));
-  StageClock clock{(flags & kCount) != 0, {}};
+  StageClock clock{(flags & kCount) != 0, stream, {}};
   clock.mark();
 
   const bool absgrad = flags & kAbsgrad, median = flags & kMedianDepth;
@@ -287,7 +311,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   const auto view = View<float>::from(camera.data(), int(width), int(height));
   const auto g = in.gaussians<float>();
   const auto real = means.options().requires_grad(false);
-  StageClock clock{(flags & kCount) != 0, {}};
+  StageClock clock{(flags & kCount) != 0, stream, {}};
   clock.mark();
 
   std::vector<Tensor> grads(kWantedCount);
