@@ -9,7 +9,6 @@ from pydantic import ValidationError
 
 from splatwizard_core.errors import UserInputError
 from splatwizard_core.experiments.record import Record, missing_reasons, read_record
-from splatwizard_core.experiments.results import collect_records
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -127,15 +126,3 @@ def test_a_damaged_record_of_schema_1_is_refused(tmp_path: Path, damage: dict[st
     path.write_text(json.dumps({**as_schema_1(content()), **damage}))
     with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
         read_record(path)
-
-
-def test_records_are_collected_from_a_tree_in_order_of_size(tmp_path: Path):
-    for folder, size in (("b", 5), ("a", 9)):
-        (tmp_path / folder).mkdir()
-        file = {"bytes": size, "sha256": "00", "sections": {"header": size}, "digest": "00"}
-        Record.model_validate(content(file=file)).write(tmp_path / folder / "metrics.json")
-    assert [r.file.bytes for r in collect_records(tmp_path)] == [5, 9]
-    assert [r.file.bytes for r in collect_records(tmp_path / "a")] == [9]
-    (tmp_path / "none").mkdir()
-    with pytest.raises(UserInputError, match=r"no metrics\.json under"):
-        collect_records(tmp_path / "none")

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatwizard_core.errors import SceneError
+from splatwizard_core.errors import SceneError, UserInputError
 from splatwizard_core.experiments.report import pictures
 from splatwizard_core.experiments.report.pictures import (
     GAIN,
@@ -22,6 +23,7 @@ from splatwizard_core.experiments.report.pictures import (
     views_per_scene,
 )
 from splatwizard_core.experiments.report.runs import collect
+from splatwizard_core.experiments.report.training_log import read_training
 from splatwizard_core.experiments.report.truth import Truth, even_views, keep_truth, shown_views
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
@@ -118,8 +120,30 @@ def test_missing_and_damaged_renders_are_said(make_run):
 def test_a_picture_of_absurd_size_is_not_decoded(make_run):
     directory = make_run()
     for path in (directory / "renders").iterdir():
-        Image.new("1", (20_000, 1)).save(path)
-    assert "is 20000 x 1 px" in single(directory).notes[0]
+        Image.new("1", (20_000, 4000)).save(path)
+    assert "is 20000 x 4000 px" in single(directory).notes[0]
+
+
+def test_a_pipe_in_place_of_a_file_is_not_waited_for(make_run):
+    directory = make_run()
+    for name in ("renders/v0.png", "truth/v1.png", "log.jsonl"):
+        (directory / name).unlink()
+        os.mkfifo(directory / name)
+    assert "toy r1: its renders are not in its folder" in single(directory).notes
+    assert read_training(directory / "log.jsonl").missing == "no log.jsonl"
+    (directory / "metrics.json").unlink()
+    os.mkfifo(directory / "metrics.json")
+    with pytest.raises(UserInputError, match=r"no metrics\.json"):
+        collect([directory])
+
+
+def test_a_run_that_was_scored_against_another_photograph_gets_no_difference(make_run):
+    right = make_run("r1")
+    wrong = make_run("r2", size=5000, change=lambda c: c["metrics"]["psnr"].update(per_view=[60.0] * 5))
+    runs = collect([right, wrong]).runs
+    gallery = scene_gallery(runs, 1, Truth(runs, None), PictureBudget())
+    assert [s.difference is not None for s in gallery.rows[0].shown] == [True, False]
+    assert gallery.notes == ["toy r2: no difference, the photograph is not the one that its record was scored against"]
 
 
 def test_kept_photographs_are_those_of_the_page_and_exact(make_run):

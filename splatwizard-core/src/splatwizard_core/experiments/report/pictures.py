@@ -32,6 +32,7 @@ MOST_RUNS = 8  # beside one photograph
 MOST_BYTES = 9_000_000  # of all pictures; a third more as text
 QUALITY = 88  # JPEG
 GAIN = 4  # of differences
+OTHER_TRUTH = "{}: no difference, the photograph is not the one that its record was scored against"
 
 
 @dataclass(frozen=True)
@@ -171,9 +172,10 @@ def _gallery(
             ]  # fmt: skip
             if any(a.render is not None and b.render is None for a, b in zip(made, kept, strict=True)):
                 notes["some pictures are left out: the page holds as many as it may"] = None
-            for note in [reason, *(f"{s.run.label}: {s.reason}" for s in kept if s.reason)]:
-                if note:
-                    notes[note] = None
+            found = [reason, *(f"{s.run.label}: {s.reason}" for s in kept if s.reason)]
+            if scored:
+                found += [OTHER_TRUTH.format(s.run.label) for s in made if s.render and not s.difference]
+            notes.update(dict.fromkeys(filter(None, found)))
             rows.append(ViewRow(view, picture, kept, remarks.get(view, ""), reason))
     return Gallery(rows, list(notes))
 

@@ -93,7 +93,8 @@ def record_paths(root: Path) -> list[Path]:
     """Every record at or below a path; a run directory holds one, and nothing below it is looked at."""
     if root.is_file():
         return [root]
-    return [root / FILE_NAME] if (root / FILE_NAME).is_file() else sorted(root.rglob(FILE_NAME))
+    own = root / FILE_NAME
+    return [own] if own.is_file() else sorted(path for path in root.rglob(FILE_NAME) if path.is_file())
 
 
 def natural(text: str) -> tuple[tuple[int, int | str], ...]:

@@ -51,6 +51,8 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
     counts: dict[str, list[tuple[float, float]]] = {}
     stages: list[tuple[int, int]] = []
     damaged, before, last = 0, 0, 0
+    if not path.is_file():
+        return TrainingCurves([], {}, [], missing="no log.jsonl")
     try:
         with path.open(encoding="utf-8", errors="replace") as file:
             for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), "")):
@@ -71,8 +73,7 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
                     if _is_number(entry.get(key)):
                         counts.setdefault(key, []).append((float(last), float(entry[key])))
     except OSError as error:
-        why = "no log.jsonl" if isinstance(error, FileNotFoundError) else f"log.jsonl: {error.strerror}"
-        return TrainingCurves([], {}, [], missing=clean(why))
+        return TrainingCurves([], {}, [], missing=clean(f"log.jsonl: {error.strerror}"))
     if not losses and not counts:
         return TrainingCurves([], {}, stages, damaged=damaged, missing="log.jsonl holds no step")
     return TrainingCurves(

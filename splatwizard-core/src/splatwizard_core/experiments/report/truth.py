@@ -30,7 +30,7 @@ EVEN_VIEWS = 4
 # Renders and composites of pictures with alpha are rounded to 8 bit in files: up to twice 1/(12 x 255^2) of MSE each.
 ROUNDING_MSE = 4 / (12 * 255**2)
 SCORE_TOLERANCE = 0.01  # of the MSE
-LARGEST_SIDE = 16_384
+LARGEST_PICTURE = 64_000_000  # pixels
 
 
 def even_views(views: int, wanted: int = EVEN_VIEWS) -> list[int]:
@@ -125,9 +125,11 @@ class Truth:
 
 def read_png(path: Path) -> Pixels:
     """RGB pixels of a PNG. Raises OSError or ValueError if it is none, or too large to be a render."""
+    if not path.is_file():  # opening a pipe would wait for whoever writes into it
+        raise FileNotFoundError(f"{path.name} is not there")
     try:
         with Image.open(path, formats=("PNG",)) as picture:
-            if max(picture.size) > LARGEST_SIDE:
+            if picture.width * picture.height > LARGEST_PICTURE:
                 raise ValueError(f"{path.name} is {picture.width} x {picture.height} px")
             return np.asarray(picture.convert("RGB"))
     except (SyntaxError, Image.DecompressionBombError) as error:
