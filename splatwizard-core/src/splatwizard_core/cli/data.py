@@ -18,7 +18,7 @@ from splatwizard_core.cli.options import (
     print_json,
     set_option,
 )
-from splatwizard_core.cli.setup import resolve_run_options, say
+from splatwizard_core.cli.setup import output_folder, resolve_run_options, say
 
 if TYPE_CHECKING:
     from splatwizard_core.scene.presence import ScenePresence
@@ -313,6 +313,7 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     target = Path(out)
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UserInputError(f"{out} is not an empty folder: choose another one")
+    output_folder(target)
     _, scene_options, _ = resolve_run_options(None, assignments(sets))
     scene = load_scene("demo" if size == "demo" else f"demo:{size}", scene_options, load_plugins())
     say(f"drawing {len(scene.train) + len(scene.test)} views")

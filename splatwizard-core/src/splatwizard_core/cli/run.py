@@ -90,9 +90,11 @@ def run(
         plugins, method_names(methods, config_file), rates,
         preset=preset, config_file=config_file, values=values, scene=scene,
     )  # fmt: skip
-    weights = lpips_folder(lpips_weights)
     output_folder(out)
     session = open_session(resolved[0].ppl, plugins)
+    for each in resolved:
+        session.scene(each)  # what is wrong with it is told before anything else is said
+    weights = lpips_folder(lpips_weights)
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     done: list[tuple[Record, Path]] = []

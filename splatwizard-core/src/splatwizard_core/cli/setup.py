@@ -32,9 +32,13 @@ def method_names(methods: Sequence[str], config_file: str | None) -> list[str]:
     if methods:
         raise click.UsageError("--method is empty: give a name, or leave it out")
     if config_file is not None:
+        from splatwizard_core.errors import ConfigError
         from splatwizard_core.experiments.config import read_config_file
 
-        return [str(read_config_file(config_file).get("method", DEFAULT_METHOD))]
+        said = read_config_file(config_file).get("method", DEFAULT_METHOD)
+        if not isinstance(said, str) or not said.strip():
+            raise ConfigError(f"bad value {said!r} for 'method' in {config_file}: expected a name", key="method")
+        return [said]
     return [DEFAULT_METHOD]
 
 
@@ -140,10 +144,12 @@ def resolve_run_options(
 
 
 def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
-    """Threads and device as asked."""
+    """Threads and device as asked. Raises PluginError for rasterizers that are not installed, CapabilityError."""
     from splatwizard_core.experiments.device import choose_device, set_threads
     from splatwizard_core.experiments.session import Session
 
+    for name in (*ppl.raster.prefer, *ppl.raster.forbid):
+        plugins.rasterizers.entry(name)
     set_threads(ppl.threads)
     return Session(plugins, choose_device(ppl.device, plugins), say)
 
@@ -189,8 +195,6 @@ def existing_file(path: str) -> Path:
 
 def output_file(path: str | Path) -> Path:
     """A path that a file can be written to; asked before the work, not after it. Raises UserInputError."""
-    import os
-
     from splatwizard_core.errors import UserInputError
 
     target = Path(path)
@@ -198,20 +202,33 @@ def output_file(path: str | Path) -> Path:
         raise UserInputError(f"{path} is a folder: give the name of a file in it")
     if not target.parent.is_dir():
         raise UserInputError(f"cannot write {path}: there is no folder {target.parent}")
-    if not os.access(target.parent, os.W_OK):
-        raise UserInputError(f"cannot write {path}: the folder {target.parent} is not writable")
+    refused = _refused(target.parent)
+    if refused is not None:
+        raise UserInputError(f"cannot write {path}: {refused}")
     return target
 
 
 def output_folder(path: str | Path) -> Path:
-    """A folder that files can be written to, made if needed, asked before the work. Raises UserInputError."""
+    """A folder that files can be written to, or made; asked before the work, and made by whoever writes the first file,
+    so that wrong input leaves nothing behind. Raises UserInputError."""
     from splatwizard_core.errors import UserInputError
 
     target = Path(path)
-    try:
-        target.mkdir(parents=True, exist_ok=True)
-    except FileExistsError:
-        raise UserInputError(f"cannot write into {path}: it is a file, not a folder") from None
-    except OSError as error:
-        raise UserInputError(f"cannot write into {path}: {error.strerror}") from error
+    nearest = next(place for place in (target, *target.absolute().parents) if place.exists())
+    if nearest == target and not target.is_dir():
+        raise UserInputError(f"cannot write into {path}: it is a file, not a folder")
+    refused = _refused(nearest)
+    if refused is not None:
+        raise UserInputError(f"cannot write into {path}: {refused}")
     return target
+
+
+def _refused(folder: Path) -> str | None:
+    """Why no file can be written into a folder that is there, found out by writing one; None if it can."""
+    import tempfile
+
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        return f"{folder}: {error.strerror}"
+    return None

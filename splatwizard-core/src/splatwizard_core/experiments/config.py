@@ -96,8 +96,17 @@ def _bad_value(
 def unknown_key(key: str, known: Mapping[str, str] | Sequence[str], source: str) -> ConfigError:
     """The error for a key that nothing has: it names the nearest valid one."""
     near = suggest(key, list(known))
-    hint = f"did you mean '{near}'?" if near else f"the keys are {', '.join(sorted({k.split('.')[0] for k in known}))}"
+    hint = f"did you mean '{near}'?" if near else _keys_beside(key, known)
     return ConfigError(f"unknown key '{key}' in {source}: {hint}", key=key)
+
+
+def _keys_beside(key: str, known: Mapping[str, str] | Sequence[str]) -> str:
+    """What there is instead: the keys of the block that it names, else those at the top."""
+    block = key.rpartition(".")[0]
+    inside = sorted(k for k in known if block and k.startswith(f"{block}."))
+    if inside:
+        return f"'{block}' has {', '.join(k.removeprefix(f'{block}.') for k in inside)}"
+    return f"the keys are {', '.join(sorted({k.split('.')[0] for k in known}))}"
 
 
 @dataclass(frozen=True)

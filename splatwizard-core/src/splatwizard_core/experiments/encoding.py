@@ -77,13 +77,19 @@ def requirements(entries: Iterable[Entry]) -> list[Requirement]:
 def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
     """The finished training of a run directory. Raises UserInputError if it is not finished."""
     key = training_key(session, resolved)
+    if finished_directory(directory, key) is None:  # asked before the lock too, which is a file in the directory
+        raise _not_finished(directory)
     with directory_lock(directory, say=session.say):
         if finished_directory(directory, key) is None:
-            raise UserInputError(
-                f"{directory} holds no finished training of this configuration: "
-                f"`sw train --config {directory}/config.toml` makes it (only `codec` keys may differ)"
-            )
+            raise _not_finished(directory)
         return train(session, resolved, directory, trained=_nothing_to_start_from)
+
+
+def _not_finished(directory: Path) -> UserInputError:
+    return UserInputError(
+        f"{directory} holds no finished training of this configuration: "
+        f"`sw train --config {directory}/config.toml` makes it (only `codec` keys may differ)"
+    )
 
 
 def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.experiments.training_run import CHECKPOINTS, make_method, train, training_key
 from splatwizard_core.experiments.versions import changes, installed, providers
 from splatwizard_core.files import file_sha256, remove_folder, sweep, write_atomic
+from splatwizard_core.scene.images import check_pictures, decode_all
 
 ENCODED = "scene.swz"
 CONFIG = "config.toml"
@@ -59,6 +60,7 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
     """
     resolved = request.resolved
     directory = run_directory(request)
+    _check_scene(session, request, directory)
     with directory_lock(directory, say=session.say):
         _begin(directory, request)
         steps = StepLog(directory)
@@ -97,6 +99,7 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
 def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:
     """The training step of a run; `run` with the same request goes on from there."""
     directory = run_directory(request)
+    _check_scene(session, request, directory)
     with directory_lock(directory, say=session.say):
         _begin(directory, request)
         return train_in(session, request, directory), directory
@@ -121,6 +124,14 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
     )  # fmt: skip
     write_config(directory, request.resolved)
     return found
+
+
+def _check_scene(session: Session, request: RunRequest, directory: Path) -> None:
+    """Before anything is written: the scene can be loaded and, of a run that begins, all its pictures decoded."""
+    scene = session.scene(request.resolved)
+    if not directory.exists() or not request.resume:
+        decode_all(scene.train)  # training reads them anyway, and they stay
+        check_pictures(scene.test)
 
 
 def _begin(directory: Path, request: RunRequest) -> None:

@@ -173,14 +173,33 @@ def decode_all(views: Iterable[View], *, workers: int | None = None) -> None:
     pending = [view for view in views if view.load is not None and "pixels" not in vars(view)]
     if not pending:
         return
-    if workers is None:
-        workers = min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
     with (
         track("read pictures", total=len(pending), unit="pictures") as bar,
-        ThreadPoolExecutor(max_workers=max(1, workers)) as pool,
+        ThreadPoolExecutor(max_workers=max(1, _workers() if workers is None else workers)) as pool,
     ):
         for _ in pool.map(lambda view: view.pixels, pending):
             bar.advance()
+
+
+def check_pictures(views: Iterable[View]) -> None:
+    """Decode the pictures and masks of these views and keep none. Raises SceneError for one that cannot be decoded.
+
+    A picture that is only needed after hours of training should not be found to be damaged then.
+    """
+    pending = [view for view in views if view.load is not None and "pixels" not in vars(view)]
+    with track("check pictures", total=len(pending), unit="pictures") as bar, ThreadPoolExecutor(_workers()) as pool:
+        for _ in pool.map(_decode_once, pending):
+            bar.advance()
+
+
+def _decode_once(view: View) -> None:
+    for load in (view.load, view.load_mask):
+        if load is not None:
+            load()
+
+
+def _workers() -> int:
+    return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
 
 
 @contextlib.contextmanager
