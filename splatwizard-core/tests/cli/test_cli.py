@@ -1,6 +1,7 @@
 """The command line: what it says, where it says it, and with which exit status."""
 
 import json
+import math
 import os
 import resource
 import signal
@@ -298,6 +299,23 @@ def test_ply_files_are_measured_drawn_and_exported(tmp_path: Path, capsys: pytes
     from PIL import Image
 
     assert Image.open(tmp_path / "views" / "view_000.png").size == (64, 48)
+
+
+def test_info_counts_the_gaussians_of_a_ply_that_are_not_finite(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], ply: Path
+):
+    import struct
+
+    head, mark, body = ply.read_bytes().partition(b"end_header\n")
+    spoiled = tmp_path / "spoiled.ply"
+    spoiled.write_bytes(head + mark + struct.pack("<f", math.nan) + body[4:])  # x of the first one
+    assert main(["info", str(spoiled), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["num_gaussians"], facts["not_finite"]) == (40, 1)
+    assert all(-0.5 <= low <= high <= 0.5 for low, high in zip(facts["box"]["min"], facts["box"]["max"], strict=True))
+    spoiled.write_bytes(head.replace(b"vertex 40", b"vertex 0") + mark)
+    assert main(["info", str(spoiled), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["box"] is None
 
 
 @pytest.fixture

@@ -65,16 +65,18 @@ def _ply_facts(path: Path) -> dict[str, Any]:
     from splatwizard_core.gaussians.ply import load_ply
 
     model = load_ply(existing(str(path)))
-    means, scales = model.means.detach(), model.scales.detach()
-    low, high = means.amin(0).tolist(), means.amax(0).tolist()
+    means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()
+    sound = means.isfinite().all(1) & scales.isfinite().all(1) & opacities.isfinite()
+    known = bool(sound.any())  # else there is no box and no median
     return {
         "path": str(path),
         "size": path.stat().st_size,
         **model.counts(),
+        "not_finite": int((~sound).sum()),
         "sh_degree": model.max_sh_degree,
-        "box": {"min": low, "max": high},
-        "median_scale": float(scales.median()),
-        "median_opacity": float(model.opacities.detach().median()),
+        "box": {"min": means[sound].amin(0).tolist(), "max": means[sound].amax(0).tolist()} if known else None,
+        "median_scale": float(scales[sound].median()) if known else None,
+        "median_opacity": float(opacities[sound].median()) if known else None,
     }
 
 
