@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_core.experiments.doctor import child, compilers, diagnosis, packages, probe, system
+from splatwizard_core.experiments.doctor import child, compilers, diagnosis, metrics, packages, probe, system
 from splatwizard_core.experiments.doctor.check import Check, gigabytes, one_line
 from splatwizard_core.native import NativeModule, toolchain
 from splatwizard_core.plugins import PluginManager, load_plugins
@@ -444,6 +444,43 @@ def test_a_rasterizer_that_draws_black_is_broken_and_the_reference_is_not(site):
     assert checks["reference"].state == "ok"
     assert checks["black"].state == "broken"
     assert "wrong picture" in checks["black"].detail
+
+
+def test_weights_of_lpips_are_known_by_their_checksum(tmp_path, monkeypatch):
+    import hashlib
+
+    from splatwizard_core.evaluation import lpips_weights
+
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    backbones = lpips_weights.BACKBONES
+    content = b"weights"
+    name = f"vgg-{hashlib.sha256(content).hexdigest()[:8]}.pth"
+    monkeypatch.setitem(backbones, "vgg", lpips_weights.Backbone(name, {}))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    (folder / name).write_bytes(content)
+    (folder / backbones["alex"].file_name).write_bytes(b"half a file")
+    checks = {c.name: c for c in metrics.check_lpips()}
+    assert checks["LPIPS weights, vgg"].state == "ok"
+    broken = checks["LPIPS weights, alex"]
+    assert broken.state == "broken"
+    assert broken.mend == (
+        f"curl -L --create-dirs -o {tmp_path}/hub/checkpoints/{backbones['alex'].file_name} {backbones['alex'].address}"
+    )
+    (folder / name).unlink()
+    assert {c.name: c.state for c in metrics.check_lpips()}["LPIPS weights, vgg"] == "missing"
+    assert not any(c.needed for c in checks.values())
+
+
+def test_a_package_lpips_that_is_not_installed_is_an_extra(monkeypatch):
+    import importlib.metadata
+
+    def absent(name: str) -> str:
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr("splatwizard_core.evaluation.perceptual.importlib.metadata.version", absent)
+    found = metrics.check_lpips()[0]
+    assert (found.state, found.mend) == ("missing", "pip install 'splatwizard-core[lpips]'")
 
 
 def test_scenes_are_counted_by_dataset(tmp_path, monkeypatch):

@@ -13,9 +13,13 @@ from splatwizard_core.errors import PluginError
 from splatwizard_core.experiments.doctor import child, compilers, packages, system
 from splatwizard_core.experiments.doctor.check import SLOWLY, Check, one_line
 
+DIED_IN = {"torch": ("torch", "CUDA"), "metrics": ("LPIPS",), "rasterizers": ("rasterizers",), "main job": ("sw run",)}
 PROBE = "splatwizard_core.experiments.doctor.probe"
+METRICS = "splatwizard_core.experiments.doctor.metrics"
 PROBE_SECONDS = 120.0  # torch from a slow network disk takes long; a hang has to end all the same
-GROUPS = ("main job", "system", "torch", "compilers", "kernels", "rasterizers", "plugins", "packages", "data")
+GROUPS = (
+    "main job", "system", "torch", "compilers", "kernels", "rasterizers", "plugins", "packages", "metrics", "data",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -44,8 +48,9 @@ def examine(method: str) -> Diagnosis:
     same time, so a crash there is a finding here.
     """
     started = time.monotonic()
-    with ThreadPoolExecutor(max_workers=4) as pool:
+    with ThreadPoolExecutor(max_workers=5) as pool:
         probe = pool.submit(child.ask, PROBE, [method], timeout=PROBE_SECONDS)
+        metrics = pool.submit(child.ask, METRICS, timeout=PROBE_SECONDS)
         cxx = pool.submit(_guarded, "C++", compilers.check_cxx)
         nvcc = pool.submit(_guarded, "nvcc", compilers.check_nvcc)
         checks, distributions = plugin_checks()
@@ -55,6 +60,8 @@ def examine(method: str) -> Diagnosis:
                       system.check_working_folder):  # fmt: skip
             checks.append(_guarded(check.__name__, check))
         checks += probed(probe.result())
+        if any(c.name == "torch" and c.state == "ok" for c in checks):  # without it that process can only fail
+            checks += probed(metrics.result(), needed=False)
         torch_cuda = next((c.facts.get("cuda") for c in checks if c.name == "torch"), None)
         checks += [cxx.result(), compilers.judge_nvcc(nvcc.result(), torch_cuda)]
         checks += packages.package_checks(needs, problems.result())
@@ -66,14 +73,17 @@ def examine(method: str) -> Diagnosis:
     return Diagnosis(checks, time.monotonic() - started)
 
 
-def probed(answer: child.Answer) -> list[Check]:
-    """The probe's checks; if it died, what it died in is broken, and so is the main job, which would do the same."""
+def probed(answer: child.Answer, *, needed: bool = True) -> list[Check]:
+    """The checks of a process; what it died in, if it died, is broken, and with it the main job if that does the same.
+
+    needed  the main job does what this process did
+    """
     checks = list(answer.checks)
     if answer.died_in is not None:
         step, how = answer.died_in
-        group = "torch" if step in ("torch", "CUDA") else "kernels" if ":" in step else "plugins"
-        mend = "pip install --force-reinstall torch" if group == "torch" else "sw build-kernels --force"
-        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, needed=True))
+        group = next((g for g, steps in DIED_IN.items() if step in steps), "kernels" if ":" in step else "plugins")
+        mend = "sw build-kernels --force" if group == "kernels" else "pip install --force-reinstall torch"
+        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, needed))
     return checks
 
 
