@@ -103,6 +103,11 @@ def test_cxx_that_names_nothing_is_broken_and_can_be_unset(bare, monkeypatch, va
     assert found.mend == "unset CXX, or set it to a compiler"
 
 
+@pytest.fixture
+def cuda_build(monkeypatch):
+    monkeypatch.setattr(compilers.importlib.metadata, "version", lambda name: "2.13.0+cu130")
+
+
 def nvcc(folder: Path, release: str, status: int = 0) -> None:
     script(
         folder / "nvcc",
@@ -113,7 +118,7 @@ def nvcc(folder: Path, release: str, status: int = 0) -> None:
     )
 
 
-def test_nvcc_is_judged_by_the_cuda_of_torch(bare):
+def test_nvcc_is_judged_by_the_cuda_of_torch(bare, cuda_build):
     nvcc(bare, "13.0")
     found = compilers.check_nvcc()
     assert (found.state, found.facts["release"]) == ("ok", "13.0")
@@ -127,12 +132,20 @@ def test_nvcc_is_judged_by_the_cuda_of_torch(bare):
     assert "of no use" in compilers.judge_nvcc(found, None).detail
 
 
-def test_an_nvcc_that_compiles_nothing_is_broken(bare):
+def test_an_nvcc_that_compiles_nothing_is_broken(bare, cuda_build):
     nvcc(bare, "13.0", status=1)
     found = compilers.check_nvcc()
     assert found.state == "broken"
     assert "unsupported GNU version" in found.detail
     assert compilers.judge_nvcc(found, "13.0") == found
+
+
+def test_an_nvcc_is_not_tried_beside_a_torch_for_cpus(bare, monkeypatch):
+    monkeypatch.setattr(compilers.importlib.metadata, "version", lambda name: "2.13.0+cpu")
+    nvcc(bare, "13.0", status=1)
+    found = compilers.judge_nvcc(compilers.check_nvcc(), None)
+    assert found.state == "ok"
+    assert "not tried" in found.detail
 
 
 @pytest.mark.skipif(Path("/usr/local/cuda/bin/nvcc").is_file(), reason="this machine has one at its usual place")

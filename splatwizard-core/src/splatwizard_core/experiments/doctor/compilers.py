@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import platform
 import re
@@ -13,7 +14,7 @@ from pathlib import Path
 
 from splatwizard_core.errors import NativeBuildError
 from splatwizard_core.experiments.doctor.check import Check, one_line
-from splatwizard_core.native.toolchain import find_compiler, find_nvcc
+from splatwizard_core.native.toolchain import find_compiler, find_nvcc, nvcc_version
 
 GROUP = "compilers"
 SECONDS = 30.0
@@ -53,13 +54,17 @@ def check_cxx() -> Check:
 
 
 def check_nvcc() -> Check:
-    """Compile a kernel of one line. Whether the release fits torch is for `judge_nvcc` to say."""
+    """Compile a kernel of one line, unless the installed torch is a CPU build by its version.
+
+    Whether the release fits torch is for `judge_nvcc` to say.
+    """
     nvcc = find_nvcc()
     if nvcc is None:
         return Check(GROUP, "nvcc", "missing", "no CUDA compiler on the PATH, in $CUDA_HOME or in /usr/local/cuda")
-    release = nvcc_release(nvcc)
+    version = nvcc_version(nvcc)
+    release = None if version is None else f"{version[0]}.{version[1]}"
     facts = {"path": nvcc, "release": release}
-    problem = _compile([nvcc], ["-c"], CUDA_LINES, "doctor.cu")
+    problem = None if _torch_is_cpu_build() else _compile([nvcc], ["-c"], CUDA_LINES, "doctor.cu")
     if problem is not None:
         mend = "install the CUDA toolkit again, with a host compiler that it knows"
         return Check(GROUP, "nvcc", "broken", f"{nvcc} does not compile a kernel: {problem}", mend, facts=facts)
@@ -73,7 +78,8 @@ def judge_nvcc(nvcc: Check, torch_cuda: str | None) -> Check:
     """
     if torch_cuda is None:
         if nvcc.state == "ok":
-            return Check(GROUP, "nvcc", "ok", f"{nvcc.detail} (of no use: this torch has no CUDA)", facts=nvcc.facts)
+            unused = f"{nvcc.detail} (not tried, and of no use: this torch has no CUDA)"
+            return Check(GROUP, "nvcc", "ok", unused, facts=nvcc.facts)
         return Check(GROUP, "nvcc", "missing", "not needed: this torch has no CUDA", facts=nvcc.facts)
     wanted = f"install the CUDA toolkit {torch_cuda}: sudo apt install cuda-toolkit-{torch_cuda.replace('.', '-')}"
     if nvcc.state == "missing":
@@ -85,14 +91,12 @@ def judge_nvcc(nvcc: Check, torch_cuda: str | None) -> Check:
     return nvcc
 
 
-def nvcc_release(nvcc: str) -> str | None:
-    """`13.0`, as nvcc tells it; None if it tells none."""
+def _torch_is_cpu_build() -> bool:
+    """By the version of the installed wheel, such as 2.13.0+cpu: torch itself is being imported meanwhile."""
     try:
-        told = subprocess.run([nvcc, "--version"], capture_output=True, text=True, timeout=SECONDS, check=False).stdout
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    found = re.search(r"release (\d+\.\d+)", told)
-    return found[1] if found else None
+        return importlib.metadata.version("torch").endswith("+cpu")
+    except importlib.metadata.PackageNotFoundError:
+        return True
 
 
 def how_to_get_a_compiler() -> str:
