@@ -83,8 +83,7 @@ class Call:
 
 def camera_numbers(cam: Camera) -> list[float]:
     """[18]: R row by row, tau, fx, fy, cx, cy, near, far."""
-    pose = [*cam.R.flatten().tolist(), *cam.tau.tolist()]
-    return [*pose, cam.fx, cam.fy, cam.cx, cam.cy, cam.near, cam.far]
+    return [*cam.pose, cam.fx, cam.fy, cam.cx, cam.cy, cam.near, cam.far]
 
 
 class _Rasterize(torch.autograd.Function):

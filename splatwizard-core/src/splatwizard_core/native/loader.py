@@ -55,6 +55,7 @@ class _Session:
     loaded: Path | None = None
     error: NativeBuildError | None = None
     warned: bool = False
+    cuda: bool | None = None
 
 
 @dataclass(frozen=True)
@@ -112,6 +113,14 @@ class NativeModule:
             return False
         return True
 
+    def has_cuda(self) -> bool:
+        """Load, and say whether there are CUDA kernels; if not, warn once. For code that has a torch fallback."""
+        if self._session.cuda is None:
+            self._session.cuda = self.try_load() and self._holds_cuda(self._session.loaded)
+            if not self._session.cuda and self._session.loaded is not None:
+                log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, self._without_cuda(), self.without)
+        return self._session.cuda
+
     def load_built(self) -> bool:
         """Load a build that is there already, and say whether there was one; compiles nothing.
 
@@ -133,7 +142,11 @@ class NativeModule:
         """
         if self._session.error is not None:
             return str(self._session.error)
-        if cuda and not self._holds_cuda(self._session.loaded or next(self._existing(), None)):
+        if (
+            cuda
+            and not self._session.cuda
+            and not self._holds_cuda(self._session.loaded or next(self._existing(), None))
+        ):
             if self._session.loaded is not None:
                 return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
             missing = self._without_cuda()

@@ -1,8 +1,10 @@
-"""One Adam step on one tensor: a compiled kernel on the CPU, torch's fused one everywhere else."""
+"""One Adam step: a compiled kernel on the CPU, one launch for all tensors on CUDA, torch's own everywhere else."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -10,6 +12,60 @@ from torch.optim.adam import adam
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.training.native import TRAINING
+
+
+@dataclass(frozen=True)
+class AdamUpdate:
+    """The arguments of one `adam_step`."""
+
+    param: Tensor
+    grad: Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
+    lr: float
+    beta1: float
+    beta2: float
+    eps: float
+    step: int
+
+
+@torch.no_grad()
+def adam_steps(updates: Sequence[AdamUpdate]) -> None:
+    """`adam_step` for each of them: the same numbers, on CUDA in one launch."""
+    together = [u for u in updates if _fits_cuda_kernel(u)]
+    if not together or not TRAINING.has_cuda():
+        together = []
+    else:
+        torch.ops.splatwizard_training.adam_many(
+            [u.param for u in together], [u.grad for u in together],
+            [u.exp_avg for u in together], [u.exp_avg_sq for u in together],
+            [u.lr for u in together], [u.beta1 for u in together], [u.beta2 for u in together],
+            [u.eps for u in together], [u.step for u in together],
+        )  # fmt: skip
+    done = {id(u) for u in together}
+    for u in updates:
+        if id(u) in done:
+            _mark_written(u.param, u.exp_avg, u.exp_avg_sq)
+            continue
+        adam_step(
+            u.param, u.grad, u.exp_avg, u.exp_avg_sq,
+            lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps, step=u.step,
+        )  # fmt: skip
+
+
+def _fits_cuda_kernel(u: AdamUpdate) -> bool:
+    shape, device = u.param.shape, u.param.device
+    return u.step >= 1 and all(
+        t.is_cuda and t.device == device and t.dtype == torch.float32 and t.shape == shape and t.is_contiguous()
+        and t.data_ptr() % 16 == 0
+        for t in (u.param, u.grad, u.exp_avg, u.exp_avg_sq)
+    )  # fmt: skip
+
+
+def _mark_written(*tensors: Tensor) -> None:
+    """The kernels write behind autograd's back."""
+    for tensor in tensors:
+        torch.autograd.graph.increment_version(tensor)
 
 
 @torch.no_grad()
@@ -58,6 +114,4 @@ def adam_step(
             [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=True, amsgrad=False, maximize=False,
             weight_decay=0.0, lr=lr, beta1=beta1, beta2=beta2, eps=eps,
         )  # fmt: skip
-    # Both write behind autograd's back.
-    for tensor in (param, exp_avg, exp_avg_sq):
-        torch.autograd.graph.increment_version(tensor)
+    _mark_written(param, exp_avg, exp_avg_sq)

@@ -1,4 +1,4 @@
-"""The photometric loss of 3DGS, L1 and SSIM, as one fused op on the CPU and in plain torch everywhere else."""
+"""The photometric loss of 3DGS, L1 and SSIM, as fused kernels in float32 and in plain torch everywhere else."""
 
 from __future__ import annotations
 
@@ -27,14 +27,15 @@ def ssim(x: Tensor, y: Tensor, *, padding: Padding = "same") -> Tensor:
     x, y        [..., H, W] float32 or float64, alike in shape, dtype and device
     padding     "same": zeros beside the image (3DGS training); "valid": only where the window fits
 
-    Returns a scalar, differentiable; moments as E[ab] - E[a]E[b], not clamped. On the CPU in float32 a fused
-    kernel computes it (differentiable in `x` alone; if `y` needs a gradient the torch path is taken).
+    Returns a scalar, differentiable; moments as E[ab] - E[a]E[b], not clamped. In float32 fused
+    kernels compute it (differentiable in `x` alone; if `y` needs a gradient the torch path is taken).
     Raises ShapeError if the images differ, or if the window does not fit a "valid" one.
     Source: Wang et al. 2004; padding as in 3DGS (arXiv 2308.04079).
     """
     _check(x, y, padding)
     if _fused(x, y):
-        result: Tensor = _Photometric.apply(x, y, padding == "valid", 0.0, 1.0)[0]  # type: ignore[no-untyped-call]
+        node = _PhotometricOnCuda if x.is_cuda else _Photometric
+        result: Tensor = node.apply(x, y, padding == "valid", 0.0, 1.0, 0.0)[0]  # type: ignore[no-untyped-call]
         return result
     return _ssim_torch(x, y, padding)
 
@@ -64,10 +65,10 @@ def photometric_loss(
     if clamp:
         image = image.clamp(0.0, 1.0)
     if _fused(image, target):
-        total, l1, similarity = _Photometric.apply(  # type: ignore[no-untyped-call]
-            image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim
+        node = _PhotometricOnCuda if image.is_cuda else _Photometric
+        total, l1, similarity = node.apply(  # type: ignore[no-untyped-call]
+            image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim, lambda_dssim
         )
-        total = total + lambda_dssim
     else:
         l1 = (image - target).abs().mean()
         similarity = _ssim_torch(image, target, padding)
@@ -76,11 +77,11 @@ def photometric_loss(
 
 
 class _Photometric(torch.autograd.Function):
-    """l1_weight * L1 + ssim_weight * SSIM, and both means. The gradient is computed along with the value."""
+    """offset + l1_weight * L1 + ssim_weight * SSIM, and both means. The gradient is computed along with the value."""
 
     @staticmethod
     def forward(
-        ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float
+        ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
     ) -> tuple[Tensor, Tensor, Tensor]:
         images = [t.reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y)]
         l1, similarity, grad = torch.ops.splatwizard_training.photometric(
@@ -89,7 +90,7 @@ class _Photometric(torch.autograd.Function):
         ctx.save_for_backward(grad.view(x.shape) if ctx.needs_input_grad[0] else None)
         parts = x.new_tensor(l1), x.new_tensor(similarity)
         ctx.mark_non_differentiable(*parts)
-        return x.new_tensor(l1_weight * l1 + ssim_weight * similarity), *parts
+        return x.new_tensor(offset + l1_weight * l1 + ssim_weight * similarity), *parts
 
     @staticmethod
     @once_differentiable
@@ -97,7 +98,34 @@ class _Photometric(torch.autograd.Function):
         (grad,) = ctx.saved_tensors
         # Nearly always the loss itself is differentiated: then there is nothing to multiply.
         scaled = grad if grad is None or float(grad_output) == 1.0 else grad * grad_output
-        return scaled, None, None, None, None
+        return scaled, None, None, None, None, None
+
+
+class _PhotometricOnCuda(torch.autograd.Function):
+    """The same on a GPU, where no number is waited for: the gradient is put together when its scale is known."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: Tensor, y: Tensor, valid: bool, l1_weight: float, ssim_weight: float, offset: float
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        images = [t.detach().reshape(-1, *t.shape[-2:]).contiguous() for t in (x, y)]
+        ctx.settings = valid, l1_weight, ssim_weight
+        means, slopes = torch.ops.splatwizard_training.photometric_means(
+            *images, *ctx.settings, offset, ctx.needs_input_grad[0]
+        )
+        ctx.save_for_backward(*images, slopes)
+        ctx.shape = x.shape
+        total, l1, similarity = means.unbind()
+        ctx.mark_non_differentiable(l1, similarity)
+        return total, l1, similarity
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad_output: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        grad = torch.ops.splatwizard_training.photometric_backward(
+            *ctx.saved_tensors, grad_output.contiguous(), *ctx.settings
+        )
+        return grad.view(ctx.shape), None, None, None, None, None
 
 
 def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
@@ -119,7 +147,9 @@ def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
 
 
 def _fused(x: Tensor, y: Tensor) -> bool:
-    return x.device.type == "cpu" and x.dtype == torch.float32 and not y.requires_grad and TRAINING.try_load()
+    if x.dtype != torch.float32 or y.requires_grad or x.device.type not in ("cpu", "cuda"):
+        return False
+    return TRAINING.has_cuda() if x.is_cuda else TRAINING.try_load()
 
 
 def _check(x: Tensor, y: Tensor, padding: str) -> None:

@@ -75,8 +75,9 @@ class SplatOptimizer:
     @torch.no_grad()
     def step(self) -> None:
         """One Adam update of every parameter that has a gradient."""
-        from splatwizard_core.training.adam import adam_step
+        from splatwizard_core.training.adam import AdamUpdate, adam_steps
 
+        updates = []
         for group_name, group in self.groups.items():
             beta1, beta2 = group.betas
             for name in self._members[group_name]:
@@ -88,17 +89,20 @@ class SplatOptimizer:
                     # As torch.optim.Adam: moments exist from the first update on.
                     moments = self._moments[name] = _Moments(_zeros(param), _zeros(param))
                 moments.step += 1
-                adam_step(
-                    param.data,
-                    param.grad,
-                    moments.exp_avg,
-                    moments.exp_avg_sq,
-                    lr=group.lr,
-                    beta1=beta1,
-                    beta2=beta2,
-                    eps=group.eps,
-                    step=moments.step,
+                updates.append(
+                    AdamUpdate(
+                        param.data,
+                        param.grad,
+                        moments.exp_avg,
+                        moments.exp_avg_sq,
+                        lr=group.lr,
+                        beta1=beta1,
+                        beta2=beta2,
+                        eps=group.eps,
+                        step=moments.step,
+                    )
                 )
+        adam_steps(updates)
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters of the model, those in no group included."""

@@ -2,17 +2,15 @@
 #include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
-#include <ATen/ops/from_blob.h>
 #include <torch/library.h>
 
-#include <chrono>
 #include <limits>
 #include <tuple>
 #include <vector>
 
 #include "binding.h"
+#include "binding_memory.h"
 #include "cpu/kernels.h"
-#include "cpu/recycler.h"
 
 namespace {
 
@@ -24,26 +22,6 @@ enum Saved {  // the state that the backward pass needs
   kBlocksOfPair, kTransmittance, kLast, kMedianPair, kSavedCount
 };
 // clang-format on
-
-// An uninitialised tensor; large ones come from the recycler.
-Tensor make_tensor(at::IntArrayRef shape, const at::TensorOptions& options) {
-  size_t bytes = c10::elementSize(options.dtype().toScalarType());
-  for (const int64_t size : shape) bytes *= size_t(size);
-  if (bytes < sw::Recycler::kSmallest) return at::empty(shape, options);
-  return at::from_blob(
-      sw::Recycler::instance().take(bytes), shape, [](void* pointer) { sw::Recycler::instance().give(pointer); },
-      options);
-}
-
-struct Clock {
-  std::chrono::steady_clock::time_point since = std::chrono::steady_clock::now();
-  double lap() {
-    const auto now = std::chrono::steady_clock::now();
-    const double seconds = std::chrono::duration<double>(now - since).count();
-    since = now;
-    return seconds;
-  }
-};
 
 template <class S>
 sw::Slots<S> slots_of(const std::vector<Tensor>& saved) {

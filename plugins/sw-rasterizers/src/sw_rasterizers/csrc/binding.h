@@ -47,6 +47,7 @@ struct Inputs {
   int64_t sh_degree;
   double scale_modifier, eps2d;
   int64_t flags;
+  int64_t scale_columns = 3;  // 2: surfels
 
   void check() const {
     check_geometry();
@@ -89,7 +90,7 @@ struct Inputs {
     const int64_t n = means.size(0);
     TORCH_CHECK(n < std::numeric_limits<int32_t>::max(), "sw_rasterizers: more than 2^31 - 1 Gaussians");
     check_shape("means", means, {n, 3});
-    check_shape("scales", scales, {n, 3});
+    check_shape("scales", scales, {n, scale_columns});
     check_shape("quats", quats, {n, 4});
     check_shape("cov3d", cov3d, {n, 6});
     check_shape("visible", visible, {n});

@@ -11,6 +11,7 @@
 #pragma once
 
 #include "camera.h"
+#include "rotation.h"
 
 namespace sw {
 
@@ -36,11 +37,6 @@ struct Projection {
   V ka, kb, kc;        // conic
   V rho;               // antialias factor, 1 if off
 };
-
-template <class V>
-SW_HD V dot3(const V* a, const V* b) {
-  return a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
-}
 
 template <class V>
 SW_HD void camera_point(const View<Scalar<V>>& view, const V* mean, V* t) {
@@ -88,14 +84,8 @@ SW_HD void project(const View<Scalar<V>>& view, Scalar<V> scale_modifier, Scalar
     p.c00 = c00 + eps, p.c01 = c01, p.c11 = c11 + eps;
     p.det = p.c00 * p.c11 - c01 * c01;
   } else {
-    const V norm2 = g.quat[0] * g.quat[0] + g.quat[1] * g.quat[1] + g.quat[2] * g.quat[2] + g.quat[3] * g.quat[3];
-    p.inverse_norm = c(1) / square_root(norm2);
-    for (int i = 0; i < 4; ++i) p.quat[i] = g.quat[i] * p.inverse_norm;
-    const V r = p.quat[0], qx = p.quat[1], qy = p.quat[2], qz = p.quat[3], two = c(2), one = c(1);
-    V* m = p.rotation;
-    m[0] = one - two * (qy * qy + qz * qz), m[1] = two * (qx * qy - r * qz), m[2] = two * (qx * qz + r * qy);
-    m[3] = two * (qx * qy + r * qz), m[4] = one - two * (qx * qx + qz * qz), m[5] = two * (qy * qz - r * qx);
-    m[6] = two * (qx * qz - r * qy), m[7] = two * (qy * qz + r * qx), m[8] = one - two * (qx * qx + qy * qy);
+    p.inverse_norm = rotation_of(g.quat, p.quat, p.rotation);
+    const V* m = p.rotation;
     for (int k = 0; k < 3; ++k) {
       const V s = scale_modifier * g.scale[k];
       p.row0[k] = s * (p.jr0[0] * m[k] + p.jr0[1] * m[3 + k] + p.jr0[2] * m[6 + k]);
@@ -207,14 +197,7 @@ SW_HD void project_backward(const View<Scalar<V>>& view, Scalar<V> scale_modifie
       }
       out.scale[k] = scale_modifier * along;
     }
-    const V r = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
-    V q[4];
-    q[0] = two * (x * (gr[7] - gr[5]) + y * (gr[2] - gr[6]) + z * (gr[3] - gr[1]));
-    q[1] = two * (y * (gr[1] + gr[3]) + z * (gr[2] + gr[6]) + r * (gr[7] - gr[5]) - two * x * (gr[4] + gr[8]));
-    q[2] = two * (x * (gr[1] + gr[3]) + z * (gr[5] + gr[7]) + r * (gr[2] - gr[6]) - two * y * (gr[0] + gr[8]));
-    q[3] = two * (x * (gr[2] + gr[6]) + y * (gr[5] + gr[7]) + r * (gr[3] - gr[1]) - two * z * (gr[0] + gr[4]));
-    const V radial = r * q[0] + x * q[1] + y * q[2] + z * q[3];
-    for (int i = 0; i < 4; ++i) out.quat[i] = (q[i] - p.quat[i] * radial) * p.inverse_norm;
+    rotation_backward(p.quat, p.inverse_norm, gr, out.quat);
   }
 
   // GJ = GA R^T; only J00, J02, J11, J12 depend on t.

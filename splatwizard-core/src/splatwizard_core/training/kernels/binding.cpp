@@ -74,6 +74,13 @@ TORCH_LIBRARY(splatwizard_training, m) {
         " -> (float, float, Tensor)");
   m.def("adam(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, float lr, float beta1,"
         " float beta2, float eps, int step) -> ()");
+  // On CUDA, where nothing may wait for a number: means [3] = offset + weighted sum, L1, SSIM; see binding_cuda.cpp.
+  m.def("photometric_means(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset,"
+        " bool with_grad) -> (Tensor means, Tensor slopes)");
+  m.def("photometric_backward(Tensor x, Tensor y, Tensor slopes, Tensor scale, bool valid, float l1_weight,"
+        " float ssim_weight) -> Tensor");
+  m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
+        " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> ()");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));
   m.impl("adam", c10::DispatchKey::CPU, TORCH_FN(adam));
 }

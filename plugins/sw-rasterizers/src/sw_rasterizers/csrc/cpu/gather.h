@@ -17,6 +17,12 @@ SW_HD void gather_rows(const Scalar<V>* base, int64_t stride, const int32_t* row
   for (int k = 0; k < kFields; ++k) out[k] = load<V>(buffer[k]);
 }
 
+// The rows first, first + 1, ... of one pack; the last one is repeated beyond `end`.
+template <class V>
+SW_HD void lane_rows(int64_t first, int64_t end, int32_t* rows) {
+  for (int i = 0; i < lanes_of<V>; ++i) rows[i] = int32_t(first + i < end ? first + i : end - 1);
+}
+
 // Long rows: blocks of L fields are loaded whole and transposed in registers. `out` has room for a multiple of L.
 template <class V>
 SW_HD void gather_long_rows(const Scalar<V>* base, int64_t stride, const int32_t* rows, int fields, V* out) {

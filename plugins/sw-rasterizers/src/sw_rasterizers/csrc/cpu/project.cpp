@@ -7,11 +7,11 @@
 #include <limits>
 
 #include "../projection.h"
-#include "../sh.h"
-#include "../tiles.h"
 #include "gather.h"
 #include "kernels.h"
 #include "parallel.h"
+#include "shade.h"
+#include "tile_list.h"
 
 namespace SW_ARCH {
 namespace {
@@ -55,20 +55,6 @@ struct Projector {
   }
 };
 
-template <class V>
-SW_HD void lane_rows(int64_t first, int64_t end, int32_t* rows) {
-  for (int i = 0; i < lanes_of<V>; ++i) rows[i] = int32_t(first + i < end ? first + i : end - 1);
-}
-
-struct TileList {
-  std::vector<int32_t>& tiles;
-  bool keep;
-  size_t size() const { return tiles.size(); }
-  void put(int tile) {
-    if (keep) tiles.push_back(tile);
-  }
-};
-
 template <class V, bool kCov3d>
 struct ChunkProjection : Projector<V, kCov3d> {
   using S = Scalar<V>;
@@ -87,15 +73,11 @@ struct ChunkProjection : Projector<V, kCov3d> {
     for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, tile_list, invalid);
     const int64_t used = slot - begin;
     slots.per_chunk[chunk] = int32_t(used);
-    if (g.sh_dc != nullptr)
-      for (int64_t s = begin; s < slot; s += L) shade_pack(s, slot);
-    if (g.colors != nullptr) copy_colors(begin, slot);
+    const Shader<V> shader{this->view, g, this->settings, slots};
+    shader.color(begin, slot);
     if (slots.channels != nullptr) fill_channels(begin, slot);
-    for (int64_t s = begin; s < slot; ++s)
-      if (!has_finite_colors(s)) {
-        drop(s);
-        ++*invalid;
-      }
+    const int total = slots.channels != nullptr ? channels.total() : 0;
+    *invalid += shader.drop_broken(begin, slot, total, radii);
   }
 
   int64_t project_pack(int64_t first, int64_t end, int64_t slot, TileList& tile_list, int64_t* invalid) const {
@@ -150,141 +132,15 @@ struct ChunkProjection : Projector<V, kCov3d> {
       // The second is false where alpha is nowhere above 1/255.
       if (radii[n] == 0 || !(record[kCutoff] > S(kCutoffShift))) continue;
       const size_t listed = tile_list.size();
-      const int tiles = list_tiles(record, radii[n], tile_list);
+      const int tiles = list_tiles(view, settings, record, record[kU], record[kV], S(radii[n]), tile_list);
       if (tiles == 0) continue;
       std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       slots.index[slot] = int32_t(n);
-      prefetch_sh_rest(n);
+      prefetch_sh_rest(g, n);
       slots.run[slot] = {int32_t(listed), tiles};
       ++slot;
     }
     return slot;
-  }
-
-  // Appends the tiles that the splat is tried in.
-  SW_HD int list_tiles(const S* record, int32_t radius, TileList& list) const {
-    const auto& view = this->view;
-    const auto put = [&](int x, int y) { list.put(y * view.tiles_x() + x); };
-    if (this->settings.tight) {
-      const Ellipse<S> e{record[kU],
-                         record[kV],
-                         record[kHalfX],
-                         record[kHalfY],
-                         record[kWidth],
-                         record[kLeanX],
-                         record[kLeanY] * record[kHalfX]};
-      return tight_tiles(e, view.width, view.height, put);
-    }
-    const TileRange square = classic_tiles(record[kU], record[kV], S(radius), view.tiles_x(), view.tiles_y());
-    for (int y = square.y0; y < square.y1; ++y)
-      for (int x = square.x0; x < square.x1; ++x) put(x, y);
-    return square.count();
-  }
-
-  void shade_pack(int64_t first, int64_t end) const {
-    const auto& g = this->g;
-    const auto c = [](double value) { return constant<V>(value); };
-    const int lanes = int(end - first < L ? end - first : L);
-    alignas(64) int32_t rows[L];
-    for (int i = 0; i < L; ++i) rows[i] = slots.index[first + (i < lanes ? i : lanes - 1)];
-    const int degree = g.sh_degree, basis_count = (degree + 1) * (degree + 1);
-
-    V dc[3], color[3];
-    gather_rows<V, 3>(g.sh_dc, g.sh_dc_stride, rows, dc);
-    for (int k = 0; k < 3; ++k) color[k] = c(0.5) + c(kSH0) * dc[k];
-    V slope[9];
-    for (V& x : slope) x = c(0);
-    if (degree > 0) {
-      V rest[3 * kMaxBasis];
-      gather_sh_rest(degree, rows, rest);
-      const V* sh = rest - 3;  // sh[3 k + channel]
-      V direction[3], basis[kMaxBasis];
-      gather_rows<V, 3>(g.means, 3, rows, direction);
-      for (int j = 0; j < 3; ++j) direction[j] -= this->view.center[j];
-      const V inverse_length = c(1) / square_root(dot3(direction, direction));
-      for (V& d : direction) d *= inverse_length;
-      sh_basis(degree, direction[0], direction[1], direction[2], basis);
-      for (int k = 1; k < basis_count; ++k)
-        for (int channel = 0; channel < 3; ++channel) color[channel] += basis[k] * sh[3 * k + channel];
-      if (slots.color_slope != nullptr) {
-        V dx[kMaxBasis], dy[kMaxBasis], dz[kMaxBasis];
-        sh_basis_gradient(degree, direction[0], direction[1], direction[2], dx, dy, dz);
-        for (int k = 1; k < basis_count; ++k)
-          for (int channel = 0; channel < 3; ++channel) {
-            slope[3 * channel] += dx[k] * sh[3 * k + channel];
-            slope[3 * channel + 1] += dy[k] * sh[3 * k + channel];
-            slope[3 * channel + 2] += dz[k] * sh[3 * k + channel];
-          }
-        for (int channel = 0; channel < 3; ++channel) {  // the direction is a unit vector
-          V* s = slope + 3 * channel;
-          const V radial = dot3(direction, s);
-          for (int j = 0; j < 3; ++j) s[j] = (s[j] - direction[j] * radial) * inverse_length;
-        }
-      }
-    }
-    alignas(64) S out[3][L];
-    for (int k = 0; k < 3; ++k) store(out[k], color[k]);
-    for (int i = 0; i < lanes; ++i) {
-      S* record = slots.records + (first + i) * kRecord;
-      int clamped = 0;
-      for (int k = 0; k < 3; ++k) {
-        const bool below = this->settings.clamp_color && out[k][i] < S(0);
-        clamped |= int(below) << k;
-        record[kRed + k] = below ? S(0) : out[k][i];
-      }
-      slots.clamped[first + i] = uint8_t(clamped);
-    }
-    if (slots.color_slope != nullptr) {
-      alignas(64) int32_t targets[L];
-      for (int i = 0; i < L; ++i) targets[i] = int32_t(first + i);
-      scatter_rows<V, 9>(slope, slots.color_slope, 9, targets, lanes);
-    }
-  }
-
-  // Asks for the coefficients of a Gaussian as soon as it is known to be drawn; they arrive while others are projected.
-  SW_HD void prefetch_sh_rest(int64_t n) const {
-    const auto& g = this->g;
-    if (g.sh_dc == nullptr || g.sh_degree == 0) return;
-    constexpr int kLine = 64 / sizeof(S);
-    const S* row = g.sh_rest + n * g.sh_rest_stride;
-    const int fields = 3 * ((g.sh_degree + 1) * (g.sh_degree + 1) - 1);
-    for (int k = 0; k < fields; k += kLine) __builtin_prefetch(row + k, 0, 2);
-    __builtin_prefetch(row + fields - 1, 0, 2);
-  }
-
-  // Constant row lengths: the tails become plain stores.
-  SW_HD void gather_sh_rest(int degree, const int32_t* rows, V* rest) const {
-    const auto& g = this->g;
-    if (degree == 1) gather_long_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 9, rest);
-    if (degree == 2) gather_long_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 24, rest);
-    if (degree == 3) gather_long_rows<V>(g.sh_rest, g.sh_rest_stride, rows, 45, rest);
-  }
-
-  bool has_finite_colors(int64_t slot) const {
-    const S* record = slots.records + slot * kRecord;
-    S probe = finite_probe(record[kRed]) + finite_probe(record[kGreen]) + finite_probe(record[kBlue]);
-    if (slots.channels != nullptr)
-      for (int k = 0; k < channels.total(); ++k) probe += finite_probe(slots.channels[slot * channels.total() + k]);
-    if (slots.color_slope != nullptr)
-      for (int k = 0; k < 9; ++k) probe += finite_probe(slots.color_slope[slot * 9 + k]);
-    return probe == S(0);
-  }
-
-  // Turns a slot into one that touches no tile and passes no gradient on.
-  void drop(int64_t slot) const {
-    radii[slots.index[slot]] = 0;
-    slots.run[slot].count = 0;
-    slots.clamped[slot] = 7;
-    if (slots.color_slope != nullptr) std::fill_n(slots.color_slope + slot * 9, 9, S(0));
-  }
-
-  void copy_colors(int64_t begin, int64_t end) const {
-    const auto& g = this->g;
-    for (int64_t s = begin; s < end; ++s) {
-      slots.clamped[s] = 0;
-      if (g.color_channels != 3) continue;
-      for (int k = 0; k < 3; ++k) slots.records[s * kRecord + kRed + k] = g.colors[slots.index[s] * int64_t(3) + k];
-    }
   }
 
   void fill_channels(int64_t begin, int64_t end) const {

@@ -6,10 +6,10 @@
 #include <algorithm>
 
 #include "../projection.h"
-#include "../sh.h"
 #include "gather.h"
 #include "kernels.h"
 #include "parallel.h"
+#include "shade.h"
 
 namespace SW_ARCH {
 namespace {
@@ -89,7 +89,8 @@ struct ChunkBackward {
     project_backward<kCov3d>(view, S(settings.scale_modifier), S(settings.eps2d), settings.antialias,
                              settings.original_jacobian, in, p, opacity, grad, result);
 
-    if (g.sh_dc != nullptr) shade_backward(first, lanes, rows, in.mean, fixed, result.mean);
+    if (g.sh_dc != nullptr)
+      ColorBackward<V>{view, g, slots, out}(first, lanes, rows, in.mean, fixed + kMoments, result.mean);
     if (out.colors != nullptr && slots.channels == nullptr)
       for (int i = 0; i < lanes; ++i)
         for (int k = 0; k < 3; ++k) out.colors[int64_t(rows[i]) * 3 + k] = fixed[kMoments + k][i];
@@ -139,45 +140,6 @@ struct ChunkBackward {
       for (int k = 0; k < 2; ++k) total[kMoments + 3 + k] = column(at++);
     if (settings.median_depth) gradient += column(at);
     return gradient;
-  }
-
-  // dL/dsh_k = B_k dL/dcolour, and the colour's part of dL/dmean through the viewing direction.
-  void shade_backward(int64_t first, int lanes, const int32_t* rows, const V* mean, S (*fixed)[L],
-                      V* mean_gradient) const {
-    alignas(64) S color[3][L];
-    for (int k = 0; k < 3; ++k)
-      for (int i = 0; i < L; ++i) {
-        const bool clamped = i >= lanes || (slots.clamped[first + i] >> k & 1) != 0;
-        color[k][i] = clamped ? S(0) : fixed[kMoments + k][i];
-      }
-    if (out.sh_dc != nullptr)
-      for (int i = 0; i < lanes; ++i)
-        for (int k = 0; k < 3; ++k) out.sh_dc[rows[i] * out.sh_dc_stride + k] = S(kSH0) * color[k][i];
-    if (g.sh_degree == 0) return;
-    if (out.means != nullptr) {
-      alignas(64) int32_t targets[L];
-      for (int i = 0; i < L; ++i) targets[i] = int32_t(first + (i < lanes ? i : lanes - 1));
-      V slope[9];
-      gather_rows<V, 9>(slots.color_slope, 9, targets, slope);
-      for (int k = 0; k < 3; ++k)
-        for (int j = 0; j < 3; ++j) mean_gradient[j] += load<V>(color[k]) * slope[3 * k + j];
-    }
-    if (out.sh_rest == nullptr) return;
-    V direction[3], basis[kMaxBasis] = {};
-    for (int j = 0; j < 3; ++j) direction[j] = mean[j] - view.center[j];
-    const V inverse_length = constant<V>(1) / square_root(dot3(direction, direction));
-    for (V& d : direction) d *= inverse_length;
-    sh_basis(g.sh_degree, direction[0], direction[1], direction[2], basis);
-    V values[3 * kMaxBasis];
-    const int count = (g.sh_degree + 1) * (g.sh_degree + 1);
-    for (int k = 1; k < count; ++k)
-      for (int channel = 0; channel < 3; ++channel) values[3 * (k - 1) + channel] = basis[k] * load<V>(color[channel]);
-    const auto write = [&](int fields) {
-      scatter_long_rows(values, fields, out.sh_rest, out.sh_rest_stride, rows, lanes);
-    };
-    if (g.sh_degree == 1) write(9);  // constant row lengths: the tails become plain stores
-    if (g.sh_degree == 2) write(24);
-    if (g.sh_degree == 3) write(45);
   }
 };
 

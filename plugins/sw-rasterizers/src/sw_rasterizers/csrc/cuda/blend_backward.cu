@@ -57,10 +57,31 @@ __device__ __forceinline__ int spread_index(int lane) {
   }
 }
 
+// The same for the sums of the plain kernel, with 9 shuffles. Lanes 8 apart lie in one column of pixels and share dx, so
+// the rows are added first, v, v dy, v dy^2 and the colours, and only then multiplied by dx and dx^2.
+__device__ __forceinline__ float column_sums(float v, float vy, float vyy, const float* color, float dx) {
+  const bool upper = lane_index() & 16, odd_row = lane_index() & 8, odd = lane_index() & 1, second = lane_index() & 2;
+  const auto swap = [](float x, int step) { return __shfl_xor_sync(kAllLanes, x, step); };
+  const float k0 = (upper ? color[0] : v) + swap(upper ? v : color[0], 16);
+  const float k1 = (upper ? color[1] : vy) + swap(upper ? vy : color[1], 16);
+  const float k2 = (upper ? color[2] : vyy) + swap(upper ? vyy : color[2], 16);
+  const float p = (odd_row ? k1 : k0) + swap(odd_row ? k0 : k1, 8), q = k2 + swap(k2, 8);
+  const float e1 = p * dx, e2 = odd_row ? q : e1 * dx;
+  const float one = (odd ? e1 : p) + swap(odd ? p : e1, 1), other = e2 + swap(e2, 1);
+  const bool takes_other = odd && second, gives_other = odd && !second;
+  const float sum = (takes_other ? other : one) + swap(gives_other ? other : one, 2);
+  return sum + swap(sum, 4);
+}
+__device__ __forceinline__ int column_index(int lane) {
+  if (lane & 4 || (lane & 3) == 2) return -1;
+  constexpr int kOf[4][3] = {{0, 1, 3}, {2, 4, 5}, {6, -1, -1}, {7, -1, 8}};  // by row of lanes: p, p dx, e2
+  return kOf[lane / 8][(lane & 3) == 0 ? 0 : (lane & 3) == 1 ? 1 : 2];
+}
+
 struct Chunk {  // the channels of one launch
   int first, count;
-  int geometry;       // how many of them influence alpha
-  bool alpha;
+  int geometry;  // how many of them influence alpha
+  bool alpha;    // the gradient of the alpha map enters here
 };
 
 template <bool kGeneral, bool kAbsgrad>
@@ -114,7 +135,8 @@ __global__ void __launch_bounds__(kThreads)
   if (lane_index() == 0) atomicMax(&block_last, unsigned(warp_last));
   __syncthreads();
 
-  const int index = spread_index<kSums>(lane_index());
+  constexpr bool kPlain = !kGeneral && !kAbsgrad;
+  const int index = kPlain ? column_index(lane_index()) : spread_index<kSums>(lane_index());
   // Column of the row: the moments, this chunk's channels, absgrad behind all channels; -1: nothing to add.
   const int column = index < 0 ? -1
                      : index < kMomentSums ? index
@@ -191,8 +213,13 @@ __global__ void __launch_bounds__(kThreads)
           }
         }
         if (!any_touched) continue;
-        sums[0] = v0, sums[1] = v0 * dx, sums[2] = vy, sums[3] = sums[1] * dx, sums[4] = vy * dx, sums[5] = vyy;
-        const float total = spread_sums<kSums>(sums);
+        float total;
+        if constexpr (kPlain) {
+          total = column_sums(v0, vy, vyy, sums + kMomentSums, dx);
+        } else {
+          sums[0] = v0, sums[1] = v0 * dx, sums[2] = vy, sums[3] = sums[1] * dx, sums[4] = vy * dx, sums[5] = vyy;
+          total = spread_sums<kSums>(sums);
+        }
         if (column >= 0) atomicAdd(rows.base + int64_t(gaussian[k]) * rows.stride + column, total);
       }
     }

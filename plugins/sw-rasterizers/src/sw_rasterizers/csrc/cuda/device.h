@@ -71,20 +71,30 @@ __device__ __forceinline__ void store_state(uint64_t* state, uint64_t value) {
   *reinterpret_cast<volatile uint64_t*>(state) = value;
 }
 
-// By all lanes of one warp: the sum over the blocks before `block`.
+// By all lanes of one warp: the sum over the blocks before `block`. Hundreds of blocks run at once and all look back as
+// far as the oldest of them, so a warp asks for kAhead windows of 32 blocks together: one wait instead of many.
 __device__ __forceinline__ unsigned look_back(uint64_t* states, int block, unsigned sum) {
+  constexpr int kAhead = 8;
   if (lane_index() == 0) store_state(states + block, (block == 0 ? kPrefixReady : kSumReady) | sum);
   unsigned before = 0;
-  for (int from = block - 1; from >= 0; from -= kWarp) {
-    const int i = from - lane_index();
-    uint64_t state;
-    do {
-      state = i >= 0 ? load_state(states + i) : kPrefixReady;
-    } while (__any_sync(kAllLanes, (state >> 32) == 0));
-    const unsigned with_prefix = __ballot_sync(kAllLanes, (state >> 32) == 2);
-    const int last = with_prefix != 0 ? __ffs(int(with_prefix)) - 1 : kWarp - 1;
-    before += warp_sum(lane_index() <= last ? unsigned(state) : 0u);
-    if (with_prefix != 0) break;
+  bool found = false;
+  for (int from = block - 1; from >= 0 && !found; from -= kAhead * kWarp) {
+    uint64_t state[kAhead];
+    const auto load = [&](int window) {
+      const int i = from - window * kWarp - lane_index();
+      state[window] = i >= 0 ? load_state(states + i) : kPrefixReady;
+    };
+#pragma unroll
+    for (int window = 0; window < kAhead; ++window) load(window);
+#pragma unroll
+    for (int window = 0; window < kAhead; ++window) {
+      if (found) break;
+      while (__any_sync(kAllLanes, (state[window] >> 32) == 0)) load(window);
+      const unsigned with_prefix = __ballot_sync(kAllLanes, (state[window] >> 32) == 2);
+      const int last = with_prefix != 0 ? __ffs(int(with_prefix)) - 1 : kWarp - 1;
+      before += warp_sum(lane_index() <= last ? unsigned(state[window]) : 0u);
+      found = with_prefix != 0;
+    }
   }
   if (lane_index() == 0 && block > 0) store_state(states + block, kPrefixReady | (before + sum));
   return before;

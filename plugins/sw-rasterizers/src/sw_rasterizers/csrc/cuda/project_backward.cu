@@ -12,28 +12,18 @@ namespace {
 constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 constexpr int kFactors = kMaxBasis + 3;  // a Gaussian's basis and colour gradient; odd: no bank conflicts
 
-// dL/dsh_k = B_k dL/dcolour: the rows of 32 Gaussians as one run of consecutive values, by the whole warp.
+// dL/dsh_k = B_k dL/dcolour: the rows of a warp's Gaussians, a row at a time, a value a lane.
 __device__ __forceinline__ void write_sh_rows(float* base, int64_t first, int rows, int floats, int first_basis,
                                               const float* factors) {
-  float* to = base + first * floats;
-  const int length = rows * floats;
-  const bool aligned = reinterpret_cast<uintptr_t>(to) % sizeof(float4) == 0;
-  int row = 0, in_row = 4 * lane_index();
-  for (int at = 4 * lane_index(); at < length; at += 4 * kWarp, in_row += 4 * kWarp) {
-    float values[4];
-#pragma unroll
-    for (int i = 0; i < 4; ++i) {
-      if (i > 0) ++in_row;
-      while (in_row >= floats) in_row -= floats, ++row;
-      const float* of = factors + (row < rows ? row : 0) * kFactors;
-      const int k = first_basis + in_row / 3;
-      values[i] = k < kMaxBasis ? of[k] * of[kMaxBasis + in_row % 3] : 0.f;
-    }
-    in_row -= 3;  // may go below 0: then the row before is meant, and the step ahead makes up for it
-    if (aligned && at + 4 <= length) {
-      *reinterpret_cast<float4*>(to + at) = make_float4(values[0], values[1], values[2], values[3]);
+  for (int value = lane_index(); value < floats; value += kWarp) {
+    const int k = first_basis + value / 3, channel = value % 3;
+    float* to = base + first * floats + value;
+    if (k < kMaxBasis) {
+#pragma unroll 4
+      for (int row = 0; row < rows; ++row)
+        to[int64_t(row) * floats] = factors[row * kFactors + k] * factors[row * kFactors + kMaxBasis + channel];
     } else {
-      for (int i = 0; i < 4 && at + i < length; ++i) to[at + i] = values[i];
+      for (int row = 0; row < rows; ++row) to[int64_t(row) * floats] = 0.f;
     }
   }
 }

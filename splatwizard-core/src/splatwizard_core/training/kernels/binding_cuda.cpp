@@ -1,0 +1,127 @@
+// The training kernels on CUDA as torch ops, on the current stream. Compiled only where there is CUDA.
+#ifdef SW_WITH_CUDA
+
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/empty_like.h>
+#include <c10/cuda/CUDAException.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+#include <torch/library.h>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+#include "cuda/kernels.h"
+
+namespace {
+
+namespace kernels = splatwizard::cuda;
+
+void check(const at::Tensor& tensor, const char* op, const char* name) {
+  TORCH_CHECK(tensor.is_cuda() && tensor.scalar_type() == at::kFloat && tensor.is_contiguous(), op, ": ", name,
+              " must be a contiguous float32 tensor on a GPU, got ", tensor.toString());
+}
+
+kernels::Photometric photometric_args(const at::Tensor& x, const at::Tensor& y, bool valid, double l1_weight,
+                                      double ssim_weight) {
+  check(x, "photometric", "x");
+  check(y, "photometric", "y");
+  TORCH_CHECK(x.dim() == 3 && x.sizes() == y.sizes(), "photometric: x and y must be [C,H,W] and alike, got ",
+              x.sizes(), " and ", y.sizes());
+  const int64_t lost = valid ? 10 : 0, most = std::numeric_limits<int>::max();
+  TORCH_CHECK(x.size(0) > 0 && x.size(1) > lost && x.size(2) > lost, "photometric: the image ", x.sizes(),
+              " is too small");
+  // Limits of a launch: planes and rows of tiles.
+  TORCH_CHECK(x.size(0) <= 65535 && x.size(1) <= 65535 * 32 && x.size(2) <= most / 2, "photometric: the image ",
+              x.sizes(), " is too large");
+  return {x.const_data_ptr<float>(), y.const_data_ptr<float>(), int(x.size(0)), int(x.size(1)), int(x.size(2)),
+          valid, l1_weight, ssim_weight, 0., nullptr};
+}
+
+// [3]: offset + l1_weight L1 + ssim_weight SSIM, and both means; and what the backward pass needs (empty unless
+// with_grad).
+std::tuple<at::Tensor, at::Tensor> photometric(const at::Tensor& x, const at::Tensor& y, bool valid, double l1_weight,
+                                               double ssim_weight, double offset, bool with_grad) {
+  kernels::Photometric args = photometric_args(x, y, valid, l1_weight, ssim_weight);
+  const c10::cuda::CUDAGuard guard(x.device());
+  const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
+  const auto real = x.options().requires_grad(false);
+  const at::Tensor means = at::empty({3}, real);
+  const at::Tensor sums = at::empty({int64_t(sizeof(kernels::PhotometricSums))}, real.dtype(at::kByte));
+  at::Tensor slopes = at::empty({with_grad ? 3 * x.numel() : 0}, real);
+  args.offset = offset;
+  args.slopes = with_grad ? slopes.mutable_data_ptr<float>() : nullptr;
+  C10_CUDA_CHECK(cudaMemsetAsync(sums.data_ptr(), 0, sizeof(kernels::PhotometricSums), stream));
+  kernels::photometric(args, static_cast<kernels::PhotometricSums*>(sums.data_ptr()), means.mutable_data_ptr<float>(),
+                       stream);
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return {means, slopes};
+}
+
+at::Tensor photometric_backward(const at::Tensor& x, const at::Tensor& y, const at::Tensor& slopes,
+                                const at::Tensor& scale, bool valid, double l1_weight, double ssim_weight) {
+  kernels::Photometric args = photometric_args(x, y, valid, l1_weight, ssim_weight);
+  check(slopes, "photometric_backward", "slopes");
+  check(scale, "photometric_backward", "scale");
+  TORCH_CHECK(slopes.numel() == 3 * x.numel() && scale.numel() == 1, "photometric_backward: slopes or scale do not fit");
+  const c10::cuda::CUDAGuard guard(x.device());
+  args.slopes = slopes.mutable_data_ptr<float>();
+  at::Tensor grad = at::empty_like(x);
+  kernels::photometric_backward(args, scale.const_data_ptr<float>(), grad.mutable_data_ptr<float>(),
+                                c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return grad;
+}
+
+// One step of many tensors; lr and step per tensor, the rest common.
+void adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
+               const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
+               at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s, at::ArrayRef<double> beta2s,
+               at::ArrayRef<double> epss, at::IntArrayRef steps) {
+  const size_t count = params.size();
+  TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
+                  lrs.size() == count && beta1s.size() == count && beta2s.size() == count && epss.size() == count &&
+                  steps.size() == count,
+              "adam: lists of different lengths");
+  if (count == 0) return;
+  const c10::cuda::CUDAGuard guard(params[0].device());
+  std::vector<kernels::AdamTensor> tensors;
+  for (size_t i = 0; i < count; ++i) {
+    const std::pair<const char*, const at::Tensor*> named[] = {
+        {"param", &params[i]}, {"grad", &grads[i]}, {"exp_avg", &exp_avgs[i]}, {"exp_avg_sq", &exp_avg_sqs[i]}};
+    for (const auto& [name, tensor] : named) {
+      check(*tensor, "adam", name);
+      TORCH_CHECK(tensor->numel() == params[i].numel() && tensor->device() == params[0].device(), "adam: ", name,
+                  " does not fit its parameter");
+      TORCH_CHECK(reinterpret_cast<uintptr_t>(tensor->const_data_ptr()) % 16 == 0, "adam: ", name,
+                  " must start at a multiple of 16 bytes");
+    }
+    TORCH_CHECK(steps[i] >= 1, "adam: step counts from 1, got ", steps[i]);
+    const double t = static_cast<double>(steps[i]);
+    tensors.push_back({params[i].mutable_data_ptr<float>(), grads[i].const_data_ptr<float>(),
+                       exp_avgs[i].mutable_data_ptr<float>(), exp_avg_sqs[i].mutable_data_ptr<float>(),
+                       params[i].numel(), static_cast<float>(lrs[i] / (1. - std::pow(beta1s[i], t))),
+                       static_cast<float>(1. - beta1s[i]), static_cast<float>(beta2s[i]),
+                       static_cast<float>(1. - beta2s[i]),
+                       static_cast<float>(1. / std::sqrt(1. - std::pow(beta2s[i], t))),
+                       static_cast<float>(epss[i]), 0});
+  }
+  for (size_t first = 0; first < count; first += kernels::kAdamTensors)
+    kernels::adam(tensors.data() + first, int(std::min<size_t>(kernels::kAdamTensors, count - first)),
+                  c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
+}  // namespace
+
+TORCH_LIBRARY_IMPL(splatwizard_training, CUDA, m) {
+  m.impl("photometric_means", photometric);
+  m.impl("photometric_backward", photometric_backward);
+  m.impl("adam_many", adam_many);
+}
+
+#endif  // SW_WITH_CUDA
