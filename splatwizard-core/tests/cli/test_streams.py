@@ -13,6 +13,7 @@ import pytest
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.streams import ended_like_ctrl_c
 from splatwizard_core.coding.container import ContainerWriter
+from splatwizard_core.training.interrupt import InterruptGuard
 
 SW = f"{shlex.quote(sys.executable)} -m splatwizard_core"
 
@@ -102,3 +103,23 @@ def test_a_full_disk_is_told_also_where_a_library_met_it(
     told = capsys.readouterr().err
     assert told.startswith("error: /scratch/x: the disk is full; nothing half-written was kept")
     assert len(told.splitlines()) == 1
+
+
+def test_a_request_to_end_is_heard_where_ctrl_c_is_ignored():
+    """As it is for what a script starts in the background."""
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(KeyboardInterrupt), ended_like_ctrl_c():
+            os.kill(os.getpid(), signal.SIGTERM)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_request_to_end_waits_for_the_end_of_a_training_step():
+    with ended_like_ctrl_c(), InterruptGuard() as guard:
+        with guard.step():
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert guard.pending
+        with pytest.raises(KeyboardInterrupt):
+            os.kill(os.getpid(), signal.SIGTERM)
+    assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL

@@ -326,7 +326,7 @@ def test_a_child_ends_with_the_process_that_started_it(toy_plugins: PluginManage
         str(tmp_path),
     ]
     child = subprocess.Popen(
-        [sys.executable, "-m", "splatwizard_core.experiments.fresh_child", *arguments],
+        [sys.executable, "-m", "splatwizard_core.cli.fresh_child", *arguments],
         stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
     )  # fmt: skip
     assert child.stdin is not None

@@ -8,7 +8,6 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from types import FrameType
 
 
 def open_streams() -> None:
@@ -41,18 +40,16 @@ def abandon_streams() -> None:
 def ended_like_ctrl_c() -> Iterator[None]:
     """In the block, a request to end (SIGTERM) or a terminal that closes (SIGHUP) does what Ctrl-C does.
 
-    So a training that a cluster stops writes a checkpoint first. What ignores SIGHUP already (`nohup`) goes on so.
+    So a training that a cluster stops writes a checkpoint first, also where Ctrl-C itself is ignored, as it is for what
+    a script starts in the background. What ignores SIGHUP already (`nohup`) goes on so.
     """
-
-    def pass_on(number: int, frame: FrameType | None) -> None:
-        signal.raise_signal(signal.SIGINT)
 
     previous = {}
     if threading.current_thread() is threading.main_thread():
         for name in ("SIGTERM", "SIGHUP"):
             number = getattr(signal, name, None)
             if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-                previous[number] = signal.signal(number, pass_on)
+                previous[number] = signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:

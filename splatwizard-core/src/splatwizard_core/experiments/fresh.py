@@ -31,7 +31,7 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     it fails, KeyboardInterrupt if it was interrupted.
     """
     environment = {k: v for k, v in os.environ.items() if not (hide_data and k in HIDDEN)}
-    command = [sys.executable, "-m", "splatwizard_core.experiments.fresh_child", *arguments]
+    command = [sys.executable, "-m", "splatwizard_core.cli.fresh_child", *arguments]
     # The display of a terminal must reach it live; anything else is kept for the message.
     done = _ended_with_us(command, cwd, environment, None if sys.stderr.isatty() else subprocess.PIPE)
     told = (done.stderr or "").strip()

@@ -1,4 +1,4 @@
-"""Ctrl-C during a training step waits for the end of the step, so that what is saved is whole."""
+"""Ctrl-C, or what is treated like it, waits for the end of a training step, so that what is saved is whole."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import logging
 import signal
 import threading
 from types import FrameType, TracebackType
-from typing import Any
 
 log = logging.getLogger(__name__)
 
@@ -15,26 +14,29 @@ class InterruptGuard:
     """While installed, a Ctrl-C inside `with guard.step():` only sets `pending`; a second one, or one outside, raises.
 
     It is installed in the main thread only, and only over Python's own handler: whoever handles SIGINT in a way of
-    their own goes on doing so. In any other case it does nothing.
+    their own, or ignores it, goes on doing so. Where that handler was also given to SIGTERM or SIGHUP, those wait too.
+    In any other case it does nothing.
     """
 
     def __init__(self) -> None:
         self.pending = False
         self._busy = False
-        self._previous: Any = None
+        self._taken: list[int] = []
 
     def __enter__(self) -> InterruptGuard:
-        in_main = threading.current_thread() is threading.main_thread()
-        if in_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-            self._previous = signal.signal(signal.SIGINT, self._handle)
+        if threading.current_thread() is threading.main_thread():
+            for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+                number = getattr(signal, name, None)
+                if number is not None and signal.getsignal(number) is signal.default_int_handler:
+                    signal.signal(number, self._handle)
+                    self._taken.append(number)
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._previous is not None:
-            signal.signal(signal.SIGINT, self._previous)
-            self._previous = None
+        while self._taken:
+            signal.signal(self._taken.pop(), signal.default_int_handler)
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self._busy and not self.pending:
