@@ -50,7 +50,7 @@ GRADIENT_CASES = (
     RasterCase("surfels-low-pass", color="colors", n=5, scale=(0.02, 0.2), spread=0.8, **FLAT),
     RasterCase("surfels-alpha-clamp", color="colors", n=3, opacity=(1.1, 1.7), scale=(0.3, 0.6), **FLAT),
     RasterCase("surfels-stop", color="colors", n=8, opacity=(0.93, 0.985), scale=(0.8, 1.4), spread=0.5, **FLAT),
-    RasterCase("surfels-behind", color="colors", n=3, scale=(1.2, 3.0), opacity=(0.2, 0.6), **FLAT),
+    RasterCase("surfels-behind", color="colors", n=3, scale=(1.2, 2.7), opacity=(0.2, 0.6), spread=0.7, **FLAT),
 )  # fmt: skip
 """Every path that has a derivative of its own."""
 

@@ -127,7 +127,10 @@ def disc_that_faces_the_camera(r: Rasterizer, device: str) -> None:
 
 @check(*NEEDS)
 def tilted_disc_is_met_where_the_ray_meets_its_plane(r: Rasterizer, device: str) -> None:
-    """Plane through (0, 0, 4) with normal (-sin, 0, -cos): the ray (x, y, 1) meets it at z = 4 cos / (x sin + cos)."""
+    """Plane through (0, 0, 4) with normal (-sin, 0, -cos): the ray (x, y, 1) meets it at z = 4 cos / (x sin + cos).
+
+    The low-pass lies around the middle between the pictures of the ends of the tilted axis, 3 sigma from the centre.
+    """
     angle = 0.9
     result = draw(r, device, _tilted(angle), front_camera(), EVERYTHING)
     dx, dy = _offsets()
@@ -135,8 +138,10 @@ def tilted_disc_is_met_where_the_ray_meets_its_plane(r: Rasterizer, device: str)
     z = 4 * math.cos(angle) / (x * math.sin(angle) + math.cos(angle))
     along = (x * z * math.cos(angle) - (z - 4) * math.sin(angle)) / 0.5
     across = y * z / 0.5
-    alpha = 0.8 * torch.exp(-0.5 * (along * along + across * across))
-    drawn = (z > 0.2) & (alpha > 0.02)  # further out the low-pass and the cut have their say
+    ends = [64 * a * math.cos(angle) / (4 - a * math.sin(angle)) for a in (1.5, -1.5)]
+    low_pass = 2 * ((dx - sum(ends) / 2) ** 2 + dy * dy)
+    alpha = 0.8 * torch.exp(-0.5 * torch.minimum(along * along + across * across, low_pass))
+    drawn = (z > 0.2) & (alpha > 1 / 250)
     assert result.alpha is not None
     assert result.normals is not None
     assert int(drawn.sum()) > 200

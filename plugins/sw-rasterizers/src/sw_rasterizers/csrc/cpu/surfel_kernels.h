@@ -1,0 +1,59 @@
+// The CPU kernels of surfels. Slots, binning, tiles and blocks are those of the other kernels: a record's ellipse is one
+// that holds every pixel the surfel may touch (surfel.h), and the plane itself lies in a second row of the slot.
+//
+//   project_surfels           N surfels -> records and planes of the drawn ones
+//   bin.cpp                   as for ellipsoids
+//   blend_surfels             lists -> image and maps
+//   blend_surfels_backward    gradients of both -> one row of sums per (splat, tile) pair
+//   project_surfels_backward  rows -> gradients of the inputs
+#pragma once
+
+#include "../surfel.h"
+#include "kernels.h"
+
+namespace sw {
+
+// Maps beside the image, [kMaps][H][W]: accumulated depth, inverse depth, normals, distortion, median depth.
+enum SurfelMap { kMapDepth, kMapInverse, kMapNormal, kMapDistortion = 5, kMapMedian, kMaps };
+
+// What the backward pass has to know of each pixel beside transmittance and last position, [tiles][kTilePixels] each:
+// 1/z of the first surfel, about which the sums are taken (the distortion does not depend on it, and differences of
+// nearly equal depths keep their digits); sum w delta and sum w delta^2 with delta = 1/z - first; the median's position.
+template <class S>
+struct SurfelPixels {
+  S *first, *sum, *square;
+  int32_t* median;
+};
+
+template <class S>
+struct SurfelCanvas {
+  Canvas<S> canvas;        // image, background, alpha, transmittance, last, counters
+  S* maps;                 // [kMaps][H][W], or null
+  SurfelPixels<S> pixels;  // null without maps, or if nothing is saved
+};
+
+inline int surfel_columns(bool maps) { return maps ? kSurfelColumns : kSurfelPlain; }
+
+}  // namespace sw
+
+// planes [N][kPlane], by slot; `maps_gradient` [kMaps][H][W] or null.
+#define SW_DECLARE_KERNELS(arch)                                                                                      \
+  namespace arch {                                                                                                    \
+  template <class S>                                                                                                  \
+  int64_t project_surfels(const View<S>& view, const Gaussians<S>& g, const Settings& settings, const Slots<S>& slots, \
+                          S* planes, int32_t* radii, int64_t* counts);                                                \
+  template <class S>                                                                                                  \
+  void visible_surfel_radii(const View<S>& view, const Gaussians<S>& g, const Settings& settings, int32_t* radii);    \
+  template <class S>                                                                                                  \
+  void blend_surfels(const View<S>& view, const Settings& settings, const Slots<S>& slots, const S* planes,           \
+                     const Pairs<S>& pairs, const SurfelCanvas<S>& canvas);                                           \
+  template <class S>                                                                                                  \
+  void blend_surfels_backward(const View<S>& view, const Settings& settings, const Slots<S>& slots, const S* planes,  \
+                              const Pairs<S>& pairs, const SurfelCanvas<S>& canvas, const CanvasGradient<S>& gradient, \
+                              const S* maps_gradient, S* sums);                                                       \
+  template <class S>                                                                                                  \
+  void project_surfels_backward(const View<S>& view, const Gaussians<S>& g, const Settings& settings,                 \
+                                const Slots<S>& slots, const S* sums, bool maps, const Gradients<S>& out);            \
+  }
+SW_FOR_EACH_ARCH(SW_DECLARE_KERNELS)
+#undef SW_DECLARE_KERNELS

@@ -1,0 +1,42 @@
+// The tiles that one splat is tried in, appended to the list of its chunk.
+#pragma once
+
+#include <vector>
+
+#include "../tiles.h"
+#include "kernels.h"
+
+namespace SW_ARCH {
+using namespace sw;
+
+struct TileList {
+  std::vector<int32_t>& tiles;
+  bool keep;
+  size_t size() const { return tiles.size(); }
+  void put(int tile) {
+    if (keep) tiles.push_back(tile);
+  }
+};
+
+// From a record's ellipse, or from the square of `radius` around (u, v) that 3DGS takes. Returns how many.
+template <class S>
+SW_HD int list_tiles(const View<S>& view, const Settings& settings, const S* record, S u, S v, S radius,
+                     TileList& list) {
+  const auto put = [&](int x, int y) { list.put(y * view.tiles_x() + x); };
+  if (settings.tight) {
+    const Ellipse<S> e{record[kU],
+                       record[kV],
+                       record[kHalfX],
+                       record[kHalfY],
+                       record[kWidth],
+                       record[kLeanX],
+                       record[kLeanY] * record[kHalfX]};
+    return tight_tiles(e, view.width, view.height, put);
+  }
+  const TileRange square = classic_tiles(u, v, radius, view.tiles_x(), view.tiles_y());
+  for (int y = square.y0; y < square.y1; ++y)
+    for (int x = square.x0; x < square.x1; ++x) put(x, y);
+  return square.count();
+}
+
+}  // namespace SW_ARCH

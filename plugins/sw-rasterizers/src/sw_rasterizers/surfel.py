@@ -1,0 +1,209 @@
+"""Surfels (2D Gaussian Splatting) on compiled kernels, on the CPU."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.rendering.checks import check_placement, check_request, checked_background
+from splatwizard_core.rendering.negotiation import declared_info
+from splatwizard_core.rendering.rasterizer import (
+    AccumOutput,
+    Feature,
+    GradBuffer,
+    RasterizerInfo,
+    RasterOptions,
+    RasterStats,
+    RenderResult,
+    check_offered,
+    option_features,
+)
+from splatwizard_core.scene.camera import Camera
+from sw_rasterizers import plugin
+from sw_rasterizers.native import MODULE
+from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, camera_numbers
+
+INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
+"""Differentiable inputs in the order in which the ops take them and return their gradients."""
+WITH_MAPS = 8192
+"""Flag beside those of ops.py: depth, normals and distortion too; mirrors `kWithMaps` in csrc/binding_surfel.cpp."""
+MAPS = {"accumulated": slice(0, 1), "inverse": slice(1, 2), "normals": slice(2, 5), "distortion": slice(5, 6),
+        "median": slice(6, 7)}  # fmt: skip
+"""Rows of the maps; mirrors `SurfelMap` in csrc/cpu/surfel_kernels.h."""
+
+
+class SurfelRasterizer:
+    """2DGS with complete gradients; float32, and float64 for checking.
+
+    Draws what the reference draws for scales [N,2]: with profile "3dgs" the exact support of every surfel, with
+    "dgr-exact" cut at the 16x16 tile squares of the published kernels and with the gradient passing through the clamp
+    of alpha (the gradient of depth through the low-pass branch, which those leave out in part, stays exact).
+    The densification statistic is the derivative with respect to a shift of the surfel on the screen.
+
+    count   also count evaluated and blended pixel-surfel pairs into the statistics; slow, for benchmarks
+    """
+
+    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "2dgs")
+
+    def __init__(self, *, count: bool = False) -> None:
+        self.count = count
+
+    def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
+        """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
+        check_request(self.info, g, opt)
+        check_placement(self.info, g)
+        call, flags = self._call(g, cam, opt)
+        sh = g.sh
+        image, radii, alpha, maps = _draw(
+            call,
+            flags,
+            {
+                "means": g.means,
+                "opacities": g.opacities,
+                "scales": g.scales,
+                "quats": g.quats,
+                "sh": None if sh is None else sh.dense,
+                "sh_dc": None if sh is None else sh.dc,
+                "sh_rest": None if sh is None else sh.rest,
+                "colors": g.colors,
+            },
+        )
+        depth = {name: maps[MAPS[name]] for name in opt.depth if name != "expected"}
+        if "expected" in opt.depth:
+            depth["expected"] = maps[MAPS["accumulated"]] / alpha.clamp(min=1e-10)
+        visible, pairs, evaluated, blended, invalid = call.counts
+        return RenderResult(
+            image=image,
+            radii=radii,
+            inputs=g,
+            alpha=alpha if opt.alpha else None,
+            depth={name: depth[name] for name in sorted(opt.depth)},
+            normals=maps[MAPS["normals"]] if opt.normals else None,
+            distortion=maps[MAPS["distortion"]] if opt.distortion else None,
+            grad2d=call.grad2d,
+            stats=RasterStats(
+                n_visible=visible,
+                n_pairs=pairs,
+                n_evaluated=evaluated if evaluated >= 0 else None,
+                n_blended=blended if blended >= 0 else None,
+                n_pixels=cam.width * cam.height,
+                n_invalid=invalid,
+                stage_seconds=call.seconds,
+            ),
+        )
+
+    @torch.no_grad()
+    def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
+        """Radii [N] int32 from means, scales and quats (opacities and colours are not looked at); 0 = culled."""
+        g.validate()
+        required = Feature.SURFEL if g.scales is not None and g.scales.shape[1] == 2 else Feature(0)
+        if g.cov3d is not None:
+            required |= Feature.COV3D
+        if g.geom_indices is not None or g.scale_factors is not None:
+            required |= Feature.INDEXED_GEOM
+        check_offered(self.info, required)
+        check_placement(self.info, g)
+        MODULE.load()
+        geometry = [None if x is None else x.detach().contiguous() for x in (g.means, g.scales, g.quats)]
+        found: Tensor = torch.ops.sw_rasterizers.visible_surfel_radii(
+            *geometry, _as_bytes(g.visible), camera_numbers(cam), cam.width, cam.height
+        )
+        return found
+
+    @torch.no_grad()
+    def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
+        """No score is declared: raises CapabilityError for any that is asked for."""
+        check_offered(self.info, option_features(opt) | Feature.SURFEL)
+        return AccumOutput({})
+
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[Call, int]:
+        quirks = opt.profile == "dgr-exact"
+        flags = Flag(0)
+        for asked, flag in (
+            (opt.clamp_color, Flag.CLAMP_COLOR),
+            (not quirks, Flag.TIGHT),
+            (quirks or opt.clamp_grad == "pass", Flag.PASS_CLAMP),
+            (opt.alpha or "expected" in opt.depth, Flag.ALPHA_MAP),
+            (self.count, Flag.COUNT),
+        ):
+            if asked:
+                flags |= flag
+        background = checked_background(opt, 3, cam, g.means)
+        call = Call(
+            camera_numbers(cam),
+            cam.width,
+            cam.height,
+            0 if g.sh is None else g.sh.active_degree,
+            opt.scale_modifier,
+            0.0,
+            flags,
+            visible=_as_bytes(g.visible),
+            background=None if background is None else background.detach().contiguous(),
+            grad2d=GradBuffer() if torch.is_grad_enabled() and opt.grad2d else None,
+        )
+        return call, WITH_MAPS if opt.depth or opt.normals or opt.distortion else 0
+
+
+def _as_bytes(mask: Tensor | None) -> Tensor | None:
+    return None if mask is None else mask.to(torch.bool).contiguous().view(torch.uint8)
+
+
+class _DrawSurfels(torch.autograd.Function):
+    """(call, flags, dummy, *INPUTS) -> image [3,H,W], radii [N] int32, alpha [0 or 1,H,W], maps [0 or 7,H,W]."""
+
+    @staticmethod
+    def forward(ctx: Any, call: Call, flags: int, dummy: Tensor | None, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        tensors = [None if x is None else x.detach().contiguous() for x in inputs]
+        image, radii, alpha, maps, saved, call.counts, seconds = torch.ops.sw_rasterizers.render_surfels(
+            *tensors, *_settings(call, flags)
+        )
+        call.seconds.update(zip(FORWARD_STAGES, seconds, strict=True))
+        ctx.call, ctx.flags = call, flags
+        ctx.mark_non_differentiable(radii)
+        ctx.set_materialize_grads(False)
+        # All state goes through save_for_backward, so that it is freed with the graph even if the result lives on.
+        ctx.present = [x is not None for x in tensors]
+        ctx.save_for_backward(*(x for x in tensors if x is not None), *saved)
+        return image, radii, alpha, maps
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *grads: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, _, alpha, maps = (None if x is None or x.numel() == 0 else x.contiguous() for x in grads)
+        call: Call = ctx.call
+        stored = list(ctx.saved_tensors)
+        tensors = [stored.pop(0) if present else None for present in ctx.present]
+        if image is None:
+            means = tensors[0]
+            assert means is not None
+            image = means.new_zeros(3, call.height, call.width)
+        wanted = [*ctx.needs_input_grad[3:], call.grad2d is not None]
+        found, seconds = torch.ops.sw_rasterizers.render_surfels_backward(
+            *tensors, *_settings(call, ctx.flags), stored, image, alpha, maps, wanted
+        )
+        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=True))
+        if call.grad2d is not None:
+            call.grad2d.set(found[-1])
+        return (None, None, None, *(g if want else None for g, want in zip(found, wanted[:-1], strict=False)))
+
+
+def _settings(call: Call, flags: int) -> tuple[Any, ...]:
+    return (call.visible, call.background, call.camera, call.width, call.height, call.sh_degree, call.scale_modifier,
+            int(call.flags) | flags)  # fmt: skip
+
+
+def _draw(call: Call, flags: int, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Image, radii, alpha and maps; state for the backward pass is kept only if something needs a gradient."""
+    MODULE.load()
+    inputs = [tensors.get(name) for name in INPUTS]
+    dummy = None
+    if torch.is_grad_enabled():
+        if call.grad2d is not None:
+            dummy = torch.empty(0, requires_grad=True)  # the statistic is wanted even if no input needs a gradient
+        if dummy is not None or any(x is not None and x.requires_grad for x in inputs):
+            call.flags |= Flag.SAVE
+    return _DrawSurfels.apply(call, flags, dummy, *inputs)  # type: ignore[no-any-return]
