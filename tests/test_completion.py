@@ -110,6 +110,16 @@ def test_every_parameter_that_takes_a_word_offers_something_or_says_that_it_cann
     assert silent == []
 
 
+def test_every_option_that_takes_a_value_says_what_holds_without_it():
+    silent = []
+    for name, command in commands():
+        for option in (p for p in command.params if isinstance(p, click.Option)):
+            takes_one = not option.is_flag and not option.multiple and not option.required
+            if takes_one and not option.show_default and "default" not in (option.help or ""):
+                silent.append(f"{name} {option.opts[0]}")
+    assert silent == []
+
+
 def test_what_a_method_declares_for_completion_is_what_it_has():
     for entry in load_plugins().methods:
         cls = entry.load()

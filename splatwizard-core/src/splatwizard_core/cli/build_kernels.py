@@ -19,7 +19,7 @@ from splatwizard_core.cli.setup import say
         help="Put the binaries beside their sources, to be shipped in a wheel.  [default: this user's cache]",
     ),
     click.option("--force", is_flag=True, help="Compile also what is up to date."),
-    click.option("--jobs", type=click.IntRange(min=1), help="Compilers at once.  [default: the cores]"),
+    click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Compilers at once.  [default: the cores]"),
     json_option, debug_option,
 )  # fmt: skip
 def build_kernels(portable: bool, into_packages: bool, force: bool, jobs: int | None, as_json: bool) -> None:

@@ -85,10 +85,11 @@ def encode(
 @options(
     click.option(
         "--out", metavar="FILE", shell_complete=complete.files,
-        help="Where to put the decoded model: .safetensors holds its tensors, other suffixes go to an exporter (.ply).",
+        help="Where to put the decoded model: .safetensors holds its tensors, other suffixes go to an exporter (.ply). "
+        " [default: it is not kept]",
     ),
     click.option(
-        "--repeats", type=click.IntRange(min=0), default=3, show_default=True,
+        "--repeats", type=click.IntRange(min=0), default=3, show_default=True, metavar="N",
         help="Timed decodes after the first one; their median is reported.",
     ),
     device_option, json_option, debug_option,

@@ -50,7 +50,8 @@ if TYPE_CHECKING:
     ),
     lpips_option,
     click.option(
-        "--renders", metavar="DIR", shell_complete=complete.folders, help="Keep the rendered test views there as PNG."
+        "--renders", metavar="DIR", shell_complete=complete.folders,
+        help="Keep the rendered test views there as PNG.  [default: they are not kept]",
     ),
     click.option(
         "--roundtrip", is_flag=True,

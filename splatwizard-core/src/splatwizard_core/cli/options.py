@@ -38,7 +38,7 @@ rate_option = click.option(
 )  # fmt: skip
 config_option = click.option(
     "--config", "config_file", type=click.Path(dir_okay=False), metavar="FILE",
-    help="TOML file of values; config.toml of a run directory repeats that run.",
+    help="TOML file of values; config.toml of a run directory repeats that run.  [default: none]",
 )  # fmt: skip
 set_option = click.option(
     "--set", "sets", multiple=True, metavar="KEY=VALUE", shell_complete=complete.nothing,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
+from splatwizard_core.cli import complete
 from splatwizard_core.cli.options import console, debug_option, options, print_json
 from splatwizard_core.cli.setup import output_file, output_folder, say
 
@@ -19,18 +20,21 @@ FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
 
 
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
-@click.argument("folders", metavar="DIR...", nargs=-1, required=True)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete.folders)
 @options(
-    click.option("--html", metavar="FILE", help="Write one self-contained page there."),
-    click.option("--survey", metavar="FOLDER", help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of "
-                 "3DGS compression asks."),
+    click.option("--html", metavar="FILE", shell_complete=complete.files,
+                 help="Write one self-contained page there.  [default: none]"),
+    click.option("--survey", metavar="FOLDER", shell_complete=complete.folders,
+                 help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
+                 "[default: none]"),
     click.option("--csv", "form", flag_value="csv",
                  help="Print CSV: the survey's columns after what tells runs apart."),
     click.option("--latex", "form", flag_value="latex", help="Print LaTeX tables (booktabs)."),
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
-    click.option("--anchor", metavar="METHOD", help="What BD-rates compare against.  [default: hac, lightgaussian, "
+    click.option("--anchor", metavar="METHOD", shell_complete=complete.names("method"),
+                 help="What BD-rates compare against.  [default: hac, lightgaussian, "
                  "3dgs, or the first]"),
     click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),
     click.option("--partial", is_flag=True, help="Means over the scenes that are there, the missing ones named; "

@@ -13,7 +13,6 @@ from splatwizard_core.cli.options import (
     debug_option,
     json_option,
     options,
-    preset_option,
     print_json,
     rate_option,
     set_option,
@@ -23,7 +22,11 @@ from splatwizard_core.cli.options import (
 @click.command(short_help="a method's plan as a table")
 @click.argument("method", shell_complete=complete.names("method"))
 @options(
-    preset_option, rate_option, config_option, set_option,
+    click.option(
+        "--preset", metavar="NAME", shell_complete=complete.presets,
+        help="Named values of the method.  [default: paper, or what --config says]",
+    ),
+    rate_option, config_option, set_option,
     click.option("--verbose", is_flag=True, help="Also the first and last step and the number of executions."),
     json_option, debug_option,
 )  # fmt: skip
@@ -36,10 +39,7 @@ def schedule(
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Print the plan that METHOD executes, stage by stage; needs no data, no device, no training.
-
-    The default preset here is `paper`, whatever the scene will be.
-    """
+    """Print the plan that METHOD executes, stage by stage; needs no data, no device, no training."""
     import json
 
     from splatwizard_core.cli.setup import resolve_one
