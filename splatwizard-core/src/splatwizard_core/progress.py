@@ -159,7 +159,8 @@ def track(
     if not out.isatty():
         bar = Bar(label, total, start, unit=unit, stream=out)
         yield bar
-        bar._finish()
+        with contextlib.suppress(OSError):
+            bar._finish()
         return
     outer = _display.get()
     if outer is not None:
@@ -175,7 +176,8 @@ def track(
         with display:
             bar = _RichBar(display, label, total, start, unit=unit)
             yield bar
-            bar._finish()
+            with contextlib.suppress(OSError):
+                bar._finish()
     finally:
         _display.reset(token)
 

@@ -13,6 +13,7 @@ import pytest
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.streams import ended_like_ctrl_c
 from splatwizard_core.coding.container import ContainerWriter
+from splatwizard_core.progress import track
 from splatwizard_core.training.interrupt import InterruptGuard
 
 SW = f"{shlex.quote(sys.executable)} -m splatwizard_core"
@@ -123,3 +124,11 @@ def test_a_request_to_end_waits_for_the_end_of_a_training_step():
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGTERM)
     assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+
+
+def test_progress_that_nobody_reads_does_not_end_the_work():
+    with open("/dev/null") as unwritable, track("train", total=3, stream=unwritable) as bar:  # raises OSError
+        bar._interval = 0.0
+        for _ in range(3):
+            bar.advance()
+    assert bar.done == 3
