@@ -44,8 +44,13 @@ def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) ->
 
 
 def _starts_with(path: Path, magic: bytes) -> bool:
-    with path.open("rb") as file:
-        return file.read(len(magic)) == magic
+    from splatwizard_core.errors import UserInputError
+
+    try:
+        with path.open("rb") as file:
+            return file.read(len(magic)) == magic
+    except OSError as error:
+        raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
 def file_facts(path: Path) -> dict[str, Any]:
