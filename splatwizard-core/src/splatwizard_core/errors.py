@@ -121,6 +121,21 @@ class DiskFullError(SplatwizardError):
         self.path, self.reason, self.wanted, self.free = path, reason, wanted, free
 
 
+class DeviceMemoryError(SplatwizardError):
+    """A GPU has too little memory left.
+
+    wanted, free, total     bytes, if known
+    """
+
+    def __init__(
+        self, doing: str, advice: str, wanted: int | None = None, free: int | None = None, total: int | None = None
+    ) -> None:
+        known = (("wanted at once", wanted), ("free", free), ("in all", total))
+        figures = [f"{count:,} bytes {what}" for what, count in known if count is not None]
+        super().__init__(f"the GPU has too little memory for {doing} ({', '.join(figures) or 'no figures'}); {advice}")
+        self.wanted, self.free, self.total = wanted, free, total
+
+
 class NativeBuildError(SplatwizardError):
     """A kernel module could not be compiled or loaded."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import resource
 import sys
 from collections.abc import Iterator
@@ -10,6 +11,8 @@ from pathlib import Path
 
 import psutil
 import torch
+
+from splatwizard_core.errors import DeviceMemoryError
 
 _STATUS = Path("/proc/self/status")
 _CLEAR = Path("/proc/self/clear_refs")
@@ -39,6 +42,19 @@ def reset_peak_rss() -> bool:
     except OSError:
         return False
     return True
+
+
+_UNITS = {"bytes": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
+
+
+def out_of_memory(error: torch.OutOfMemoryError, doing: str, advice: str) -> DeviceMemoryError:
+    """The error that says what torch's does, and what was being done: counts, resolution, bytes."""
+    found = re.search(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)", str(error))
+    wanted = None if found is None else round(float(found[1]) * _UNITS[found[2]])
+    free = total = None
+    if torch.cuda.is_available():
+        free, total = torch.cuda.mem_get_info()
+    return DeviceMemoryError(doing, advice, wanted, free, total)
 
 
 class MemoryMeter:

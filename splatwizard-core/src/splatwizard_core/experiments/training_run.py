@@ -212,7 +212,7 @@ def run_stages(
         "steps": outcome.steps,
         "peak_bytes": outcome.peak_memory,
         "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
-        "pictures_in": "host" if scene.train[0].pixels.device.type == "cpu" else scene.train[0].pixels.device.type,
+        "pictures_in": outcome.pictures_in,
         "breakdown_s": outcome.stage_breakdown,
         "plan": outcome.plan,
         "rasterizers": outcome.rasterizers,

@@ -59,6 +59,12 @@ class SH:
         return 0
 
 
+_TENSORS = (
+    "means", "opacities", "scales", "quats", "cov3d", "geom_indices", "scale_factors", "colors", "features", "visible",
+)  # fmt: skip
+_SH_TENSORS = tuple((name, f"sh.{name}") for name in ("dense", "dc", "rest", "codebook", "indices"))
+
+
 @dataclass
 class GaussianInputs:
     """Activated Gaussians, all tensors on one device.
@@ -95,15 +101,13 @@ class GaussianInputs:
 
     def tensors(self) -> dict[str, Tensor]:
         """Every tensor that is present, by field name (`sh.dense`, `sh.dc`, ... for colours)."""
-        names = (
-            "means", "opacities", "scales", "quats", "cov3d", "geom_indices", "scale_factors",
-            "colors", "features", "visible",
-        )  # fmt: skip
-        found = {name: getattr(self, name) for name in names if getattr(self, name) is not None}
+        own = vars(self)
+        found = {name: own[name] for name in _TENSORS if own[name] is not None}
         if self.sh is not None:
-            for name in ("dense", "dc", "rest", "codebook", "indices"):
-                if (tensor := getattr(self.sh, name)) is not None:
-                    found[f"sh.{name}"] = tensor
+            stored = vars(self.sh)
+            for name, full in _SH_TENSORS:
+                if stored[name] is not None:
+                    found[full] = stored[name]
         return found
 
     def requires_grad(self) -> bool:
@@ -115,7 +119,7 @@ class GaussianInputs:
         n = self.means.shape[0]
 
         def need(name: str, tensor: Tensor | None, *expected: int | str) -> None:
-            if tensor is None:
+            if tensor is None or tensor.shape == expected:
                 return
             ok = tensor.dim() == len(expected) and all(
                 isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
@@ -161,6 +165,7 @@ class GaussianInputs:
             need("sh.rest", self.sh.rest, n, "K-1", 3)
             need("sh.codebook", self.sh.codebook, "M", "K", 3)
             need("sh.indices", self.sh.indices, n)
-        devices = {t.device for t in self.tensors().values()}
-        if len(devices) > 1:
-            raise ShapeError(f"GaussianInputs mixes devices: {', '.join(sorted(map(str, devices)))}")
+        device = self.means.device
+        for name, tensor in self.tensors().items():
+            if tensor.device != device:
+                raise ShapeError(f"GaussianInputs mixes devices: {name} is on {tensor.device}, means on {device}")

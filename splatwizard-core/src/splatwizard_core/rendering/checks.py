@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+
+import torch
 from torch import Tensor
 
 from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
@@ -26,6 +29,12 @@ def check_request(info: RasterizerInfo, g: GaussianInputs, opt: RasterOptions) -
         raise ConfigError(f"clamp_grad is '{opt.clamp_grad}', must be 'exact' or 'pass'")
 
 
+@functools.cache
+def dtype_name(dtype: torch.dtype) -> str:
+    """As declared: "float32", ..."""
+    return str(dtype).removeprefix("torch.")
+
+
 def check_placement(info: RasterizerInfo, g: GaussianInputs) -> None:
     """Raise CapabilityError or ShapeError unless all tensors share a device kind and a dtype that `info` declares."""
     if g.means.device.type not in info.devices:
@@ -34,10 +43,13 @@ def check_placement(info: RasterizerInfo, g: GaussianInputs) -> None:
             f"the Gaussians are on {g.means.device}",
             missing=(),
         )
-    name = str(g.means.dtype).removeprefix("torch.")
-    mixed = {t.dtype for t in g.tensors().values() if t.is_floating_point()} != {g.means.dtype}
-    if name not in info.dtypes or mixed:
-        raise ShapeError(f"rasterizer '{info.name}' needs all tensors in one dtype of {', '.join(sorted(info.dtypes))}")
+    dtype = g.means.dtype
+    for name, tensor in g.tensors().items():
+        if tensor.is_floating_point() and (tensor.dtype != dtype or dtype_name(dtype) not in info.dtypes):
+            raise ShapeError(
+                f"rasterizer '{info.name}' needs all tensors in one dtype of {', '.join(sorted(info.dtypes))}: "
+                f"{name} is {dtype_name(tensor.dtype)}" + (f", means {dtype_name(dtype)}" if name != "means" else "")
+            )
 
 
 def checked_background(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor | None:

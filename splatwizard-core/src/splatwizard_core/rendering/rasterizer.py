@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import enum
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, runtime_checkable
 
+import torch
 from torch import Tensor
 
 from splatwizard_core.errors import CapabilityError
@@ -235,13 +237,16 @@ class RasterizerInfo:
         here = self.per_device.get(device)
         if here is None:
             return self
-        return replace(
-            self,
-            features=self.features - here.lacks,
-            available=here.available or self.available,
-            speed=self.speed if here.speed is None else here.speed,
-            per_device={},
-        )
+        known: dict[str, RasterizerInfo] = vars(self).setdefault("_on", {})  # asked for at every render
+        if device not in known:
+            known[device] = replace(
+                self,
+                features=self.features - here.lacks,
+                available=here.available or self.available,
+                speed=self.speed if here.speed is None else here.speed,
+                per_device={},
+            )
+        return known[device]
 
 
 @runtime_checkable
@@ -332,11 +337,12 @@ def required_features(g: GaussianInputs, opt: RasterOptions) -> Feature:
             required |= Feature.SPLIT_SH
     if g.scales is not None and g.scales.shape[-1] == 2:
         required |= Feature.SURFEL
-    if str(g.means.dtype) == "torch.float64":
+    if g.means.dtype == torch.float64:
         required |= Feature.FLOAT64
     return required
 
 
+@functools.cache
 def feature_names(features: Feature) -> frozenset[str]:
     """{"BACKWARD", ...} for a set of flags."""
     return frozenset(f.name for f in Feature if f in features and f.name is not None)

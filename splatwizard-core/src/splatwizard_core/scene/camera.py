@@ -51,6 +51,11 @@ class Camera:
         """Camera centre in the world, [3]."""
         return -self.R.T @ self.tau
 
+    @cached_property
+    def pose(self) -> tuple[float, ...]:
+        """R row by row, then tau: 12 numbers on the host, read once (from a GPU, reading waits for it)."""
+        return (*self.R.detach().flatten().tolist(), *self.tau.detach().tolist())
+
     @property
     def tan_half_fov(self) -> tuple[float, float]:
         """(W / 2 fx, H / 2 fy)."""
@@ -88,7 +93,10 @@ class Camera:
         tau = self.tau.to(device=device, dtype=dtype)
         if R is self.R and tau is self.tau:
             return self
-        return replace(self, R=R, tau=tau)
+        moved = replace(self, R=R, tau=tau)
+        if R.dtype == self.R.dtype and tau.dtype == self.tau.dtype and ("pose" in vars(self) or not self.R.is_cuda):
+            vars(moved)["pose"] = self.pose  # the numbers stay: nobody need fetch them back
+        return moved
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution: intrinsics scale per axis, so the field of view is kept."""

@@ -28,6 +28,7 @@ class View:
     name: str
     load: Callable[[], np.ndarray] | None = None
     load_mask: Callable[[], np.ndarray] | None = None
+    _resident: Tensor | None = field(default=None, init=False, repr=False)
 
     @cached_property
     def pixels(self) -> Tensor:
@@ -43,14 +44,29 @@ class View:
 
     def image(self, background: Tensor | None = None, device: torch.device | str = "cpu") -> Tensor:
         """float32 [3,H,W] in 0..1 on `device`; an RGBA picture is composited on `background` [3] (None: black)."""
-        pixels = self.pixels.to(device)
-        rgb = pixels[:3].float() / 255
+        pixels = self._pixels_on(torch.device(device))
         if pixels.shape[0] == 3:
-            return rgb
+            return pixels.float() / 255
+        rgb = pixels[:3].float() / 255
         alpha = pixels[3:].float() / 255
         if background is None:
             return rgb * alpha
         return rgb * alpha + background.to(device)[:, None, None] * (1 - alpha)
+
+    def keep_on(self, device: torch.device | str) -> None:
+        """Keep a copy of `pixels` in a GPU's memory, so that `image` need not send it each time; "cpu" drops it."""
+        device = torch.device(device)
+        self._resident = None if device.type == "cpu" else self.pixels.to(device)
+
+    @property
+    def kept_on(self) -> torch.device:
+        """Where `image` takes the picture from: a GPU after `keep_on`, else the host."""
+        return torch.device("cpu") if self._resident is None else self._resident.device
+
+    def _pixels_on(self, device: torch.device) -> Tensor:
+        if self._resident is not None and self._resident.device.type == device.type:
+            return self._resident.to(device)
+        return self.pixels.to(device)
 
 
 @dataclass(frozen=True, eq=False)

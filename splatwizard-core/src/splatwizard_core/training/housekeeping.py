@@ -17,6 +17,7 @@ from splatwizard_core.progress import track
 from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.run_log import RunLog
+from splatwizard_core.training.scalars import read_scalars
 from splatwizard_core.training.timing import LoopClock, synchronize
 from splatwizard_core.training.trainer import StepRecord, Trainer
 
@@ -36,6 +37,7 @@ class Progress:
     breakdown       stage name -> seconds per stage of a step, where they are timed
     peak_memory     bytes
     rasterizers     features asked for -> who served them
+    pictures_in     where the training pictures were: "host" or "cuda"
     """
 
     stage_seconds: dict[str, float] = field(default_factory=dict)
@@ -43,6 +45,7 @@ class Progress:
     breakdown: dict[str, dict[str, float]] = field(default_factory=dict)
     peak_memory: int = 0
     rasterizers: dict[str, str] = field(default_factory=dict)
+    pictures_in: str = "host"
 
     @property
     def steps(self) -> int:
@@ -177,9 +180,12 @@ class Housekeeping:
             self._write_lines()
 
     def _write_lines(self) -> None:
+        if not self._unread:
+            return
+        values = iter(read_scalars([x for r, _ in self._unread for x in (r.total, *r.parts.values())]))
         for record, facts in self._unread:
-            line: dict[str, Any] = {"view": record.view, "loss": record.total.item()}
-            line["parts"] = {name: part.item() for name, part in record.parts.items()}
+            line: dict[str, Any] = {"view": record.view, "loss": next(values)}
+            line["parts"] = {name: next(values) for name in record.parts}
             if record.seconds:
                 line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
             self.run_log.write(record.stage, record.step, **line, **facts)

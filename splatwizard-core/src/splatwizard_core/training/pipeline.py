@@ -13,7 +13,7 @@ from splatwizard_core.errors import CheckpointError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter
 from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.images import decode_all
+from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences, normalised
@@ -48,6 +48,7 @@ class TrainOutcome:
     stage_breakdown stage name -> seconds in pre, render, loss, backward, post, optimize; None: not profiled
     plan            of each stage: name, steps, and its tasks as printed
     rasterizers     features asked for -> who served them
+    pictures_in     where the training pictures were: "host" or "cuda"
     """
 
     model: SplatModel
@@ -58,6 +59,7 @@ class TrainOutcome:
     stage_breakdown: dict[str, dict[str, float]] | None
     plan: list[dict[str, Any]]
     rasterizers: dict[str, str]
+    pictures_in: str = "host"
 
 
 @dataclass
@@ -257,6 +259,7 @@ def train_stages(
         progress.breakdown or None,
         plans,
         dict(progress.rasterizers),
+        progress.pictures_in,
     )
 
 
@@ -287,8 +290,12 @@ def _run_stage(
     )
     if until > trainer.step or stop_after is None:
         decode_all(run.scene.train)  # reading pictures is not training time
-        with housekeeping:
-            trainer.run(until, housekeeping.after_step, housekeeping.guard)
+        progress.pictures_in = "cuda" if keep_pictures(run.scene.train, trainer.device) else "host"
+        try:
+            with housekeeping:
+                trainer.run(until, housekeeping.after_step, housekeeping.guard)
+        finally:
+            keep_pictures(run.scene.train, "cpu")
     finished = trainer.stopped or trainer.step >= iterations
     housekeeping.save(finished=finished)
     last = finished and index == len(run.stages) - 1

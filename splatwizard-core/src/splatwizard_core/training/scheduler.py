@@ -9,6 +9,8 @@ import logging
 from collections.abc import Callable
 from typing import Any, Final
 
+import torch
+
 from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.params import PipelineParams
@@ -100,7 +102,7 @@ class Scheduler:
             context.step, context.scheduler, self._step = step, self, step
             try:
                 result = binding(context)
-            except (EmptyModel, TrainingDiverged, TaskSignatureError):
+            except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.OutOfMemoryError):
                 raise
             except Exception as error:
                 raise TaskError(self.stage, step, entry.name, error) from error

@@ -9,26 +9,30 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NoReturn
 from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import EmptyModel, NothingToDo, TrainingDiverged
+from splatwizard_core.errors import DeviceMemoryError, EmptyModel, NothingToDo, TaskError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import out_of_memory
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
+from splatwizard_core.training.scalars import Verdict
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import CameraIterator, LossPack, Stage
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
 
-CHECK_EVERY = 32  # steps between looks at the losses on a GPU: each look waits for the device
+CHECK_EVERY = 32
+"""Steps between questions to a GPU whether the losses are finite; each is answered at the next one, so that none is
+waited for. A loss that is not finite ends the training at most twice as many steps later, and before any checkpoint."""
 
 
 @dataclass
@@ -88,9 +92,11 @@ class Trainer:
         self.post.check(self.context)
         self.step = 0
         self.stopped = False
+        self._view: View | None = None
         self._background = scene.background.to(self.device)
         self._cameras: WeakKeyDictionary[View, Camera] = WeakKeyDictionary()
         self._unchecked: list[StepRecord] = []
+        self._asked: tuple[Verdict, list[StepRecord]] | None = None
 
     def run(self, until: int, after_step: Callable[[StepRecord], None], guard: InterruptGuard | None = None) -> None:
         """Run the steps after `self.step` up to `until`, or to the one after which a task wants to stop.
@@ -107,7 +113,13 @@ class Trainer:
         guard = guard or InterruptGuard()
         while self.step < min(until, self.stage.iterations) and not self.stopped:
             with guard.step():
-                record = self._run_step(self.step + 1)
+                try:
+                    record = self._run_step(self.step + 1)
+                except (EmptyModel, TaskError):
+                    self.check_losses()  # what a step with a loss that is not finite leaves behind may have caused it
+                    raise
+                except torch.OutOfMemoryError as error:
+                    raise self._out_of_memory(error) from error
                 self.step += 1
             after_step(record)
         self.check_losses()
@@ -123,7 +135,7 @@ class Trainer:
         if clock:
             clock.mark("pre")
 
-        view = self.sampler.next(step)
+        view = self._view = self.sampler.next(step)
         background = self._next_background()
         camera = self._camera(view)
         inputs = self.model.gaussians(camera, self.rasterizer)
@@ -172,21 +184,34 @@ class Trainer:
         )
         self._unchecked.append(record)
         # On a CPU a look costs a microsecond, so it happens before a bad gradient can spread.
-        if self.device.type == "cpu" or len(self._unchecked) >= CHECK_EVERY:
+        if self.device.type == "cpu":
             self.check_losses()
+        elif len(self._unchecked) >= CHECK_EVERY:
+            self._hear_verdict()
+            records, self._unchecked = self._unchecked, []
+            self._asked = Verdict([r.total for r in records]), records
         return record
 
     def check_losses(self) -> None:
         """Raise TrainingDiverged if a loss since the last look is not finite. Waits for the device."""
+        self._hear_verdict()
         records, self._unchecked = self._unchecked, []
         if not records:
             return
         if len(records) == 1:
             fine = math.isfinite(records[0].total.item())
         else:
-            fine = bool(torch.stack([r.total for r in records]).isfinite().all())
-        if fine:
-            return
+            fine = Verdict([r.total for r in records]).fine()
+        if not fine:
+            self._raise_diverged(records)
+
+    def _hear_verdict(self) -> None:
+        asked, self._asked = self._asked, None
+        if asked is not None and not asked[0].fine():
+            self._raise_diverged(asked[1])
+
+    @staticmethod
+    def _raise_diverged(records: list[StepRecord]) -> NoReturn:
         for record in records:
             if math.isfinite(record.total.item()):
                 continue
@@ -194,6 +219,19 @@ class Trainer:
             values["total"] = record.total.item()
             part = next(name for name, value in values.items() if not math.isfinite(value))
             raise TrainingDiverged(record.step, record.view, part, values[part])
+        raise AssertionError("all of these losses are finite")
+
+    def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
+        view = self._view
+        rows = self._num_rows()
+        what = "anchors" if "num_anchors" in self.model.counts() else "Gaussians"
+        drawn = "" if view is None else f" at {view.camera.width}x{view.camera.height}"
+        return out_of_memory(
+            error,
+            f"step {self.step + 1} of stage '{self.stage.name}' with {rows:,} {what}{drawn}",
+            "use smaller pictures or a plan that makes fewer, or free the GPU, and give the same command again: "
+            "it goes on from the last checkpoint",
+        )
 
     def _num_rows(self) -> int:
         return self.model.num_rows if self.model.ROWS else 0
@@ -204,7 +242,7 @@ class Trainer:
 
     def _next_background(self) -> Tensor:
         if self.ppl.random_background:
-            return torch.rand(3, generator=self.streams("background")).to(self.device)
+            return torch.rand(3, generator=self.streams("background")).to(self.device, non_blocking=True)
         return self._background
 
     def _camera(self, view: View) -> Camera:
