@@ -8,7 +8,8 @@ Scenes of benchmarks/scene.py, eight orbit views in turn, spherical harmonics of
 float32; medians over --repeats with CUDA events, after as many turns to warm up. Forward under no_grad;
 forward + backward of sum(image * fixed random weight) with gradients of all five inputs. `ref` are the times on an H200
 that this library set out to beat (gsplat after 1.5.3), scaled by what gsplat 1.5.3 takes here over what it took there,
-both with packed=False, its faster mode; without gsplat they are unscaled. Peak memory is above the inputs, with the gradients.
+both with packed=False, its faster mode; without gsplat they are unscaled. Peak memory is above the inputs, with the
+gradients.
 """
 
 from __future__ import annotations

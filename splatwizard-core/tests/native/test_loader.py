@@ -436,9 +436,16 @@ def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_
     library = module._library(module.prebuilt_folder, "portable", True)
     library.parent.mkdir()
     library.write_bytes(b"not looked into")
-    facts = {"sha256": file_sha256(library), "architectures": ["8.0", "9.0"]}
+    facts = {"sha256": file_sha256(library), "architectures": ["8.0", "9.0", "12.0a"]}
     library.with_suffix(".json").write_text(json.dumps(facts))
-    for gpu, suits in (((9, 0), True), ((8, 6), True), ((7, 5), False), ((10, 0), False)):
+    for gpu, suits in (
+        ((9, 0), True),
+        ((8, 6), True),
+        ((7, 5), False),
+        ((10, 0), False),
+        ((12, 0), True),
+        ((12, 1), False),
+    ):
         monkeypatch.setattr(toolchain, "gpus", lambda gpu=gpu: [gpu])
         assert (library in module._existing()) == suits
         assert (module.available(cuda=True) is None) == suits

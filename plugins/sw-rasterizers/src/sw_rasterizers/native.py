@@ -32,8 +32,6 @@ MODULE = NativeModule(
     # Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square
     # roots and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written.
     cflags=("-fno-math-errno", "-fno-trapping-math"),
-    # Quotients and roots within 2 ulp: a sixth of the instructions of the exact ones. Denormals and NaN stay.
-    cuda_cflags=("--prec-div=false", "--prec-sqrt=false"),
     seconds=20,
     without="rendering falls back to the pure-torch reference, some hundred times slower",
 )

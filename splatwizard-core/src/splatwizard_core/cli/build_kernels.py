@@ -18,11 +18,18 @@ from splatwizard_core.cli.setup import say
         "--into-packages", is_flag=True,
         help="Put the binaries beside their sources, to be shipped in a wheel.  [default: this user's cache]",
     ),
+    click.option(
+        "--cuda", is_flag=True,
+        help="Fail if the CUDA kernels cannot be built. For the GPUs here, or those of $TORCH_CUDA_ARCH_LIST."
+        "  [default: with CUDA where torch and toolkit have it]",
+    ),
     click.option("--force", is_flag=True, help="Compile also what is up to date."),
     click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Compilers at once.  [default: the cores]"),
     json_option, debug_option,
 )  # fmt: skip
-def build_kernels(portable: bool, into_packages: bool, force: bool, jobs: int | None, as_json: bool) -> None:
+def build_kernels(
+    portable: bool, into_packages: bool, cuda: bool, force: bool, jobs: int | None, as_json: bool
+) -> None:
     """Compile the native modules of the core and of all plugins ahead of time; exit status 1 if one fails.
 
     Without this they are compiled when first used.
@@ -34,7 +41,9 @@ def build_kernels(portable: bool, into_packages: bool, force: bool, jobs: int | 
     from splatwizard_core.plugins import load_plugins
 
     march = "portable" if portable else "native"
-    rows = build_all(load_plugins(), march=march, into_packages=into_packages, force=force, jobs=jobs, say=say)
+    rows = build_all(
+        load_plugins(), march=march, into_packages=into_packages, force=force, cuda=cuda, jobs=jobs, say=say
+    )
     failed = [row for row in rows if row.error is not None]
     if as_json:
         print_json(

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatwizard_core.errors import NativeBuildError
+from splatwizard_core.native import toolchain
 from splatwizard_core.native.loader import NativeModule, Say
 from splatwizard_core.native.toolchain import Toolchain
 
@@ -60,12 +61,14 @@ def build_all(
     march: str = "native",
     into_packages: bool = False,
     force: bool = False,
+    cuda: bool = False,
     jobs: int | None = None,
     say: Say | None = None,
 ) -> list[BuildRow]:
     """Build the core's and all plugins' native modules; one row each, in the order of `declared_modules`.
 
     march, force    as for `NativeModule.build`
+    cuda            fail where a module's CUDA kernels cannot be built, instead of building what is left
     into_packages   put the libraries beside their packages' sources instead of into the user's cache
     jobs            most compilers at once, over all modules; None: the cores
     A module that fails has its reason in its row and stops no other one.
@@ -77,6 +80,9 @@ def build_all(
         started = time.monotonic()
         try:
             module = resolve_module(target)
+            missing = toolchain.cuda_mismatch() if cuda and module.cuda_sources else None
+            if missing is not None:
+                raise NativeBuildError(f"the CUDA kernels of '{module.name}' cannot be built: {missing}")
             folder = module.prebuilt_folder if into_packages else module.cache_folder
             fresh = not force and module.is_built(march, folder)
             path = module.build(march=march, folder=folder, force=force, tools=tools, say=say)

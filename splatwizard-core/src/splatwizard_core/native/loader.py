@@ -299,11 +299,9 @@ class NativeModule:
         return library is not None and self._wants_cuda() and bool(_facts(library).get("architectures"))
 
     def _suits_gpus(self, library: Path) -> bool:
-        """Whether the library's CUDA kernels run on every GPU here: same major capability, no higher minor one."""
-        held = [tuple(map(int, a.split("."))) for a in _facts(library).get("architectures") or ()]
-        return not held or all(
-            any(major == of[0] and minor >= of[1] for of in held) for major, minor in toolchain.gpus()
-        )
+        """Whether the library's CUDA kernels run on every GPU here."""
+        held = _facts(library).get("architectures") or []
+        return not held or all(any(toolchain.runs_on(a, gpu) for a in held) for gpu in toolchain.gpus())
 
     def _root(self) -> Path:
         spec = importlib.util.find_spec(self.package)

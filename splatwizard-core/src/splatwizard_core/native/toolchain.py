@@ -35,6 +35,9 @@ X86_LEVELS = {
 }
 
 
+ARCHITECTURE = re.compile(r"(\d+)\.(\d)([af]?)")
+
+
 class CompilerMissingError(NativeBuildError):
     """There is no compiler on this machine."""
 
@@ -127,8 +130,21 @@ def cuda_architectures() -> list[str]:
     """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and 9.0."""
     listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
     if listed:
-        return sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
+        asked = sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
+        for a in asked:
+            if not ARCHITECTURE.fullmatch(a):
+                raise NativeBuildError(f"$TORCH_CUDA_ARCH_LIST names '{a}': give compute capabilities, as 8.0;9.0")
+        return asked
     return [f"{major}.{minor}" for major, minor in gpus()] or ["8.0", "9.0"]
+
+
+def runs_on(architecture: str, gpu: tuple[int, int]) -> bool:
+    """Whether machine code runs there: of "8.0" on 8.0 and any later 8.x, of "9.0a" on 9.0 alone."""
+    found = ARCHITECTURE.fullmatch(architecture)
+    if found is None:
+        return False
+    major, minor = int(found[1]), int(found[2])
+    return gpu == (major, minor) if found[3] else gpu[0] == major and gpu[1] >= minor
 
 
 def gpus() -> list[tuple[int, int]]:

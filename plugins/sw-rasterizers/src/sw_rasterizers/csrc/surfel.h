@@ -118,39 +118,86 @@ SW_HD V surfel_radius(const SurfelProjection<V>& p) {
   return round_up(maximum(largest, c(kSurfelMinRadius)));
 }
 
-// An ellipse that holds every pixel with rho <= level: the outline at that level, widened by the low-pass around its own
-// centre. Its covariance per unit of `level` is a sum of squares, as is the determinant: needles keep their shape.
+// An ellipse that holds every pixel with rho <= level: its centre in pixels, its covariance per unit of `level`, and the
+// inverse of that.
 template <class V>
 struct SurfelBound {
-  V u, v;           // centre, pixels
-  V c00, c01, c11;  // covariance
-  V ka, kb, kc;     // its inverse
+  V u, v;
+  V c00, c01, c11;
+  V ka, kb, kc;
 };
+
+// Where a plane comes nearer than `near` its picture may have no end. What is drawn of the circle then is the part beyond
+// z = near, a convex piece: its lowest and highest u lie at the ends of the cut or where the circle touches a line of
+// constant u. `axis`: Tu' or Tv', tw: Tw, with scales; middle, squared: the outline's; low, high: as those, from (u0, v0).
+template <class V>
+SW_HD void cut_circle_span(const V* axis, const V* tw, V tz, V level, V near, V middle, V squared, V* low, V* high) {
+  const V zero = constant<V>(0), tiny = constant<V>(1e-30);
+  const V slope = maximum(tw[0] * tw[0] + tw[1] * tw[1], tiny), foot = (near - tz) / slope;
+  const V half = square_root(maximum(level / slope - foot * foot, zero));
+  const V at_foot = foot * (axis[0] * tw[0] + axis[1] * tw[1]), along = half * (axis[1] * tw[0] - axis[0] * tw[1]);
+  const V first = (at_foot + along) / near, second = (at_foot - along) / near;
+  *low = minimum(first, second), *high = maximum(first, second);
+  const V extent = square_root(maximum(squared, zero));
+  for (int side = 0; side < 2; ++side) {
+    const V u = side == 0 ? middle + extent : middle - extent;
+    const V x = axis[0] - u * tw[0], y = axis[1] - u * tw[1];
+    const V t = u * tz / maximum(x * x + y * y, tiny);  // the circle is touched at t (x, y)
+    const auto drawn = (squared >= zero) & (tz + t * (x * tw[0] + y * tw[1]) >= near);
+    *low = select(drawn, minimum(*low, u), *low);
+    *high = select(drawn, maximum(*high, u), *high);
+  }
+}
 
 template <class V>
 SW_HD SurfelBound<V> surfel_bound(const View<Scalar<V>>& view, const SurfelProjection<V>& p, V level) {
   const auto c = [](double value) { return constant<V>(value); };
+  const V zero = c(0), half = c(0.5), scale = c(1) / level;
   const SurfelOutline<V> o = surfel_outline(p, level);
-  const V root = square_root(maximum(o.k, c(0)));
-  const V x[3] = {o.x, root * p.scale[0] * p.tu[0], root * p.scale[1] * p.tu[1]};
-  const V y[3] = {o.y, root * p.scale[0] * p.tv[0], root * p.scale[1] * p.tv[1]};
+  const V xs[2] = {p.scale[0] * p.tu[0], p.scale[1] * p.tu[1]};
+  const V ys[2] = {p.scale[0] * p.tv[0], p.scale[1] * p.tv[1]};
+  // The outline's covariance and its determinant are sums of squares: needles keep their shape.
+  const V root = square_root(maximum(o.k, zero));
+  const V x[3] = {o.x, root * xs[0], root * xs[1]}, y[3] = {o.y, root * ys[0], root * ys[1]};
   const V n0 = x[1] * y[2] - x[2] * y[1], n1 = x[2] * y[0] - x[0] * y[2], n2 = x[0] * y[1] - x[1] * y[0];
-  const V off_x = p.center_x - o.x, off_y = p.center_y - o.y;
-  const V reach = square_root(c(kSurfelDot) * level) + square_root(off_x * off_x + off_y * off_y);
-  const V scale = c(1) / level, eps = reach * reach * scale;
   const V xx = scale * dot3(x, x), yy = scale * dot3(y, y), xy = scale * dot3(x, y);
-  const V det0 = scale * scale * (n0 * n0 + n1 * n1 + n2 * n2);
-  const V det = det0 + eps * (xx + yy) + eps * eps;
-  // Where the plane reaches behind the camera its picture has no end: a circle far larger than any image.
-  const auto ends = (o.denominator < c(0)) & (det < c(1e30)) & (xx + yy < c(1e15));
-  const V everywhere = c(1e10), zero = c(0);
+  const V det = scale * scale * (n0 * n0 + n1 * n1 + n2 * n2);
+  // Both axes are long enough to hold the low-pass around its own centre.
+  const V dot = square_root(c(kSurfelDot) * level), off_x = p.center_x - o.x, off_y = p.center_y - o.y;
+  const V reach = dot + square_root(off_x * off_x + off_y * off_y), least = reach * reach * scale;
+  const V mid = half * (xx + yy), gap = half * (xx - yy), spread = square_root(gap * gap + xy * xy);
+  const V longer = maximum(mid + spread, least);
+  const V shorter = maximum(det / maximum(mid + spread, c(1e-30)), least);
+  const V turn = half * (longer - shorter) / maximum(spread, c(1e-30)), level_mid = half * (longer + shorter);
   SurfelBound<V> bound;
-  bound.u = select(ends, p.u0 + o.x, c(0.5 * view.width));
-  bound.v = select(ends, p.v0 + o.y, c(0.5 * view.height));
-  bound.c00 = select(ends, xx + eps, everywhere);
-  bound.c11 = select(ends, yy + eps, everywhere);
-  bound.c01 = select(ends, xy, zero);
-  const V inverse = c(1) / select(ends, det, everywhere * everywhere);
+  bound.u = p.u0 + o.x, bound.v = p.v0 + o.y;
+  bound.c00 = level_mid + turn * gap, bound.c11 = level_mid - turn * gap, bound.c01 = turn * xy;
+  V inverse = c(1) / (longer * shorter);
+
+  // No end, or one that is too far away: the box of what lies in front of the camera, and the ellipse around that.
+  const auto endless = (o.denominator >= zero) | (longer >= c(1e12));
+  if (any(endless)) {
+    const V near = c(view.near);
+    const V extent_x = o.x * o.x + o.k * (xs[0] * xs[0] + xs[1] * xs[1]);
+    const V extent_y = o.y * o.y + o.k * (ys[0] * ys[0] + ys[1] * ys[1]);
+    const V tw[2] = {p.scale[0] * p.tw[0], p.scale[1] * p.tw[1]};
+    V low_x, high_x, low_y, high_y;
+    cut_circle_span(xs, tw, p.t[2], level, near, o.x, extent_x, &low_x, &high_x);
+    cut_circle_span(ys, tw, p.t[2], level, near, o.y, extent_y, &low_y, &high_y);
+    const auto flat = o.denominator == zero;  // a parabola: tried everywhere
+    const auto fit = [&](V low, V high, V origin, V dot_center, int size, V* middle, V* spread_of) {
+      const V slack = c(2), first = c(-8), last = c(size + 8.0);
+      const V from = clamp(origin + minimum(low, dot_center - dot) - slack, first, last);
+      const V to = clamp(origin + maximum(high, dot_center + dot) + slack, first, last);
+      const V a = select(flat, first, from), b = select(flat, last, to);
+      *middle = select(endless, half * (a + b), *middle);
+      *spread_of = select(endless, scale * c(0.5) * (b - a) * (b - a) + scale, *spread_of);  // 2 (half width)^2
+    };
+    fit(low_x, high_x, p.u0, p.center_x, view.width, &bound.u, &bound.c00);
+    fit(low_y, high_y, p.v0, p.center_y, view.height, &bound.v, &bound.c11);
+    bound.c01 = select(endless, zero, bound.c01);
+    inverse = select(endless, c(1) / (bound.c00 * bound.c11), inverse);
+  }
   bound.ka = bound.c11 * inverse, bound.kb = -bound.c01 * inverse, bound.kc = bound.c00 * inverse;
   return bound;
 }

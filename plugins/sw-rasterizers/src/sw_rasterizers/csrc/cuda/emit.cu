@@ -1,7 +1,8 @@
 // Pairs: one (tile, splat) for every tile that a splat touches, written in depth order.
 //
 // A block takes 256 splats; where its pairs start is a prefix sum over the grid within the same launch. A splat of
-// few rows is written by its own thread; a large one by its whole warp, a row of tiles a lane.
+// few rows is listed by its own thread; a large one by its whole warp, a row of tiles a lane. The block's pairs are put
+// together in shared memory, unless they are too many, and written in one run.
 #include "device.h"
 #include "kernels.h"
 #include "splat.h"
@@ -25,12 +26,16 @@ struct Target {
   }
 };
 
+constexpr unsigned kStaged = 4096;  // pairs of a block; 5 a splat are usual
+
 template <class Key, bool kTight>
 __global__ void __launch_bounds__(kEmitThreads)
     emit_kernel(View<float> view, int count, const int32_t* order, Splats splats, SplatWork work, bool copy,
                 Splats compact, int channels, Key* keys, int32_t* values, Counters* counters, uint64_t* states) {
   __shared__ unsigned scratch[kWarp + 1];
   __shared__ unsigned block_number, base;
+  __shared__ Key staged_keys[kStaged];
+  __shared__ int32_t staged_values[kStaged];
   if (threadIdx.x == 0) block_number = atomicAdd(&counters->emit_ticket, 1u);
   __syncthreads();
   const int rank = int(block_number) * kEmitThreads + int(threadIdx.x);
@@ -65,7 +70,10 @@ __global__ void __launch_bounds__(kEmitThreads)
 
   const int value = copy ? rank : slot;
   const int tiles_x = view.tiles_x(), no_tile = tiles_x * view.tiles_y();
-  Target<Key> own{keys, values, base + position, base + position + unsigned(tiles)};
+  const bool staged = block_tiles <= kStaged;
+  Key* const to_keys = staged ? staged_keys : keys + base;
+  int32_t* const to_values = staged ? staged_values : values + base;
+  Target<Key> own{to_keys, to_values, position, position + unsigned(tiles)};
   const int rows = tiles > 0 ? box.tiles.y1 - box.tiles.y0 : 0;
   const auto put_row = [&](Target<Key>& to, const TileBox& in, const Ellipse<float>& e, int row, int of) {
     int first = in.tiles.x0, last = in.tiles.x1;
@@ -87,7 +95,7 @@ __global__ void __launch_bounds__(kEmitThreads)
     if constexpr (kTight) in = tile_box(e, view.width, view.height);
     else in.tiles = {from(box.tiles.x0), from(box.tiles.x1), from(box.tiles.y0), from(box.tiles.y1)};
     const int of = from(value);
-    Target<Key> to{keys, values, from(own.at), from(own.end)};
+    Target<Key> to{to_keys, to_values, from(own.at), from(own.end)};
     for (int row0 = in.tiles.y0; row0 < in.tiles.y1; row0 += kWarp) {
       const int row = row0 + lane_index();
       int first = in.tiles.x0, last = in.tiles.x1;
@@ -95,13 +103,17 @@ __global__ void __launch_bounds__(kEmitThreads)
         if (row < in.tiles.y1) slab_span(e, in, 1.f / e.hy, row, &first, &last);
       }
       const unsigned width = row < in.tiles.y1 ? unsigned(last - first) : 0u;
-      Target<Key> mine{keys, values, to.at + warp_prefix(width), to.end};
+      Target<Key> mine{to_keys, to_values, to.at + warp_prefix(width), to.end};
       for (unsigned x = 0; x < width; ++x) mine.put(row * tiles_x + first + int(x), of);
       to.at += warp_sum(width);
     }
     to.at += unsigned(lane_index());
     to.fill(no_tile, of, kWarp);
   }
+  if (!staged) return;
+  __syncthreads();
+  for (unsigned i = threadIdx.x; i < block_tiles; i += kEmitThreads)
+    keys[base + i] = staged_keys[i], values[base + i] = staged_values[i];
 }
 
 // Where each tile's pairs start: a pair that differs from the one before it starts its tile, and all empty ones since.

@@ -82,8 +82,8 @@ __global__ void __launch_bounds__(kProjectThreads)
                    Splats splats, SplatWork work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
                    Published* published) {
   __shared__ unsigned scratch[kWarp + 1];
-  __shared__ unsigned block_number, base;
-  if (threadIdx.x == 0) block_number = atomicAdd(&counters->project_ticket, 1u);
+  __shared__ unsigned block_number, base, block_tiles;
+  if (threadIdx.x == 0) block_number = atomicAdd(&counters->project_ticket, 1u), block_tiles = 0;
   __syncthreads();
   const int64_t n = int64_t(block_number) * kProjectThreads + threadIdx.x;
   const bool asked = n < g.count && (g.visible == nullptr || g.visible[n]);
@@ -122,15 +122,17 @@ __global__ void __launch_bounds__(kProjectThreads)
     if (flags != nullptr) flags[n] = drawn ? kDrawn : 0;
   }
 
+  // Sums of the block first: atomics on one address pass one after the other.
+  const unsigned warp_tiles = warp_sum(unsigned(tiles));  // a block's fit 32 bits: below 2^24 tiles a splat
+  if (lane_index() == 0) atomicAdd(&block_tiles, warp_tiles);
+  const unsigned visible = unsigned(__syncthreads_count(radius > 0));
   unsigned block_drawn;
   const unsigned position = block_prefix(drawn, scratch, &block_drawn);
-  const unsigned visible = warp_sum(radius > 0), bad = warp_sum(invalid);
-  unsigned long long pairs = unsigned(tiles);
-  for (int step = kWarp / 2; step > 0; step /= 2) pairs += __shfl_xor_sync(kAllLanes, pairs, step);
-  if (lane_index() == 0) {
-    if (pairs > 0) atomicAdd(&counters->pairs, pairs);
-    if (visible > 0) atomicAdd(&counters->visible, visible);
-    if (bad > 0) atomicAdd(&counters->invalid, bad);
+  const unsigned bad = warp_sum(invalid);
+  if (lane_index() == 0 && bad > 0) atomicAdd(&counters->invalid, bad);
+  if (threadIdx.x == 0 && visible > 0) {
+    atomicAdd(&counters->visible, visible);
+    atomicAdd(&counters->pairs, static_cast<unsigned long long>(block_tiles));
   }
   if (warp_index() == 0) {
     const unsigned before = look_back(states, int(block_number), block_drawn);
