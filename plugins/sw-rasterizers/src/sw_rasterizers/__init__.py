@@ -1,3 +1,3 @@
-"""Compiled rasterizers for Splatwizard: one C++ kernel family, vectorised and multi-threaded on the CPU."""
+"""Compiled rasterizers for Splatwizard: one C++ and CUDA kernel family, its mathematics shared."""
 
 __version__ = "0.1.0"
