@@ -56,12 +56,6 @@ class Camera:
         """R row by row, then tau: 12 numbers on the host, read once (from a GPU, reading waits for it)."""
         return (*self.R.detach().flatten().tolist(), *self.tau.detach().tolist())
 
-    @cached_property
-    def numbers(self) -> tuple[float, ...]:
-        """All of it as 18 numbers: R row by row, tau, fx, fy, cx, cy, near, far. Read once: on a GPU that waits."""
-        pose = (*self.R.flatten().tolist(), *self.tau.tolist())
-        return (*pose, self.fx, self.fy, self.cx, self.cy, self.near, self.far)
-
     @property
     def tan_half_fov(self) -> tuple[float, float]:
         """(W / 2 fx, H / 2 fy)."""
