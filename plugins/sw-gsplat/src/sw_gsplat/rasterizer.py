@@ -1,4 +1,4 @@
-"""gsplat's `rasterization` as a rasterizer of ours: inputs, conventions and statistics translated, nothing computed twice.
+"""gsplat's `rasterization` as a rasterizer of ours: inputs, conventions and statistics are translated, no more.
 
 Where its pictures differ from the other rasterizers' (version 1.5): alpha is clamped at 0.999 instead of 0.99, a pixel
 stops at T <= 1e-4 instead of < 1e-4. Its gradients stop at the clamp of alpha, as ours do.
