@@ -245,6 +245,24 @@ SW_HD auto hit_surfel(const S* plane, S level, S inverse_far, V x, V y) {
   return h;
 }
 
+// Whether a pixel of a box, `half` around (x, y), may have rho <= level: for large outlines, that an ellipse fits badly.
+// Bounds of n1, n2 and w over the box one by one; `dot` is the reach of the low-pass in pixels.
+template <class V, class S>
+SW_HD auto surfel_meets_box(const S* plane, S level, S dot, V x, V y, S half) {
+  const V zero = constant<V>(0), dx = x - plane[kPlaneU], dy = y - plane[kPlaneV];
+  const S wide1 = half * (absolute(plane[kPlaneA]) + absolute(plane[kPlaneB]));
+  const S wide2 = half * (absolute(plane[kPlaneC]) + absolute(plane[kPlaneD]));
+  const S wide3 = half * (absolute(plane[kPlaneE]) + absolute(plane[kPlaneF]));
+  const V n1 = maximum(absolute(plane[kPlaneA] * dx + plane[kPlaneB] * dy) - wide1, zero);
+  const V n2 = maximum(absolute(plane[kPlaneC] * dx + plane[kPlaneD] * dy) - wide2, zero);
+  const V w = plane[kPlaneE] * dx + plane[kPlaneF] * dy + S(1), most = w + wide3;
+  const auto on_plane =
+      (most > zero) & (w - wide3 <= V{} + plane[kPlaneFarthest]) & (n1 * n1 + n2 * n2 <= level * most * most);
+  const auto at_center = (absolute(dx - plane[kPlaneCenterX]) <= V{} + (half + dot)) &
+                         (absolute(dy - plane[kPlaneCenterY]) <= V{} + (half + dot));
+  return on_plane | at_center;
+}
+
 // The sums of one (splat, tile) pair over its pixels. The moments are dL/d(n1, n2, w) x (1, dx, dy).
 // clang-format off
 enum SurfelSum {

@@ -132,7 +132,8 @@ struct ChunkProjection : Projector<V, kCov3d> {
       // The second is false where alpha is nowhere above 1/255.
       if (radii[n] == 0 || !(record[kCutoff] > S(kCutoffShift))) continue;
       const size_t listed = tile_list.size();
-      const int tiles = list_tiles(view, settings, record, record[kU], record[kV], S(radii[n]), tile_list);
+      const int tiles = list_tiles(view, settings, record, record[kU], record[kV], S(radii[n]), tile_list,
+                                   [](int, int) { return true; });
       if (tiles == 0) continue;
       std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       slots.index[slot] = int32_t(n);

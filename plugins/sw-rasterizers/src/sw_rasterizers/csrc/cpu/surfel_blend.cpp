@@ -63,8 +63,12 @@ struct SurfelBlender {
       std::fill(w.length, w.length + kBlocks, 0);
       for (int k = 0; k < count; ++k) {
         unsigned mask = unsigned(w.stage.blocks[k] & live);
+        const auto& record = w.stage.field;
+        const S* plane = planes + int64_t(pairs.slot[first + k]) * kPlane;
+        const LargeSurfel<S> large(plane, record[kCutoff][k], record[kHalfX][k] + record[kHalfY][k]);
+        if (mask != 0 && large.is_large) mask &= met_blocks(large, frame);
         if (pairs.blocks != nullptr) pairs.blocks[first + k] = uint16_t(mask);
-        if (mask != 0) __builtin_prefetch(planes + int64_t(pairs.slot[first + k]) * kPlane);
+        if (mask != 0) __builtin_prefetch(plane);
         for (; mask != 0; mask &= mask - 1) {
           const int b = __builtin_ctz(mask);
           w.list[b][w.length[b]++] = uint8_t(k);
@@ -78,6 +82,21 @@ struct SurfelBlender {
       }
     }
     write(tile, frame, w, begin);
+  }
+
+  // Blocks of the tile that the plane (or the low-pass around its centre) may touch.
+  static unsigned met_blocks(const LargeSurfel<S>& large, const TileFrame& frame) {
+    unsigned mask = 0;
+    for (int b = 0; b < kBlocks; b += L) {
+      alignas(64) S x[L], y[L];
+      for (int i = 0; i < L; ++i) {
+        x[i] = S(frame.x0 + (b + i) % kBlocksPerRow * kBlock + kBlock / 2);
+        y[i] = S(frame.y0 + (b + i) / kBlocksPerRow * kBlock + kBlock / 2);
+      }
+      const auto met = large.meets(load<V>(x), load<V>(y), S(kBlock / 2));
+      for (int i = 0; i < L; ++i) mask |= unsigned(lane(met, i)) << (b + i);
+    }
+    return mask;
   }
 
   static bool is_live(const Workspace& w, int block) {

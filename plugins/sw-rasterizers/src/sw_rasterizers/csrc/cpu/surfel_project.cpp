@@ -141,8 +141,12 @@ struct ChunkProjection : SurfelProjector<V> {
       // The second is false where alpha is nowhere above 1/255.
       if (radii_of_all[n] == 0 || !(record[kCutoff] > S(kCutoffShift))) continue;
       const size_t listed = tile_list.size();
+      const LargeSurfel<S> large(record, plane_of[i]);
+      const auto accept = [&](int x, int y) {
+        return !large.is_large || large.meets(S(kTile * (x + 0.5)), S(kTile * (y + 0.5)), S(kTile * 0.5));
+      };
       const int tiles =
-          list_tiles(view, this->settings, record, center[0][i], center[1][i], S(radii_of_all[n]), tile_list);
+          list_tiles(view, this->settings, record, center[0][i], center[1][i], S(radii_of_all[n]), tile_list, accept);
       if (tiles == 0) continue;
       std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       std::copy_n(plane_of[i], int(kPlane), planes + slot * kPlane);

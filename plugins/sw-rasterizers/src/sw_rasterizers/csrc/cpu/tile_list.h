@@ -18,10 +18,11 @@ struct TileList {
   }
 };
 
-// From a record's ellipse, or from the square of `radius` around (u, v) that 3DGS takes. Returns how many.
-template <class S>
+// From a record's ellipse, as far as accept(tile_x, tile_y) agrees, or from the square of `radius` around (u, v) that
+// 3DGS takes. Returns how many.
+template <class S, class Accept>
 SW_HD int list_tiles(const View<S>& view, const Settings& settings, const S* record, S u, S v, S radius,
-                     TileList& list) {
+                     TileList& list, const Accept& accept) {
   const auto put = [&](int x, int y) { list.put(y * view.tiles_x() + x); };
   if (settings.tight) {
     const Ellipse<S> e{record[kU],
@@ -31,7 +32,13 @@ SW_HD int list_tiles(const View<S>& view, const Settings& settings, const S* rec
                        record[kWidth],
                        record[kLeanX],
                        record[kLeanY] * record[kHalfX]};
-    return tight_tiles(e, view.width, view.height, put);
+    int count = 0;
+    tight_tiles(e, view.width, view.height, [&](int x, int y) {
+      if (!accept(x, y)) return;
+      put(x, y);
+      ++count;
+    });
+    return count;
   }
   const TileRange square = classic_tiles(u, v, radius, view.tiles_x(), view.tiles_y());
   for (int y = square.y0; y < square.y1; ++y)
