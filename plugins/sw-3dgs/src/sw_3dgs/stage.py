@@ -117,6 +117,4 @@ class ThreeDGSStage(Stage):
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)
         settings = self.config.loss
-        return photometric_loss(
-            result.image, truth, lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding
-        )
+        return photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding)

@@ -18,6 +18,7 @@ from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.learning_rate import exponential_lr
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams
+from splatwizard_core.training.statistics import accumulate_statistics
 
 log = logging.getLogger(__name__)
 
@@ -61,14 +62,14 @@ def collect_gradient_statistics(model: GaussianModel, result: RenderResult) -> N
     """Adds this view's screen-space gradients (RasterOptions.grad2d) to the model's statistics."""
     if result.grad2d is None:
         raise ValueError("collect-gradient-statistics needs RasterOptions(grad2d=True)")
-    density.accumulate_statistics(model, result.grad2d.value, result.radii)
+    accumulate_statistics(model, result.grad2d.value, result.radii)
 
 
 def collect_absgrad_statistics(model: GaussianModel, result: RenderResult) -> None:
     """The same of absolute pixel gradients (RasterOptions.absgrad). Source: AbsGS (arXiv 2404.10484)."""
     if result.absgrad2d is None:
         raise ValueError("collect-absgrad-statistics needs RasterOptions(absgrad=True)")
-    density.accumulate_statistics(model, result.absgrad2d.value, result.radii)
+    accumulate_statistics(model, result.absgrad2d.value, result.radii)
 
 
 class PruneAndDensify:
