@@ -12,6 +12,7 @@ from splatwizard_core.errors import CapabilityError, ShapeError
 from splatwizard_core.gaussians.inputs import SH
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.rendering.projection import rotation_matrices
 from splatwizard_core.rendering.rasterizer import Feature, RasterOptions, ScoreSpec
 from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.testing.raster_gradients import (
@@ -116,6 +117,23 @@ def test_surfels_that_reach_behind_the_camera_equal_the_reference():
     g, cam = draw_scene(replace(MANY, n=60, scale=(0.5, 3.0)), 4)
     g.opacities *= 0.3
     in_float64(g, cam, EVERYTHING)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_pixel_of_a_surfel_near_the_camera_is_lost(seed):
+    """Planes of all directions around the camera, thin ones too, close enough that most have no bounded outline."""
+    g, cam = draw_scene(replace(MANY, n=80, scale=(0.02, 1.5), opacity=(0.05, 0.15), color="colors"), seed)
+    depth = 0.25 + 1.5 * torch.rand(80, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    t = g.means @ cam.R.T + cam.tau
+    t = torch.cat([t[:, :2] / t[:, 2:] * depth[:, None], depth[:, None]], dim=1)
+    g.means = (t - cam.tau) @ cam.R
+    result = SurfelRasterizer(count=True).render(g, cam, RasterOptions(alpha=True))
+    expected = ReferenceRasterizer().render(g, cam, RasterOptions(alpha=True))
+    assert torch.equal(result.radii, expected.radii)
+    assert result.stats.n_blended == expected.stats.n_blended
+    torch.testing.assert_close(result.alpha, expected.alpha, atol=1e-12, rtol=0)
+    axes = (cam.R @ rotation_matrices(g.quats))[:, 2, :2] * g.scales
+    assert int((depth < 3 * axes.norm(dim=1)).sum()) > 20
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -118,8 +118,8 @@ SW_HD V surfel_radius(const SurfelProjection<V>& p) {
   return round_up(maximum(largest, c(kSurfelMinRadius)));
 }
 
-// An ellipse that holds every pixel with rho <= level: its centre in pixels, its covariance per unit of `level`, and the
-// inverse of that.
+// An ellipse that holds every pixel with rho <= level: its centre in pixels, its covariance per unit of `level`, and
+// the inverse of that.
 template <class V>
 struct SurfelBound {
   V u, v;
@@ -127,9 +127,10 @@ struct SurfelBound {
   V ka, kb, kc;
 };
 
-// Where a plane comes nearer than `near` its picture may have no end. What is drawn of the circle then is the part beyond
-// z = near, a convex piece: its lowest and highest u lie at the ends of the cut or where the circle touches a line of
-// constant u. `axis`: Tu' or Tv', tw: Tw, with scales; middle, squared: the outline's; low, high: as those, from (u0, v0).
+// Where a plane comes nearer than `near` its picture may have no end. What is drawn of the circle then is the part
+// beyond z = near, a convex piece: its lowest and highest u lie at the ends of the cut or where the circle touches a
+// line of constant u. `axis`: Tu' or Tv', tw: Tw, with scales; middle, squared: the outline's; low, high: from the
+// projected centre, as those.
 template <class V>
 SW_HD void cut_circle_span(const V* axis, const V* tw, V tz, V level, V near, V middle, V squared, V* low, V* high) {
   const V zero = constant<V>(0), tiny = constant<V>(1e-30);
@@ -245,8 +246,8 @@ SW_HD auto hit_surfel(const S* plane, S level, S inverse_far, V x, V y) {
   return h;
 }
 
-// Whether a pixel of a box, `half` around (x, y), may have rho <= level: for large outlines, that an ellipse fits badly.
-// Bounds of n1, n2 and w over the box one by one; `dot` is the reach of the low-pass in pixels.
+// Whether a pixel of a box, `half` around (x, y), may have rho <= level: for large outlines, which an ellipse fits
+// badly. Bounds of n1, n2 and w over the box one by one; `dot` is the reach of the low-pass in pixels.
 template <class V, class S>
 SW_HD auto surfel_meets_box(const S* plane, S level, S dot, V x, V y, S half) {
   const V zero = constant<V>(0), dx = x - plane[kPlaneU], dy = y - plane[kPlaneV];

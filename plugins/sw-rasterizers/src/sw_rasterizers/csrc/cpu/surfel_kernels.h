@@ -1,5 +1,5 @@
-// The CPU kernels of surfels. Slots, binning, tiles and blocks are those of the other kernels: a record's ellipse is one
-// that holds every pixel the surfel may touch (surfel.h), and the plane itself lies in a second row of the slot.
+// The CPU kernels of surfels. Slots, binning, tiles and blocks are those of the other kernels: a record's ellipse is
+// one that holds every pixel the surfel may touch (surfel.h), and the plane itself lies in a second row of the slot.
 //
 //   project_surfels           N surfels -> records and planes of the drawn ones
 //   bin.cpp                   as for ellipsoids
@@ -18,7 +18,8 @@ enum SurfelMap { kMapDepth, kMapInverse, kMapNormal, kMapDistortion = 5, kMapMed
 
 // What the backward pass has to know of each pixel beside transmittance and last position, [tiles][kTilePixels] each:
 // 1/z of the first surfel, about which the sums are taken (the distortion does not depend on it, and differences of
-// nearly equal depths keep their digits); sum w delta and sum w delta^2 with delta = 1/z - first; the median's position.
+// nearly equal depths keep their digits); sum w delta and sum w delta^2 with delta = 1/z - first; the median's list
+// position.
 template <class S>
 struct SurfelPixels {
   S *first, *sum, *square;

@@ -70,7 +70,8 @@ struct ChunkBackward {
     if (out.quats != nullptr) scatter_rows<V, 4>(result.quat, out.quats, 4, rows, lanes);
     if (out.grad2d != nullptr) {
       // NDC units: pixel gradient times half the image size.
-      const V ndc[2] = {constant<V>(0.5 * view.width) * result.shift_x, constant<V>(0.5 * view.height) * result.shift_y};
+      const V half_width = constant<V>(0.5 * view.width), half_height = constant<V>(0.5 * view.height);
+      const V ndc[2] = {half_width * result.shift_x, half_height * result.shift_y};
       scatter_rows<V, 2>(ndc, out.grad2d, 2, rows, lanes);
     }
   }
