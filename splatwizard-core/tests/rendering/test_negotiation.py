@@ -188,18 +188,18 @@ def test_other_devices_are_not_candidates(plugins, scene):
 
 
 def test_an_error_names_what_is_missing_and_who_is_near(plugins, scene):
-    plugins.install("gpu", "FISHER", devices=["cuda"])
-    plugins.install("absent", "FISHER", available="negotiation_fakes:not_here")
+    plugins.install("gpu", "UINT8_OUT", devices=["cuda"])
+    plugins.install("absent", "UINT8_OUT", available="negotiation_fakes:not_here")
     rasterizer = NegotiatedRasterizer(plugins, device="cpu", forbid=["reference"])
     with pytest.raises(CapabilityError) as caught:
-        rasterizer.render(*scene, RasterOptions(fisher=True, alpha=True))
+        rasterizer.render(*scene, RasterOptions(dtype_out="uint8", alpha=True))
     message = str(caught.value)
-    assert "no rasterizer offers ALPHA_MAP + FISHER on cpu" in message
+    assert "no rasterizer offers ALPHA_MAP + UINT8_OUT on cpu" in message
     assert "gpu (cuda) lacks ALPHA_MAP" in message
-    assert "reference (cpu/cuda) lacks FISHER is forbidden" in message
+    assert "reference (cpu/cuda) lacks UINT8_OUT is forbidden" in message
     assert caught.value.missing == {"ALPHA_MAP"}
     with pytest.raises(CapabilityError, match="Not usable here: absent: needs a GPU"):
-        rasterizer.render(*scene, RasterOptions(fisher=True))
+        rasterizer.render(*scene, RasterOptions(dtype_out="uint8"))
 
 
 def warnings(caplog):
@@ -400,8 +400,8 @@ def test_an_entry_that_cannot_be_read_harms_no_other(plugins, scene, caplog, dec
     for _ in range(2):
         rasterizer = NegotiatedRasterizer(plugins, device="cpu")
         rasterizer.render(*scene, RasterOptions())
-        with pytest.raises(CapabilityError, match="FISHER"):
-            rasterizer.render(*scene, RasterOptions(fisher=True))
+        with pytest.raises(CapabilityError, match="UINT8_OUT"):
+            rasterizer.render(*scene, RasterOptions(dtype_out="uint8"))
     assert rasterizer.choices == {"plain": "reference"}
     assert len([w for w in warnings(caplog) if name in w]) == 1
     with pytest.raises(PluginError, match=name):
@@ -415,9 +415,9 @@ def test_unknown_option_values_are_refused(scene):
 
 
 def test_negotiated_info_is_the_union(plugins):
-    plugins.install("fast", "FISHER")
+    plugins.install("fast", "UINT8_OUT")
     info = NegotiatedRasterizer(plugins, device="cpu").info
-    assert {"FISHER", "BACKWARD"} <= info.features
+    assert {"UINT8_OUT", "BACKWARD"} <= info.features
     assert info.features <= {f.name for f in Feature}
 
 

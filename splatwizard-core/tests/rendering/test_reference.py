@@ -185,9 +185,9 @@ def test_dgr_profile_differentiates_the_clamped_jacobian_as_the_original():
 
 def test_what_is_not_offered_is_refused():
     g, cam = draw_scene(RasterCase(), 0)
-    with pytest.raises(CapabilityError, match="does not offer FISHER") as caught:
-        REFERENCE.render(g, cam, RasterOptions(fisher=True))
-    assert caught.value.missing == {"FISHER"}
+    with pytest.raises(CapabilityError, match="does not offer UINT8_OUT") as caught:
+        REFERENCE.render(g, cam, RasterOptions(dtype_out="uint8"))
+    assert caught.value.missing == {"UINT8_OUT"}
     with pytest.raises(CapabilityError, match="normals and distortion of surfels only"):
         REFERENCE.render(g, cam, RasterOptions(normals=True, distortion=True))
     with pytest.raises(CapabilityError, match="ANTIALIAS and SURFEL together"):

@@ -7,13 +7,15 @@ from splatwizard_core.native import NativeModule
 MODULE = NativeModule(
     name="sw_rasterizers",
     package="sw_rasterizers",
-    sources=("csrc/binding.cpp", "csrc/binding_surfel.cpp", "csrc/binding_cuda.cpp"),
+    sources=("csrc/binding.cpp", "csrc/binding_surfel.cpp", "csrc/binding_scores.cpp", "csrc/binding_cuda.cpp"),
     kernels=(
         "csrc/cpu/blend_backward.cpp",
         "csrc/cpu/surfel_blend_backward.cpp",
         "csrc/cpu/surfel_blend.cpp",
         "csrc/cpu/surfel_project.cpp",
         "csrc/cpu/surfel_project_backward.cpp",
+        "csrc/cpu/fisher.cpp",
+        "csrc/cpu/scores.cpp",
         "csrc/cpu/project.cpp",
         "csrc/cpu/project_backward.cpp",
         "csrc/cpu/blend.cpp",

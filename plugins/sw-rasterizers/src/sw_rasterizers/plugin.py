@@ -13,6 +13,24 @@ SURFEL_FEATURES = [
     "DEPTH_ACCUM", "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "TIGHT_TILES", "FLOAT64", "DETERMINISTIC",
 ]  # fmt: skip
 
+CONTRIBUTIONS = [
+    "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST",
+    "SCORE_PIXEL_WEIGHT",
+]  # fmt: skip
+# Name -> (target, summary, scores, speed). One set of kernels under the names of what needs them; the speeds only rank
+# them below `standard` and by how much beyond a request each one offers.
+SCORING = {
+    "mesongs": ("MesonRasterizer", "MesonGS' importance", ["SCORE_BLEND", "SCORE_PIXEL_WEIGHT"], 49),
+    "trimgs": ("TrimRasterizer", "TrimGS' contribution", ["SCORE_HITS", "SCORE_GAMMA", "SCORE_PIXEL_WEIGHT"], 48),
+    "count": ("CountRasterizer", "all contribution sums, LightGaussian's among them", CONTRIBUTIONS, 47),
+    "speedy": ("SpeedyRasterizer", "Speedy-Splat's squared derivatives", [*CONTRIBUTIONS, "SCORE_GRAD_SQ"], 46),
+    "pup": ("PupRasterizer", "PUP 3D-GS' Fisher blocks", [*CONTRIBUTIONS, "SCORE_GRAD_SQ", "FISHER"], 45),
+}
+# A derivative of three colours, without that of the antialias factor; log scales need scales.
+SCORING_FORBIDDEN = [
+    ["COLORS_ND", "SCORE_GRAD_SQ"], ["COLORS_ND", "FISHER"], ["ANTIALIAS", "FISHER"], ["COV3D", "FISHER"],
+]  # fmt: skip
+
 
 @hookimpl
 def register_rasterizers(registry: Registry) -> None:
@@ -43,3 +61,17 @@ def register_rasterizers(registry: Registry) -> None:
         speed=50,
         native="sw_rasterizers.native:MODULE",
     )
+    for name, (target, summary, scores, speed) in SCORING.items():
+        registry.add(
+            name,
+            f"sw_rasterizers.scoring:{target}",
+            summary=f"compiled 3DGS rasterizer with scores of Gaussians: {summary}",
+            devices=["cpu"],
+            dtypes=["float32", "float64"],
+            features=[*STANDARD_FEATURES, *scores],
+            combos_forbidden=[combo for combo in SCORING_FORBIDDEN if combo[1] in scores],
+            available="sw_rasterizers.native:unavailable",
+            exactness="exact",
+            speed=speed,
+            native="sw_rasterizers.native:MODULE",
+        )

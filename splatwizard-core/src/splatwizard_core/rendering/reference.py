@@ -6,6 +6,7 @@ Values follow specs of 3DGS to the letter; gradients come from autograd, not fro
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -24,7 +25,7 @@ from splatwizard_core.rendering.rasterizer import (
     RasterStats,
     RenderResult,
 )
-from splatwizard_core.rendering.scores import merge_scores, score_dtype, view_scores
+from splatwizard_core.rendering.scores import merge_scores, score_dtype, view_fisher, view_scores
 from splatwizard_core.rendering.shading import background_image, splat_colors
 from splatwizard_core.rendering.surfels import are_surfels, check_ellipsoids, draw_surfels, visible_surfel_radii
 from splatwizard_core.scene.camera import Camera
@@ -106,6 +107,7 @@ class ReferenceRasterizer:
             grad2d=grad2d,
             absgrad2d=absgrad2d,
             scores=scores,
+            fisher=self._fisher(g, cam, opt).float() if opt.fisher else None,
             stats=RasterStats(
                 n_visible=len(p.rows),
                 n_pairs=len(lists.splats),
@@ -125,13 +127,25 @@ class ReferenceRasterizer:
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
-        """Sum the scores over views ("blend_max": their maximum)."""
+        """Sum scores and Fisher blocks over views ("blend_max": their maximum)."""
+        check_request(self.info, g, opt)
         totals = {s.name: torch.zeros(len(g), dtype=score_dtype(s), device=g.means.device) for s in opt.scores}
+        fisher = g.means.new_zeros(len(g), 21, dtype=torch.float64) if opt.fisher else None
         for cam in cams:
-            view = self.render(g, cam, opt).scores
-            for spec in opt.scores:
-                totals[spec.name] = merge_scores(spec, totals[spec.name], view[spec.name])
-        return AccumOutput(totals)
+            if opt.scores:
+                view = self.render(g, cam, replace(opt, fisher=False)).scores
+                for spec in opt.scores:
+                    totals[spec.name] = merge_scores(spec, totals[spec.name], view[spec.name])
+            if fisher is not None:
+                fisher += self._fisher(g, cam, opt)
+        return AccumOutput(totals, None if fisher is None else fisher.float())
+
+    def _fisher(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Tensor:
+        """[N,21] float64 of one view; a pass of autograd for every pixel and channel."""
+        plain = replace(
+            opt, fisher=False, scores=(), depth=frozenset(), alpha=False, grad2d=False, absgrad=False
+        )  # fmt: skip
+        return view_fisher(lambda inputs: self.render(inputs, cam, plain).image, g)
 
     @staticmethod
     def _depth_channels(p: Projection, opt: RasterOptions) -> dict[str, Tensor]:

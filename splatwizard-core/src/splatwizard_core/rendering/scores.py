@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from splatwizard_core.errors import ConfigError
+from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.compositing import (
     T_MIN,
     Batch,
@@ -29,6 +33,20 @@ def merge_scores(spec: ScoreSpec, total: Tensor, view: Tensor) -> Tensor:
     return torch.maximum(total, view) if spec.kind == "blend_max" else total + view
 
 
+def check_scores(specs: tuple[ScoreSpec, ...], height: int, width: int) -> None:
+    """Raise ConfigError for an unknown rule, a pixel weight of the wrong size, or two scores of one name."""
+    for spec in specs:
+        rules = ("blended",) if spec.kind == "grad_sq" else ("blended", "tested")
+        if spec.rule not in rules:
+            raise ConfigError(f"score '{spec.name}': rule is '{spec.rule}', must be {' or '.join(map(repr, rules))}")
+        if spec.pixel_weight is not None and spec.pixel_weight.shape != (height, width):
+            raise ConfigError(
+                f"score '{spec.name}': pixel_weight is {list(spec.pixel_weight.shape)}, must be [{height}, {width}]"
+            )
+    if len({s.name for s in specs}) < len(specs):
+        raise ConfigError(f"two scores have one name: {', '.join(s.name for s in specs)}")
+
+
 @torch.no_grad()
 def view_scores(
     specs: tuple[ScoreSpec, ...], splats: Splats, lists: TileLists, num_colors: int, background: Tensor
@@ -40,16 +58,10 @@ def view_scores(
     Over blended pairs: hits 1; opacity o; opacity_T o T; blend alpha T; blend_max its maximum;
     gamma alpha^(2g) T^(2-2g); dist |d| in pixels; grad_sq (o dL/dalpha)^2 for L = sum of all pixels and channels
     (Speedy-Splat, arXiv 2412.00578). Rule "tested" also counts the splat that triggers the stop.
-    Raises ConfigError for an unknown rule or a pixel weight of the wrong size.
+    Raises ConfigError as `check_scores` does.
     """
     height, width = background.shape[1:]
-    for spec in specs:
-        if spec.rule not in ("blended", "tested"):
-            raise ConfigError(f"score '{spec.name}': rule is '{spec.rule}', must be 'blended' or 'tested'")
-        if spec.pixel_weight is not None and spec.pixel_weight.shape != (height, width):
-            raise ConfigError(
-                f"score '{spec.name}': pixel_weight is {list(spec.pixel_weight.shape)}, must be [{height}, {width}]"
-            )
+    check_scores(specs, height, width)
     packed = splats.packed
     totals = {s.name: torch.zeros(len(packed), dtype=torch.float64, device=packed.device) for s in specs}
     if not len(packed):
@@ -118,3 +130,31 @@ def _value_gradient(splats: Splats, terms: Terms, num_colors: int, left: Tensor)
     if not splats.pass_clamp:
         gradient = torch.where(terms.clamped, 0, gradient)
     return gradient, left - own[..., -1] if own.shape[-1] else left
+
+
+def view_fisher(draw: Callable[[GaussianInputs], Tensor], g: GaussianInputs) -> Tensor:
+    """Fisher blocks of one view by brute force: autograd once per pixel and channel. For small images.
+
+    draw    inputs -> image [C,H,W], differentiable; `g` needs means, scales and quats (indexed ones are gathered)
+    Returns [N,21] float64, the upper triangle row by row of F = sum over pixels and channels of g g^T,
+    g = d image / d (mean, log scale): mean, projected covariance and viewing direction (PUP 3D-GS, arXiv 2406.10219).
+    """
+    assert g.scales is not None
+    assert g.quats is not None
+    scales, quats = g.scales.detach(), g.quats.detach()
+    if g.geom_indices is not None:
+        scales, quats = scales[g.geom_indices], quats[g.geom_indices]
+    if g.scale_factors is not None:
+        scales = scales * g.scale_factors.detach()[:, None]
+    first, second = torch.triu_indices(6, 6, device=g.means.device)
+    blocks = torch.zeros(len(g), len(first), dtype=torch.float64, device=g.means.device)
+    with torch.enable_grad():
+        means, scales = g.means.detach().requires_grad_(), scales.requires_grad_()
+        image = draw(replace(g, means=means, scales=scales, quats=quats, geom_indices=None, scale_factors=None))
+        if not image.requires_grad:
+            return blocks
+        for value in image.flatten():
+            of_means, of_scales = torch.autograd.grad(value, (means, scales), retain_graph=True)
+            slope = torch.cat([of_means, of_scales * scales.detach()], dim=1).double()  # [N,6]
+            blocks += slope[:, first] * slope[:, second]
+    return blocks

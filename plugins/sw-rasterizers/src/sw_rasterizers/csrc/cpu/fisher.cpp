@@ -1,0 +1,195 @@
+// How the image reacts to a splat: squared derivatives, one row of sums per (splat, tile) pair, and the Fisher blocks
+// that are put together from them.
+//
+// Tiles are walked back to front, as in blend_backward, because the light behind a splat must be known; `blend` has
+// left the last transmittance, the last splat and the touched blocks. Rows are added up in float64.
+#include <algorithm>
+#include <limits>
+#include <memory>
+
+#include "gather.h"
+#include "parallel.h"
+#include "score_kernels.h"
+#include "tile_stage.h"
+
+namespace SW_ARCH {
+namespace {
+
+template <class V, bool kForFisher>
+struct TileSensitivity {
+  using S = Scalar<V>;
+  using I = IntOf<V>;
+  static constexpr int L = lanes_of<V>;
+  static constexpr int kPacks = kBlockPixels / L;
+  static constexpr int kLights = kForFisher ? 3 : 1;  // channels apart, or their sum
+  static constexpr int kAhead = 8;                          // pairs between prefetch and use of a record
+
+  const View<S>& view;
+  const Settings& settings;
+  const Slots<S>& slots;
+  const Pairs<S>& pairs;
+  const Canvas<S>& canvas;
+  const Scores<S>* scores;
+  S* sums;
+
+  struct Workspace {
+    PixelCentres<S> centres;
+    alignas(64) S transmittance[kTilePixels];
+    alignas(64) S behind[kLights][kTilePixels];
+    alignas(64) int32_t last[kTilePixels];
+    alignas(64) S weight[kForFisher ? 1 : kMaxScores][kTilePixels];
+    V clamp_limit;  // of the unclamped alpha, above which its gradient is 0
+  };
+
+  int columns() const { return kForFisher ? int(kFisherSums) : scores->count; }
+  S* row(int64_t pair) const { return sums + int64_t(pairs.origin[pair]) * columns(); }
+
+  void operator()(int64_t tile, Workspace& w) const {
+    const TileFrame frame(view, tile);
+    const int64_t begin = pairs.tile_start[tile], end = pairs.tile_start[tile + 1];
+    if (begin == end) return;
+    load_pixels(tile, frame, w);
+    const int64_t used = *std::max_element(w.last, w.last + kTilePixels);
+    for (int64_t i = begin + used; i < end; ++i) std::fill_n(row(i), columns(), S(0));
+    for (int64_t i = begin + used; i-- > begin;) {
+      if (i >= begin + kAhead) __builtin_prefetch(slots.records + int64_t(pairs.slot[i - kAhead]) * kRecord);
+      add_splat(w, i, int32_t(i - begin));
+    }
+  }
+
+  void load_pixels(int64_t tile, const TileFrame& frame, Workspace& w) const {
+    const int64_t size = int64_t(view.width) * view.height;
+    w.centres.set(frame);
+    w.clamp_limit = constant<V>(settings.pass_clamp ? double(std::numeric_limits<float>::max()) : kAlphaMax);
+    std::copy_n(canvas.transmittance + tile * kTilePixels, kTilePixels, w.transmittance);
+    std::copy_n(canvas.last + tile * kTilePixels, kTilePixels, w.last);
+    for (auto& light : w.behind) std::fill_n(light, kTilePixels, S(0));
+    frame.for_each_pixel([&](int i, int x, int y) {
+      const int64_t pixel = int64_t(frame.y0 + y) * view.width + frame.x0 + x;
+      for (int c = 0; canvas.background != nullptr && c < 3; ++c)
+        w.behind[c % kLights][i] += w.transmittance[i] *
+                                    canvas.background[canvas.background_is_image ? c * size + pixel : int64_t(c)];
+      if constexpr (!kForFisher)
+        for (int s = 0; s < scores->count; ++s)
+          if (scores->of[s].weight != nullptr) w.weight[s][i] = scores->of[s].weight[pixel];
+    });
+  }
+
+  void add_splat(Workspace& w, int64_t pair, int32_t position) const {
+    const S* record = slots.records + int64_t(pairs.slot[pair]) * kRecord;
+    constexpr int kTotals = kForFisher ? int(kFisherSums) : int(kMaxScores);
+    V total[kTotals];
+    for (int k = 0; k < columns(); ++k) total[k] = constant<V>(0);
+    for (unsigned mask = pairs.blocks[pair]; mask != 0; mask &= mask - 1)
+      for (int pack = 0; pack < kPacks; ++pack)
+        add_pack(w, __builtin_ctz(mask) * kBlockPixels + pack * L, position, record, total);
+    if constexpr (kForFisher)
+      lane_sums<V, kFisherSums>(total, row(pair));
+    else
+      for (int s = 0; s < scores->count; ++s) row(pair)[s] = horizontal_sum(total[s]);
+  }
+
+  SW_HD void add_pack(Workspace& w, int at, int32_t position, const S* record, V* total) const {
+    const V zero = constant<V>(0), one = constant<V>(1), ceiling = constant<V>(kAlphaMax);
+    const V dx = record[kU] - load<V>(w.centres.x + at), dy = record[kV] - load<V>(w.centres.y + at);
+    const V power = log2_alpha(dx, dy, V{} + record[kA], V{} + record[kB], V{} + record[kC], V{} + record[kLevel]);
+    const auto touched = (power >= constant<V>(kLog2AlphaMin)) & (load<I>(w.last + at) > position);
+    const V unclamped = select(touched, exp_2(power), zero), alpha = minimum(ceiling, unclamped);
+    const auto through = touched & (unclamped <= w.clamp_limit);
+
+    const V gain = reciprocal(one - alpha);
+    const V transmittance = load<V>(w.transmittance + at) * gain, weight = alpha * transmittance;
+    store(w.transmittance + at, transmittance);
+    V slope[kLights];  // d image_c / d alpha
+    for (int c = 0; c < kLights; ++c) {
+      const V color = V{} + (kForFisher ? record[kRed + c] : record[kRed] + record[kGreen] + record[kBlue]);
+      const V behind = load<V>(w.behind[c] + at);
+      slope[c] = select(through, transmittance * color - behind * gain, zero);
+      store(w.behind[c] + at, behind + weight * color);
+    }
+    if constexpr (kForFisher) {
+      V v[3];
+      for (int c = 0; c < 3; ++c) v[c] = -(unclamped * slope[c]);
+      add_fisher_pixel(dx, dy, v, weight, total);
+    } else {
+      const V square = slope[0] * slope[0];
+      for (int s = 0; s < scores->count; ++s) {
+        if (scores->of[s].weight != nullptr)
+          total[s] += square * load<V>(w.weight[s] + at);
+        else
+          total[s] += square;
+      }
+    }
+  }
+};
+
+template <class V, bool kForFisher>
+void sensitivity_tiles(const View<Scalar<V>>& view, const Settings& settings, const Slots<Scalar<V>>& slots,
+                       const Pairs<Scalar<V>>& pairs, const Canvas<Scalar<V>>& canvas,
+                       const Sensitivity<Scalar<V>>& what, Scalar<V>* sums) {
+  using Tiles = TileSensitivity<V, kForFisher>;
+  const Tiles walk{view, settings, slots, pairs, canvas, what.scores, sums};
+  const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
+  const std::vector<int32_t> order = tiles_by_work(pairs.tile_start, tiles);
+  std::atomic<int64_t> next{0};
+  parallel(settings.threads, [&](int, int) {
+    const auto w = std::make_unique<typename Tiles::Workspace>();
+    std::fill_n(&w->weight[0][0], sizeof w->weight / sizeof(Scalar<V>), Scalar<V>(0));
+    for (int64_t i; (i = next.fetch_add(1, std::memory_order_relaxed)) < tiles;) walk(order[size_t(i)], *w);
+  });
+}
+
+template <class V>
+void add_fisher_pack(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
+                     const Slots<Scalar<V>>& slots, const Scalar<V>* sums, int64_t first, int64_t end, double* blocks) {
+  using S = Scalar<V>;
+  constexpr int L = lanes_of<V>;
+  const int lanes = int(std::min<int64_t>(end - first, L));
+  alignas(64) int32_t rows[L];
+  for (int i = 0; i < L; ++i) rows[i] = slots.index[first + (i < lanes ? i : lanes - 1)];
+  Geometry<V> in;
+  gather_rows<V, 3>(g.means, 3, rows, in.mean);
+  gather_rows<V, 3>(g.scales, 3, rows, in.scale);
+  gather_rows<V, 4>(g.quats, 4, rows, in.quat);
+  V packs[kTheta][kPositions];
+  fisher_basis(view, in, S(settings.scale_modifier), S(settings.eps2d), settings.original_jacobian, packs);
+  for (int i = 0; i < lanes; ++i) {
+    const int64_t slot = first + i;
+    if (slots.run[slot].count == 0) continue;
+    double total[kFisherSums] = {};
+    const S* row = sums + int64_t(slots.run[slot].first) * kFisherSums;
+    for (int32_t n = 0; n < slots.run[slot].count; ++n, row += kFisherSums)
+      for (int k = 0; k < kFisherSums; ++k) total[k] += double(row[k]);
+    S basis[kTheta][kPositions], color[9] = {};
+    for (int a = 0; a < kTheta; ++a)
+      for (int k = 0; k < kPositions; ++k) basis[a][k] = lane(packs[a][k], i);
+    if (slots.color_slope != nullptr)
+      for (int k = 0; k < 9; ++k)
+        if ((slots.clamped[slot] >> (k / 3) & 1) == 0) color[k] = slots.color_slope[slot * 9 + k];
+    add_fisher_block(basis, total, color, blocks + int64_t(rows[i]) * kFisher);
+  }
+}
+
+}  // namespace
+
+#define SW_INSTANTIATE(S, V)                                                                                      \
+  template <>                                                                                                     \
+  void sensitivity_pairs<S>(const View<S>& view, const Settings& settings, const Slots<S>& slots,                 \
+                            const Pairs<S>& pairs, const Canvas<S>& canvas, const Sensitivity<S>& what, S* sums) { \
+    what.fisher ? sensitivity_tiles<V, true>(view, settings, slots, pairs, canvas, what, sums)                    \
+                : sensitivity_tiles<V, false>(view, settings, slots, pairs, canvas, what, sums);                  \
+  }                                                                                                               \
+  template <>                                                                                                     \
+  void add_fisher<S>(const View<S>& view, const Gaussians<S>& g, const Settings& settings, const Slots<S>& slots, \
+                     const S* sums, double* blocks) {                                                             \
+    parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, [&](int64_t chunk) {                      \
+      const int64_t begin = chunk * kChunk, end = begin + slots.per_chunk[chunk];                                 \
+      for (int64_t s = begin; s < end; s += lanes_of<V>)                                                          \
+        add_fisher_pack<V>(view, g, settings, slots, sums, s, end, blocks);                                       \
+    });                                                                                                           \
+  }
+SW_INSTANTIATE(float, Lanes)
+SW_INSTANTIATE(double, double)
+#undef SW_INSTANTIATE
+
+}  // namespace SW_ARCH
