@@ -26,14 +26,15 @@ struct Target {
   }
 };
 
-constexpr unsigned kStaged = 4096;  // pairs of a block; 5 a splat are usual
+constexpr unsigned kStaged = 2048;  // pairs of a block; 5 a splat are usual
 
 template <class Key, bool kTight>
 __global__ void __launch_bounds__(kEmitThreads)
     emit_kernel(View<float> view, int count, const int32_t* order, Splats splats, SplatWork work, bool copy,
                 Splats compact, int channels, Key* keys, int32_t* values, Counters* counters, uint64_t* states) {
   __shared__ unsigned scratch[kWarp + 1];
-  __shared__ unsigned block_number, base;
+  __shared__ unsigned block_number;
+  __shared__ __align__(16) unsigned base;  // no neighbour's wide load may touch it while it is written
   __shared__ Key staged_keys[kStaged];
   __shared__ int32_t staged_values[kStaged];
   if (threadIdx.x == 0) block_number = atomicAdd(&counters->emit_ticket, 1u);

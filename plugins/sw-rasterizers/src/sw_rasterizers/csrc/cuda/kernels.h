@@ -92,7 +92,7 @@ struct TileLists {
   const int32_t* splat;  // [pairs]
 };
 
-constexpr int kProjectThreads = 256, kEmitThreads = 256;
+constexpr int kProjectThreads = 128, kEmitThreads = 128;
 
 void project(const View<float>& view, const Gaussians<float>& g, const Settings& settings, const Splats& splats,
              const SplatWork& work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,

@@ -82,7 +82,8 @@ __global__ void __launch_bounds__(kProjectThreads)
                    Splats splats, SplatWork work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
                    Published* published) {
   __shared__ unsigned scratch[kWarp + 1];
-  __shared__ unsigned block_number, base, block_tiles;
+  __shared__ unsigned block_number, block_tiles;
+  __shared__ __align__(16) unsigned base;  // no neighbour's wide load may touch it while it is written
   if (threadIdx.x == 0) block_number = atomicAdd(&counters->project_ticket, 1u), block_tiles = 0;
   __syncthreads();
   const int64_t n = int64_t(block_number) * kProjectThreads + threadIdx.x;
