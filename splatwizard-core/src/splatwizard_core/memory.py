@@ -47,7 +47,7 @@ def reset_peak_rss() -> bool:
 _UNITS = {"bytes": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
 
 
-def out_of_memory(error: torch.OutOfMemoryError, doing: str, advice: str) -> DeviceMemoryError:
+def out_of_memory(error: torch.cuda.OutOfMemoryError, doing: str, advice: str) -> DeviceMemoryError:
     """The error that says what torch's does, and what was being done: counts, resolution, bytes."""
     found = re.search(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)", str(error))
     wanted = None if found is None else round(float(found[1]) * _UNITS[found[2]])

@@ -30,6 +30,7 @@ class ThreeDGSStage(Stage):
     def __init__(self, opt: ThreeDGSConfig) -> None:
         super().__init__(opt)
         self.config = opt
+        self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
     def when(self, when: When) -> When:
@@ -111,8 +112,10 @@ class ThreeDGSStage(Stage):
         )
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        absgrad = self.config.densify.absgrad
-        return RasterOptions(background=background, grad2d=not absgrad, absgrad=absgrad)
+        if self._options is None or self._options.background is not background:
+            absgrad = self.config.densify.absgrad
+            self._options = RasterOptions(background=background, grad2d=not absgrad, absgrad=absgrad)
+        return self._options
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 
 import torch
@@ -120,24 +121,10 @@ class StandardRasterizer:
         return AccumOutput({})
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
-        quirks = opt.profile == "dgr-exact"
-        flags = Flag(0)
-        for asked, flag in (
-            (opt.antialias, Flag.ANTIALIAS),
-            (opt.clamp_color, Flag.CLAMP_COLOR),
-            (not quirks, Flag.TIGHT),
-            (quirks or opt.clamp_grad == "pass", Flag.PASS_CLAMP),
-            (quirks, Flag.ORIGINAL_JACOBIAN),
-            ("inverse" in opt.depth, Flag.INVERSE_DEPTH),
-            (bool(opt.depth & {"accumulated", "expected"}), Flag.ACCUMULATED_DEPTH),
-            ("median" in opt.depth, Flag.MEDIAN_DEPTH),
-            (opt.features_detach_geometry, Flag.DETACH_FEATURES),
-            (opt.absgrad, Flag.ABSGRAD),
-            (opt.alpha or "expected" in opt.depth, Flag.ALPHA_MAP),
-            (self.count, Flag.COUNT),
-        ):
-            if asked:
-                flags |= flag
+        flags = _flags(
+            opt.profile, opt.clamp_grad, frozenset(opt.depth), opt.antialias, opt.clamp_color,
+            opt.features_detach_geometry, opt.absgrad, opt.alpha, self.count,
+        )  # fmt: skip
         watch = torch.is_grad_enabled()
         background = checked_background(opt, 3 if g.colors is None else g.colors.shape[1], cam, g.means)
         return Call(
@@ -153,6 +140,40 @@ class StandardRasterizer:
             grad2d=GradBuffer() if watch and opt.grad2d else None,
             absgrad2d=GradBuffer() if watch and opt.absgrad else None,
         )
+
+
+@functools.cache  # a training asks for the same at every step
+def _flags(
+    profile: str,
+    clamp_grad: str,
+    depth: frozenset[str],
+    antialias: bool,
+    clamp_color: bool,
+    detach_features: bool,
+    absgrad: bool,
+    alpha: bool,
+    count: bool,
+) -> Flag:
+    """The switches of the kernels that these options stand for."""
+    quirks = profile == "dgr-exact"
+    flags = Flag(0)
+    for asked, flag in (
+        (antialias, Flag.ANTIALIAS),
+        (clamp_color, Flag.CLAMP_COLOR),
+        (not quirks, Flag.TIGHT),
+        (quirks or clamp_grad == "pass", Flag.PASS_CLAMP),
+        (quirks, Flag.ORIGINAL_JACOBIAN),
+        ("inverse" in depth, Flag.INVERSE_DEPTH),
+        (bool(depth & {"accumulated", "expected"}), Flag.ACCUMULATED_DEPTH),
+        ("median" in depth, Flag.MEDIAN_DEPTH),
+        (detach_features, Flag.DETACH_FEATURES),
+        (absgrad, Flag.ABSGRAD),
+        (alpha or "expected" in depth, Flag.ALPHA_MAP),
+        (count, Flag.COUNT),
+    ):
+        if asked:
+            flags |= flag
+    return flags
 
 
 def _as_bytes(mask: Tensor | None) -> Tensor | None:

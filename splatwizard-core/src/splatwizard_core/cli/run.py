@@ -29,7 +29,15 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import lpips_folder, method_names, open_session, output_folder, resolve_all, say
+from splatwizard_core.cli.setup import (
+    lpips_folder,
+    method_names,
+    open_session,
+    output_folder,
+    resolve_all,
+    say,
+    say_device,
+)
 
 if TYPE_CHECKING:
     from splatwizard_core.experiments.record import Record
@@ -95,6 +103,7 @@ def run(
     for each in resolved:
         session.scene(each)  # what is wrong with it is told before anything else is said
     weights = lpips_folder(lpips_weights)
+    say_device(resolved[0].ppl, session)
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     done: list[tuple[Record, Path]] = []

@@ -154,6 +154,13 @@ def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
     return Session(plugins, choose_device(ppl.device, plugins), say)
 
 
+def say_device(ppl: PipelineParams, session: Session) -> None:
+    """Tell where a training computes, and why there."""
+    from splatwizard_core.experiments.device import device_reason
+
+    say(device_reason(ppl.device, session.device, session.plugins))
+
+
 def lpips_folder(folder: str | None, *, quiet: bool = False) -> Path | None:
     """The folder of --lpips-weights, checked before the work; says it once if LPIPS cannot be computed.
 

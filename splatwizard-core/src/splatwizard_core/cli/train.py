@@ -25,7 +25,7 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.setup import open_session, output_folder, resolve_one
+from splatwizard_core.cli.setup import open_session, output_folder, resolve_one, say_device
 
 
 @click.command(short_help="train one method on one scene")
@@ -61,6 +61,8 @@ def train(
     resolved = resolve_one(plugins, method, rate, preset=preset, config_file=config_file, values=values, scene=scene)
     output_folder(out)
     session = open_session(resolved.ppl, plugins)
+    session.scene(resolved)  # what is wrong with it is told before anything else is said
+    say_device(resolved.ppl, session)
     request = RunRequest(resolved, Path(out), resume=resume, allow_changed_plan=allow_changed_plan)
     trained, directory = train_only(session, request)
     facts = {

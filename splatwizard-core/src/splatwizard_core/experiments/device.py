@@ -28,6 +28,23 @@ def choose_device(asked: str, plugins: PluginManager) -> torch.device:
     return torch.device("cpu")
 
 
+def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> str:
+    """One line for the user: where a run computes, and why there."""
+    if chosen.type == "cuda":
+        name = torch.cuda.get_device_name(chosen)
+        served = ", ".join(cuda_rasterizers(plugins))
+        why = "--device cuda" if asked == "cuda" else f"it is here, and there are kernels for it: {served}"
+        return f"computing on cuda, {name} ({why})"
+    if asked == "cpu":
+        why = "--device cpu"
+    elif not torch.cuda.is_available():
+        why = "torch sees no CUDA device"
+    else:
+        why = f"no rasterizer can run on {torch.cuda.get_device_name()}; `sw doctor` says why"
+    threads = torch.get_num_threads()
+    return f"computing on cpu, {threads} thread{'s' if threads > 1 else ''} ({why})"
+
+
 def cuda_rasterizers(plugins: PluginManager) -> list[str]:
     """The installed rasterizers with CUDA kernels that say they can run here; the slow reference does not count."""
     found = []

@@ -288,6 +288,13 @@ _SCORE_FEATURES = {
 
 def option_features(opt: RasterOptions) -> Feature:
     """The features that these options ask for, whatever is drawn."""
+    known = vars(opt).get("_asked")  # options do not change, and a training renders with the same at every step
+    if known is None:
+        known = vars(opt)["_asked"] = _read_off(opt)
+    return known
+
+
+def _read_off(opt: RasterOptions) -> Feature:
     required = Feature(0)
     for asked, feature in (
         (opt.antialias, Feature.ANTIALIAS),

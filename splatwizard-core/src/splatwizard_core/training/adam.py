@@ -14,7 +14,7 @@ from splatwizard_core.errors import ShapeError
 from splatwizard_core.training.native import TRAINING
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class AdamUpdate:
     """The arguments of one `adam_step`."""
 
@@ -32,21 +32,20 @@ class AdamUpdate:
 @torch.no_grad()
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     """`adam_step` for each of them: the same numbers, on CUDA in one launch."""
-    together = [u for u in updates if _fits_cuda_kernel(u)]
-    if not together or not TRAINING.has_cuda():
-        together = []
-    else:
+    together = [u for u in updates if u.param.is_cuda and _fits_cuda_kernel(u)]
+    if together and TRAINING.has_cuda():
         torch.ops.splatwizard_training.adam_many(
             [u.param for u in together], [u.grad for u in together],
             [u.exp_avg for u in together], [u.exp_avg_sq for u in together],
             [u.lr for u in together], [u.beta1 for u in together], [u.beta2 for u in together],
             [u.eps for u in together], [u.step for u in together],
         )  # fmt: skip
-    done = {id(u) for u in together}
+        _mark_written(*[t for u in together for t in (u.param, u.exp_avg, u.exp_avg_sq)])
+        if len(together) == len(updates):
+            return
+        done = {id(u) for u in together}
+        updates = [u for u in updates if id(u) not in done]
     for u in updates:
-        if id(u) in done:
-            _mark_written(u.param, u.exp_avg, u.exp_avg_sq)
-            continue
         adam_step(
             u.param, u.grad, u.exp_avg, u.exp_avg_sq,
             lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps, step=u.step,
@@ -55,11 +54,14 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
 
 def _fits_cuda_kernel(u: AdamUpdate) -> bool:
     shape, device = u.param.shape, u.param.device
-    return u.step >= 1 and all(
-        t.is_cuda and t.device == device and t.dtype == torch.float32 and t.shape == shape and t.is_contiguous()
-        and t.data_ptr() % 16 == 0
-        for t in (u.param, u.grad, u.exp_avg, u.exp_avg_sq)
-    )  # fmt: skip
+    if u.step < 1 or device.type != "cuda":
+        return False
+    for t in (u.param, u.grad, u.exp_avg, u.exp_avg_sq):
+        if t.shape != shape or t.dtype != torch.float32 or not t.is_contiguous() or t.data_ptr() % 16:
+            return False
+        if t.device != device:
+            return False
+    return True
 
 
 def _mark_written(*tensors: Tensor) -> None:

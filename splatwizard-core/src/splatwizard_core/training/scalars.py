@@ -34,7 +34,7 @@ class Verdict:
         if fine.is_cuda:
             # Into pinned memory, behind what is queued: neither this nor the next steps wait for it.
             fine = fine.to("cpu", non_blocking=True)
-            self._event = torch.cuda.Event()
+            self._event = torch.cuda.Event()  # type: ignore[no-untyped-call]
             self._event.record()
         self._fine = fine
 

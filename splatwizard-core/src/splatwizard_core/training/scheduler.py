@@ -102,7 +102,7 @@ class Scheduler:
             context.step, context.scheduler, self._step = step, self, step
             try:
                 result = binding(context)
-            except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.OutOfMemoryError):
+            except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.cuda.OutOfMemoryError):
                 raise
             except Exception as error:
                 raise TaskError(self.stage, step, entry.name, error) from error

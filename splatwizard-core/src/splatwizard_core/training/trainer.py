@@ -93,6 +93,7 @@ class Trainer:
         self.step = 0
         self.stopped = False
         self._view: View | None = None
+        self._one = torch.ones((), device=self.device)
         self._background = scene.background.to(self.device)
         self._cameras: WeakKeyDictionary[View, Camera] = WeakKeyDictionary()
         self._unchecked: list[StepRecord] = []
@@ -118,7 +119,7 @@ class Trainer:
                 except (EmptyModel, TaskError):
                     self.check_losses()  # what a step with a loss that is not finite leaves behind may have caused it
                     raise
-                except torch.OutOfMemoryError as error:
+                except torch.cuda.OutOfMemoryError as error:
                     raise self._out_of_memory(error) from error
                 self.step += 1
             after_step(record)
@@ -149,7 +150,7 @@ class Trainer:
         record = self._record(step, view, loss)
         if clock:
             clock.mark("loss")
-        loss.total.backward()  # type: ignore[no-untyped-call]
+        self._backward(loss.total)
         if clock:
             clock.mark("backward")
 
@@ -171,6 +172,16 @@ class Trainer:
         self.stopped = stop
         record.num_rows = self._num_rows()
         return record
+
+    def _backward(self, total: Tensor) -> None:
+        if not total.is_cuda:
+            total.backward()  # type: ignore[no-untyped-call]
+            return
+        # In this thread: torch's thread for the GPU would be woken up, and take the interpreter's lock, each time.
+        with torch.autograd.set_multithreading_enabled(False):
+            if total.dtype != self._one.dtype or total.dim():
+                self._one = torch.ones_like(total)
+            total.backward(self._one)  # type: ignore[no-untyped-call]
 
     def _record(self, step: int, view: View, loss: LossPack) -> StepRecord:
         record = StepRecord(
@@ -221,7 +232,7 @@ class Trainer:
             raise TrainingDiverged(record.step, record.view, part, values[part])
         raise AssertionError("all of these losses are finite")
 
-    def _out_of_memory(self, error: torch.OutOfMemoryError) -> DeviceMemoryError:
+    def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         view = self._view
         rows = self._num_rows()
         what = "anchors" if "num_anchors" in self.model.counts() else "Gaussians"

@@ -81,6 +81,8 @@ TORCH_LIBRARY(splatwizard_training, m) {
         " float ssim_weight) -> Tensor");
   m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
         " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> ()");
+  m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
+        " Tensor(c!) max_radii) -> ()");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));
   m.impl("adam", c10::DispatchKey::CPU, TORCH_FN(adam));
 }
