@@ -29,6 +29,19 @@ def test_the_surveys_files_have_its_columns_and_places(make_run, tmp_path):
     assert float(rows[0]["PSNR"]) == pytest.approx(record["metrics"]["psnr"]["mean"], abs=5e-5)
 
 
+def test_no_other_lpips_passes_for_the_surveys(make_run, tmp_path):
+    def other_form_alone(content):
+        content["metrics"]["lpips_vgg_3dgs"] = {"mean": None, "per_view": [], "direction": "lower"}
+        content["metrics"]["lpips_alex"] = {"mean": 0.25, "per_view": [], "direction": "lower"}
+
+    make_run("r1", change=other_form_alone)
+    runs = collect([tmp_path / "out"]).runs
+    (file,) = exports.write_survey(runs, tmp_path / "survey")
+    assert [row["LPIPS"] for row in csv.DictReader(file.open())] == [""]
+    (row,) = csv.DictReader(io.StringIO(exports.to_csv(runs)))
+    assert (row["LPIPS"], row["LPIPS variant"]) == ("0.25000", "lpips_alex")
+
+
 def test_two_protocols_of_a_scene_never_share_a_survey_file(make_run, tmp_path):
     make_run("r1")
     make_run("r2", change=lambda c: c["protocol"].update(id="another"))

@@ -63,11 +63,12 @@ def test_a_published_data_set_needs_all_its_scenes(make_run, tmp_path):
     assert row.size is None
 
 
-def protocol(images="images", resolution=-1):
+def protocol(images="images", resolution=-1, name="custom"):
     def change(content):
         content["protocol"].update(
-            id=f"colmap/{images}/r{resolution}/every8/black/pp-center/q8", images=images, resolution=resolution
-        )
+            id=f"colmap/{images}/r{resolution}/every8/black/pp-center/q8", images=images, resolution=resolution,
+            name=name,
+        )  # fmt: skip
 
     return change
 
@@ -95,6 +96,23 @@ def test_one_scene_under_two_folders_is_two_tables(make_run, tmp_path):
         (("colmap/images_2/r-1/every8/black/pp-center/q8",), ["r1"]),
         (("colmap/images_4/r-1/every8/black/pp-center/q8",), ["r2"]),
     ]
+
+
+def test_two_named_protocols_have_a_mean_each(make_run, tmp_path):
+    for scene, images in (("outdoor", "images_4"), ("indoor", "images_2")):
+        make_run("r1", scene=scene, change=protocol(images, name="inria"), out=tmp_path / "inria")
+        make_run("r1", scene=scene, size=3000, change=protocol("images", name="survey"), out=tmp_path / "survey")
+    tables = dataset_tables(collect([tmp_path]).runs)
+    assert sorted((len(t.protocols), t.rows[0].size) for t in tables) == [(1, 3000), (2, 1000)]
+
+
+def test_scenes_of_two_named_protocols_never_share_a_mean(make_curve, tmp_path):
+    for scene, images, name in (("a", "images_4", "inria"), ("b", "images", "survey")):
+        make_curve("anchor", scene=scene, change=protocol(images, name=name))
+        make_curve("better", 0.5, scene=scene, change=protocol(images, name=name))
+    runs = collect([tmp_path]).runs
+    assert dataset_tables(runs) == []
+    assert [[row.scene for row in table.rows] for table in bd_tables(runs, "anchor")] == [["a"], ["a"], ["b"], ["b"]]
 
 
 def test_an_unknown_value_makes_an_unknown_mean():

@@ -57,16 +57,31 @@ def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[Datase
 
     partial     means over the scenes that are there, the missing ones named
     """
-    groups: dict[tuple[str, str], list[Run]] = {}
-    for run in runs:
-        groups.setdefault((run.facts.dataset, run.facts.protocol.without_folder()), []).append(run)
-    tables = []
-    for group in groups.values():
-        tables += [_table(part, partial) for part in _comparable(group)]
+    tables = [_table(part, partial) for part in comparable(runs)]
     return [table for table in tables if len(table.scenes) > 1]
 
 
-def _comparable(group: Sequence[Run]) -> list[list[Run]]:
+def comparable(runs: Sequence[Run]) -> list[list[Run]]:
+    """The runs that may share a mean over scenes: one data set, one set of rules.
+
+    Only the picture folder may differ between scenes, and then only within one named protocol: `survey` and `inria`
+    read the same scenes of Mip-NeRF 360 from different folders.
+    """
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.facts.dataset, run.facts.protocol.without_folder()), []).append(run)
+    found = []
+    for group in groups.values():
+        several = len({run.facts.protocol.id for run in group}) > 1
+        named: dict[str, list[Run]] = {}
+        for run in group:
+            named.setdefault(str(run.facts.protocol.rules().get("name")) if several else "", []).append(run)
+        for part in named.values():
+            found += _one_protocol_a_scene(part)
+    return found
+
+
+def _one_protocol_a_scene(group: Sequence[Run]) -> list[list[Run]]:
     """One part if every scene has one protocol; else the protocols apart."""
     by_scene: dict[str, set[str]] = {}
     for run in group:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from splatwizard_core.errors import UserInputError
 from splatwizard_core.evaluation.rate_distortion import BdResult, bd_quality, bd_rate
-from splatwizard_core.experiments.report.aggregate import mean
+from splatwizard_core.experiments.report.aggregate import comparable, mean
 from splatwizard_core.experiments.report.numbers import main_lpips
 from splatwizard_core.experiments.report.runs import Run
 
@@ -79,11 +79,8 @@ def bd_tables(runs: Sequence[Run], anchor: str | None, *, pareto: bool = False, 
     """
     if anchor is None:
         return []
-    protocols: dict[str, list[Run]] = {}
-    for run in runs:
-        protocols.setdefault(run.facts.protocol.without_folder(), []).append(run)
     tables = []
-    for group in protocols.values():
+    for group in comparable(runs):
         places = dict.fromkeys(run.place for run in group if run.variant == anchor)
         others = [v for v in dict.fromkeys(run.variant for run in group) if v != anchor]
         if not places or not others:

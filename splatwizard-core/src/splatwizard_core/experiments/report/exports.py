@@ -23,9 +23,11 @@ from splatwizard_core.files import write_atomic
 SURVEY_COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
 
 
-def survey_row(run: Run) -> list[str]:
-    """One run as the survey wants it; unknown values are empty."""
-    lpips = numbers.main_lpips(run.facts.metrics)
+def survey_row(run: Run, lpips: str | None = numbers.FIELD_LPIPS) -> list[str]:
+    """One run as the survey wants it; unknown values are empty.
+
+    lpips   the form that stands under "LPIPS"; the survey's own is the default, and nothing else may pass for it
+    """
 
     def value(name: str | None, digits: int) -> str:
         mean = run.mean(name) if name is not None else None
@@ -47,7 +49,7 @@ def to_csv(runs: Sequence[Run]) -> str:
         facts = run.facts
         where = [facts.dataset, facts.scene, facts.protocol.id, run.variant]
         lpips = numbers.main_lpips(name for name in facts.metrics if run.mean(name) is not None)
-        writer.writerow([*map(_cell, where), *survey_row(run), lpips or ""])
+        writer.writerow([*map(_cell, where), *survey_row(run, lpips), lpips or ""])
     return text.getvalue()
 
 
