@@ -1,0 +1,95 @@
+"""A training step of 3DGS on a GPU: it waits for nothing, and the statistics are those of the CPU."""
+
+import math
+
+import pytest
+import torch
+
+from splatwizard_core.gaussians import density
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.plugins.manager import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.images import keep_pictures
+from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.training.native import TRAINING
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.rng import Streams
+from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.statistics import accumulate_statistics
+from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
+from sw_3dgs.config import ThreeDGSConfig
+from sw_3dgs.stage import ThreeDGSStage
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU"),
+    pytest.mark.skipif(TRAINING.available(cuda=True) is not None, reason=str(TRAINING.available(cuda=True))),
+]
+
+
+def small_scene(channels: int) -> Scene:
+    generator = torch.Generator().manual_seed(3)
+    views = []
+    for i in range(6):
+        angle = 2 * math.pi * i / 6
+        eye = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.0])
+        camera = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=64, height=48, fov_x=0.8)
+        pixels = torch.randint(0, 256, (48, 64, channels), generator=generator, dtype=torch.uint8).numpy()
+        views.append(View(camera, f"view{i}.png", lambda pixels=pixels: pixels))
+    points = PointCloud(torch.rand(500, 3, generator=generator) - 0.5, torch.rand(500, 3, generator=generator))
+    return Scene("small", views, views[:1], points, Protocol("toy"))
+
+
+def make_trainer(scene: Scene, **settings) -> Trainer:
+    stage = ThreeDGSStage(ThreeDGSConfig(iterations=7000))
+    ppl, streams = PipelineParams(device="cuda", **settings), Streams(0)
+    rasterizer = NegotiatedRasterizer(load_plugins(), device="cuda")
+    assert scene.points is not None
+    model = stage.begin(
+        StageContext(GaussianModel.from_points(scene.points).cuda(), scene, ppl, rasterizer, streams, lambda name: None)
+    )
+    return Trainer(stage, model, scene, ppl, rasterizer, streams)
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+@pytest.mark.parametrize("random_background", [False, True])
+def test_a_step_between_densifications_waits_for_nothing_that_torch_sees(channels, random_background):
+    scene = small_scene(channels)
+    assert keep_pictures(scene.train, "cuda")
+    trainer = make_trainer(scene, random_background=random_background)
+    records = []
+    trainer.run(2 * CHECK_EVERY, records.append)
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        while trainer.step < 4 * CHECK_EVERY:  # verdicts on the losses are among them
+            trainer.step += 1
+            records.append(trainer._run_step(trainer.step))
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    trainer.check_losses()
+    assert records[-1].total.item() < records[0].total.item()
+    keep_pictures(scene.train, "cpu")
+
+
+def test_statistics_of_one_launch_are_those_of_many():
+    generator = torch.Generator().manual_seed(5)
+    assert small_scene(3).points is not None
+    ours, theirs = (GaussianModel.from_points(small_scene(3).points).cuda() for _ in range(2))
+    for _ in range(3):
+        gradients = torch.randn(500, 2, generator=generator).cuda()
+        radii = torch.randint(-1, 20, (500,), generator=generator, dtype=torch.int32).cuda()
+        gradients[radii <= 0] = float("nan")
+        accumulate_statistics(ours, gradients, radii)
+        density.accumulate_statistics(theirs, gradients, radii)
+    for name in ("grad_accum", "denom", "max_radii2d"):
+        torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-6, atol=0)
+    accumulate_statistics(ours, gradients.double(), radii)  # what no kernel takes goes the other way
+    assert ours.denom.sum() > theirs.denom.sum()
+
+
+def test_a_picture_on_a_gpu_is_the_one_on_the_host():
+    view = small_scene(4).train[0]
+    background = torch.tensor([1.0, 0.5, 0.0])
+    view.keep_on("cuda")
+    torch.testing.assert_close(view.image(background, "cuda").cpu(), view.image(background), rtol=0, atol=1e-7)
