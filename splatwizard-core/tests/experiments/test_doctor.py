@@ -459,6 +459,31 @@ def test_a_rasterizer_that_draws_black_is_broken_and_the_reference_is_not(site):
     assert "wrong picture" in checks["black"].detail
 
 
+def test_a_rasterizer_of_surfels_draws_surfels(site):
+    plugins = manager(
+        site, "doctored_flat",
+        """
+        @hookimpl
+        def register_rasterizers(registry):
+            registry.add("flat", "doctored_flat:Flat", summary="none", devices=["cpu"], features=["SURFEL", "BACKWARD"],
+                         needs=["SURFEL"], speed=3)
+
+        def Flat():
+            from splatwizard_core.rendering.reference import ReferenceRasterizer
+
+            class FlatRasterizer(ReferenceRasterizer):
+                def render(self, g, cam, opt):
+                    assert g.scales.shape[1] == 2
+                    return super().render(g, cam, opt)
+
+            return FlatRasterizer()
+        """,
+    )  # fmt: skip
+    checks = {c.name: c for c in probe.check_rasterizers(plugins)}
+    assert checks["reference"].state == "ok"
+    assert checks["flat"].state == "ok", checks["flat"].detail
+
+
 def test_weights_of_lpips_are_known_by_their_checksum(tmp_path, monkeypatch):
     import hashlib
 

@@ -178,15 +178,15 @@ def a_tiny_surfel_is_a_dot_of_the_low_pass(r: Rasterizer, device: str) -> None:
 @check("SURFEL", "DISTORTION", "ALPHA_MAP")
 def distortion_of_two_discs(r: Rasterizer, device: str) -> None:
     """w1 w2 (m1 - m2)^2 with m = far/(far - near) (1 - near/z); swapping the inputs changes nothing."""
-    g = surfels([[0, 0, 4], [0, 0, 5]], opacities=[0.6, 0.8], scales=[2.0, 2.0])
+    g = surfels([[0, 0, 2], [0, 0, 20]], opacities=[0.6, 0.8], scales=[1.0, 10.0])
     result = draw(r, device, g, front_camera(), EVERYTHING)
     dx, dy = _offsets()
-    squared = dx * dx + dy * dy
-    first = 0.6 * torch.exp(-0.5 * squared * (4 / 128) ** 2)
-    second = (1 - first) * 0.8 * torch.exp(-0.5 * squared * (5 / 128) ** 2)
-    m1, m2 = (100 / 99.8 * (1 - 0.2 / z) for z in (4.0, 5.0))
+    gaussian = torch.exp(-0.5 * (dx * dx + dy * dy) / 32**2)  # both 32 px on the screen
+    first = 0.6 * gaussian
+    second = (1 - first) * 0.8 * gaussian
+    m1, m2 = (100 / 99.8 * (1 - 0.2 / z) for z in (2.0, 20.0))
     assert result.distortion is not None
-    close(result.distortion[0], first * second * (m1 - m2) ** 2, atol=1e-8, rtol=2e-3)
+    close(result.distortion[0], first * second * (m1 - m2) ** 2, atol=1e-7, rtol=1e-3)
 
 
 @check("SURFEL", "BACKWARD")

@@ -185,7 +185,8 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         exactness = entry.declared.get("exactness", "exact")
         alone = [name for name in plugins.rasterizers.names if name != entry.name]
         rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=alone, exactness=[exactness])
-        _draw(rasterizer, device, backward="BACKWARD" in entry.declared.get("features", ()))
+        flat = "SURFEL" in entry.declared.get("needs", ())
+        _draw(rasterizer, device, backward="BACKWARD" in entry.declared.get("features", ()), axes=2 if flat else 3)
     except Exception as error:
         mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
         return Check("rasterizers", entry.name, "broken", one_line(f"{type(error).__name__}: {error}"), mend)
@@ -199,8 +200,8 @@ def _lacking_kernels(entry: Entry) -> Check | None:
     return next((check for check in checks if check.state != "ok"), None)
 
 
-def _draw(rasterizer: object, device: str, *, backward: bool) -> None:
-    """Sixteen splats on 32 x 24 pixels. Raises if the picture is empty or a gradient is not finite."""
+def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> None:
+    """Sixteen splats (two axes: surfels) on 32 x 24 pixels. Raises if the picture is empty or a gradient is not finite."""
     import torch
 
     from splatwizard_core.gaussians.inputs import GaussianInputs
@@ -213,7 +214,7 @@ def _draw(rasterizer: object, device: str, *, backward: bool) -> None:
     splats = GaussianInputs(
         means=means.to(device),
         opacities=torch.full((16,), 0.8, device=device),
-        scales=torch.full((16, 3), 0.1, device=device),
+        scales=torch.full((16, axes), 0.1, device=device),
         quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device).repeat(16, 1),
         colors=torch.ones(16, 3, device=device),
     )
