@@ -1,4 +1,4 @@
-"""What a training step does differently on a GPU, with fakes: late verdicts, pictures kept there, memory running out."""
+"""A training step on a GPU, played with fakes: late verdicts, pictures that are kept there, memory that runs out."""
 
 import pytest
 import torch
