@@ -201,7 +201,7 @@ def _lacking_kernels(entry: Entry) -> Check | None:
 
 
 def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> None:
-    """Sixteen splats (two axes: surfels) on 32 x 24 pixels. Raises if the picture is empty or a gradient is not finite."""
+    """Sixteen splats (two axes: surfels) on 32 x 24 pixels. Raises if the picture is empty, a gradient not finite."""
     import torch
 
     from splatwizard_core.gaussians.inputs import GaussianInputs
