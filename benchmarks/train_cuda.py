@@ -1,0 +1,212 @@
+"""How fast 3DGS trains on a GPU, beside gsplat's trainer on the same pictures, and where a step's time goes.
+
+    python benchmarks/train_cuda.py ../shared/data/mug ../shared/data/fox:images_2 ../shared/data/lego
+    python benchmarks/train_cuda.py ../shared/data/mug=out/prepared/mug --gsplat ../shared/bench/train_gsplat.py
+
+A scene is FOLDER[:PICTURES][=PREPARED]; PREPARED is the folder that prep_scene.py, beside the trainer of gsplat, wrote
+from the same files. Without it, or where gsplat or what its trainer needs cannot be imported, only ours is measured.
+One after the other, so that nothing shares the GPU. Iterations a second count the loop alone, densification included,
+as both trainers report it; PSNR is the mean over the held-out views, memory the peak of torch's allocator in the loop.
+
+--profile trains ours once more and says, of windows of steps early, half-way and late: wall clock, the time in which
+the GPU had work, kernels launched, and what took longest on the device and on the host (torch.profiler slows the host
+down, so it watches other steps than the clock).
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib.util
+import json
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch.profiler import ProfilerActivity, profile
+
+from splatwizard_core.evaluation.evaluate import evaluate
+from splatwizard_core.experiments.config import resolve
+from splatwizard_core.experiments.device import device_reason
+from splatwizard_core.experiments.session import Session
+from splatwizard_core.experiments.training_run import make_method
+from splatwizard_core.plugins.manager import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.streams import stream
+from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.trainer import StepRecord
+
+WINDOW = 40  # steps that are timed, and as many after them that are profiled
+MIB = 1 << 20
+
+
+@dataclass
+class Figures:
+    """What one trainer reaches on one scene."""
+
+    iterations_per_second: float
+    psnr: float
+    gaussians: int
+    peak_mib: float
+
+
+@dataclass
+class Watch:
+    """Called after each step: times and profiles two windows of steps that follow each of `starts`."""
+
+    starts: tuple[int, ...]
+    lines: list[str] = field(default_factory=list)
+    _since: float = 0.0
+    _wall: float = 0.0
+    _profile: profile | None = None
+
+    def __call__(self, record: StepRecord) -> None:
+        for start in self.starts:
+            if record.step == start:
+                torch.cuda.synchronize()
+                self._since = time.perf_counter()
+            elif record.step == start + WINDOW:
+                torch.cuda.synchronize()
+                self._wall = (time.perf_counter() - self._since) / WINDOW
+                self._profile = profile(activities=[ProfilerActivity.CPU, ProfilerActivity.CUDA])
+                self._profile.__enter__()
+            elif record.step == start + 2 * WINDOW and self._profile is not None:
+                torch.cuda.synchronize()
+                self._profile.__exit__(None, None, None)
+                self._report(record)
+
+    def _report(self, record: StepRecord) -> None:
+        assert self._profile is not None
+        found = self._profile.key_averages()
+        on_device = [e for e in found if str(e.device_type).endswith("CUDA")]
+        busy = sum(e.self_device_time_total for e in on_device) / WINDOW
+        launches = sum(e.count for e in on_device) / WINDOW
+        self.lines.append(
+            f"  steps {record.step - 2 * WINDOW + 1:,} to {record.step:,}, {record.num_rows:,} Gaussians: "
+            f"{1e3 * self._wall:.2f} ms a step, GPU at work {busy / 1e3:.2f} ms in {launches:.0f} launches"
+        )
+        for e in sorted(on_device, key=lambda e: -e.self_device_time_total)[:6]:
+            self.lines.append(f"    device {e.self_device_time_total / WINDOW:7.1f} us  {_short(e.key)}")
+        on_host = [e for e in found if not str(e.device_type).endswith("CUDA")]
+        for e in sorted(on_host, key=lambda e: -e.self_cpu_time_total)[:6]:
+            self.lines.append(
+                f"    host   {e.self_cpu_time_total / WINDOW:7.1f} us  {_short(e.key)} x{e.count / WINDOW:.0f}"
+            )
+        self._profile = None
+
+
+def _short(name: str) -> str:
+    return name.replace("(anonymous namespace)::", "").replace("void ", "", 1)[:70]
+
+
+def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: Watch | None) -> tuple[Figures, bool]:
+    """Figures of this trainer, and whether the scene's background is white."""
+    plugins = load_plugins()
+    sets: dict[str, Any] = {"iterations": iterations, "seed": seed, "device": "cuda"}
+    if pictures is not None:
+        sets["images"] = pictures
+    resolved = resolve(plugins.methods.load("3dgs"), "paper", sets=sets, scene=folder)
+    session = Session(plugins, torch.device("cuda"), lambda line: print(line, file=sys.stderr))
+    session.load_kernels()
+    scene = session.scene(resolved)
+    method = make_method(session, resolved)
+    rasterizer = NegotiatedRasterizer(plugins, device=session.device)
+    ppl = resolved.ppl
+    stages = list(method.stages())
+    outcome = train_stages(
+        stages,
+        lambda: method.create_model(scene, stream(ppl.seed, "init")).to(session.device),
+        scene,
+        ppl,
+        rasterizer,
+        directory=None,
+        identity={"method": "3dgs"},
+        trained=_no_other,
+        on_step=watch,
+    )
+    options = stages[-1].raster_options(iterations, scene.background.cuda())
+    options = replace(options, grad2d=False, absgrad=False)
+    result = evaluate(
+        outcome.model, scene.test, rasterizer, plugins, device=session.device, options=options, metrics=["psnr"]
+    )
+    psnr = result.metrics["psnr"].mean
+    assert psnr is not None
+    figures = Figures(outcome.steps / outcome.train_s, psnr, outcome.model.num_rows, outcome.peak_memory / MIB)
+    return figures, scene.protocol.background == "white"
+
+
+def _no_other(name: str) -> Any:
+    raise AssertionError(f"3dgs starts from no {name}")
+
+
+def theirs(script: Path, prepared: str, iterations: int, seed: int, white: bool) -> Figures | str:
+    """Figures of gsplat's trainer in a process of its own, or why there are none."""
+    missing = [name for name in ("gsplat", "cv2", "scipy") if importlib.util.find_spec(name) is None]
+    if missing:
+        return f"{', '.join(missing)} cannot be imported"
+    if not script.is_file():
+        return f"{script} is not there"
+    command = [sys.executable, str(script), prepared, "--iters", str(iterations), "--eval", str(iterations)]
+    command += ["--seed", str(seed)] + ["--white"] * white
+    with tempfile.TemporaryDirectory() as scratch:
+        done = subprocess.run(command, capture_output=True, text=True, cwd=scratch, check=False)
+    lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
+    if done.returncode != 0 or not lines:
+        return f"it failed: {(done.stderr.strip().splitlines() or ['no output'])[-1][:200]}"
+    found = json.loads(lines[-1].removeprefix("RESULT "))
+    return Figures(found["iters"] / found["train_s"], found["psnr"], found["n"], found["peak_mib"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES][=PREPARED]")
+    parser.add_argument("--iterations", type=int, default=7000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--gsplat", type=Path, default=Path("../shared/bench/train_gsplat.py"), help="its trainer")
+    parser.add_argument("--profile", action="store_true", help="also where a step's time goes")
+    args = parser.parse_args()
+    if not torch.cuda.is_available():
+        sys.exit("torch sees no CUDA device here")
+    print(device_reason("cuda", torch.device("cuda"), load_plugins()))
+    ratios = []
+    for asked in args.scenes:
+        where, _, prepared = asked.partition("=")
+        folder, _, pictures = where.partition(":")
+        mine, white = ours(folder, pictures or None, args.iterations, args.seed, None)
+        name = f"{Path(folder).name} {pictures}".strip()
+        print(f"{name:16} {'it/s':>7} {'PSNR':>7} {'Gaussians':>10} {'peak MiB':>9}")
+        print(_row("ours", mine))
+        other: Figures | str = "no prepared folder was given"
+        if prepared:
+            other = theirs(args.gsplat.resolve(), str(Path(prepared).resolve()), args.iterations, args.seed, white)
+        if isinstance(other, str):
+            print(f"  gsplat: not measured, {other}")
+        else:
+            print(_row("gsplat", other))
+            ratio = mine.iterations_per_second / other.iterations_per_second
+            ratios.append(ratio)
+            memory = mine.peak_mib / other.peak_mib
+            print(
+                f"  ours / gsplat: {ratio:.2f} x its/s, {mine.psnr - other.psnr:+.2f} dB, {memory:.2f} x memory",
+                flush=True,
+            )
+        if args.profile:
+            last = args.iterations - 2 * WINDOW - 10
+            watch = Watch(tuple(step for step in (1010, args.iterations // 2 + 10, last) if step > 0))
+            ours(folder, pictures or None, args.iterations, args.seed, watch)
+            print("\n".join(watch.lines), flush=True)
+    if ratios:
+        print(f"iterations/s over gsplat's, geometric mean of {len(ratios)}: {statistics.geometric_mean(ratios):.2f}")
+
+
+def _row(name: str, f: Figures) -> str:
+    return f"  {name:14} {f.iterations_per_second:7.1f} {f.psnr:7.2f} {f.gaussians:10,} {f.peak_mib:9.0f}"
+
+
+if __name__ == "__main__":
+    main()
