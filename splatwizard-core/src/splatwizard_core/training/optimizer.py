@@ -78,30 +78,23 @@ class SplatOptimizer:
         from splatwizard_core.training.adam import AdamUpdate, adam_steps
 
         updates = []
+        own = self.model._parameters  # get_parameter walks a path, which takes several times longer
         for group_name, group in self.groups.items():
             beta1, beta2 = group.betas
             for name in self._members[group_name]:
-                param = self.model.get_parameter(name)
-                if param.grad is None:
+                param = own.get(name)
+                if param is None:
+                    param = self.model.get_parameter(name)
+                grad = param.grad
+                if grad is None:
                     continue
                 moments = self._moments.get(name)
                 if moments is None:
                     # As torch.optim.Adam: moments exist from the first update on.
                     moments = self._moments[name] = _Moments(_zeros(param), _zeros(param))
                 moments.step += 1
-                updates.append(
-                    AdamUpdate(
-                        param.data,
-                        param.grad,
-                        moments.exp_avg,
-                        moments.exp_avg_sq,
-                        lr=group.lr,
-                        beta1=beta1,
-                        beta2=beta2,
-                        eps=group.eps,
-                        step=moments.step,
-                    )
-                )
+                tensors = param.data, grad, moments.exp_avg, moments.exp_avg_sq
+                updates.append(AdamUpdate(*tensors, group.lr, beta1, beta2, group.eps, moments.step))
         adam_steps(updates)
 
     def zero_grad(self) -> None:
