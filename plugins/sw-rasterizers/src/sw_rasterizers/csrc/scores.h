@@ -92,33 +92,33 @@ SW_HD void fisher_basis(const View<Scalar<V>>& view, const Geometry<V>& in, Scal
   }
 }
 
-// Adds F to `out` [kFisher]. `color` [3][3]: d colour_c / d mean, zero where the channel is clamped.
-template <class S>
-SW_HD void add_fisher_block(const S (*basis)[kPositions], const double* sums, const S* color, double* out) {
-  const double* cross = sums + kMoments4;
-  const double squared_weight = sums[kFisherSums - 1];
-  double along[3][kTheta];  // B X_c
+// F to `out` [kFisher], from B, the sums, and `color` [3][3]: d colour_c / d mean, zero where the channel is clamped.
+// D is double, or a pack of them.
+template <class D>
+SW_HD void fisher_block(const D (*basis)[kPositions], const D* sums, const D* color, D* out) {
+  const D* cross = sums + kMoments4;
+  const D squared_weight = sums[kFisherSums - 1];
+  D along[3][kTheta];  // B X_c
   for (int c = 0; c < 3; ++c)
     for (int a = 0; a < kTheta; ++a) {
-      double value = 0;
-      for (int i = 0; i < kPositions; ++i) value += double(basis[a][i]) * cross[kPositions * c + i];
-      along[c][a] = value;
+      along[c][a] = basis[a][0] * cross[kPositions * c];
+      for (int i = 1; i < kPositions; ++i) along[c][a] += basis[a][i] * cross[kPositions * c + i];
     }
   int slot = 0;
   for (int a = 0; a < kTheta; ++a) {
-    double left[kPositions];  // row a of B Q
+    D left[kPositions];  // row a of B Q
     for (int j = 0; j < kPositions; ++j) {
-      left[j] = 0;
-      for (int i = 0; i < kPositions; ++i) left[j] += double(basis[a][i]) * sums[moment_at(i, j)];
+      left[j] = basis[a][0] * sums[moment_at(0, j)];
+      for (int i = 1; i < kPositions; ++i) left[j] += basis[a][i] * sums[moment_at(i, j)];
     }
     for (int b = a; b < kTheta; ++b, ++slot) {
-      double value = 0;
-      for (int j = 0; j < kPositions; ++j) value += left[j] * double(basis[b][j]);
-      for (int c = 0; c < 3; ++c) {
-        const double color_a = a < 3 ? double(color[3 * c + a]) : 0.0, color_b = b < 3 ? double(color[3 * c + b]) : 0.0;
-        value += along[c][a] * color_b + color_a * along[c][b] + squared_weight * color_a * color_b;
+      D value = left[0] * basis[b][0];
+      for (int j = 1; j < kPositions; ++j) value += left[j] * basis[b][j];
+      for (int c = 0; c < 3; ++c) {  // colours change with the mean only
+        if (a < 3) value += color[3 * c + a] * along[c][b];
+        if (b < 3) value += color[3 * c + b] * (along[c][a] + squared_weight * color[3 * c + a]);
       }
-      out[slot] += value;
+      out[slot] = value;
     }
   }
 }

@@ -4,8 +4,10 @@
 // Tiles are walked back to front, as in blend_backward, because the light behind a splat must be known; `blend` has
 // left the last transmittance, the last splat and the touched blocks. Rows are added up in float64.
 #include <algorithm>
+#include <cstring>
 #include <limits>
 #include <memory>
+#include <type_traits>
 
 #include "gather.h"
 #include "parallel.h"
@@ -139,6 +141,19 @@ void sensitivity_tiles(const View<Scalar<V>>& view, const Settings& settings, co
   });
 }
 
+// As many doubles as V has lanes.
+#if SW_LANES > 1
+typedef double PackD __attribute__((vector_size(8 * SW_LANES)));
+template <class V>
+using Doubles = std::conditional_t<(lanes_of<V> > 1), PackD, double>;
+SW_HD void widen(const PackF& from, PackD& to) { to = __builtin_convertvector(from, PackD); }
+#else
+template <class V>
+using Doubles = double;
+SW_HD void widen(float from, double& to) { to = double(from); }
+#endif
+SW_HD void widen(double from, double& to) { to = from; }
+
 template <class V>
 void add_fisher_pack(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
                      const Slots<Scalar<V>>& slots, const Scalar<V>* sums, int64_t first, int64_t end, double* blocks) {
@@ -153,20 +168,30 @@ void add_fisher_pack(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g,
   gather_rows<V, 4>(g.quats, 4, rows, in.quat);
   V packs[kTheta][kPositions];
   fisher_basis(view, in, S(settings.scale_modifier), S(settings.eps2d), settings.original_jacobian, packs);
+
+  using D = Doubles<V>;
+  alignas(64) double total[kFisherSums][L] = {}, color[9][L] = {};
   for (int i = 0; i < lanes; ++i) {
     const int64_t slot = first + i;
-    if (slots.run[slot].count == 0) continue;
-    double total[kFisherSums] = {};
     const S* row = sums + int64_t(slots.run[slot].first) * kFisherSums;
     for (int32_t n = 0; n < slots.run[slot].count; ++n, row += kFisherSums)
-      for (int k = 0; k < kFisherSums; ++k) total[k] += double(row[k]);
-    S basis[kTheta][kPositions], color[9] = {};
-    for (int a = 0; a < kTheta; ++a)
-      for (int k = 0; k < kPositions; ++k) basis[a][k] = lane(packs[a][k], i);
+      for (int k = 0; k < kFisherSums; ++k) total[k][i] += double(row[k]);
     if (slots.color_slope != nullptr)
       for (int k = 0; k < 9; ++k)
-        if ((slots.clamped[slot] >> (k / 3) & 1) == 0) color[k] = slots.color_slope[slot * 9 + k];
-    add_fisher_block(basis, total, color, blocks + int64_t(rows[i]) * kFisher);
+        if ((slots.clamped[slot] >> (k / 3) & 1) == 0) color[k][i] = double(slots.color_slope[slot * 9 + k]);
+  }
+  D wide[kFisherSums], slope[9], basis[kTheta][kPositions], block[kFisher];
+  std::memcpy(wide, total, sizeof total);
+  std::memcpy(slope, color, sizeof color);
+  for (int a = 0; a < kTheta; ++a)
+    for (int k = 0; k < kPositions; ++k) widen(packs[a][k], basis[a][k]);
+  fisher_block(basis, wide, slope, block);
+  alignas(64) double found[kFisher][L];
+  std::memcpy(found, block, sizeof block);
+  for (int i = 0; i < lanes; ++i) {
+    if (slots.run[first + i].count == 0) continue;  // dropped: its values have no meaning
+    double* to = blocks + int64_t(rows[i]) * kFisher;
+    for (int k = 0; k < kFisher; ++k) to[k] += found[k][i];
   }
 }
 
