@@ -8,6 +8,40 @@ STANDARD_FEATURES = [
     "FLOAT64", "DETERMINISTIC",
 ]  # fmt: skip
 
+# Sums over pixels are atomic there: their order, and so their last bits, vary from run to run.
+ON_CUDA = {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
+# Name -> (target, summary, features, speed). The same kernels under the names of what needs them; the speeds only rank
+# the others below `standard`, which serves whatever nobody asks for by name, codebooks excepted.
+STANDARD = {
+    "standard": (
+        "standard:StandardRasterizer",
+        "compiled 3DGS rasterizer: CPU, vectorised and multi-threaded, and CUDA",
+        STANDARD_FEATURES,
+        50,
+    ),
+    "accel": (
+        "variants:AccelRasterizer",
+        "the kernels of standard for training: split SH, exact tiles (Taming 3DGS)",
+        ["BACKWARD", "ABSGRAD", "VISIBLE_FILTER", "SPLIT_SH", "TIGHT_TILES", "COLORS_ND", "FLOAT64", "DETERMINISTIC"],
+        44,
+    ),
+    "depth": (
+        "variants:DepthRasterizer",
+        "the kernels of standard for depth: inverse, accumulated, expected, median; antialiased",
+        [
+            "BACKWARD", "ANTIALIAS", "VISIBLE_FILTER", "SPLIT_SH", "DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED",
+            "DEPTH_MEDIAN", "ALPHA_MAP", "FLOAT64", "DETERMINISTIC",
+        ],
+        43,
+    ),
+    "c3dgs": (
+        "variants:IndexedRasterizer",
+        "compiled 3DGS rasterizer that reads codebooks of colours and shapes (C3DGS)",
+        [*STANDARD_FEATURES, "INDEXED_SH", "INDEXED_GEOM"],
+        42,
+    ),
+}  # fmt: skip
+
 SURFEL_FEATURES = [
     "SURFEL", "BACKWARD", "VISIBLE_FILTER", "SPLIT_SH", "NO_COLOR_CLAMP", "NORMALS", "DISTORTION", "DEPTH_INVERSE",
     "DEPTH_ACCUM", "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "TIGHT_TILES", "FLOAT64", "DETERMINISTIC",
@@ -34,20 +68,20 @@ SCORING_FORBIDDEN = [
 
 @hookimpl
 def register_rasterizers(registry: Registry) -> None:
-    registry.add(
-        "standard",
-        "sw_rasterizers.standard:StandardRasterizer",
-        summary="compiled 3DGS rasterizer: CPU, vectorised and multi-threaded, and CUDA",
-        devices=["cpu", "cuda"],
-        dtypes=["float32", "float64"],
-        features=STANDARD_FEATURES,
-        available="sw_rasterizers.native:unavailable",
-        # Sums over pixels are atomic there: their order, and so their last bits, vary from run to run.
-        on={"cuda": {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}},
-        exactness="exact",
-        speed=50,
-        native="sw_rasterizers.native:MODULE",
-    )
+    for name, (target, summary, features, speed) in STANDARD.items():
+        registry.add(
+            name,
+            f"sw_rasterizers.{target}",
+            summary=summary,
+            devices=["cpu", "cuda"],
+            dtypes=["float32", "float64"],
+            features=features,
+            available="sw_rasterizers.native:unavailable",
+            on={"cuda": ON_CUDA},
+            exactness="exact",
+            speed=speed,
+            native="sw_rasterizers.native:MODULE",
+        )
     registry.add(
         "2dgs",
         "sw_rasterizers.surfel:SurfelRasterizer",

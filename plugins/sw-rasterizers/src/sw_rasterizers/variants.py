@@ -1,0 +1,77 @@
+"""The standard kernels under the names of the variants that ask for nothing beyond them, and codebooks before them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.gaussians.inputs import SH, GaussianInputs
+from splatwizard_core.rendering.checks import check_request
+from splatwizard_core.rendering.negotiation import declared_info
+from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
+from splatwizard_core.scene.camera import Camera
+from sw_rasterizers import plugin
+from sw_rasterizers.segments import Tables
+from sw_rasterizers.standard import StandardRasterizer
+
+
+class AccelRasterizer(StandardRasterizer):
+    """Split SH, exact tiles and a backward pass without an atomic per pixel: what `standard` does anyway.
+
+    Source: Taming 3DGS (arXiv 2406.15643). Its checkpoints per 32 splats are not needed: the kernels go back to front
+    from the final transmittance.
+    """
+
+    info = declared_info(plugin.register_rasterizers, "accel")
+
+
+class DepthRasterizer(StandardRasterizer):
+    """Inverse, accumulated, expected and median depth, and the antialias factor: `standard` draws them itself.
+
+    Source: hierarchical 3DGS (arXiv 2406.12080) for the inverse depth, Mip-Splatting (arXiv 2311.16493) for the factor.
+    """
+
+    info = declared_info(plugin.register_rasterizers, "depth")
+
+
+class IndexedRasterizer(StandardRasterizer):
+    """Codebooks of colours and of shapes, with a scale factor for each Gaussian, read in front of the kernels.
+
+    Gradients of codebook rows are sums over their users in a fixed order (`segments`); those of factors and of
+    quaternions are exact. On CUDA the sums of the kernels in front of them are atomic.
+    Source: C3DGS (arXiv 2401.02436).
+    """
+
+    info = declared_info(plugin.register_rasterizers, "c3dgs")
+
+    def __init__(self, *, count: bool = False) -> None:
+        super().__init__(count=count)
+        self._tables = Tables()
+
+    def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
+        """As `standard`; `RenderResult.inputs` are the inputs as they came. Raises ShapeError for a wrong index too."""
+        check_request(self.info, g, opt)
+        return replace(super().render(self._gathered(g), cam, opt), inputs=g)
+
+    @torch.no_grad()
+    def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
+        """Radii [N] int32 from geometry alone; 0 = culled."""
+        g.validate()
+        return super().visible_filter(self._gathered(g), cam)
+
+    def _gathered(self, g: GaussianInputs) -> GaussianInputs:
+        """A shallow copy in which every Gaussian has its own scales, quaternion and colours; differentiable."""
+        lookup, scales, quats, sh = self._tables.lookup, g.scales, g.quats, g.sh
+        if g.geom_indices is not None and scales is not None and quats is not None:
+            scales, quats = lookup(scales, g.geom_indices), lookup(quats, g.geom_indices)
+        if g.scale_factors is not None and scales is not None:
+            scales = scales * g.scale_factors[:, None]
+        if sh is not None and sh.codebook is not None and sh.indices is not None:
+            rest = lookup(sh.codebook, sh.indices)
+            if sh.dc is None:
+                sh = SH(dense=rest, active_degree=sh.active_degree)
+            else:
+                sh = SH(dc=sh.dc, rest=rest, active_degree=sh.active_degree)
+        return replace(g, scales=scales, quats=quats, sh=sh, geom_indices=None, scale_factors=None)
