@@ -409,3 +409,15 @@ def test_list_imports_no_torch(data: Path):
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stderr.split() == ["False"]
+
+
+@pytest.mark.parametrize(("layout", "options"), [("colmap", "split=every4"), ("blender", "split=file")])
+def test_the_views_that_synth_tells_are_those_that_are_read(layout, options, tmp_path, capsys):
+    out = str(tmp_path / "scene")
+    assert main(["data", "synth", out, "--size", "tiny", "--format", layout]) == 0
+    told = capsys.readouterr().out
+    assert told.startswith("6 train and 2 test views")
+    assert (f"--set {options}" in told) == (layout == "colmap")
+    assert main(["info", out, "--set", options, "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["views"] == {"train": 6, "test": 2}

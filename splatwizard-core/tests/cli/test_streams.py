@@ -42,6 +42,16 @@ def test_closed_streams_are_no_error(command: str, closed: str, encoded: str):
     assert done.stderr == ""
 
 
+@pytest.mark.parametrize("encoding", ["LC_ALL=C PYTHONUTF8=0 PYTHONCOERCECLOCALE=0", "PYTHONIOENCODING=latin-1"])
+def test_a_name_that_the_terminal_cannot_show_is_escaped(encoding: str, tmp_path: Path):
+    name = "h\N{GREEK SMALL LETTER ALPHA}"
+    made = in_shell(f"{SW} data synth {shlex.quote(str(tmp_path / name))} --size tiny")
+    assert made.returncode == 0, made.stderr
+    done = in_shell(f"{encoding} {SW} info {shlex.quote(str(tmp_path / name))}")
+    assert done.returncode == 0, done.stderr
+    assert "u03b1" in done.stdout or "udcce" in done.stdout
+
+
 def test_an_error_with_closed_streams_still_has_its_status(tmp_path: Path):
     done = in_shell(f"{SW} info {shlex.quote(str(tmp_path))}/absent.swz >&- 2>&-")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")

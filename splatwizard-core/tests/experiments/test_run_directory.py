@@ -10,14 +10,15 @@ import sys
 import textwrap
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from splatwizard_core.errors import RunLockedError
+from splatwizard_core.errors import RunLockedError, SceneError
 from splatwizard_core.experiments import lock
 from splatwizard_core.experiments.cache import FOLDER
 from splatwizard_core.experiments.lock import directory_lock
-from splatwizard_core.experiments.run import OWN_FILES
+from splatwizard_core.experiments.run import OWN_FILES, RunRequest, run
 from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.training.params import PipelineParams
 
@@ -194,3 +195,10 @@ def test_the_page_about_run_directories_says_what_is():
     assert f"touches the file every {lock.BEAT_SECONDS:.0f} s" in text
     assert f"silent for {lock.SILENT_SECONDS:.0f} s" in text
     assert f"`checkpoint_every`, {PipelineParams().checkpoint_every} steps" in text
+
+
+def test_a_scene_that_no_record_can_name_is_refused_before_anything_is_written(tmp_path: Path):
+    resolved = SimpleNamespace(scene_spec=str(tmp_path / "caf\udce9"), method="toy", rate="r1")
+    with pytest.raises(SceneError, match="is not UTF-8"):
+        run(None, RunRequest(resolved, tmp_path / "out"))
+    assert not (tmp_path / "out").exists()

@@ -329,4 +329,6 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     if as_json:
         print_json(facts)
     else:
-        click.echo(f"{facts['train_views']} train and {facts['test_views']} test views ({layout}): {out}")
+        # A COLMAP folder holds no split: who reads it by another rule tests other views.
+        rule = f" by --set split={facts['split']}" if layout == "colmap" else ""
+        click.echo(f"{facts['train_views']} train and {facts['test_views']} test views{rule} ({layout}): {out}")

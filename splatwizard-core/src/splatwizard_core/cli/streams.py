@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import codecs
 import contextlib
+import io
 import os
 import signal
 import sys
@@ -11,9 +13,10 @@ from collections.abc import Iterator
 
 
 def open_streams() -> None:
-    """Let standard streams that the caller closed (`sw info x >&-`) lead to nowhere.
+    """Let standard streams that the caller closed (`sw info x >&-`) lead to nowhere, and take every character.
 
-    Else the next file that is opened takes the number of the closed one, and whoever prints writes into it.
+    Else the next file that is opened takes the number of the closed one, and whoever prints writes into it; and a name
+    that the terminal's encoding lacks would end the command.
     """
     for descriptor in (0, 1, 2):
         try:
@@ -25,6 +28,11 @@ def open_streams() -> None:
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            # What cannot be shown is escaped. Bytes of a file name that are no text pass where UTF-8 lets them.
+            passes = stream.errors == "surrogateescape" and codecs.lookup(stream.encoding).name == "utf-8"
+            stream.reconfigure(errors="surrogateescape" if passes else "backslashreplace")
 
 
 def abandon_streams() -> None:

@@ -6,12 +6,13 @@ a finished one is not done again.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.errors import SceneError, SplatwizardError, UserInputError
 from splatwizard_core.experiments.asked import Asked, what_is_asked
 from splatwizard_core.experiments.cache import trained_scene
 from splatwizard_core.experiments.config import SCENE_KEYS, ResolvedConfig, absolute_spec, content_hash
@@ -127,11 +128,26 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
 
 
 def _check_scene(session: Session, request: RunRequest, directory: Path) -> None:
-    """Before anything is written: the scene can be loaded and, of a run that begins, all its pictures decoded."""
+    """Before anything is written: the scene can be named in a record and loaded, and all pictures of a run that begins
+    decoded.
+    """
+    _check_name(absolute_spec(request.resolved.scene_spec))
     scene = session.scene(request.resolved)
     if not directory.exists() or not request.resume:
         decode_all(scene.train)  # training reads them anyway, and they stay
         check_pictures(scene.test)
+
+
+def _check_name(scene: str) -> None:
+    """config.toml and the record name the scene's folder, as text."""
+    try:
+        scene.encode()
+    except UnicodeEncodeError:
+        shown = os.fsencode(scene).decode(errors="replace")
+        raise SceneError(
+            f"scene '{shown}': the name of its folder, or the locale, is not UTF-8: rename it, or set LC_ALL=C.UTF-8",
+            path=shown,
+        ) from None
 
 
 def _begin(directory: Path, request: RunRequest) -> None:
