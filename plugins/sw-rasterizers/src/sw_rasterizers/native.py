@@ -7,7 +7,13 @@ from splatwizard_core.native import NativeModule
 MODULE = NativeModule(
     name="sw_rasterizers",
     package="sw_rasterizers",
-    sources=("csrc/binding.cpp", "csrc/binding_surfel.cpp", "csrc/binding_scores.cpp", "csrc/binding_cuda.cpp"),
+    sources=(
+        "csrc/binding.cpp",
+        "csrc/binding_surfel.cpp",
+        "csrc/binding_scores.cpp",
+        "csrc/binding_cuda.cpp",
+        "csrc/binding_scores_cuda.cpp",
+    ),
     kernels=(
         "csrc/cpu/blend_backward.cpp",
         "csrc/cpu/surfel_blend_backward.cpp",
@@ -26,7 +32,9 @@ MODULE = NativeModule(
         "csrc/cuda/sort.cu",
         "csrc/cuda/blend_backward.cu",
         "csrc/cuda/blend.cu",
+        "csrc/cuda/fisher.cu",
         "csrc/cuda/project_backward.cu",
+        "csrc/cuda/scores.cu",
         "csrc/cuda/project.cu",
         "csrc/cuda/emit.cu",
         "csrc/cuda/shade.cu",

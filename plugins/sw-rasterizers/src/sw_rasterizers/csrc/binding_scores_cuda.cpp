@@ -1,0 +1,87 @@
+// The op torch.ops.sw_rasterizers.accumulate_scores on CUDA: `render` makes the lists and the pixels' state, the sums
+// are formed by cuda/scores.cu and cuda/fisher.cu. Compiled only where there is CUDA.
+#ifdef SW_WITH_CUDA
+
+#include <ATen/core/Tensor.h>
+#include <ATen/core/dispatch/Dispatcher.h>
+#include <ATen/ops/zeros.h>
+#include <c10/cuda/CUDAException.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+#include <torch/library.h>
+
+#include <tuple>
+#include <vector>
+
+#include "binding_scores.h"
+#include "cuda/score_kernels.h"
+
+namespace {
+
+using namespace sw;        // NOLINT: one file
+using namespace sw::cuda;  // NOLINT
+
+// The state that `render` keeps for the backward pass, in the order of `Saved` in binding_cuda.cpp.
+enum Saved { kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kFlags, kSavedCount };
+
+using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
+                            std::vector<double>>;
+using Render = Rendered(const Tensor&, const Tensor&, const OptionalTensor&, const OptionalTensor&,
+                        const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
+                        const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
+                        at::ArrayRef<double>, int64_t, int64_t, int64_t, double, double, int64_t);
+
+void accumulate_scores(const Tensor& means, const Tensor& opacities, const OptionalTensor& scales,
+                       const OptionalTensor& quats, const OptionalTensor& cov3d, const OptionalTensor& sh,
+                       const OptionalTensor& sh_dc, const OptionalTensor& sh_rest, const OptionalTensor& colors,
+                       const OptionalTensor& visible, const OptionalTensor& background, at::ArrayRef<double> camera,
+                       int64_t width, int64_t height, int64_t sh_degree, double scale_modifier, double eps2d,
+                       int64_t flags, at::ArrayRef<int64_t> kinds, at::ArrayRef<int64_t> rules,
+                       at::ArrayRef<double> gammas, at::ArrayRef<int64_t> weight_rows, const OptionalTensor& weights,
+                       Tensor totals, const OptionalTensor& blocks) {
+  const OptionalTensor none;
+  const Inputs in{means, opacities, scales,     quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
+                  none,  visible,   background, sh_degree, scale_modifier, eps2d, flags};
+  const ScoreInputs asked{kinds, rules, weight_rows, gammas, weights, totals, blocks};
+  asked.check(in, camera, width, height);
+  if (means.size(0) == 0) return;
+  const c10::cuda::CUDAGuard guard(means.device());
+  const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
+  static const auto render =
+      c10::Dispatcher::singleton().findSchemaOrThrow("sw_rasterizers::render", "").typed<Render>();
+  const Rendered rendered =
+      render.call(means, opacities, scales, quats, cov3d, sh, sh_dc, sh_rest, colors, none, visible, background, camera,
+                  width, height, sh_degree, scale_modifier, eps2d, (flags | kSave) & ~int64_t(kCount));
+  const std::vector<Tensor>& saved = std::get<4>(rendered);
+  TORCH_CHECK(saved.size() == kSavedCount, "sw_rasterizers: the forward pass kept another state than expected");
+  if (saved[kSplat].numel() == 0) return;
+
+  const auto view = View<float>::from(camera.data(), int(width), int(height));
+  const Splats splats{data<float4>(saved[kShape]), data<float2>(saved[kTail]), data<float>(saved[kChannelRows])};
+  const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
+  Totals to{};
+  const Scores<float> contributions = asked.select<float>(false, to.of);
+  if (contributions.count > 0) score_pixels(view, splats, lists, contributions, to, stream);
+
+  Image image{};
+  image.background = data<float>(in.background);
+  image.background_is_image = in.background.has_value() && in.background->dim() == 3;
+  image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
+  const bool pass_clamp = flags & kPassClamp;
+  const Scores<float> squares = asked.select<float>(true, to.of);
+  if (squares.count > 0) square_derivatives(view, pass_clamp, splats, lists, image, squares, to, stream);
+  if (blocks.has_value()) {
+    const int64_t used = saved[kTail].size(0);
+    const Tensor rows = at::zeros({used, kFisherSums}, means.options().requires_grad(false));
+    fisher_sums(view, pass_clamp, splats, lists, image, data<float>(rows), stream);
+    fisher_blocks(view, in.gaussians<float>(), in.settings(), int(used), splats, data<uint8_t>(saved[kFlags]),
+                  data<float>(rows), data<double>(blocks.value()), stream);
+  }
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
+}  // namespace
+
+TORCH_LIBRARY_IMPL(sw_rasterizers, CUDA, m) { m.impl("accumulate_scores", accumulate_scores); }
+
+#endif  // SW_WITH_CUDA
