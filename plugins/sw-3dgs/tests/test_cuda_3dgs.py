@@ -68,7 +68,8 @@ def test_a_step_between_densifications_waits_for_nothing_that_torch_sees(channel
     finally:
         torch.cuda.set_sync_debug_mode("default")
     trainer.check_losses()
-    assert records[-1].total.item() < records[0].total.item()
+    assert all(math.isfinite(record.total.item()) for record in records)
+    assert trainer.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
     keep_pictures(scene.train, "cpu")
 
 
@@ -92,4 +93,6 @@ def test_a_picture_on_a_gpu_is_the_one_on_the_host():
     view = small_scene(4).train[0]
     background = torch.tensor([1.0, 0.5, 0.0])
     view.keep_on("cuda")
-    torch.testing.assert_close(view.image(background, "cuda").cpu(), view.image(background), rtol=0, atol=1e-7)
+    torch.testing.assert_close(
+        view.image(background, "cuda").cpu(), view.image(background), rtol=0, atol=2.5e-7
+    )  # 255 as a factor there, as a divisor here
