@@ -4,9 +4,11 @@ import pytest
 import torch
 
 from splatwizard_core.errors import DeviceMemoryError, TaskError, TrainingDiverged
+from splatwizard_core.evaluation.evaluate import render_view
 from splatwizard_core.experiments.device import device_reason
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
+from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.training import trainer as trainer_module
 from splatwizard_core.training.optimizer import SplatOptimizer
@@ -165,3 +167,13 @@ def test_where_a_run_computes_is_told_with_the_reason(monkeypatch: pytest.Monkey
     told = device_reason("cuda", torch.device("cuda"), plugins)
     assert told.startswith("computing on cuda, Some GPU")
     assert "--device cuda" in told
+
+
+def test_out_of_memory_in_an_evaluation_is_named_too(toy):
+    class Full(toy.Rasterizer):
+        def render(self, g, cam, opt):
+            raise torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 MiB. GPU 0 has")
+
+    with pytest.raises(DeviceMemoryError, match="a view of 40 gaussians at 12x10") as info:
+        render_view(toy.make_model(toy.scene), toy.scene.test[0].camera, Full(), RasterOptions())
+    assert info.value.wanted == 20 << 20

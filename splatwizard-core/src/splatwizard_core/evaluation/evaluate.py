@@ -18,6 +18,7 @@ from splatwizard_core.evaluation.image import prepare_render
 from splatwizard_core.evaluation.metrics import MetricSetup, PreparedMetric, default_metrics, prepare_metrics
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import out_of_memory
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.progress import track
@@ -96,9 +97,14 @@ def raster_header(options: RasterOptions) -> dict[str, Any]:
 
 
 def render_view(model: SplatModel, camera: Camera, rasterizer: Rasterizer, options: RasterOptions) -> RenderResult:
-    """Draw one view without gradients."""
-    with torch.no_grad():
-        return rasterizer.render(model.gaussians(camera, rasterizer), camera, options)
+    """Draw one view without gradients. Raises DeviceMemoryError where a GPU's memory does not suffice."""
+    try:
+        with torch.no_grad():
+            return rasterizer.render(model.gaussians(camera, rasterizer), camera, options)
+    except torch.cuda.OutOfMemoryError as error:
+        counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in model.counts().items())
+        doing = f"a view of {counted} at {camera.width}x{camera.height}"
+        raise out_of_memory(error, doing, "free the GPU, or compute with --device cpu") from error
 
 
 def evaluate(
