@@ -240,8 +240,8 @@ class Trainer:
         return out_of_memory(
             error,
             f"step {self.step + 1} of stage '{self.stage.name}' with {rows:,} {what}{drawn}",
-            "use smaller pictures or a plan that makes fewer, or free the GPU, and give the same command again: "
-            "it goes on from the last checkpoint",
+            "free the GPU and give the same command again, it goes on from the last checkpoint; "
+            "smaller pictures, or a plan that makes fewer, start anew",
         )
 
     def _num_rows(self) -> int:
