@@ -49,6 +49,23 @@ class Densify(Params):
     pause_after_reset: int = Field(0, ge=0, description="steps after an opacity reset without densification")
 
 
+class MCMC(Params):
+    """Density control as in 3DGS-MCMC, in place of `densify` (arXiv 2404.09591)."""
+
+    enabled: bool = Field(False, description="relocate, grow and shake Gaussians; no cloning, splitting or resets")
+    cap: int = Field(1_000_000, ge=1, description="most Gaussians that growth makes")
+    start: int = Field(600, ge=0, description="first step that relocates and grows")
+    stop: int = Field(25_000, ge=0, description="no relocation or growth from this step on")
+    interval: int = Field(100, ge=1, description="steps between relocations")
+    growth: float = Field(0.05, ge=0, description="share of Gaussians that are added each time")
+    min_opacity: float = Field(0.005, gt=0, lt=1, description="Gaussians up to this opacity are dead: relocated")
+    noise: float = Field(5e5, ge=0, description="strength of the noise on the means, times their step size")
+    opacity_weight: float = Field(0.01, ge=0, description="weight of the mean opacity in the loss")
+    scale_weight: float = Field(0.01, ge=0, description="weight of the mean scale in the loss, world units")
+    init_opacity: float = Field(0.5, gt=0, lt=1, description="opacity at the start")
+    init_scale: float = Field(0.1, gt=0, description="scales at the start, times the distance to the neighbours")
+
+
 class Loss(Params):
     """The photometric loss."""
 
@@ -84,5 +101,6 @@ class ThreeDGSConfig(OptimizationParams):
     )
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     densify: Densify = Field(Densify(), description="adaptive density control")
+    mcmc: MCMC = Field(MCMC(), description="density control of 3DGS-MCMC, off by default")
     loss: Loss = Field(Loss(), description="photometric loss")
     codec: Codec = Field(Codec(), description="what the file holds")

@@ -46,7 +46,14 @@ class ThreeDGS(Method):
                 f"scene '{scene.name}' has no start points: 3DGS needs SfM points, random ones, or --set init=FILE.ply",
                 path=scene.path,
             )
-        return GaussianModel.from_points(scene.points, max_sh_degree=config.sh_degree)
+        if not config.mcmc.enabled:
+            return GaussianModel.from_points(scene.points, max_sh_degree=config.sh_degree)
+        return GaussianModel.from_points(
+            scene.points,
+            max_sh_degree=config.sh_degree,
+            opacity=config.mcmc.init_opacity,
+            scale_factor=config.mcmc.init_scale,
+        )
 
     def stages(self) -> Sequence[Stage]:
         return [ThreeDGSStage(self.config)]

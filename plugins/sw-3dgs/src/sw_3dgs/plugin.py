@@ -7,7 +7,7 @@ from splatwizard_core.plugins import Registry, hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("3dgs", "sw_3dgs.method:ThreeDGS",
                  summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised",
-                 presets=["paper", "inria", "inria2024", "absgrad", "quick"],
+                 presets=["paper", "inria", "inria2024", "absgrad", "mcmc", "quick"],
                  rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
 
 
@@ -25,3 +25,9 @@ def register_tasks(registry: Registry) -> None:
                  summary="clone, split and prune Gaussians by those statistics", factory=True)  # fmt: skip
     registry.add("reset-opacity", "sw_3dgs.tasks:ResetOpacity",
                  summary="lower every opacity to at most 0.01", factory=True)  # fmt: skip
+    registry.add("relocate-dead", "sw_3dgs.mcmc:Relocate",
+                 summary="move faint Gaussians onto opaque ones (3DGS-MCMC)", factory=True)  # fmt: skip
+    registry.add("grow-to-cap", "sw_3dgs.mcmc:Grow",
+                 summary="add Gaussians beside opaque ones, up to a cap (3DGS-MCMC)", factory=True)  # fmt: skip
+    registry.add("add-position-noise", "sw_3dgs.mcmc:AddNoise",
+                 summary="shake the means of faint Gaussians after each update (3DGS-MCMC)", factory=True)  # fmt: skip

@@ -12,6 +12,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "inria2024": {"densify.start": 600, "lr.opacity": 0.025, "clamp_render": True},
     # AbsGS (arXiv 2404.10484) with the threshold that gsplat suggests.
     "absgrad": {"densify.absgrad": True, "densify.grad_threshold": 8e-4},
+    # 3DGS-MCMC (arXiv 2404.09591): density control by relocation and noise up to `mcmc.cap` Gaussians.
+    "mcmc": {"mcmc.enabled": True},
     # The plan scaled down for a CPU and the demo scene, with no opacity reset and larger steps, since there are few:
     # 34.3 dB there with 25,000 Gaussians, against 31.6 dB at the paper's rates (2,000 and 1,500 steps).
     "quick": {

@@ -9,7 +9,7 @@ from splatwizard_core.training.losses import photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.plan import When, scaled
 from splatwizard_core.training.stage import LossPack, Stage, StageContext
-from sw_3dgs import tasks
+from sw_3dgs import mcmc, tasks
 from sw_3dgs.config import ThreeDGSConfig
 
 if TYPE_CHECKING:
@@ -63,7 +63,11 @@ class ThreeDGSStage(Stage):
         )
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        lr = self.config.lr
+        lr, chain = self.config.lr, self.config.mcmc
+        if chain.enabled and chain.noise > 0:
+            noise = mcmc.AddNoise(strength=chain.noise, min_opacity=chain.min_opacity)
+            # First of all: it belongs to the update of the step before, and to that step's learning rate.
+            scheduler.register_task(self.when(range(lr.max_steps)), noise, name="add noise")
         update_lr = tasks.UpdateLearningRate(
             init=lr.position_init,
             final=lr.position_final,
@@ -79,6 +83,9 @@ class ThreeDGSStage(Stage):
         )
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        if self.config.mcmc.enabled:
+            self._register_mcmc(scheduler)
+            return
         densify = self.config.densify
         scheduler.register_task(
             self.when(range(densify.stop)),
@@ -111,13 +118,32 @@ class ThreeDGSStage(Stage):
             self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
         )
 
+    def _register_mcmc(self, scheduler: Scheduler) -> None:
+        chain = self.config.mcmc
+        when = self.when(range(chain.start, chain.stop, chain.interval))
+        scheduler.register_task(when, mcmc.Relocate(min_opacity=chain.min_opacity), name="relocate")
+        grow = mcmc.Grow(cap=chain.cap, growth=chain.growth, min_opacity=chain.min_opacity)
+        scheduler.register_task(when, grow, name="grow")
+
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         if self._options is None or self._options.background is not background:
-            absgrad = self.config.densify.absgrad
-            self._options = RasterOptions(background=background, grad2d=not absgrad, absgrad=absgrad)
+            statistics, absgrad = not self.config.mcmc.enabled, self.config.densify.absgrad
+            self._options = RasterOptions(
+                background=background, grad2d=statistics and not absgrad, absgrad=statistics and absgrad
+            )
         return self._options
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)
         settings = self.config.loss
-        return photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding)
+        loss = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding)
+        return self._regularised(loss, result) if self.config.mcmc.enabled else loss
+
+    def _regularised(self, loss: LossPack, result: RenderResult) -> LossPack:
+        """Plus what makes Gaussians fade and shrink unless a picture needs them, so that they can be relocated."""
+        chain, inputs = self.config.mcmc, result.inputs
+        if inputs.scales is None:
+            raise TypeError("mcmc.enabled needs a model with scales: that of 3dgs has them")
+        parts = {"opacity": inputs.opacities.mean(), "scale": inputs.scales.mean()}
+        total = loss.total + chain.opacity_weight * parts["opacity"] + chain.scale_weight * parts["scale"]
+        return LossPack(total, loss.parts | {name: part.detach() for name, part in parts.items()})

@@ -33,6 +33,10 @@ class RowEditor(Protocol):
         """Keep the rows where `mask` [N] bool is True, of parameters, buffers and Adam moments."""
         ...
 
+    def set_rows(self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor]) -> None:
+        """New values for the rows `index` [n] int64 of the parameters named; Adam moments of these rows become zero."""
+        ...
+
     def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
         """Replace one parameter; its Adam moments become zero, the step counter stays."""
         ...

@@ -178,6 +178,37 @@ class SplatOptimizer:
                 moments.exp_avg, moments.exp_avg_sq = kept(moments.exp_avg), kept(moments.exp_avg_sq)
 
     @torch.no_grad()
+    def set_rows(self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor]) -> None:
+        """Give some primitives new values.
+
+        index   [n] int64, each row once
+        rows    parameter or buffer of `model.ROWS` -> new rows [n, ...]; what is not named keeps its values
+
+        Moments of these rows become zero in every parameter, named or not; step counters stay. Every parameter of the
+        model is a new tensor afterwards: none is updated in this step. Raises ShapeError if rows do not fit.
+        """
+        for name, new in rows.items():
+            expected = (len(index), *_attribute(model, name).shape[1:]) if name in model.ROWS else None
+            if expected is None or new.shape != expected:
+                raise ShapeError(
+                    f"set_rows: '{name}' must be one of the rows of {type(model).__name__} and "
+                    f"{list(expected or ())}, got {list(new.shape)}",
+                    actual=new.shape,
+                    expected=expected,
+                )
+        prefix = self._prefix(model)
+        for name in model.ROWS:
+            old = _attribute(model, name)
+            if name in rows:
+                self._put(model, name, old.detach().index_copy(0, index, rows[name].detach().to(old)))
+            elif isinstance(old, nn.Parameter):
+                self._put(model, name, old.detach())
+            moments = self._moments.get(prefix + name)
+            if moments is not None:
+                moments.exp_avg = moments.exp_avg.index_fill(0, index, 0)
+                moments.exp_avg_sq = moments.exp_avg_sq.index_fill(0, index, 0)
+
+    @torch.no_grad()
     def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
         """Give one parameter (or buffer) a new value; its moments become zero, its step counter stays."""
         old = _attribute(model, name)
