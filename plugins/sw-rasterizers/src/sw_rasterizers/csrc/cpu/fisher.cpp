@@ -24,7 +24,8 @@ struct TileSensitivity {
   static constexpr int L = lanes_of<V>;
   static constexpr int kPacks = kBlockPixels / L;
   static constexpr int kLights = kForFisher ? 3 : 1;  // channels apart, or their sum
-  static constexpr int kAhead = 8;                          // pairs between prefetch and use of a record
+  static constexpr int kAhead = 8;                          // pairs between prefetch and use of a record and a row
+  static constexpr int kLine = 64 / int(sizeof(S));         // values of a cache line
 
   const View<S>& view;
   const Settings& settings;
@@ -54,7 +55,11 @@ struct TileSensitivity {
     const int64_t used = *std::max_element(w.last, w.last + kTilePixels);
     for (int64_t i = begin + used; i < end; ++i) std::fill_n(row(i), columns(), S(0));
     for (int64_t i = begin + used; i-- > begin;) {
-      if (i >= begin + kAhead) __builtin_prefetch(slots.records + int64_t(pairs.slot[i - kAhead]) * kRecord);
+      if (i >= begin + kAhead) {
+        __builtin_prefetch(slots.records + int64_t(pairs.slot[i - kAhead]) * kRecord);
+        const S* ahead = row(i - kAhead);
+        for (int k = 0; k < columns(); k += kLine) __builtin_prefetch(ahead + k, 1);
+      }
       add_splat(w, i, int32_t(i - begin));
     }
   }

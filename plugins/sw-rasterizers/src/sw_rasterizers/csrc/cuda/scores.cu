@@ -88,9 +88,15 @@ __global__ void __launch_bounds__(kThreads)
         float mine = 0.f;  // a lane a score
         for (int s = 0; s < scores.count; ++s) {
           const Score<float>& score = scores.of[s];
-          float value = pixel_value(score, (score.tested ? tried : blended) ? 1.f : 0.f, alpha, before, dx, dy);
-          if (score.weight != nullptr) value *= score.weight[pixel];
-          float total = score.kind == kBlendMax ? lanes_maximum(value) : lanes_sum(value);
+          const bool counted = score.tested ? tried : blended;
+          float total;
+          if (score.weight == nullptr && (score.kind == kHits || score.kind == kOpacity)) {
+            total = float(__popc(__ballot_sync(kAllLanes, counted)));
+          } else {
+            float value = pixel_value(score, counted ? 1.f : 0.f, alpha, before, dx, dy);
+            if (score.weight != nullptr) value *= score.weight[pixel];
+            total = score.kind == kBlendMax ? lanes_maximum(value) : lanes_sum(value);
+          }
           if (score.kind == kOpacity || score.kind == kOpacityT) total *= opacity;
           if (lane_index() == s) mine = total;
         }
