@@ -1,6 +1,7 @@
 """How fast the compiled CUDA rasterizer is, beside gsplat in the same process: one run prints one table.
 
     python benchmarks/rasterize_cuda.py [--scenes 200000,1000000,3000000] [--sizes 1237x822,1920x1080] [--repeats 40]
+    python benchmarks/rasterize_cuda.py --inference    the approximate rasterizers beside the exact one, forward only
     python benchmarks/rasterize_cuda.py --check        values and gradients against the CPU's kernels
     compute-sanitizer --tool memcheck python benchmarks/rasterize_cuda.py --sanitize      (also --tool racecheck)
 
@@ -9,12 +10,14 @@ float32; medians over --repeats with CUDA events, after as many turns to warm up
 forward + backward of sum(image * fixed random weight) with gradients of all five inputs. `ref` are the times on an H200
 that this library set out to beat (gsplat after 1.5.3), scaled by what gsplat 1.5.3 takes here over what it took there,
 both with packed=False, its faster mode; without gsplat they are unscaled. Peak memory is above the inputs, with the
-gradients.
+gradients. --inference also says how far the approximate images are from the exact ones, the worst of eight views, and
+`bar`, the fastest approximate rasterizer known on an H200; it fails where the images do not agree.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import math
 import statistics
 import sys
@@ -27,6 +30,7 @@ import torch
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.camera import Camera
+from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
 from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.standard import StandardRasterizer
 
@@ -42,6 +46,15 @@ REFERENCE = {
     (1_000_000, "1920x1080"): ((1.52, 4.25), (1.30, 4.00)),
     (3_000_000, "1237x822"): ((2.24, 5.96), (2.08, 5.84)),
     (3_000_000, "1920x1080"): ((2.39, 6.79), (2.18, 6.72)),
+}
+# H200, milliseconds: the fastest forward-only rasterizer known, of 16-bit or 8-bit precision.
+FASTEST_APPROXIMATE = {
+    (200_000, "1237x822"): 0.43,
+    (200_000, "1920x1080"): 0.58,
+    (1_000_000, "1237x822"): 0.84,
+    (1_000_000, "1920x1080"): 1.02,
+    (3_000_000, "1237x822"): 1.51,
+    (3_000_000, "1920x1080"): 1.58,
 }
 SH_COEFFICIENTS = 16
 
@@ -222,6 +235,57 @@ def table(arguments: argparse.Namespace) -> None:
         print(f"  {name:9s} {means[0]:.3f} {means[1]:.3f}   worst cell {worst[0]:.2f} {worst[1]:.2f}")
 
 
+def one_view(r: StandardRasterizer, opt: RasterOptions, g: GaussianInputs, cameras: list[Camera], i: int) -> None:
+    r.render(g, cameras[i % VIEWS], opt)
+
+
+@torch.no_grad()
+def inference(arguments: argparse.Namespace) -> bool:
+    """Prints forward times and image agreement of the approximate rasterizers; whether all images agree."""
+    kinds: dict[str, type[StandardRasterizer]] = {
+        "exact": StandardRasterizer,
+        "flash": FlashRasterizer,
+        "tcgs": TensorCoreRasterizer,
+    }
+    drawn = {name: (kind(), RasterOptions()) for name, kind in kinds.items()}
+    drawn["flash8"] = FlashRasterizer(), RasterOptions(dtype_out="uint8")
+    print(f"{torch.cuda.get_device_name(0)}, torch {torch.__version__}; forward, milliseconds (of which blending)")
+    good = True
+    for n in map(int, arguments.scenes.split(",")):
+        g = scene_on(n, "cuda")
+        for size in arguments.sizes.split(","):
+            width, height = map(int, size.split("x"))
+            cameras = orbit_cameras(VIEWS, width, height)
+            cells = []
+            for name, (rasterizer, options) in drawn.items():
+                draw = functools.partial(one_view, rasterizer, options, g, cameras)
+                took = milliseconds(draw, arguments.repeats)
+                counting = type(rasterizer)(count=name != "exact")  # the exact kernel is slower while it counts
+                seconds = [counting.render(g, cam, options).stats.stage_seconds.get("blend") for cam in cameras]
+                blend = [1e3 * s for s in seconds if s is not None]
+                cells.append(f"{name} {took:.3f}" + (f" ({statistics.median(blend):.3f})" if blend else ""))
+            bar = FASTEST_APPROXIMATE.get((n, size))
+            print(f"\n{n} Gaussians, {size}: {', '.join(cells)}" + (f"; bar {bar:.2f}" if bar else ""), flush=True)
+            for name in ("flash", "tcgs"):
+                found = [agreement(g, cam, drawn[name][0]) for cam in cameras]
+                psnr, mean, within, most = min(f[0] for f in found), *(max(f[i] for f in found) for i in (1, 2, 3))
+                good &= psnr >= 50 and mean <= 5e-4 if name == "tcgs" else within <= 0.01 and most <= 4
+                print(f"  {name}: PSNR {psnr:.1f} dB, mean |d| {mean:.1e}; 8 bit: {within:.1e} of the values more than "
+                      f"1 level off, at most {most:.0f}")  # fmt: skip
+    return good
+
+
+def agreement(g: GaussianInputs, cam: Camera, rasterizer: StandardRasterizer) -> tuple[float, float, float, float]:
+    """Against the exact image: PSNR, mean |d|; of 8-bit images the share more than a level off, most levels off."""
+    exact = StandardRasterizer().render(g, cam, RasterOptions()).image
+    seen = rasterizer.render(g, cam, RasterOptions()).image
+    levels = rasterizer.render(g, cam, RasterOptions(dtype_out="uint8")).image.float()
+    off = (levels - torch.round(255 * exact.clamp(0, 1))).abs()
+    error = (seen - exact).double()
+    psnr = -10 * math.log10(max(float(error.square().mean()), 1e-20))
+    return psnr, float(error.abs().mean()), float((off > 1).float().mean()), float(off.max())
+
+
 def print_stages(g: GaussianInputs, cameras: list[Camera], top: tuple[float, float, float]) -> None:
     took, counts = stages(g, cameras)
     least = limits(counts, *top)
@@ -268,6 +332,7 @@ def main() -> None:
     parser.add_argument("--sizes", default="1237x822,1920x1080", help="images, WIDTHxHEIGHT, separated by commas")
     parser.add_argument("--repeats", type=int, default=40, help="timed runs (default: 40)")
     parser.add_argument("--stages", action="store_true", help="also each stage, with its fraction of the roofline")
+    parser.add_argument("--inference", action="store_true", help="the approximate rasterizers, forward only, instead")
     parser.add_argument("--check", action="store_true", help="compare with the CPU's kernels instead")
     parser.add_argument("--sanitize", action="store_true", help="only draw a small scene, for compute-sanitizer")
     arguments = parser.parse_args()
@@ -279,7 +344,14 @@ def main() -> None:
         options = RasterOptions(grad2d=True, absgrad=True, alpha=True, depth=frozenset({"median", "inverse"}))
         for opt in (RasterOptions(), options):
             StandardRasterizer().render(g, cam, opt).image.sum().backward()
+        with torch.no_grad():
+            for rasterizer in (FlashRasterizer(), TensorCoreRasterizer()):
+                rasterizer.render(g, cam, RasterOptions(alpha=True))
+                rasterizer.render(g, cam, RasterOptions(dtype_out="uint8"))
         torch.cuda.synchronize()
+    elif arguments.inference:
+        if not inference(arguments):
+            raise SystemExit("FAILED: the images do not agree")
     elif arguments.check:
         sizes = [(int(n), s) for n in arguments.scenes.split(",") for s in arguments.sizes.split(",")]
         if not all([check(n, s) for n, s in sizes]):  # noqa: C419 (all are printed)

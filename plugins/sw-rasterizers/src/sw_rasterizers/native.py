@@ -32,6 +32,8 @@ MODULE = NativeModule(
         "csrc/cuda/sort.cu",
         "csrc/cuda/blend_backward.cu",
         "csrc/cuda/blend.cu",
+        "csrc/cuda/flash.cu",
+        "csrc/cuda/tcgs.cu",
         "csrc/cuda/fisher.cu",
         "csrc/cuda/project_backward.cu",
         "csrc/cuda/scores.cu",

@@ -38,6 +38,9 @@ class Flag(enum.IntFlag):
     SAVE = 1024
     COUNT = 2048
     ORIGINAL_JACOBIAN = 4096
+    FLASH = 8192  # CUDA only
+    TENSOR_CORES = 16384
+    BYTES = 32768
 
 
 @dataclass

@@ -47,6 +47,15 @@ SURFEL_FEATURES = [
     "DEPTH_ACCUM", "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "TIGHT_TILES", "FLOAT64", "DETERMINISTIC",
 ]  # fmt: skip
 
+INFERENCE_FEATURES = [
+    "ANTIALIAS", "VISIBLE_FILTER", "COV3D", "SPLIT_SH", "NO_COLOR_CLAMP", "ALPHA_MAP", "TIGHT_TILES", "UINT8_OUT",
+]  # fmt: skip
+# Name -> (target, summary, exactness, speed): forward only. Whoever asks must accept the exactness.
+INFERENCE = {
+    "flash": ("FlashRasterizer", "FlashGS-style, polynomial exponents, 8-bit images", "approx-uint8", 55),
+    "tcgs": ("TensorCoreRasterizer", "TC-GS-style, exponents by tensor cores", "approx-fp16", 60),
+}
+
 CONTRIBUTIONS = [
     "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T", "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST",
     "SCORE_PIXEL_WEIGHT",
@@ -95,6 +104,20 @@ def register_rasterizers(registry: Registry) -> None:
         speed=50,
         native="sw_rasterizers.native:MODULE",
     )
+    for name, (target, summary, exactness, speed) in INFERENCE.items():
+        registry.add(
+            name,
+            f"sw_rasterizers.inference:{target}",
+            summary=f"approximate 3DGS rasterizer for inference on CUDA: {summary}",
+            devices=["cuda"],
+            dtypes=["float32"],
+            features=INFERENCE_FEATURES,
+            available="sw_rasterizers.native:unavailable_on_cuda",
+            exactness=exactness,
+            speed=speed,
+            min_cc=[8, 0],  # copies past the registers and products of tensor cores
+            native="sw_rasterizers.native:MODULE",
+        )
     for name, (target, summary, scores, speed) in SCORING.items():
         registry.add(
             name,

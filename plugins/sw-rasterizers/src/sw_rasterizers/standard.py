@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ShapeError
+from splatwizard_core.errors import CapabilityError, ShapeError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.checks import check_placement, check_request, checked_background
 from splatwizard_core.rendering.negotiation import declared_info
@@ -26,6 +26,9 @@ from splatwizard_core.rendering.rasterizer import (
 from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_radii
+
+CUDA_CHANNELS = 8
+"""`kMaxChunk` of csrc/cuda/kernels.h."""
 
 
 class StandardRasterizer:
@@ -51,6 +54,8 @@ class StandardRasterizer:
         call = self._call(g, cam, opt)
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
             raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
+        if opt.absgrad and g.means.is_cuda:
+            _check_absgrad(g, call.flags)
         sh = g.sh
         image, radii, alpha, median = rasterize(
             call,
@@ -139,6 +144,19 @@ class StandardRasterizer:
             background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if watch and opt.grad2d else None,
             absgrad2d=GradBuffer() if watch and opt.absgrad else None,
+        )
+
+
+def _check_absgrad(g: GaussianInputs, flags: Flag) -> None:
+    """On CUDA channels are blended eight at a time, and an absolute value of a sum is not one of its parts."""
+    channels = 3 if g.colors is None else g.colors.shape[1]
+    channels += (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
+    channels += 0 if g.features is None else g.features.shape[1]
+    if channels > CUDA_CHANNELS:
+        raise CapabilityError(
+            f"absgrad on CUDA is offered for up to {CUDA_CHANNELS} channels of colours, depths and features together, "
+            f"here are {channels}",
+            missing=frozenset({"ABSGRAD"}),
         )
 
 

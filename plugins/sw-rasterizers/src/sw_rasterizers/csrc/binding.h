@@ -30,6 +30,9 @@ enum Flag : int64_t {  // mirrored in ops.py
   kSave = 1024,
   kCount = 2048,
   kOriginalJacobian = 4096,
+  kFlash = 8192,  // CUDA only
+  kTensorCores = 16384,
+  kBytes = 32768,
 };
 
 template <class S>

@@ -198,21 +198,29 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   saved[kTransmittance] = make({save ? height : 0, width});
   saved[kLast] = make_as({save ? height : 0, width}, at::kInt);
   saved[kMedianSplat] = make_as({save && median ? height : 0, width}, at::kInt);
-  Tensor picture = make({total, height, width});
+  const bool fast = in.flags & (kFlash | kTensorCores), as_bytes = in.flags & kBytes;
+  TORCH_CHECK(fast || !as_bytes, "sw_rasterizers: 8-bit images are drawn by the inference kernels only");
+  TORCH_CHECK(!fast || (!general && !save), "sw_rasterizers: the inference kernels draw three colours, no gradients");
+  Tensor picture = as_bytes ? make_as({total, height, width}, at::kByte) : make({total, height, width});
   Tensor alpha = make({(in.flags & kAlphaMap) ? 1 : 0, height, width});
   Tensor median_depth = make({median ? 1 : 0, height, width});
   Image image = image_of(in);
-  image.image = data<float>(picture), image.alpha = data<float>(alpha), image.median = data<float>(median_depth);
+  image.image = as_bytes ? nullptr : data<float>(picture);
+  image.alpha = data<float>(alpha), image.median = data<float>(median_depth);
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
-  blend(view, drawn, {data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])}, image, general,
-        count_work ? counters : nullptr, sorted_depth, stream);
+  const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
+  if (fast)
+    (in.flags & kFlash ? blend_flash : blend_tcgs)(view, drawn, lists, image,
+                                                   as_bytes ? data<uint8_t>(picture) : nullptr, stream);
+  else
+    blend(view, drawn, lists, image, general, count_work ? counters : nullptr, sorted_depth, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
 
   if (n > 0) colored.wait();  // long past by now
   int64_t evaluated = -1, blended = -1;
-  if (count_work) {
+  if (count_work && !fast) {
     Counters now{};
     C10_CUDA_CHECK(cudaMemcpyAsync(&now, counters, sizeof now, cudaMemcpyDeviceToHost, stream));
     C10_CUDA_CHECK(cudaStreamSynchronize(stream));

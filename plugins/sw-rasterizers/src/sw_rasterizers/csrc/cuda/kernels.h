@@ -7,6 +7,7 @@
 //   sort_pairs         pairs by tile; stable, so front to back within a tile
 //   find_tiles         where each tile's pairs start
 //   blend              pairs -> image
+//   blend_flash, blend_tcgs   the same, approximately and faster, three colours, no state for a backward pass
 //   blend_backward     dL/dimage -> a row of sums for every Gaussian that was drawn
 //   project_backward   rows of sums -> gradients of the inputs
 #pragma once
@@ -120,6 +121,11 @@ void find_tiles(int count, int tiles, const void* keys, bool wide, int32_t* star
 
 void blend(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
            bool general, Counters* counters, const uint32_t* depth, cudaStream_t stream);
+// Into image.image, or into `bytes` [3][H][W] as 8-bit levels if that is not null; and image.alpha.
+void blend_flash(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
+                 uint8_t* bytes, cudaStream_t stream);
+void blend_tcgs(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
+                uint8_t* bytes, cudaStream_t stream);
 // The last `detached` channels do not influence the geometry; `pass_clamp`: the gradient passes the clamp of alpha.
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
                     const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,

@@ -1,0 +1,72 @@
+"""Rasterizers for showing and measuring only: faster than `standard`, not exact, CUDA, no gradients.
+
+FlashGS (arXiv 2408.07967) and TC-GS (arXiv 2505.24796) name what each one does with the exponent. Everything before the
+pixels (projection, exact ellipse-tile tests, sorting) is the standard family's.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.rendering.checks import check_placement, check_request
+from splatwizard_core.rendering.negotiation import declared_info
+from splatwizard_core.rendering.rasterizer import RasterizerInfo, RasterOptions, RenderResult
+from splatwizard_core.scene.camera import Camera
+from sw_rasterizers import plugin
+from sw_rasterizers.ops import Call, Flag
+from sw_rasterizers.standard import StandardRasterizer
+
+
+class InferenceRasterizer(StandardRasterizer):
+    """What both share. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
+
+    A pixel draws the splat that brings its transmittance below 1e-4 (the standard rasterizers leave it out) and goes on
+    until all 32 pixels of its warp are below. Alpha is still clamped at 0.99 and cut below 1/255.
+    """
+
+    method: Flag
+
+    def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
+        """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
+        check_request(self.info, g, opt)
+        check_placement(self.info, g)
+        if self.info.min_cc is not None and torch.cuda.get_device_capability(g.means.device) < self.info.min_cc:
+            raise CapabilityError(
+                f"rasterizer '{self.info.name}' needs a GPU of compute capability {self.info.min_cc[0]}."
+                f"{self.info.min_cc[1]} or higher",
+                missing=frozenset(),
+            )
+        return super().render(g, cam, opt)
+
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+        if g.colors is not None and g.colors.shape[1] != 3:
+            raise ShapeError("GaussianInputs.colors must have 3 channels here", actual=g.colors.shape)
+        call = super()._call(g, cam, opt)
+        call.flags |= self.method
+        if opt.dtype_out == "uint8":
+            call.flags |= Flag.BYTES
+        return call
+
+
+class FlashRasterizer(InferenceRasterizer):
+    """FlashGS-style: a base-2 exponent with the opacity folded in, a polynomial about the tile's middle."""
+
+    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "flash")
+    method = Flag.FLASH
+
+
+class TensorCoreRasterizer(InferenceRasterizer):
+    """TC-GS-style: exponents by tensor cores, every coefficient as the sum of two halves, float32 sums.
+
+    Raises ConfigError for a low-pass below 0.1 px^2: the exponents of sharper splats leave the range of a half.
+    """
+
+    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "tcgs")
+    method = Flag.TENSOR_CORES
+
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+        if opt.eps2d < 0.1:
+            raise ConfigError(f"rasterizer 'tcgs' needs eps2d of 0.1 or more, got {opt.eps2d}", key="raster.eps2d")
+        return super()._call(g, cam, opt)
