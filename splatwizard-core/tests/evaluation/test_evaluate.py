@@ -133,6 +133,8 @@ def test_no_view_is_an_error():
 def test_picture_names_stay_apart():
     assert png_names(["a.jpg", "b.c.jpg", "d/a.jpg"]) == ["a.png", "b.c.png", "d__a.png"]
     assert png_names(["a.jpg", "a.png", "x.jpg"]) == ["a.jpg.png", "a.png.png", "x.png"]
+    for clashing in (["a/b.png", "a__b.png"], ["a.jpg", "a.png", "a.png.tif"], ["a", "a~2", "a"]):
+        assert len(set(png_names(clashing))) == len(clashing)
 
 
 def test_what_changes_the_picture_goes_into_the_file_and_comes_back():

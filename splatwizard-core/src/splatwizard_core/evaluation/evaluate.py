@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -193,7 +195,16 @@ def png_names(views: Sequence[str]) -> list[str]:
     """File names for the renders of views: no folders, and unique also where stems are not."""
     flat = [name.replace("/", "__").replace(os.sep, "__") for name in views]
     stems = [name.rsplit(".", 1)[0] for name in flat]
-    return [f"{stem if stems.count(stem) == 1 else name}.png" for name, stem in zip(flat, stems, strict=True)]
+    shared = Counter(stems)
+    used: set[str] = set()
+    found = []
+    for name, stem in zip(flat, stems, strict=True):
+        chosen = stem if shared[stem] == 1 else name
+        # Also where the one's folder is spelt in the other's name: a/b.png and a__b.png.
+        free = itertools.chain([chosen], (f"{chosen}~{n}" for n in itertools.count(2)))
+        found.append(next(candidate for candidate in free if candidate not in used))
+        used.add(found[-1])
+    return [f"{name}.png" for name in found]
 
 
 def save_png(image: Tensor, path: Path) -> None:
