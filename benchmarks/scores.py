@@ -1,6 +1,7 @@
-"""What scores cost on the CPU beside drawing the same view: one run prints one table.
+"""What scores of Gaussians cost beside drawing the same view: one run prints one table.
 
-    python benchmarks/scores_cpu.py [--n 250000] [--size 270x480] [--repeats 10] [--threads 1]
+    python benchmarks/scores.py [--device cpu] [--n 250000] [--size 270x480] [--repeats 10] [--threads 1] [--views 4]
+    python benchmarks/scores.py --device cuda --n 1000000 --size 1080x1920
 
 Each row is a view of an `accumulate` over --views of them; "of forward" compares with the forward pass of `standard`,
 "of both" with its forward and backward pass. Times are minima.
@@ -17,6 +18,7 @@ from pathlib import Path
 import torch
 
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.testing.raster_scenes import cast_inputs, with_tensors
 from sw_rasterizers.scoring import PupRasterizer
 from sw_rasterizers.standard import StandardRasterizer
 
@@ -35,19 +37,27 @@ REQUESTS = {
 }
 
 
-def fastest(run: Callable[[], object], repeats: int) -> float:
+def fastest(run: Callable[[], object], repeats: int, device: str) -> float:
     """Seconds; the first call warms up."""
+
+    def wait() -> None:
+        if device == "cuda":
+            torch.cuda.synchronize()
+
     run()
     best = float("inf")
     for _ in range(repeats):
+        wait()
         start = time.perf_counter()
         run()
+        wait()
         best = min(best, time.perf_counter() - start)
     return best
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--device", default="cpu", choices=["cpu", "cuda"])
     parser.add_argument("--n", type=int, default=250_000, help="Gaussians")
     parser.add_argument("--size", default="270x480", help="height x width")
     parser.add_argument("--repeats", type=int, default=10)
@@ -56,24 +66,29 @@ def main() -> None:
     arguments = parser.parse_args()
     height, width = map(int, arguments.size.split("x"))
     torch.set_num_threads(arguments.threads)
-    g, camera = make_splats(arguments.n, requires_grad=True), orbit_cameras(8, width, height)[0]
+    g, camera = cast_inputs(make_splats(arguments.n), device=arguments.device), orbit_cameras(8, width, height)[0]
     views = [camera] * arguments.views
-    print(f"{arguments.n} Gaussians, {width}x{height}, {arguments.threads} threads")
+    leaves = with_tensors(g, {k: x.clone().requires_grad_() for k, x in g.tensors().items() if x.is_floating_point()})
 
-    def train() -> None:
-        for x in g.tensors().values():
+    def forward() -> None:
+        with torch.no_grad():
+            StandardRasterizer().render(g, camera, RasterOptions())
+
+    def forward_and_backward() -> None:
+        for x in leaves.tensors().values():
             x.grad = None
-        StandardRasterizer().render(g, camera, RasterOptions()).image.sum().backward()
+        StandardRasterizer().render(leaves, camera, RasterOptions()).image.sum().backward()
 
-    with torch.no_grad():
-        forward = fastest(lambda: StandardRasterizer().render(g, camera, RasterOptions()), arguments.repeats)
-    both = fastest(train, arguments.repeats)
-    print(f"{'forward of standard':34} {1e3 * forward:8.2f} ms\n{'forward and backward':34} {1e3 * both:8.2f} ms")
+    def measure(run: Callable[[], object]) -> float:
+        return fastest(run, arguments.repeats, arguments.device)
+
+    place = f"{arguments.threads} threads" if arguments.device == "cpu" else torch.cuda.get_device_name()
+    print(f"{arguments.n} Gaussians, {width}x{height}, {place}")
+    one, both = measure(forward), measure(forward_and_backward)
+    print(f"{'forward of standard':34} {1e3 * one:8.2f} ms\n{'forward and backward':34} {1e3 * both:8.2f} ms")
     for name, options in REQUESTS.items():
-        seconds = fastest(
-            lambda options=options: PupRasterizer().accumulate(g, views, options), arguments.repeats
-        ) / len(views)
-        ratios = f"{seconds / forward:5.2f} of forward {seconds / both:5.2f} of both"
+        seconds = measure(lambda options=options: PupRasterizer().accumulate(g, views, options)) / len(views)
+        ratios = f"{seconds / one:5.2f} of forward {seconds / both:5.2f} of both"
         print(f"{name:34} {1e3 * seconds:8.2f} ms {ratios}")
 
 
