@@ -4,7 +4,10 @@
     python benchmarks/train_cuda.py ../shared/data/mug=out/prepared/mug --gsplat ../shared/bench/train_gsplat.py
 
 A scene is FOLDER[:PICTURES][=PREPARED]; PREPARED is the folder that prep_scene.py, beside the trainer of gsplat, wrote
-from the same files. Without it, or where gsplat cannot be imported, only ours is measured.
+from the same files. Without it, or where gsplat cannot be imported, only ours is measured. gsplat's trainer takes its
+SSIM from the package fused_ssim where that is installed, else from torch's convolutions, which slows it down: the
+output says which.
+
 One after the other, so that nothing shares the GPU. Iterations a second count the loop alone, densification included,
 as both trainers report it; PSNR is the mean over the held-out views, memory the peak of torch's allocator in the loop.
 
@@ -53,6 +56,7 @@ class Figures:
     psnr: float
     gaussians: int
     peak_mib: float
+    note: str = ""
 
 
 @dataclass
@@ -152,13 +156,16 @@ def theirs(script: Path, prepared: str, iterations: int, seed: int, white: bool)
         return f"{script} is not there"
     command = [sys.executable, str(script), prepared, "--iters", str(iterations), "--eval", str(iterations)]
     command += ["--seed", str(seed)] + ["--white"] * white
+    if importlib.util.find_spec("fused_ssim") is not None:
+        command += ["--ssim", "fused_ssim"]  # its faster way
     with tempfile.TemporaryDirectory() as scratch:
         done = subprocess.run(command, capture_output=True, text=True, cwd=scratch, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     if done.returncode != 0 or not lines:
         return f"it failed: {(done.stderr.strip().splitlines() or ['no output'])[-1][:200]}"
     found = json.loads(lines[-1].removeprefix("RESULT "))
-    return Figures(found["iters"] / found["train_s"], found["psnr"], found["n"], found["peak_mib"])
+    note = f"gsplat {found['gsplat']}, SSIM of {found['ssim_impl']}"
+    return Figures(found["iters"] / found["train_s"], found["psnr"], found["n"], found["peak_mib"], note)
 
 
 def main() -> None:
@@ -204,7 +211,8 @@ def main() -> None:
 
 
 def _row(name: str, f: Figures) -> str:
-    return f"  {name:14} {f.iterations_per_second:7.1f} {f.psnr:7.2f} {f.gaussians:10,} {f.peak_mib:9.0f}"
+    figures = f"{f.iterations_per_second:7.1f} {f.psnr:7.2f} {f.gaussians:10,} {f.peak_mib:9.0f}"
+    return f"  {name:14} {figures}  {f.note}".rstrip()
 
 
 if __name__ == "__main__":

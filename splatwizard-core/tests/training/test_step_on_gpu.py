@@ -1,5 +1,8 @@
 """A training step on a GPU, played with fakes: late verdicts, pictures that are kept there, memory that runs out."""
 
+import gc
+import weakref
+
 import pytest
 import torch
 
@@ -177,3 +180,21 @@ def test_out_of_memory_in_an_evaluation_is_named_too(toy):
     with pytest.raises(DeviceMemoryError, match="a view of 40 gaussians at 12x10") as info:
         render_view(toy.make_model(toy.scene), toy.scene.test[0].camera, Full(), RasterOptions())
     assert info.value.wanted == 20 << 20
+
+
+def test_the_optimizers_memory_goes_with_the_training(toy):
+    made = []
+
+    class Watched(toy.Stage):
+        def create_optimizer(self, model, scene):
+            optimizer = super().create_optimizer(model, scene)
+            made.append(weakref.ref(optimizer))
+            return optimizer
+
+    gc.disable()  # nobody may have to look for rings before a GPU's memory is free
+    try:
+        outcome = toy.train([Watched(OptimizationParams(iterations=5))])
+        assert outcome.steps == 5
+        assert made[0]() is None
+    finally:
+        gc.enable()

@@ -102,6 +102,8 @@ class Housekeeping:
             self._write_lines()
         finally:
             self._stack.__exit__(kind, error, trace)
+            for scheduler in (self.trainer.pre, self.trainer.post):
+                scheduler.on_log = None  # a ring of references would keep the optimizer's memory for a while
         self._account()
 
     def after_step(self, record: StepRecord) -> None:
