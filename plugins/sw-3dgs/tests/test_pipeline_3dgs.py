@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.errors import ConfigError
 from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -13,7 +14,7 @@ from splatwizard_core.scene.loaders import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingStopped, train_stages
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
 
@@ -133,3 +134,28 @@ def test_absgrad_trains(scene, rasterizer):
     outcome = train(scene, rasterizer, iterations=60, densify__absgrad=True, densify__grad_threshold=8e-4)
     assert outcome.steps == 60
     assert torch.isfinite(outcome.model.means).all()
+
+
+@pytest.mark.parametrize("correction", ["none", "per_row"])
+def test_sparse_adam_trains_and_resumes(scene, rasterizer, tmp_path, correction):
+    values = {"iterations": 80, "sparse_adam": correction}
+
+    def stopped_after(stop, directory):
+        made = method(**values)
+        return train_stages(
+            made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
+            directory=directory, identity={}, trained=no_trained_scene, stop_after=stop,
+        )  # fmt: skip
+
+    whole = train(scene, rasterizer, **values)
+    start = method().create_model(scene, stream(0, "init"))
+    assert psnr(whole.model, scene, rasterizer) > psnr(start, scene, rasterizer) + 2
+    assert whole.model.digest() != train(scene, rasterizer, iterations=80).model.digest()
+    with pytest.raises(TrainingStopped):
+        stopped_after(60, tmp_path)  # after the first densification
+    assert stopped_after(None, tmp_path).model.digest() == whole.model.digest()
+
+
+def test_sparse_adam_and_the_regularisers_of_mcmc_exclude_each_other():
+    with pytest.raises(ConfigError, match="set one of the two"):
+        method(sparse_adam="none", mcmc__enabled=True).stages()

@@ -99,6 +99,9 @@ class ThreeDGSConfig(OptimizationParams):
     init: InputFile = Field(
         "", description="a .ply to start from, with all its SH bands active; empty: the scene's points"
     )
+    sparse_adam: Literal["off", "none", "per_row"] = Field(
+        "off", description="update only what the view shows: none: without bias correction, as published; per_row: with"
+    )
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     densify: Densify = Field(Densify(), description="adaptive density control")
     mcmc: MCMC = Field(MCMC(), description="density control of 3DGS-MCMC, off by default")

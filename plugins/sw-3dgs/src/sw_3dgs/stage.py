@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from splatwizard_core.errors import ConfigError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.training.losses import photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
@@ -29,6 +30,11 @@ class ThreeDGSStage(Stage):
 
     def __init__(self, opt: ThreeDGSConfig) -> None:
         super().__init__(opt)
+        if opt.sparse_adam != "off" and opt.mcmc.enabled:
+            raise ConfigError(
+                "sparse_adam leaves hidden Gaussians as they are, which the regularisers of mcmc.enabled must reach: "
+                "set one of the two"
+            )
         self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self.white = False  # known when the stage begins; a plan can be printed without a scene
@@ -60,6 +66,7 @@ class ThreeDGSStage(Stage):
                 ParamGroup("log_scales", lr=lr.scales),
                 ParamGroup("quats", lr=lr.quats),
             ],
+            sparse=None if self.config.sparse_adam == "off" else self.config.sparse_adam,
         )
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:

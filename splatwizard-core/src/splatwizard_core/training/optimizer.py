@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.learning_rate import exponential_lr
+from splatwizard_core.training.sparse_adam import BiasCorrection
 
 __all__ = ["ParamGroup", "SplatOptimizer", "exponential_lr"]
 
@@ -37,6 +38,7 @@ class _Moments:
     exp_avg: Tensor
     exp_avg_sq: Tensor
     step: int = 0
+    row_steps: Tensor | None = None  # [N] int32 updates of each row, for sparse steps with bias correction
 
 
 class SplatOptimizer:
@@ -46,9 +48,15 @@ class SplatOptimizer:
     replaced (densify, prune, opacity reset) is not updated in that step, as in the published trainer.
     """
 
-    def __init__(self, model: SplatModel, groups: Iterable[ParamGroup]) -> None:
-        """Raises ValueError for a group that names nothing, or a parameter that two groups claim."""
+    def __init__(
+        self, model: SplatModel, groups: Iterable[ParamGroup], *, sparse: BiasCorrection | None = None
+    ) -> None:
+        """Raises ValueError for a group that names nothing, or a parameter that two groups claim.
+
+        sparse  update only the rows that `step` is told of (`sparse_adam`), with this bias correction; None: dense
+        """
         self.model = model
+        self.sparse = sparse
         self.groups = {group.name: group for group in groups}
         self._members: dict[str, list[str]] = {}
         self._moments: dict[str, _Moments] = {}
@@ -73,29 +81,63 @@ class SplatOptimizer:
         self.groups[name].lr = lr
 
     @torch.no_grad()
-    def step(self) -> None:
-        """One Adam update of every parameter that has a gradient."""
+    def step(self, visible: Tensor | None = None) -> None:
+        """One Adam update of every parameter that has a gradient.
+
+        visible     [N] bool, with `sparse`: which rows of the model are updated (None: all of them). Parameters that
+                    are not rows of the model (networks) are updated whole.
+
+        Raises ShapeError if the mask does not fit, ValueError if the optimizer is a dense one.
+        """
         from splatwizard_core.training.adam import AdamUpdate, adam_steps
 
+        if visible is not None and self.sparse is None:
+            raise ValueError("step(visible) needs an optimizer that was made with `sparse`")
         updates = []
-        own = self.model._parameters  # get_parameter walks a path, which takes several times longer
         for group_name, group in self.groups.items():
             beta1, beta2 = group.betas
             for name in self._members[group_name]:
-                param = own.get(name)
-                if param is None:
-                    param = self.model.get_parameter(name)
-                grad = param.grad
-                if grad is None:
+                param = self.model.get_parameter(name)
+                if param.grad is None:
                     continue
                 moments = self._moments.get(name)
                 if moments is None:
                     # As torch.optim.Adam: moments exist from the first update on.
                     moments = self._moments[name] = _Moments(_zeros(param), _zeros(param))
                 moments.step += 1
-                tensors = param.data, grad, moments.exp_avg, moments.exp_avg_sq
-                updates.append(AdamUpdate(*tensors, group.lr, beta1, beta2, group.eps, moments.step))
+                if self.sparse is not None and name in self.model.ROWS:
+                    self._sparse_step(param, moments, group, visible)
+                    continue
+                updates.append(
+                    AdamUpdate(
+                        param.data,
+                        param.grad,
+                        moments.exp_avg,
+                        moments.exp_avg_sq,
+                        lr=group.lr,
+                        beta1=beta1,
+                        beta2=beta2,
+                        eps=group.eps,
+                        step=moments.step,
+                    )
+                )
         adam_steps(updates)
+
+    def _sparse_step(self, param: Tensor, moments: _Moments, group: ParamGroup, visible: Tensor | None) -> None:
+        from splatwizard_core.training.sparse_adam import sparse_adam
+
+        assert param.grad is not None
+        assert self.sparse is not None
+        if visible is None:
+            visible = torch.ones(len(param), dtype=torch.bool, device=param.device)
+        if self.sparse == "per_row" and moments.row_steps is None:
+            moments.row_steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
+        beta1, beta2 = group.betas
+        sparse_adam(
+            param.data, param.grad, moments.exp_avg, moments.exp_avg_sq, visible,
+            lr=group.lr, beta1=beta1, beta2=beta2, eps=group.eps,
+            bias_correction=self.sparse, row_steps=moments.row_steps,
+        )  # fmt: skip
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters of the model, those in no group included."""
@@ -124,6 +166,8 @@ class SplatOptimizer:
                 zeros = torch.zeros_like(new)
                 moments.exp_avg = torch.cat([moments.exp_avg, zeros])
                 moments.exp_avg_sq = torch.cat([moments.exp_avg_sq, zeros])
+                if moments.row_steps is not None:
+                    moments.row_steps = torch.cat([moments.row_steps, moments.row_steps.new_zeros(count)])
 
     def _check_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> int:
         counts = set()
@@ -176,6 +220,8 @@ class SplatOptimizer:
             moments = self._moments.get(prefix + name)
             if moments is not None:
                 moments.exp_avg, moments.exp_avg_sq = kept(moments.exp_avg), kept(moments.exp_avg_sq)
+                if moments.row_steps is not None:
+                    moments.row_steps = kept(moments.row_steps)
 
     @torch.no_grad()
     def set_rows(self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor]) -> None:
@@ -207,6 +253,8 @@ class SplatOptimizer:
             if moments is not None:
                 moments.exp_avg = moments.exp_avg.index_fill(0, index, 0)
                 moments.exp_avg_sq = moments.exp_avg_sq.index_fill(0, index, 0)
+                if moments.row_steps is not None:
+                    moments.row_steps = moments.row_steps.index_fill(0, index, 0)
 
     @torch.no_grad()
     def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
@@ -217,6 +265,7 @@ class SplatOptimizer:
         if moments is not None:
             fresh = _attribute(model, name)
             moments.exp_avg, moments.exp_avg_sq = _zeros(fresh), _zeros(fresh)
+            moments.row_steps = None  # its count is one of updates that the moments hold
 
     def moments(self, name: str) -> tuple[Tensor, Tensor, int] | None:
         """(exp_avg, exp_avg_sq, step) of a parameter by its full name; None before its first update."""
@@ -228,7 +277,9 @@ class SplatOptimizer:
         return {
             "groups": {n: {"lr": g.lr, "eps": g.eps, "betas": list(g.betas)} for n, g in self.groups.items()},
             "moments": {
-                n: {"exp_avg": m.exp_avg, "exp_avg_sq": m.exp_avg_sq, "step": m.step} for n, m in self._moments.items()
+                n: {"exp_avg": m.exp_avg, "exp_avg_sq": m.exp_avg_sq, "step": m.step}
+                | ({} if m.row_steps is None else {"row_steps": m.row_steps})
+                for n, m in self._moments.items()
             },
         }
 
@@ -249,6 +300,8 @@ class SplatOptimizer:
                 raise ValueError(f"optimizer state of '{name}' is {list(m['exp_avg'].shape)}, not {list(param.shape)}")
             # Clones: what is loaded must not be changed in place.
             loaded[name] = _Moments(m["exp_avg"].clone().to(param), m["exp_avg_sq"].clone().to(param), int(m["step"]))
+            if "row_steps" in m:
+                loaded[name].row_steps = m["row_steps"].clone().to(param.device, torch.int32)
         for name, g in state["groups"].items():
             betas = g["betas"]
             self.groups[name] = ParamGroup(name, float(g["lr"]), float(g["eps"]), (float(betas[0]), float(betas[1])))
