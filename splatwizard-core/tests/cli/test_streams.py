@@ -52,6 +52,19 @@ def test_a_name_that_the_terminal_cannot_show_is_escaped(encoding: str, tmp_path
     assert "u03b1" in done.stdout or "udcce" in done.stdout
 
 
+def test_a_terminal_gets_no_orders_from_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    orders = "\x1b[31mred\x07\r\x9b1m\N{RIGHT-TO-LEFT OVERRIDE}"
+    writer = ContainerWriter("toy", 1)
+    writer.static["note"] = orders
+    writer.add("means", b"12345")
+    writer.write(tmp_path / "x.swz")
+    assert main(["info", str(tmp_path / "x.swz")]) == 0
+    assert main(["info", str(tmp_path / f"absent {orders}.swz")]) == 2
+    for told in capsys.readouterr():
+        assert "[31mred" in told
+        assert not set(orders) & set(told) - set("[31mred")
+
+
 def test_an_error_with_closed_streams_still_has_its_status(tmp_path: Path):
     done = in_shell(f"{SW} info {shlex.quote(str(tmp_path))}/absent.swz >&- 2>&-")
     assert (done.returncode, done.stdout, done.stderr) == (2, "", "")

@@ -12,7 +12,7 @@ from typing import Any
 
 import click
 
-from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams
+from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
 from splatwizard_core.errors import DiskFullError, PluginError, SplatwizardError
 from splatwizard_core.files import FULL
 
@@ -176,4 +176,4 @@ def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
 
 def _say(text: str) -> None:
     with contextlib.suppress(OSError):  # nobody reads it: the exit status must do
-        print(text, file=sys.stderr, flush=True)
+        print(without_orders(text), file=sys.stderr, flush=True)

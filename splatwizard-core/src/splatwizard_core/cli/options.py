@@ -107,12 +107,21 @@ def console() -> Console:
     import sys
 
     from rich.console import Console
+    from rich.text import Text
+
+    from splatwizard_core.cli.streams import without_orders
 
     class Loud(Console):
-        """Rich would end the process with status 1 where the reader of a pipe has gone; that is for `main` to say."""
+        """Rich would end the process with status 1 where the reader of a pipe has gone; that is for `main` to say.
+
+        And it would pass on what a file holds, orders to the terminal too.
+        """
 
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
+
+        def render_str(self, text: str, **options: Any) -> Text:
+            return super().render_str(without_orders(text), **options)
 
     # A pipe has no width: 80 columns would break tables that are meant to be searched.
     return Loud(highlight=False, width=None if sys.stdout.isatty() else 160)

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from splatwizard_core.cli.streams import without_orders
+
 if TYPE_CHECKING:
     from splatwizard_core.experiments.config import ResolvedConfig
     from splatwizard_core.experiments.method import Method
@@ -21,7 +23,7 @@ DEFAULT_METHOD = "3dgs"
 
 def say(message: str) -> None:
     """A line for the user, on stderr: stdout holds results only."""
-    click.echo(message, err=True)
+    click.echo(without_orders(message), err=True)
 
 
 def method_names(methods: Sequence[str], config_file: str | None) -> list[str]:

@@ -35,6 +35,16 @@ def open_streams() -> None:
             stream.reconfigure(errors="surrogateescape" if passes else "backslashreplace")
 
 
+# C0 but tab and line feed, DEL, C1, and what turns the direction of writing: a terminal obeys these.
+_ORDERS = {c: "\N{REPLACEMENT CHARACTER}" for c in [*range(32), *range(0x7F, 0xA0), *range(0x202A, 0x202F),
+                                                   *range(0x2066, 0x206A)] if chr(c) not in "\t\n"}  # fmt: skip
+
+
+def without_orders(text: str) -> str:
+    """Text from a stranger's file or folder name that a terminal shows and does not obey."""
+    return text.translate(_ORDERS)
+
+
 def abandon_streams() -> None:
     """After a reader has gone: what is still buffered leads to nowhere, so that the interpreter ends without a word."""
     for stream in (sys.stdout, sys.stderr):
