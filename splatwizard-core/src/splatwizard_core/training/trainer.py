@@ -179,9 +179,8 @@ class Trainer:
             return
         # In this thread: torch's thread for the GPU would be woken up, and take the interpreter's lock, each time.
         with torch.autograd.set_multithreading_enabled(False):
-            if total.dtype != self._one.dtype or total.dim():
-                self._one = torch.ones_like(total)
-            total.backward(self._one)  # type: ignore[no-untyped-call]
+            usual = total.dim() == 0 and total.dtype == self._one.dtype and total.device == self._one.device
+            total.backward(self._one if usual else None)  # type: ignore[no-untyped-call]
 
     def _record(self, step: int, view: View, loss: LossPack) -> StepRecord:
         record = StepRecord(
