@@ -8,11 +8,10 @@ from __future__ import annotations
 
 import torch
 
-from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
+from splatwizard_core.errors import CapabilityError, ConfigError
 from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.checks import check_placement, check_request
 from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import RasterizerInfo, RasterOptions, RenderResult
+from splatwizard_core.rendering.rasterizer import RasterizerInfo, RasterOptions
 from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag
@@ -28,21 +27,13 @@ class InferenceRasterizer(StandardRasterizer):
 
     method: Flag
 
-    def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
-        """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        check_request(self.info, g, opt)
-        check_placement(self.info, g)
-        if self.info.min_cc is not None and torch.cuda.get_device_capability(g.means.device) < self.info.min_cc:
+    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
+        least = self.info.min_cc
+        if least is not None and torch.cuda.get_device_capability(g.means.device) < least:
             raise CapabilityError(
-                f"rasterizer '{self.info.name}' needs a GPU of compute capability {self.info.min_cc[0]}."
-                f"{self.info.min_cc[1]} or higher",
+                f"rasterizer '{self.info.name}' needs a GPU of compute capability {least[0]}.{least[1]} or higher",
                 missing=frozenset(),
             )
-        return super().render(g, cam, opt)
-
-    def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
-        if g.colors is not None and g.colors.shape[1] != 3:
-            raise ShapeError("GaussianInputs.colors must have 3 channels here", actual=g.colors.shape)
         call = super()._call(g, cam, opt)
         call.flags |= self.method
         if opt.dtype_out == "uint8":
@@ -68,5 +59,5 @@ class TensorCoreRasterizer(InferenceRasterizer):
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
         if opt.eps2d < 0.1:
-            raise ConfigError(f"rasterizer 'tcgs' needs eps2d of 0.1 or more, got {opt.eps2d}", key="raster.eps2d")
+            raise ConfigError(f"rasterizer 'tcgs' needs eps2d of 0.1 or more, got {opt.eps2d}")
         return super()._call(g, cam, opt)

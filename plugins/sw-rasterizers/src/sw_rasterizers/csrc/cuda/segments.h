@@ -69,7 +69,7 @@ __device__ __forceinline__ void put(uint8_t* image, int64_t at, float value) {
 // Method: Record, what a splat is in shared memory, with `set`; and what a lane knows of its column, with
 // `walk(records, list, steps, segment)`: composites kStep * steps entries, a quarter each. Entries are offsets in bytes.
 template <class Method, class Value>
-__global__ void __launch_bounds__(kFastThreads)
+__global__ void __launch_bounds__(kFastThreads, 4)  // a few spilled bytes cost less than a quarter fewer warps
     fast_kernel(View<float> view, Splats splats, TileLists lists, Image image, Value* out) {
   using Record = typename Method::Record;
   constexpr int kWords = kFastThreads / kWarp;
@@ -77,8 +77,7 @@ __global__ void __launch_bounds__(kFastThreads)
   __shared__ Record records[kFastThreads + 1];  // the last one draws nothing
   __shared__ __align__(16) uint16_t entries[kBoxes][kFastThreads + kStep];
   __shared__ unsigned words[kBoxes][kWords];  // bit i of word w: splat 32 w + i reaches the box
-  const int tile = int(blockIdx.x), tiles_x = view.tiles_x();
-  const int x0 = tile % tiles_x * kTile, y0 = tile / tiles_x * kTile;
+  const int tile = int(blockIdx.y * gridDim.x + blockIdx.x), x0 = int(blockIdx.x) * kTile, y0 = int(blockIdx.y) * kTile;
   const float middle_x = float(x0) + 0.5f * kTile, middle_y = float(y0) + 0.5f * kTile;
   const int box = warp_index(), quarter = lane_index() % kQuarters;
   const int x = x0 + box % kBoxColumns * kBoxWidth + lane_index() / kQuarters;
@@ -86,6 +85,7 @@ __global__ void __launch_bounds__(kFastThreads)
   const Method method(float(x) + 0.5f - middle_x, float(y) + 0.5f - middle_y);
   const int begin = lists.start[tile], end = lists.start[tile + 1];
   uint16_t* const list = entries[box];
+  const unsigned bit = 1u << lane_index(), below = bit - 1;
 
   Segment all = {};
 #pragma unroll
@@ -118,53 +118,54 @@ __global__ void __launch_bounds__(kFastThreads)
     __syncthreads();
     if (done) continue;
 
-    int length = 0;
+    unsigned length = 0;
+    unsigned mine = unsigned(lane_index() * sizeof(Record));
 #pragma unroll
-    for (int w = 0; w < kWords; ++w) {
-      const unsigned word = words[box][w], bit = 1u << lane_index();
-      if (word & bit) list[length + __popc(word & (bit - 1))] = uint16_t((w * kWarp + lane_index()) * sizeof(Record));
-      length += __popc(word);
+    for (int w = 0; w < kWords; ++w, mine += unsigned(kWarp * sizeof(Record))) {
+      const unsigned word = words[box][w];
+      if (word & bit) list[length + unsigned(__popc(word & below))] = uint16_t(mine);
+      length += unsigned(__popc(word));
     }
-    if (lane_index() < kStep) list[length + lane_index()] = uint16_t(kFastThreads * sizeof(Record));
+    if (lane_index() < kStep) list[length + unsigned(lane_index())] = uint16_t(kFastThreads * sizeof(Record));
     __syncwarp();
-    for (int from = 0; from < length && !done; from += kRun) {
+    for (unsigned from = 0; from < length && !done; from += kRun) {
       Segment part = {};
 #pragma unroll
       for (int j = 0; j < kColumn; ++j) part.transmittance[j] = 1.f;
-      method.walk(records, list + from, (min(kRun, length - from) + kStep - 1) / kStep, part);
+      method.walk(records, list + from, int(min(unsigned(kRun), length - from) + kStep - 1) / kStep, part);
       join(all, part);
       done = finished();
     }
   }
 
+  // Each lane of a group ends up with the sums of another pixel of the column, and writes it.
+  const bool odd = quarter & 1, high = quarter & 2;
+  float color[3];
 #pragma unroll
-  for (int j = 0; j < kColumn; ++j)
-#pragma unroll
-    for (int k = 0; k < 3; ++k) {
-      float& sum = all.color[j][k];
-      sum += __shfl_xor_sync(kAllLanes, sum, 1);
-      sum += __shfl_xor_sync(kAllLanes, sum, 2);
-    }
-  const int64_t size = int64_t(view.width) * view.height;
-#pragma unroll
-  for (int j = 0; j < kColumn; ++j) {  // each lane of a group writes another pixel of the column
-    if (j != quarter || x >= view.width || y + j >= view.height) continue;
-    const int64_t pixel = int64_t(y + j) * view.width + x;
-#pragma unroll
-    for (int k = 0; k < 3; ++k) {
-      float value = all.color[j][k];
-      if (image.background != nullptr)
-        value += all.transmittance[j] * image.background[image.background_is_image ? k * size + pixel : int64_t(k)];
-      put(out, k * size + pixel, value);
-    }
-    if (image.alpha != nullptr) image.alpha[pixel] = 1.f - all.transmittance[j];
+  for (int k = 0; k < 3; ++k) {
+    const auto c = [&](int j) { return all.color[j][k]; };
+    const float first = (odd ? c(1) : c(0)) + __shfl_xor_sync(kAllLanes, odd ? c(0) : c(1), 1);
+    const float second = (odd ? c(3) : c(2)) + __shfl_xor_sync(kAllLanes, odd ? c(2) : c(3), 1);
+    color[k] = (high ? second : first) + __shfl_xor_sync(kAllLanes, high ? first : second, 2);
   }
+  const float* t = all.transmittance;
+  const float transmittance = high ? (odd ? t[3] : t[2]) : (odd ? t[1] : t[0]);
+  if (x >= view.width || y + quarter >= view.height) return;
+  const int64_t size = int64_t(view.width) * view.height, pixel = int64_t(y + quarter) * view.width + x;
+#pragma unroll
+  for (int k = 0; k < 3; ++k) {
+    float value = color[k];
+    if (image.background != nullptr)
+      value += transmittance * image.background[image.background_is_image ? k * size + pixel : int64_t(k)];
+    put(out, k * size + pixel, value);
+  }
+  if (image.alpha != nullptr) image.alpha[pixel] = 1.f - transmittance;
 }
 
 template <class Method>
 void blend_fast(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
                 uint8_t* bytes, cudaStream_t stream) {
-  const unsigned tiles = unsigned(view.tiles_x()) * unsigned(view.tiles_y());
+  const dim3 tiles(unsigned(view.tiles_x()), unsigned(view.tiles_y()));
   if (bytes != nullptr)
     fast_kernel<Method><<<tiles, kFastThreads, 0, stream>>>(view, splats, lists, image, bytes);
   else

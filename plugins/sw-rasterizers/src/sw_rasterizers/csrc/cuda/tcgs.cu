@@ -50,7 +50,8 @@ struct Tensor {
 #pragma unroll
     for (int j = 0; j < kColumn; ++j) {
       const float at = y + float(j);
-      rows[j] = q == 0 ? pair(1.f, x) : q == 1 ? pair(at, x * x) : q == 2 ? pair(x * at, at * at) : 0;
+      const float first = q == 0 ? 1.f : q == 1 ? at : x * at, second = q == 0 ? x : q == 1 ? x * x : at * at;
+      rows[j] = q == 3 ? 0 : pair(first, second);
     }
   }
 
