@@ -43,7 +43,9 @@ def other_camera(width, height):
 
 def score_checks():
     """What every rasterizer with scores passes; the rest is that of `standard`, whose code draws the image."""
-    return [check for check in checks_for(PupRasterizer.info) if any(n.startswith("SCORE") for n in check.needs)]
+    return [
+        check for check in checks_for(PupRasterizer.info) if any(n.startswith(("SCORE", "FISHER")) for n in check.needs)
+    ]
 
 
 @pytest.mark.parametrize("check", score_checks(), ids=str)
@@ -66,7 +68,7 @@ def test_scores_of_many_splats_equal_the_reference_in_float64(specs, options):
     torch.testing.assert_close(found.image, expected.image, atol=1e-11, rtol=0)
     assert list(found.scores) == list(expected.scores)
     for name, value in expected.scores.items():
-        torch.testing.assert_close(found.scores[name], value, rtol=1e-6, atol=1e-6, msg=lambda m: f"{name}: {m}")  # noqa: B023
+        torch.testing.assert_close(found.scores[name], value, rtol=1e-6, atol=1e-6, msg=name)
         assert float(value.abs().max()) > 0
 
 
@@ -225,3 +227,13 @@ def test_each_request_finds_its_rasterizer(specs, changes, name):
     g, cam = draw_scene(replace(FEW, width=5, height=4), 1, torch.float32)
     rasterizer.render(g, cam, RasterOptions(scores=tuple(ScoreSpec(k, k) for k in specs), **changes))
     assert set(rasterizer.choices.values()) == {name}
+
+
+def test_codebooks_are_gathered_in_front_of_scores():
+    """MesonGS' request: a codebook of the higher coefficients beside its importance."""
+    g, cam = draw_scene(replace(FEW, color="indexed"), 1, torch.float32)
+    rasterizer = NegotiatedRasterizer(load_plugins(), device="cpu")
+    opt = RasterOptions(scores=(ScoreSpec("w", "blend"),))
+    found = rasterizer.accumulate(g, [cam], opt).scores["w"]
+    assert rasterizer.choices == {"INDEXED_SH+SCORE_BLEND": "mesongs"}
+    torch.testing.assert_close(found, ReferenceRasterizer().accumulate(g, [cam], opt).scores["w"])

@@ -28,7 +28,9 @@ MANY = RasterCase("many", n=3000, width=203, height=150, spread=2.0, scale=(0.01
 FEW = RasterCase("few", n=6, width=18, height=7, spread=0.7, scale=(0.2, 0.6), opacity=(0.5, 0.98))
 ALL = [ScoreSpec(kind, kind) for kind in scoring.KINDS]
 TESTED = [ScoreSpec(f"{kind} tested", kind, rule="tested", gamma=0.3) for kind in scoring.KINDS if kind != "grad_sq"]
-CHECKS = [c for c in checks_for(PupRasterizer.info.on("cuda")) if any(n.startswith("SCORE") for n in c.needs)]
+CHECKS = [
+    c for c in checks_for(PupRasterizer.info.on("cuda")) if any(n.startswith(("SCORE", "FISHER")) for n in c.needs)
+]
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=str)

@@ -64,7 +64,7 @@ class ScoreSpec:
     name            key in RenderResult.scores
     kind            "hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq"
     pixel_weight    optional [H,W] float or bool factor per pixel
-    rule            "blended", or "tested": also the splat that triggers the stop
+    rule            "blended", or "tested": also the splat that triggers the stop ("grad_sq" knows only the first)
     gamma           exponent of kind "gamma": alpha^(2g) T^(2-2g)
     """
 
@@ -157,7 +157,8 @@ class RenderResult:
     features    [E,H,W] | None
     grad2d, absgrad2d   .value [N,2] in NDC units, valid after backward | None
     scores      ScoreSpec.name -> [N] float32 (hits: int32)
-    fisher      [N,21] | None
+    fisher      [N,21] | None: upper triangle, row by row, of the sum over pixels and channels of g g^T,
+                g = d image / d (mean, log scale)
     inputs      the GaussianInputs that were drawn
     """
 

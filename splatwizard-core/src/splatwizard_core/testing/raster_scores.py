@@ -7,6 +7,7 @@ from torch import Tensor
 
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, ScoreSpec
+from splatwizard_core.rendering.scores import view_fisher
 from splatwizard_core.testing.naive_rasterizer import Pair, naive_render
 from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, margin_scene
 from splatwizard_core.testing.rasterizer_checks import check, close, draw
@@ -134,3 +135,21 @@ def _grad_sq(g: GaussianInputs, pairs: list[Pair], background: Tensor, policy: s
         assert leaf.grad is not None
         scores[pair.index] = leaf.grad.square().sum()
     return scores
+
+
+@check("FISHER")
+def fisher_blocks_equal_their_definition(r: Rasterizer, device: str) -> None:
+    """Autograd through the definitions of the image, for each pixel and channel: all three ways of a mean."""
+    case = RasterCase("fisher", n=4, width=17, height=5, spread=0.6, scale=(0.2, 0.6), opacity=(0.5, 0.95))
+    g, cam = margin_scene(case, 5)
+    background = torch.tensor([0.2, 0.7, 0.4], dtype=torch.float64)
+    expected = view_fisher(lambda inputs: naive_render(inputs, cam, RasterOptions(background=background)).image, g)
+    options = RasterOptions(fisher=True, background=background.to(device))
+    with torch.no_grad():
+        found = draw(r, device, cast_inputs(g, torch.float32), cam.to(dtype=torch.float32), options).fisher
+    assert found is not None
+    assert found.shape == (len(g), 21)
+    # A Gaussian's own largest entry is the measure: small ones differ by many decades.
+    scale = expected.abs().amax(dim=1, keepdim=True)
+    assert bool((scale > 0).all())
+    close(found.cpu() / scale, expected / scale, rtol=1e-3, atol=1e-4)

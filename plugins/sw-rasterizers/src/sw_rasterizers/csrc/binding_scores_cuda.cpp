@@ -22,7 +22,11 @@ using namespace sw;        // NOLINT: one file
 using namespace sw::cuda;  // NOLINT
 
 // The state that `render` keeps for the backward pass, in the order of `Saved` in binding_cuda.cpp.
-enum Saved { kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kFlags, kSavedCount };
+// clang-format off
+enum Saved {
+  kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kFlags, kSavedCount
+};
+// clang-format on
 
 using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
                             std::vector<double>>;
