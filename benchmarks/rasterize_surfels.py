@@ -1,6 +1,7 @@
-"""What surfels cost beside ellipsoids on the CPU: `2dgs` and `standard` on the same splats, for the same outputs.
+"""What surfels cost beside ellipsoids: `2dgs` and `standard` on the same splats, for the same outputs.
 
     python benchmarks/rasterize_surfels.py [--n 250000] [--size 270x480] [--threads 1] [--repeats 10]
+    python benchmarks/rasterize_surfels.py --device cuda --n 1000000 --size 1920x1080
 
 The scene is that of benchmarks/scene.py; the surfels are its Gaussians without their third, thinnest axis. Turns
 alternate, so that whatever else the machine does meets both; times are minima. The last rows have no counterpart: only
@@ -21,6 +22,7 @@ import torch
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions
 from splatwizard_core.scene.camera import Camera
+from splatwizard_core.testing.raster_scenes import cast_inputs, with_tensors
 from sw_rasterizers.standard import StandardRasterizer
 from sw_rasterizers.surfel import SurfelRasterizer
 
@@ -35,40 +37,57 @@ OUTPUTS = {
 }
 
 
+def now(device: torch.device) -> float:
+    """Seconds, after all that was asked of the device is done."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+    return time.perf_counter()
+
+
 def step(rasterizer: Rasterizer, g: GaussianInputs, camera: Camera, options: RasterOptions) -> dict[str, float]:
     """Seconds of both passes and of the stages."""
     for x in g.tensors().values():
         x.grad = None
-    start = time.perf_counter()
+    device = g.means.device
+    start = now(device)
     result = rasterizer.render(g, camera, options)
-    middle = time.perf_counter()
+    middle = now(device)
     maps = [result.image, *result.depth.values()]
     maps += [x for x in (result.alpha, result.normals, result.distortion) if x is not None]
     gradients = [torch.full_like(x, 1e-6) for x in maps]
-    turn = time.perf_counter()
+    turn = now(device)
     torch.autograd.backward(maps, gradients)
-    end = time.perf_counter()
+    end = now(device)
     return {**result.stats.stage_seconds, "forward": middle - start, "backward": end - turn}
+
+
+def leaves(g: GaussianInputs, device: str) -> GaussianInputs:
+    moved = cast_inputs(g, device=device)
+    return with_tensors(moved, {k: x.detach().clone().requires_grad_() for k, x in moved.tensors().items()})
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--n", type=int, default=250_000, help="Gaussians (default: 250000)")
     parser.add_argument("--size", default="270x480", help="image, WIDTHxHEIGHT (default: 270x480)")
+    parser.add_argument("--device", default="cpu", choices=("cpu", "cuda"))
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--repeats", type=int, default=10, help="timed turns, the fastest counts (default: 10)")
-    parser.add_argument("--stages", action="store_true", help="print every stage")
+    parser.add_argument("--stages", action="store_true", help="print every stage (CPU)")
     arguments = parser.parse_args()
     width, height = (int(v) for v in arguments.size.split("x"))
     torch.set_num_threads(arguments.threads)
     camera = orbit_cameras(8, width, height)[0]
-    ellipsoids = make_splats(arguments.n, requires_grad=True)
+    ellipsoids = leaves(make_splats(arguments.n), arguments.device)
     assert ellipsoids.scales is not None
-    flat = make_splats(arguments.n, requires_grad=True)
-    flat = replace(flat, scales=ellipsoids.scales.detach()[:, :2].clone().requires_grad_())
+    flat = make_splats(arguments.n)
+    flat = leaves(replace(flat, scales=ellipsoids.scales.detach()[:, :2]), arguments.device)
 
     load = ", ".join(f"{x:.1f}" for x in os.getloadavg())
-    print(f"{arguments.n} splats, {width}x{height}, {arguments.threads} threads of {os.cpu_count()} CPUs; load {load}")
+    place = f"{arguments.threads} threads of {os.cpu_count()} CPUs; load {load}"
+    if arguments.device == "cuda":
+        place = torch.cuda.get_device_name()
+    print(f"{arguments.n} splats, {width}x{height}, {place}")
     with torch.no_grad():
         for name, counting, g in (
             ("standard", StandardRasterizer(count=True), ellipsoids),

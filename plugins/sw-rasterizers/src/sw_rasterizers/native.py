@@ -13,6 +13,7 @@ MODULE = NativeModule(
         "csrc/binding_scores.cpp",
         "csrc/binding_cuda.cpp",
         "csrc/binding_scores_cuda.cpp",
+        "csrc/binding_surfel_cuda.cpp",
     ),
     kernels=(
         "csrc/cpu/blend_backward.cpp",
@@ -36,6 +37,10 @@ MODULE = NativeModule(
         "csrc/cuda/tcgs.cu",
         "csrc/cuda/fisher.cu",
         "csrc/cuda/project_backward.cu",
+        "csrc/cuda/surfel_blend_backward.cu",
+        "csrc/cuda/surfel_project_backward.cu",
+        "csrc/cuda/surfel_blend.cu",
+        "csrc/cuda/surfel_project.cu",
         "csrc/cuda/scores.cu",
         "csrc/cuda/project.cu",
         "csrc/cuda/emit.cu",

@@ -1,4 +1,4 @@
-"""Surfels (2D Gaussian Splatting) on compiled kernels, on the CPU."""
+"""Surfels (2D Gaussian Splatting) on compiled kernels, on the CPU or on CUDA, where the tensors are."""
 
 from __future__ import annotations
 
@@ -29,22 +29,23 @@ from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, came
 
 INPUTS = ("means", "opacities", "scales", "quats", "sh", "sh_dc", "sh_rest", "colors")
 """Differentiable inputs in the order in which the ops take them and return their gradients."""
-WITH_MAPS = 8192
-"""Flag beside those of ops.py: depth, normals and distortion too; mirrors `kWithMaps` in csrc/binding_surfel.cpp."""
+WITH_MAPS = 1 << 20
+"""Flag beside those of ops.py: depth, normals and distortion too; mirrors `kWithMaps` in csrc/binding_surfel.h."""
 MAPS = {"accumulated": slice(0, 1), "inverse": slice(1, 2), "normals": slice(2, 5), "distortion": slice(5, 6),
         "median": slice(6, 7)}  # fmt: skip
-"""Rows of the maps; mirrors `SurfelMap` in csrc/cpu/surfel_kernels.h."""
+"""Rows of the maps; mirrors `SurfelMap` in csrc/surfel.h."""
 
 
 class SurfelRasterizer:
-    """2DGS with complete gradients; float32, and float64 for checking.
+    """2DGS with complete gradients; float32, and on the CPU float64 for checking.
 
     Draws what the reference draws for scales [N,2]: with profile "3dgs" the exact support of every surfel, with
     "dgr-exact" cut at the 16x16 tile squares of the published kernels and with the gradient passing through the clamp
     of alpha (the gradient of depth through the low-pass branch, which those leave out in part, stays exact).
     The densification statistic is the derivative with respect to a shift of the surfel on the screen.
 
-    count   also count evaluated and blended pixel-surfel pairs into the statistics; slow, for benchmarks
+    count   also count evaluated and blended pixel-surfel pairs into the statistics; slow, for benchmarks; on
+            CUDA also the only way to the seconds of the stages, which wait for the device
     """
 
     info: RasterizerInfo = declared_info(plugin.register_rasterizers, "2dgs")
@@ -161,7 +162,7 @@ class _DrawSurfels(torch.autograd.Function):
         image, radii, alpha, maps, saved, call.counts, seconds = torch.ops.sw_rasterizers.render_surfels(
             *tensors, *_settings(call, flags)
         )
-        call.seconds.update(zip(FORWARD_STAGES, seconds, strict=True))
+        call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # on CUDA only if counting
         ctx.call, ctx.flags = call, flags
         ctx.mark_non_differentiable(radii)
         ctx.set_materialize_grads(False)
@@ -185,7 +186,7 @@ class _DrawSurfels(torch.autograd.Function):
         found, seconds = torch.ops.sw_rasterizers.render_surfels_backward(
             *tensors, *_settings(call, ctx.flags), stored, image, alpha, maps, wanted
         )
-        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=True))
+        call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
         if call.grad2d is not None:
             call.grad2d.set(found[-1])
         return (None, None, None, *(g if want else None for g, want in zip(found, wanted[:-1], strict=False)))

@@ -2,22 +2,13 @@
 // is done in cuda/. Compiled only where there is CUDA.
 #ifdef SW_WITH_CUDA
 
-#include <ATen/core/Tensor.h>
-#include <ATen/ops/empty.h>
 #include <ATen/ops/zeros.h>
-#include <c10/cuda/CUDAException.h>
-#include <c10/cuda/CUDAGuard.h>
-#include <c10/cuda/CUDAStream.h>
 #include <torch/library.h>
 
-#include <algorithm>
-#include <bit>
 #include <tuple>
-#include <utility>
 #include <vector>
 
-#include "binding.h"
-#include "cuda/kernels.h"
+#include "binding_cuda.h"
 
 namespace {
 
@@ -26,60 +17,6 @@ using namespace sw::cuda;  // NOLINT
 
 // The state that blend_backward needs; the flags of the Gaussians, for project_backward, come behind it.
 enum Saved { kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kSavedCount };
-
-class Event {
- public:
-  explicit Event(bool timed) {
-    C10_CUDA_CHECK(cudaEventCreateWithFlags(&event_, timed ? cudaEventDefault : cudaEventDisableTiming));
-  }
-  ~Event() {
-    if (event_ != nullptr) C10_CUDA_CHECK_WARN(cudaEventDestroy(event_));
-  }
-  Event(Event&& other) noexcept : event_(std::exchange(other.event_, nullptr)) {}
-  Event& operator=(Event&&) = delete;
-
-  void record(cudaStream_t stream) { C10_CUDA_CHECK(cudaEventRecord(event_, stream)); }
-  void wait() const { C10_CUDA_CHECK(cudaEventSynchronize(event_)); }
-  double seconds_to(const Event& later) const {
-    float milliseconds = 0;
-    C10_CUDA_CHECK(cudaEventElapsedTime(&milliseconds, event_, later.event_));
-    return 1e-3 * milliseconds;
-  }
-
- private:
-  cudaEvent_t event_ = nullptr;
-};
-
-// Seconds between marks, measured on the device; only where they are asked for, since reading them waits.
-struct StageClock {
-  bool on;
-  cudaStream_t stream;
-  std::vector<Event> events;
-  void mark() {
-    if (!on) return;
-    events.emplace_back(true);
-    events.back().record(stream);
-  }
-  std::vector<double> seconds() {
-    std::vector<double> out;
-    if (on) events.back().wait();
-    for (size_t i = 1; i < events.size(); ++i) out.push_back(events[i - 1].seconds_to(events[i]));
-    return out;
-  }
-};
-
-void check_placement(const Inputs& in) {
-  TORCH_CHECK(in.means.scalar_type() == at::kFloat, "sw_rasterizers: on CUDA means must be float32, got ",
-              in.means.scalar_type());
-  TORCH_CHECK(!in.background.has_value() || in.background->device() == in.means.device(),
-              "sw_rasterizers: background is on ", in.background->device(), ", means on ", in.means.device());
-  TORCH_CHECK(!in.quats.has_value() || reinterpret_cast<uintptr_t>(in.quats->data_ptr()) % 16 == 0,
-              "sw_rasterizers: on CUDA quats must start at a multiple of 16 bytes; clone() it");
-}
-
-Splats splats_of(const Tensor& shape, const Tensor& tail, const Tensor& channels) {
-  return {data<float4>(shape), data<float2>(tail), data<float>(channels)};
-}
 
 Image image_of(const Inputs& in) {
   Image image{};
@@ -100,99 +37,38 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   const auto settings = in.settings();
   const auto channels = in.channels();
   const bool save = in.flags & kSave, general = !in.plain(), count_work = in.flags & kCount;
-  const int64_t n = g.count, total = channels.total(), tiles = int64_t(view.tiles_x()) * view.tiles_y();
-  const bool wide = tiles >= 0xffff;  // one key more than tiles: for places that no tile claims
+  const int64_t n = g.count, total = channels.total();
   const auto real = in.means.options().requires_grad(false);
   const auto make = [&](at::IntArrayRef shape) { return at::empty(shape, real); };
   const auto make_as = [&](at::IntArrayRef shape, at::ScalarType type) { return at::empty(shape, real.dtype(type)); };
-  const auto bytes = [&](size_t count) { return make_as({int64_t(count)}, at::kByte); };
   StageClock clock{count_work, stream, {}};
   clock.mark();
 
-  const int64_t project_blocks = (n + kProjectThreads - 1) / kProjectThreads;
-  const size_t counter_bytes = sizeof(Counters) + 2 * size_t(project_blocks + 1) * sizeof(uint64_t);
-  const Tensor counter_memory = bytes(counter_bytes);
-  auto* counters = reinterpret_cast<Counters*>(counter_memory.data_ptr());
-  auto* states = reinterpret_cast<uint64_t*>(counters + 1);
-  C10_CUDA_CHECK(cudaMemsetAsync(counters, 0, counter_bytes, stream));
-  const Tensor pinned = at::empty({16}, at::TensorOptions().dtype(at::kLong).pinned_memory(true));
-  auto* published = reinterpret_cast<Published*>(pinned.data_ptr());
-  auto* after = reinterpret_cast<Counters*>(published + 1);
-  *published = {};
-  *after = {};
+  Tally tally(n, real, stream);
 
-  // Compact, but for up to N splats: how many there are is not known yet.
-  Tensor shape = make({n, 8}), tail = make({n, 2}), channel_rows = make({general ? n : 0, total});
-  Tensor depth = make_as({n}, at::kInt), order = make_as({n}, at::kInt);
-  Tensor extent = make({n, 2}), tile_counts = make_as({n}, at::kInt), radius = make_as({settings.tight ? 0 : n}, at::kInt);
+  const int row = general ? int(total) : 0;
+  Projected projected(n, row, settings.tight, real);
+  const Splats& splats = projected.splats;
+  const SplatWork& work = projected.work;
   Tensor radii = make_as({n}, at::kInt), flags = make_as({save ? n : 0}, at::kByte);
-  Splats splats = splats_of(shape, tail, channel_rows);
-  const SplatWork work{data<uint32_t>(depth), data<float2>(extent), data<int32_t>(radius), data<int32_t>(tile_counts),
-                       data<int32_t>(order)};
-  Event counted(false), colored(false);
   if (n > 0) {
-    project(view, g, settings, splats, work, data<int32_t>(radii), data<uint8_t>(flags), counters, states, published,
-            stream);
-    counted.record(stream);
+    project(view, g, settings, splats, work, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, tally.states,
+            tally.published, stream);
+    tally.projected();
     if (g.colors == nullptr || g.color_channels == 3)
-      shade(view, g, settings, splats, data<int32_t>(radii), data<uint8_t>(flags), counters, stream);
+      shade(view, g, settings, splats, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, stream);
     if (general)
-      fill_channels(g, channels, splats, work, data<int32_t>(radii), data<uint8_t>(flags), counters, stream);
-    C10_CUDA_CHECK(cudaMemcpyAsync(after, counters, sizeof(Counters), cudaMemcpyDeviceToHost, stream));
-    colored.record(stream);
-    C10_CUDA_KERNEL_LAUNCH_CHECK();
-    counted.wait();  // the colours are still being computed
-  }
-  const int64_t used = published->splats, count = published->pairs;
-  TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
-              " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
-  clock.mark();
-
-  int32_t* sorted = nullptr;
-  Tensor depth_other, order_other;
-  uint32_t* sorted_depth = nullptr;
-  if (used > 0) {
-    depth_other = make_as({used}, at::kInt), order_other = make_as({used}, at::kInt);
-    const auto run = [&](void* scratch, size_t size) {
-      return depth_order(scratch, size, int(used), data<uint32_t>(depth), data<uint32_t>(depth_other),
-                         data<int32_t>(order), data<int32_t>(order_other), &sorted, &sorted_depth, stream);
-    };
-    const size_t size = run(nullptr, 0);
-    const Tensor scratch = bytes(std::max<size_t>(size, 1));
-    run(scratch.data_ptr(), size);
+      fill_channels(g, channels, splats, work, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, stream);
+    tally.shaded();
   }
   clock.mark();
 
   std::vector<Tensor> saved(kSavedCount);
-  saved[kTileStart] = make_as({tiles + 1}, at::kInt);
-  const bool median = settings.median_depth, compact = save || median;
-  Tensor keys[2], values[2];
-  void* sorted_keys = nullptr;
-  int32_t* sorted_values = nullptr;
-  Splats drawn = splats;
-  if (count > 0) {
-    for (Tensor& t : keys) t = make_as({count}, wide ? at::kInt : at::kShort);
-    for (Tensor& t : values) t = make_as({count}, at::kInt);
-    if (compact) {
-      saved[kShape] = make({used, 8}), saved[kTail] = make({used, 2});
-      saved[kChannelRows] = make({general ? used : 0, total});
-      drawn = splats_of(saved[kShape], saved[kTail], saved[kChannelRows]);
-    }
-    emit(view, settings, int(used), sorted, splats, work, compact ? &drawn : nullptr, general ? int(total) : 0,
-         keys[0].data_ptr(), wide, data<int32_t>(values[0]), counters, states + project_blocks + 1, stream);
-    const int key_bits = std::bit_width(uint64_t(tiles));
-    const auto run = [&](void* scratch, size_t size) {
-      return sort_pairs(scratch, size, int(count), key_bits, wide, keys[0].data_ptr(), keys[1].data_ptr(),
-                        data<int32_t>(values[0]), data<int32_t>(values[1]), &sorted_keys, &sorted_values, stream);
-    };
-    const size_t size = run(nullptr, 0);
-    const Tensor scratch = bytes(std::max<size_t>(size, 1));
-    run(scratch.data_ptr(), size);
-  }
-  find_tiles(int(count), int(tiles), sorted_keys, wide, data<int32_t>(saved[kTileStart]), stream);
-  if (count > 0) saved[kSplat] = sorted_values == data<int32_t>(values[0]) ? values[0] : values[1];
-  for (Tensor& t : keys) t.reset();
-  for (Tensor& t : values) t.reset();
+  const bool median = settings.median_depth;
+  const Binned binned(view, settings, projected, tally, row, save || median, clock);
+  saved[kShape] = binned.compact.shape, saved[kTail] = binned.compact.tail;
+  saved[kChannelRows] = binned.compact.channels;
+  saved[kTileStart] = binned.tile_start, saved[kSplat] = binned.splat;
   clock.mark();
 
   saved[kTransmittance] = make({save ? height : 0, width});
@@ -209,25 +85,16 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   image.alpha = data<float>(alpha), image.median = data<float>(median_depth);
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
-  const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
   if (fast)
-    (in.flags & kFlash ? blend_flash : blend_tcgs)(view, drawn, lists, image,
+    (in.flags & kFlash ? blend_flash : blend_tcgs)(view, binned.drawn, binned.lists(), image,
                                                    as_bytes ? data<uint8_t>(picture) : nullptr, stream);
   else
-    blend(view, drawn, lists, image, general, count_work ? counters : nullptr, sorted_depth, stream);
+    blend(view, binned.drawn, binned.lists(), image, general, count_work ? tally.counters : nullptr,
+          binned.sorted_depth, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
 
-  if (n > 0) colored.wait();  // long past by now
-  int64_t evaluated = -1, blended = -1;
-  if (count_work && !fast) {
-    Counters now{};
-    C10_CUDA_CHECK(cudaMemcpyAsync(&now, counters, sizeof now, cudaMemcpyDeviceToHost, stream));
-    C10_CUDA_CHECK(cudaStreamSynchronize(stream));
-    evaluated = int64_t(now.evaluated), blended = int64_t(now.blended);
-  }
-  const int64_t bad = after->bad_colors;
-  std::vector<int64_t> counts = {published->visible - bad, count, evaluated, blended, published->invalid + bad};
+  std::vector<int64_t> counts = tally.counts(count_work);
   if (save) {
     for (Tensor& t : saved)
       if (!t.defined()) t = make({0});

@@ -5,8 +5,8 @@
 #include <tuple>
 #include <vector>
 
-#include "binding.h"
 #include "binding_memory.h"
+#include "binding_surfel.h"
 #include "cpu/surfel_kernels.h"
 
 namespace {
@@ -18,30 +18,7 @@ enum Saved {  // the state that the backward pass needs
   kRecords, kPlanes, kIndex, kPerChunk, kRuns, kColorSlope, kClamped, kTileStart, kSlot, kOrigin, kBlocksOfPair,
   kTransmittance, kLast, kFirst, kSum, kSquare, kMedian, kSavedCount
 };
-enum WantedSurfel {  // order of the gradients asked for and returned
-  kSurfelMeans, kSurfelOpacities, kSurfelScales, kSurfelQuats, kSurfelSh, kSurfelShDc, kSurfelShRest, kSurfelColors,
-  kSurfelGrad2d, kSurfelWanted
-};
 // clang-format on
-
-constexpr int64_t kWithMaps = 8192;  // beside the flags of binding.h; mirrored in surfel.py
-const OptionalTensor kNone;
-
-struct SurfelInputs : Inputs {
-  SurfelInputs(const Tensor& means, const Tensor& opacities, const OptionalTensor& scales, const OptionalTensor& quats,
-               const OptionalTensor& sh, const OptionalTensor& sh_dc, const OptionalTensor& sh_rest,
-               const OptionalTensor& colors, const OptionalTensor& visible, const OptionalTensor& background,
-               int64_t sh_degree, double scale_modifier, int64_t flags)
-      : Inputs{means,  opacities, scales,  quats,      kNone,     sh,             sh_dc, sh_rest,
-               colors, kNone,     visible, background, sh_degree, scale_modifier, 0,     flags,
-               2} {}
-
-  void check_all(at::ArrayRef<double> camera, int64_t width, int64_t height) const {
-    check();
-    TORCH_CHECK(channels().colors == 3, "sw_rasterizers: surfels have 3 colour channels, got ", channels().colors);
-    TORCH_CHECK(camera.size() == 18 && width > 0 && height > 0, "sw_rasterizers: malformed camera");
-  }
-};
 
 template <class S>
 Slots<S> slots_of(const std::vector<Tensor>& saved) {
@@ -177,33 +154,11 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
                                        gradient, data<S>(maps_gradient), data<S>(sums));
   seconds.push_back(clock.lap());
 
-  std::vector<Tensor> grads(kSurfelWanted);
-  const auto want = [&](int which, const OptionalTensor& like) {
-    grads[size_t(which)] =
-        make_tensor(wanted[size_t(which)] && like.has_value() ? like->sizes() : at::IntArrayRef{0}, real);
-    return data<S>(grads[size_t(which)]);
-  };
-  Gradients<S> out{};
-  out.means = want(kSurfelMeans, in.means);
-  out.opacities = want(kSurfelOpacities, in.opacities);
-  out.scales = want(kSurfelScales, in.scales);
-  out.quats = want(kSurfelQuats, in.quats);
-  S* sh = want(kSurfelSh, in.sh);
-  S* dc = want(kSurfelShDc, in.sh_dc);
-  S* rest = want(kSurfelShRest, in.sh_rest);
-  if (sh != nullptr) {
-    out.sh_dc = sh, out.sh_dc_stride = out.sh_rest_stride = g.sh_dc_stride;
-    if (in.sh->size(1) > 1) out.sh_rest = sh + 3;
-  } else {
-    out.sh_dc = dc, out.sh_dc_stride = 3;
-    out.sh_rest = rest, out.sh_rest_stride = g.sh_rest_stride;
-  }
-  out.colors = want(kSurfelColors, in.colors);
-  const OptionalTensor screen = at::empty({wanted[kSurfelGrad2d] ? g.count : 0, 2}, real);
-  out.grad2d = want(kSurfelGrad2d, screen);
-  if (g.count > 0) SW_SELECT(project_surfels_backward<S>)(view, g, settings, slots, data<S>(sums), maps, out);
+  SurfelGradients found(in, wanted, [&](at::IntArrayRef shape) { return make_tensor(shape, real); });
+  if (g.count > 0)
+    SW_SELECT(project_surfels_backward<S>)(view, g, settings, slots, data<S>(sums), maps, found.pointers<S>());
   seconds.push_back(clock.lap());
-  return {std::move(grads), std::move(seconds)};
+  return {std::move(found.tensors), std::move(seconds)};
 }
 
 std::tuple<std::vector<Tensor>, std::vector<double>> render_backward(

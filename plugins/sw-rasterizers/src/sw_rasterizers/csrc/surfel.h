@@ -216,6 +216,19 @@ enum PlaneField {
 };
 // clang-format on
 
+// Maps beside the image, [kMaps][H][W]: accumulated depth, inverse depth, normals, distortion, median depth.
+enum SurfelMap { kMapDepth, kMapInverse, kMapNormal, kMapDistortion = 5, kMapMedian, kMaps };
+
+// What the backward pass has to know of each pixel beside transmittance and last position, [tiles][kTilePixels] each
+// on the CPU, [H][W] on CUDA: 1/z of the first surfel, about which the sums are taken (the distortion does not depend on
+// it, and differences of nearly equal depths keep their digits); sum w delta and sum w delta^2 with delta = 1/z - first;
+// the median's list position.
+template <class S>
+struct SurfelPixels {
+  S *first, *sum, *square;
+  int32_t* median;
+};
+
 template <class V, class Mask>
 struct SurfelHit {
   V n1, n2, w, inverse_w;
@@ -246,21 +259,21 @@ SW_HD auto hit_surfel(const S* plane, S level, S inverse_far, V x, V y) {
   return h;
 }
 
-// Whether a pixel of a box, `half` around (x, y), may have rho <= level: for large outlines, which an ellipse fits
+// Whether a pixel of a box around (x, y) may have rho <= level: for large outlines, which an ellipse fits
 // badly. Bounds of n1, n2 and w over the box one by one; `dot` is the reach of the low-pass in pixels.
 template <class V, class S>
-SW_HD auto surfel_meets_box(const S* plane, S level, S dot, V x, V y, S half) {
+SW_HD auto surfel_meets_box(const S* plane, S level, S dot, V x, V y, S half_x, S half_y) {
   const V zero = constant<V>(0), dx = x - plane[kPlaneU], dy = y - plane[kPlaneV];
-  const S wide1 = half * (absolute(plane[kPlaneA]) + absolute(plane[kPlaneB]));
-  const S wide2 = half * (absolute(plane[kPlaneC]) + absolute(plane[kPlaneD]));
-  const S wide3 = half * (absolute(plane[kPlaneE]) + absolute(plane[kPlaneF]));
+  const S wide1 = half_x * absolute(plane[kPlaneA]) + half_y * absolute(plane[kPlaneB]);
+  const S wide2 = half_x * absolute(plane[kPlaneC]) + half_y * absolute(plane[kPlaneD]);
+  const S wide3 = half_x * absolute(plane[kPlaneE]) + half_y * absolute(plane[kPlaneF]);
   const V n1 = maximum(absolute(plane[kPlaneA] * dx + plane[kPlaneB] * dy) - wide1, zero);
   const V n2 = maximum(absolute(plane[kPlaneC] * dx + plane[kPlaneD] * dy) - wide2, zero);
   const V w = plane[kPlaneE] * dx + plane[kPlaneF] * dy + S(1), most = w + wide3;
   const auto on_plane =
       (most > zero) & (w - wide3 <= V{} + plane[kPlaneFarthest]) & (n1 * n1 + n2 * n2 <= level * most * most);
-  const auto at_center = (absolute(dx - plane[kPlaneCenterX]) <= V{} + (half + dot)) &
-                         (absolute(dy - plane[kPlaneCenterY]) <= V{} + (half + dot));
+  const auto at_center = (absolute(dx - plane[kPlaneCenterX]) <= V{} + (half_x + dot)) &
+                         (absolute(dy - plane[kPlaneCenterY]) <= V{} + (half_y + dot));
   return on_plane | at_center;
 }
 
@@ -277,6 +290,8 @@ enum SurfelSum {
   kSurfelColumns = 20
 };
 // clang-format on
+
+inline int surfel_columns(bool maps) { return maps ? kSurfelColumns : kSurfelPlain; }
 
 template <class V>
 struct SurfelGradient {

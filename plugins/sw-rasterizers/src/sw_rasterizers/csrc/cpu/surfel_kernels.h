@@ -13,19 +13,6 @@
 
 namespace sw {
 
-// Maps beside the image, [kMaps][H][W]: accumulated depth, inverse depth, normals, distortion, median depth.
-enum SurfelMap { kMapDepth, kMapInverse, kMapNormal, kMapDistortion = 5, kMapMedian, kMaps };
-
-// What the backward pass has to know of each pixel beside transmittance and last position, [tiles][kTilePixels] each:
-// 1/z of the first surfel, about which the sums are taken (the distortion does not depend on it, and differences of
-// nearly equal depths keep their digits); sum w delta and sum w delta^2 with delta = 1/z - first; the median's list
-// position.
-template <class S>
-struct SurfelPixels {
-  S *first, *sum, *square;
-  int32_t* median;
-};
-
 template <class S>
 struct SurfelCanvas {
   Canvas<S> canvas;        // image, background, alpha, transmittance, last, counters
@@ -50,11 +37,9 @@ struct LargeSurfel {
         is_large(extent > kLargest) {}
   template <class V>
   SW_HD auto meets(V x, V y, S half) const {
-    return surfel_meets_box<V>(plane, level, dot, x, y, half);
+    return surfel_meets_box<V>(plane, level, dot, x, y, half, half);
   }
 };
-
-inline int surfel_columns(bool maps) { return maps ? kSurfelColumns : kSurfelPlain; }
 
 }  // namespace sw
 

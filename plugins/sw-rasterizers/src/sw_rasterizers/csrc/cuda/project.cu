@@ -1,9 +1,9 @@
 // Projection: culls and projects all Gaussians, and gives those that are drawn a number, in index order.
 //
-// One thread a Gaussian. Numbers come from a prefix sum over the grid within the same launch; equal depths are
-// later drawn in the order of these numbers, so they may not depend on timing.
+// One thread a Gaussian.
 #include "gather.h"
 #include "kernels.h"
+#include "numbering.h"
 #include "splat.h"
 
 namespace sw::cuda {
@@ -52,41 +52,14 @@ __device__ __forceinline__ int32_t classic_radius(const View<float>& view, const
   return seen ? to_int(s.radius, 0, 1 << 30) : 0;
 }
 
-// Tiles that an ellipse touches; by all lanes of a warp, `wanted` where there is one to count.
-__device__ __forceinline__ int count_tiles(const View<float>& view, bool wanted, const Ellipse<float>& ellipse) {
-  int tiles = 0, rows = 0;
-  if (wanted) {
-    const TileBox box = tile_box(ellipse, view.width, view.height);
-    rows = box.tiles.y1 - box.tiles.y0;
-    if (rows <= kOwnRows) tiles = tight_tiles(ellipse, view.width, view.height, [](int, int) {});
-  }
-  for (unsigned left = __ballot_sync(kAllLanes, rows > kOwnRows); left != 0; left &= left - 1) {
-    const int owner = __ffs(int(left)) - 1;
-    const Ellipse<float> e = from_lane(ellipse, owner);
-    const TileBox box = tile_box(e, view.width, view.height);
-    int count = 0;
-    for (int row = box.tiles.y0 + lane_index(); row < box.tiles.y1; row += kWarp) {
-      int first, last;
-      slab_span(e, box, 1.f / e.hy, row, &first, &last);
-      count += last - first;
-    }
-    count = int(warp_sum(unsigned(count)));
-    if (lane_index() == owner) tiles = count;
-  }
-  return tiles;
-}
-
 template <bool kCov3d, bool kTight>
 __global__ void __launch_bounds__(kProjectThreads)
     project_kernel(View<float> view, Gaussians<float> g, float scale_modifier, float eps2d, bool antialias,
                    Splats splats, SplatWork work, int32_t* radii, uint8_t* flags, Counters* counters, uint64_t* states,
                    Published* published) {
-  __shared__ unsigned scratch[kWarp + 1];
-  __shared__ unsigned block_number, block_tiles;
-  __shared__ __align__(16) unsigned base;  // no neighbour's wide load may touch it while it is written
-  if (threadIdx.x == 0) block_number = atomicAdd(&counters->project_ticket, 1u), block_tiles = 0;
-  __syncthreads();
-  const int64_t n = int64_t(block_number) * kProjectThreads + threadIdx.x;
+  __shared__ Numbering numbering;
+  start_numbering(numbering, counters);
+  const int64_t n = int64_t(numbering.block) * kProjectThreads + threadIdx.x;
   const bool asked = n < g.count && (g.visible == nullptr || g.visible[n]);
 
   bool invalid = false;
@@ -123,25 +96,8 @@ __global__ void __launch_bounds__(kProjectThreads)
     if (flags != nullptr) flags[n] = drawn ? kDrawn : 0;
   }
 
-  // Sums of the block first: atomics on one address pass one after the other.
-  const unsigned warp_tiles = warp_sum(unsigned(tiles));  // a block's fit 32 bits: below 2^24 tiles a splat
-  if (lane_index() == 0) atomicAdd(&block_tiles, warp_tiles);
-  const unsigned visible = unsigned(__syncthreads_count(radius > 0));
-  unsigned block_drawn;
-  const unsigned position = block_prefix(drawn, scratch, &block_drawn);
-  const unsigned bad = warp_sum(invalid);
-  if (lane_index() == 0 && bad > 0) atomicAdd(&counters->invalid, bad);
-  if (threadIdx.x == 0 && visible > 0) {
-    atomicAdd(&counters->visible, visible);
-    atomicAdd(&counters->pairs, static_cast<unsigned long long>(block_tiles));
-  }
-  if (warp_index() == 0) {
-    const unsigned before = look_back(states, int(block_number), block_drawn);
-    if (lane_index() == 0) base = before;
-  }
-  __syncthreads();
+  const unsigned slot = take_number(numbering, counters, states, {radius > 0, drawn, invalid, unsigned(tiles)});
   if (drawn) {
-    const unsigned slot = base + position;
     splats.shape[2 * slot] = make_float4(s.p.u, s.p.v, a, b);
     splats.shape[2 * slot + 1] = make_float4(c, level, 0.f, 0.f);
     splats.tail[slot] = make_float2(0.f, __int_as_float(int(n)));
@@ -151,17 +107,7 @@ __global__ void __launch_bounds__(kProjectThreads)
     work.order[slot] = int32_t(slot);
     if constexpr (!kTight) work.radius[slot] = radius;
   }
-  if (threadIdx.x == 0) {
-    if (block_number == gridDim.x - 1) counters->splats = base + block_drawn;
-    __threadfence();
-    if (atomicAdd(&counters->project_done, 1u) == gridDim.x - 1) {  // all counts are in
-      __threadfence();
-      const volatile Counters* all = counters;
-      published->splats = all->splats, published->pairs = int64_t(all->pairs);
-      published->visible = all->visible, published->invalid = all->invalid;
-      __threadfence_system();
-    }
-  }
+  publish(numbering, counters, published);
 }
 
 template <bool kCov3d>

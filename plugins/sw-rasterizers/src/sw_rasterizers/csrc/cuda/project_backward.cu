@@ -2,31 +2,13 @@
 //
 // One thread a Gaussian; those that were not drawn get zeros, so no gradient needs to be cleared before. The projection
 // is computed again, which is cheaper than to have stored it.
-#include "../sh.h"
-#include "gather.h"
+#include "color_backward.h"
 #include "kernels.h"
 
 namespace sw::cuda {
 namespace {
 
 constexpr int kThreads = 128, kWarps = kThreads / kWarp;
-constexpr int kFactors = kMaxBasis + 3;  // a Gaussian's basis and colour gradient; odd: no bank conflicts
-
-// dL/dsh_k = B_k dL/dcolour: the rows of a warp's Gaussians, a row at a time, a value a lane.
-__device__ __forceinline__ void write_sh_rows(float* base, int64_t first, int rows, int floats, int first_basis,
-                                              const float* factors) {
-  for (int value = lane_index(); value < floats; value += kWarp) {
-    const int k = first_basis + value / 3, channel = value % 3;
-    float* to = base + first * floats + value;
-    if (k < kMaxBasis) {
-#pragma unroll 4
-      for (int row = 0; row < rows; ++row)
-        to[int64_t(row) * floats] = factors[row * kFactors + k] * factors[row * kFactors + kMaxBasis + channel];
-    } else {
-      for (int row = 0; row < rows; ++row) to[int64_t(row) * floats] = 0.f;
-    }
-  }
-}
 
 template <bool kCov3d>
 __global__ void __launch_bounds__(kThreads)
@@ -39,7 +21,7 @@ __global__ void __launch_bounds__(kThreads)
   const int flag = exists ? flags[n] : 0;
   const bool drawn = flag & kDrawn, shaded = g.sh_dc != nullptr;
   float* shared = staged + warp_index() * kWarp * kRestFloats;
-  const int degree = shaded ? g.sh_degree : 0, active = (degree + 1) * (degree + 1);
+  const int degree = shaded ? g.sh_degree : 0;
   const bool through_direction = degree > 0 && out.means != nullptr;
   const float* rest = shared;
   if (through_direction) rest = stage_rest(g, n, drawn, rest_floats(degree), shared);
@@ -96,20 +78,7 @@ __global__ void __launch_bounds__(kThreads)
   if (through_direction) {
     async_wait();
     __syncwarp();
-    if (drawn) {
-      float dx[kMaxBasis], dy[kMaxBasis], dz[kMaxBasis], slope[3] = {};
-      sh_basis_gradient(degree, direction[0], direction[1], direction[2], dx, dy, dz);
-#pragma unroll
-      for (int k = 1; k < kMaxBasis; ++k) {
-        if (k >= active) break;
-        const float* sh = rest + 3 * (k - 1);
-        const float along = sh[0] * color[0] + sh[1] * color[1] + sh[2] * color[2];
-        slope[0] += dx[k] * along, slope[1] += dy[k] * along, slope[2] += dz[k] * along;
-      }
-      const float radial = dot3(direction, slope);
-#pragma unroll
-      for (int j = 0; j < 3; ++j) result.mean[j] += (slope[j] - direction[j] * radial) * inverse_length;
-    }
+    if (drawn) add_color_slope(degree, direction, inverse_length, rest, color, result.mean);
   }
 
   if (exists) {
@@ -129,20 +98,7 @@ __global__ void __launch_bounds__(kThreads)
     if (out.grad2d != nullptr) ndc(out.grad2d, screen);
     if (out.absgrad2d != nullptr) ndc(out.absgrad2d, absolute_screen);
   }
-  if (out.sh_dc == nullptr && out.sh_rest == nullptr) return;
-
-  __syncwarp();  // the coefficients have been read: their place is free
-  float* mine = shared + lane_index() * kFactors;
-#pragma unroll
-  for (int k = 0; k < kMaxBasis; ++k) mine[k] = basis[k];
-#pragma unroll
-  for (int k = 0; k < 3; ++k) mine[kMaxBasis + k] = color[k];
-  __syncwarp();
-  const int count = int(min(int64_t(kWarp), g.count - first));
-  const bool dense = out.sh_dc != nullptr && out.sh_dc_stride > 3;
-  if (out.sh_dc != nullptr) write_sh_rows(out.sh_dc, first, count, int(out.sh_dc_stride), 0, shared);
-  if (!dense && out.sh_rest != nullptr)
-    write_sh_rows(out.sh_rest, first, count, int(out.sh_rest_stride), 1, shared);
+  write_sh_gradient(g, out, first, basis, color, shared);
 }
 
 }  // namespace

@@ -1,6 +1,7 @@
 // The cut-off ellipse of a splat and where it reaches: tiles when pairs are made, boxes of pixels inside a tile.
 #pragma once
 
+#include "../camera.h"
 #include "../tiles.h"
 #include "device.h"
 
@@ -27,6 +28,30 @@ constexpr int kOwnRows = 4;
 __device__ __forceinline__ Ellipse<float> from_lane(const Ellipse<float>& e, int lane) {
   const auto from = [&](float x) { return __shfl_sync(kAllLanes, x, lane); };
   return {from(e.u), from(e.v), from(e.hx), from(e.hy), from(e.wx), from(e.lean), from(e.tip)};
+}
+
+// Tiles that an ellipse touches; by all lanes of a warp, `wanted` where there is one to count.
+__device__ __forceinline__ int count_tiles(const View<float>& view, bool wanted, const Ellipse<float>& ellipse) {
+  int tiles = 0, rows = 0;
+  if (wanted) {
+    const TileBox box = tile_box(ellipse, view.width, view.height);
+    rows = box.tiles.y1 - box.tiles.y0;
+    if (rows <= kOwnRows) tiles = tight_tiles(ellipse, view.width, view.height, [](int, int) {});
+  }
+  for (unsigned left = __ballot_sync(kAllLanes, rows > kOwnRows); left != 0; left &= left - 1) {
+    const int owner = __ffs(int(left)) - 1;
+    const Ellipse<float> e = from_lane(ellipse, owner);
+    const TileBox box = tile_box(e, view.width, view.height);
+    int count = 0;
+    for (int row = box.tiles.y0 + lane_index(); row < box.tiles.y1; row += kWarp) {
+      int first, last;
+      slab_span(e, box, 1.f / e.hy, row, &first, &last);
+      count += last - first;
+    }
+    count = int(warp_sum(unsigned(count)));
+    if (lane_index() == owner) tiles = count;
+  }
+  return tiles;
 }
 
 // A tile is blended by boxes of 8 x 4 pixels, one a warp: box b covers column b % 2, row b / 2.
