@@ -6,19 +6,21 @@ import pytest
 import torch
 
 from splatwizard_core.gaussians import density
+from splatwizard_core.gaussians.mcmc import draw
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.streams import stream
 from splatwizard_core.training.native import TRAINING
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.statistics import accumulate_statistics
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
-from sw_3dgs.config import ThreeDGSConfig
+from sw_3dgs.config import MCMC, ThreeDGSConfig
 from sw_3dgs.stage import ThreeDGSStage
 
 pytestmark = [
@@ -41,8 +43,8 @@ def small_scene(channels: int) -> Scene:
     return Scene("small", views, views[:1], points, Protocol("toy"))
 
 
-def make_trainer(scene: Scene, **settings) -> Trainer:
-    stage = ThreeDGSStage(ThreeDGSConfig(iterations=7000))
+def make_trainer(scene: Scene, config: ThreeDGSConfig | None = None, **settings) -> Trainer:
+    stage = ThreeDGSStage(config or ThreeDGSConfig(iterations=7000))
     ppl, streams = PipelineParams(device="cuda", **settings), Streams(0)
     rasterizer = NegotiatedRasterizer(load_plugins(), device="cuda")
     assert scene.points is not None
@@ -57,7 +59,23 @@ def make_trainer(scene: Scene, **settings) -> Trainer:
 def test_a_step_between_densifications_waits_for_nothing_that_torch_sees(channels, random_background):
     scene = small_scene(channels)
     assert keep_pictures(scene.train, "cuda")
-    trainer = make_trainer(scene, random_background=random_background)
+    waits_for_nothing(make_trainer(scene, random_background=random_background))
+    keep_pictures(scene.train, "cpu")
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [{"mcmc": MCMC(enabled=True)}, {"sparse_adam": "none"}, {"sparse_adam": "per_row"}],
+    ids=["mcmc", "sparse", "sparse-per-row"],
+)
+def test_nor_does_it_with_noise_or_with_sparse_updates(settings):
+    scene = small_scene(3)
+    assert keep_pictures(scene.train, "cuda")
+    waits_for_nothing(make_trainer(scene, ThreeDGSConfig(iterations=7000, **settings)))
+    keep_pictures(scene.train, "cpu")
+
+
+def waits_for_nothing(trainer: Trainer) -> None:
     records = []
     trainer.run(2 * CHECK_EVERY, records.append)
     torch.cuda.set_sync_debug_mode("error")
@@ -70,7 +88,17 @@ def test_a_step_between_densifications_waits_for_nothing_that_torch_sees(channel
     trainer.check_losses()
     assert all(math.isfinite(record.total.item()) for record in records)
     assert trainer.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
-    keep_pictures(scene.train, "cpu")
+
+
+def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():
+    chain = MCMC(enabled=True, start=20, interval=20, cap=600)
+    trainer = make_trainer(small_scene(3), ThreeDGSConfig(iterations=200, mcmc=chain))
+    trainer.run(200, lambda record: None)
+    assert trainer.model.num_rows == 600
+    assert all(torch.isfinite(p).all() for p in trainer.model.parameters())
+    weights = torch.rand(5000, generator=torch.Generator().manual_seed(1))
+    drawn = [draw(weights.to(device), 300, stream(1, "draw")).cpu() for device in ("cpu", "cuda")]
+    assert torch.equal(*drawn)
 
 
 def test_statistics_of_one_launch_are_those_of_many():
