@@ -220,9 +220,9 @@ enum PlaneField {
 enum SurfelMap { kMapDepth, kMapInverse, kMapNormal, kMapDistortion = 5, kMapMedian, kMaps };
 
 // What the backward pass has to know of each pixel beside transmittance and last position, [tiles][kTilePixels] each
-// on the CPU, [H][W] on CUDA: 1/z of the first surfel, about which the sums are taken (the distortion does not depend on
-// it, and differences of nearly equal depths keep their digits); sum w delta and sum w delta^2 with delta = 1/z - first;
-// the median's list position.
+// on the CPU, [H][W] on CUDA: 1/z of the first surfel, about which the sums are taken (the distortion does not depend
+// on it, and differences of nearly equal depths keep their digits); sum w delta and sum w delta^2 with
+// delta = 1/z - first; the median's list position.
 template <class S>
 struct SurfelPixels {
   S *first, *sum, *square;

@@ -1,8 +1,8 @@
 // Pairs: one (tile, splat) for every tile that a splat touches, written in depth order.
 //
-// A block takes 256 splats; where its pairs start is a prefix sum over the grid within the same launch. A splat of
-// few rows is listed by its own thread; a large one by its whole warp, a row of tiles a lane. The block's pairs are put
-// together in shared memory, unless they are too many, and written in one run.
+// A block takes 128 splats; where its pairs start is a prefix sum over the grid within the same launch. A splat of
+// few rows is listed by its own thread; a large one by its whole warp, a row of tiles a lane or, where rows are long, a
+// tile a lane. The block's pairs are put together in shared memory, unless they are too many, and written in one run.
 #include "device.h"
 #include "kernels.h"
 #include "splat.h"
@@ -104,8 +104,19 @@ __global__ void __launch_bounds__(kEmitThreads)
         if (row < in.tiles.y1) slab_span(e, in, 1.f / e.hy, row, &first, &last);
       }
       const unsigned width = row < in.tiles.y1 ? unsigned(last - first) : 0u;
-      Target<Key> mine{to_keys, to_values, to.at + warp_prefix(width), to.end};
-      for (unsigned x = 0; x < width; ++x) mine.put(row * tiles_x + first + int(x), of);
+      const unsigned at = to.at + warp_prefix(width);
+      const int listed = min(kWarp, in.tiles.y1 - row0);
+      if (int(warp_max(width)) > listed) {  // long rows: one after the other, so that lanes write side by side
+        for (int i = 0; i < listed; ++i) {
+          const unsigned long_width = __shfl_sync(kAllLanes, width, i), start = __shfl_sync(kAllLanes, at, i);
+          const int left_tile = (row0 + i) * tiles_x + __shfl_sync(kAllLanes, first, i);
+          for (unsigned x = unsigned(lane_index()); x < long_width; x += kWarp)
+            Target<Key>{to_keys, to_values, start + x, to.end}.put(left_tile + int(x), of);
+        }
+      } else {
+        Target<Key> mine{to_keys, to_values, at, to.end};
+        for (unsigned x = 0; x < width; ++x) mine.put(row * tiles_x + first + int(x), of);
+      }
       to.at += warp_sum(width);
     }
     to.at += unsigned(lane_index());

@@ -1,5 +1,5 @@
-// Backward compositing of surfels: the scheme of blend_backward.cu. What the maps add to phi and to dL/d(1/z) is told at
-// the top of cpu/surfel_blend_backward.cpp.
+// Backward compositing of surfels: the scheme of blend_backward.cu. What the maps add to phi and to dL/d(1/z) is told
+// at the top of cpu/surfel_blend_backward.cpp.
 #include "../blend.h"
 #include "surfel_stage.h"
 #include "warp_sums.h"
