@@ -96,14 +96,14 @@ def evaluate(
     plugins = load_plugins()
     for name in wanted or ():
         plugins.metrics.entry(name)
-    asks_lpips = wanted is None or any(name.startswith("lpips") for name in wanted)
-    weights = lpips_folder(lpips_weights, quiet=quiet or not asks_lpips)
     if renders is not None:
         output_folder(renders)
     values = assignments(sets, images=images, device=device, seed=seed)
     stored = path.is_dir()
     if stored:
-        config_file = config_file or str(existing(str(path / "config.toml")))
+        if not (path / "config.toml").exists():
+            raise click.UsageError(f"{file} is no run directory, it has no config.toml: give <scene>/<method>/<rate>")
+        config_file = config_file or str(path / "config.toml")
         resolved = resolve_one(plugins, None, None, preset=None, config_file=config_file, values=values, scene=scene)
         ppl, scene_options, spec = resolved.ppl, resolved.scene, resolved.scene_spec
     elif roundtrip:
@@ -111,6 +111,8 @@ def evaluate(
     else:
         ppl, scene_options, said_scene = resolve_run_options(config_file, values)
         spec = scene or said_scene or "demo"
+    asks_lpips = wanted is None or any(name.startswith("lpips") for name in wanted)
+    weights = lpips_folder(lpips_weights, quiet=quiet or not asks_lpips)
     session = open_session(ppl, plugins)
 
     with contextlib.ExitStack() as stack:
