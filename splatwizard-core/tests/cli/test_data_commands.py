@@ -119,6 +119,13 @@ def states(capsys: pytest.CaptureFixture[str]) -> dict[str, tuple[str, str]]:
     }
 
 
+def test_the_list_needs_no_folder(data: Path, capsys, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.delenv("SPLATWIZARD_DATA")
+    assert states(capsys)["lab"] == ("missing", "pinned")
+    assert main(["data", "list"]) == 0
+    assert "under $SPLATWIZARD_DATA (not set)" in capsys.readouterr().out
+
+
 def test_a_data_set_is_fetched_verified_listed_and_loaded(data: Path, site: Site, capsys):
     assert states(capsys)["lab"] == ("missing", "pinned")
     assert main(["data", "fetch", "lab", "--yes", "--json"]) == 0

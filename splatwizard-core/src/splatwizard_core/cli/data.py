@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -40,14 +41,16 @@ def list_datasets(dataset: str | None, registry: str | None, as_json: bool) -> N
     Checksum: "verified" if everything that is here was unpacked by `sw data fetch` from archives whose SHA-256 was
     pinned; "pinned" if nothing is here and the registry states the SHA-256 of what would be fetched.
     """
-    from splatwizard_core.scene.presence import data_root
+    from splatwizard_core.scene.presence import DATA_VARIABLE, data_root
     from splatwizard_core.scene.registry import load_registry
 
     known = load_registry(registry)
-    root = data_root()
+    # Without the variable everything is missing, and the folders show where it would go.
+    named = bool(os.environ.get(DATA_VARIABLE))
+    root = data_root() if named else Path(f"${DATA_VARIABLE}")
     facts = [_dataset_facts(root, known[name]) for name in ([dataset] if dataset is not None else known)]
     if as_json:
-        print_json({"root": str(root), "datasets": facts})
+        print_json({"root": str(root) if named else None, "datasets": facts})
     elif dataset is not None:
         _print_one(facts[0])
     else:
@@ -123,7 +126,7 @@ def _print_all(root: Path, facts: list[dict[str, Any]]) -> None:
         table.add_row(*map(escape, row))
     out = console()
     out.print(table)
-    there_is = "" if root.is_dir() else " (no such folder yet)"
+    there_is = "" if root.is_dir() else " (not set)" if not root.is_absolute() else " (no such folder yet)"
     out.print(escape(f"under {root}{there_is}; one data set scene by scene: sw data list DATASET"), soft_wrap=True)
 
 
