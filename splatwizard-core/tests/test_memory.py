@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from fresh_memory import fresh_memory
 
 from splatwizard_core import memory
 from splatwizard_core.memory import MemoryMeter, reset_peak_rss
@@ -14,7 +15,7 @@ needs_reset = pytest.mark.skipif(not reset_peak_rss(), reason="this system canno
 
 def touch(megabytes: int) -> np.ndarray:
     """Memory that is really there."""
-    return np.ones(megabytes * MEGABYTE, dtype=np.uint8)
+    return fresh_memory(megabytes * MEGABYTE)
 
 
 @needs_reset

@@ -4,6 +4,7 @@ import time
 
 import pytest
 import torch
+from fresh_memory import fresh_memory
 
 from splatwizard_core.evaluation import speed
 from splatwizard_core.evaluation.speed import WARMUP_FRAMES, measure_speed, percentile, spread
@@ -59,7 +60,7 @@ def test_gradients_are_off_while_frames_are_drawn():
 
 def test_memory_on_a_cpu_is_flagged_and_sees_a_large_frame():
     def render(view: int) -> torch.Tensor:
-        return torch.ones(3, 2048, 2048)  # 50 MB
+        return torch.from_numpy(fresh_memory(3 * 2048 * 2048 * 4)).view(torch.float32)  # 50 MB
 
     report = measure_speed(render, [0, 1], "cpu")
     assert report.memory_kind == "rss"

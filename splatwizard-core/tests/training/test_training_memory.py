@@ -1,7 +1,7 @@
 """Peak memory of a training is that of its loop."""
 
-import numpy as np
 import pytest
+from fresh_memory import fresh_memory
 
 from splatwizard_core.memory import reset_peak_rss
 from splatwizard_core.training.checkpoint import CheckpointStore
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.skipif(not reset_peak_rss(), reason="this system cannot
 
 def touch(*_: object) -> None:
     """Memory that is there for a moment."""
-    np.ones(PART, dtype=np.uint8)
+    fresh_memory(PART)
 
 
 def test_what_the_loop_takes_counts(toy):
