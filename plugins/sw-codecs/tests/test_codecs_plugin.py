@@ -11,7 +11,17 @@ NAMES = {
     "quantizers": {"uniform", "ste-round", "uniform-noise", "ste-binary", "ste-mask", "vq"},
     "entropy_models": {"columns", "categorical", "bernoulli", "gaussian-exact", "laplace-exact"},
     "context_models": {"integer-mlp"},
-    "coders": {"range", "rans", "huffman", "octree", "morton-delta", "raw"},
+    "coders": {
+        "range",
+        "rans",
+        "huffman",
+        "octree",
+        "morton-delta",
+        "raw",
+        "byte-planes",
+        "float-delta",
+        "packed-bits",
+    },
 }
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -37,7 +39,11 @@ def check_points(points: npt.ArrayLike, bits: int) -> np.ndarray:
 
 def encode(points: np.ndarray) -> np.ndarray:
     """Morton codes int64 [N] of points [N,3], 0 <= p < 2^21."""
-    spread = np.asarray(points, np.int64)
+    return interleave(np.asarray(points, np.int64))
+
+
+def interleave(spread: Any) -> Any:
+    """Morton codes [N] of int64 points [N,3], 0 <= p < 2^21: an array for an array, a tensor for a tensor."""
     for shift, mask in _SPREAD:
         spread = (spread | (spread << shift)) & mask
     return spread[:, 0] | (spread[:, 1] << 1) | (spread[:, 2] << 2)

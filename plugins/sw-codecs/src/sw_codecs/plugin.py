@@ -41,3 +41,8 @@ def register_coders(registry: Registry) -> None:
     registry.add("octree", "sw_codecs.octree:Octree", summary="point positions as octree occupancy")
     registry.add("morton-delta", "sw_codecs.position_codecs:MortonDelta", summary="point positions as Morton steps")
     registry.add("raw", "sw_codecs.position_codecs:RawPositions", summary="point positions as they are, zstd")
+    registry.add("byte-planes", "sw_codecs.byte_planes:BytePlanes",
+                 summary="float or integer arrays without loss: byte planes, zstd")  # fmt: skip
+    registry.add("float-delta", "sw_codecs.byte_planes:FloatDelta",
+                 summary="float32 positions without loss: steps as byte planes, zstd")  # fmt: skip
+    registry.add("packed-bits", "sw_codecs.packed_bits:PackedBits", summary="indices of 1 to 16 bits, packed")

@@ -6,10 +6,9 @@ import zlib
 
 import numpy as np
 import numpy.typing as npt
-import zstandard
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import morton
+from sw_codecs import morton, zstd_frame
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.columns import Columns
 from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
@@ -51,7 +50,7 @@ class RawPositions:
         """points [N,3] integers, 0 <= p < 2^bits, in Morton order. Raises ValueError if they are not."""
         codes = morton.sorted_codes(points, bits)
         plain = np.asarray(points).T.astype(_coordinate(bits)).tobytes()
-        data = _head(codes, bits) + zstandard.ZstdCompressor(level=19).compress(plain)
+        data = _head(codes, bits) + zstd_frame.compress(plain)
         return check_written(len(codes), data, self.max_points)
 
     def decode(self, data: bytes) -> np.ndarray:
@@ -60,14 +59,7 @@ class RawPositions:
         bits, crc, count = _parse_head(reader, point_limit(len(data), self.max_points))
         size = 3 * count * np.dtype(_coordinate(bits)).itemsize
         frame = bytes(reader.take(reader.left))
-        try:
-            if zstandard.frame_content_size(frame) != size:
-                raise BitstreamError("the compressed coordinates have another length than announced")
-            plain = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
-        except zstandard.ZstdError as error:
-            raise BitstreamError(f"the compressed coordinates are damaged: {error}") from error
-        if len(plain) != size:
-            raise BitstreamError("the compressed coordinates have another length than announced")
+        plain = zstd_frame.decompress(frame, size)
         points = np.frombuffer(plain, _coordinate(bits)).reshape(3, count).T.astype(np.int64)
         if points.size and points.max() >= 1 << bits:
             raise BitstreamError("a coordinate is out of range")

@@ -1,0 +1,64 @@
+"""Coder `packed-bits`: indices at a fixed width, most significant bit first, nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from splatwizard_core.errors import BitstreamError
+
+MAX_WIDTH = 16
+BLOCK = 1 << 20  # indices at once; a multiple of 8, so that every block starts at a byte
+
+
+class PackedBits:
+    """Integers 0 <= i < 2^width, width 1..16: ceil(n width / 8) bytes and no header, as the papers count indices.
+
+    There is no checksum: a section of a `.swz` file has its own. `PackedBits.width(K)` is ceil(log2 K).
+    """
+
+    @staticmethod
+    def width(size: int) -> int:
+        """Bits of an index into `size` entries: ceil(log2 size), at least 1. Raises ValueError beyond 2^16."""
+        found = max((size - 1).bit_length(), 1)
+        if size < 1 or found > MAX_WIDTH:
+            raise ValueError(f"indices into {size:,} entries cannot be packed: 1..{1 << MAX_WIDTH:,} can")
+        return found
+
+    def encode(self, indices: npt.ArrayLike, width: int) -> bytes:
+        """indices [n] integers; the last byte is padded with zeros. Raises ValueError for values out of range."""
+        _check_width(width)
+        values = np.asarray(indices)
+        if values.ndim != 1 or values.dtype.kind not in "iu":
+            raise ValueError(f"indices must be integers [n], not {values.dtype} {list(values.shape)}")
+        if values.size and (values.min() < 0 or values.max() >= 1 << width):
+            raise ValueError(f"indices {values.min()}..{values.max()} leave 0..{(1 << width) - 1} ({width} bits)")
+        parts = []
+        for start in range(0, len(values), BLOCK):
+            octets = values[start : start + BLOCK].astype(">u2").view(np.uint8).reshape(-1, 2)
+            parts.append(np.packbits(np.unpackbits(octets, axis=1)[:, MAX_WIDTH - width :]).tobytes())
+        return b"".join(parts)
+
+    def decode(self, data: bytes, n: int, width: int) -> np.ndarray:
+        """int64 [n]. Raises BitstreamError unless `data` has ceil(n width / 8) bytes and its padding is zero."""
+        _check_width(width)
+        if len(data) != (n * width + 7) // 8:
+            raise BitstreamError(
+                f"{len(data):,} bytes of packed bits, {n:,} of {width} bits are {(n * width + 7) // 8:,}"
+            )
+        octets, found = np.frombuffer(data, np.uint8), np.empty(n, np.int64)
+        for start in range(0, n, BLOCK):
+            count = min(BLOCK, n - start)
+            begin = start * width // 8
+            bits = np.unpackbits(octets[begin : begin + (count * width + 7) // 8])
+            if bits[count * width :].any():
+                raise BitstreamError("the padding of packed bits is not zero")
+            block = np.zeros((count, MAX_WIDTH), np.uint8)
+            block[:, MAX_WIDTH - width :] = bits[: count * width].reshape(count, width)
+            found[start : start + count] = np.packbits(block, axis=1).view(">u2").ravel()
+        return found
+
+
+def _check_width(width: int) -> None:
+    if not 1 <= width <= MAX_WIDTH:
+        raise ValueError(f"a width of {width} bits, must be 1..{MAX_WIDTH}")

@@ -1,0 +1,27 @@
+"""One zstd frame whose length both sides know: what it decodes to is never longer than the caller allows."""
+
+from __future__ import annotations
+
+import zstandard
+
+from splatwizard_core.errors import BitstreamError
+
+LEVEL = 19
+
+
+def compress(plain: bytes, level: int = LEVEL) -> bytes:
+    """A frame that states its content size."""
+    return zstandard.ZstdCompressor(level=level).compress(plain)
+
+
+def decompress(frame: bytes | memoryview, size: int) -> bytes:
+    """The `size` bytes in `frame`. Raises BitstreamError, before any memory is taken, if it holds another number."""
+    try:
+        if zstandard.frame_content_size(frame) != size:
+            raise BitstreamError(f"a zstd frame does not hold the {size:,} bytes that are expected")
+        plain = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise BitstreamError(f"a zstd frame is damaged: {error}") from error
+    if len(plain) != size:
+        raise BitstreamError(f"a zstd frame does not hold the {size:,} bytes that are expected")
+    return plain
