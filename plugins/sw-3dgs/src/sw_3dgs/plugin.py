@@ -1,4 +1,4 @@
-"""What this package provides: the method 3dgs, and its schedule tasks for any method that wants them."""
+"""What this package provides: the method 3dgs, and its tasks, its files and a pruner for any method that wants them."""
 
 from splatwizard_core.plugins import Registry, hookimpl
 
@@ -31,3 +31,16 @@ def register_tasks(registry: Registry) -> None:
                  summary="add Gaussians beside opaque ones, up to a cap (3DGS-MCMC)", factory=True)  # fmt: skip
     registry.add("add-position-noise", "sw_3dgs.mcmc:AddNoise",
                  summary="shake the means of faint Gaussians after each update (3DGS-MCMC)", factory=True)  # fmt: skip
+
+
+@hookimpl
+def register_pruners(registry: Registry) -> None:
+    registry.add("opacity", "sw_3dgs.pruners:Opacity", summary="keeps what is opaque; looks at no view")
+
+
+@hookimpl
+def register_coders(registry: Registry) -> None:
+    registry.add("gaussians-exact", "sw_3dgs.codecs:Exact", codes="gaussians",
+                 summary="whole Gaussian models, float32 as trained")  # fmt: skip
+    registry.add("gaussians-quantized", "sw_3dgs.codecs:Quantized", codes="gaussians",
+                 summary="whole Gaussian models on a lattice, octree positions, range coded")  # fmt: skip

@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from splatwizard_core.coding.gaussian_codec import BORROWED
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.model import GaussianModel, logit
 from splatwizard_core.training.params import Params
@@ -202,7 +203,7 @@ def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArr
 
 def _layout(reader: ContainerReader) -> Layout:
     try:
-        layout = Layout.model_validate({k: v for k, v in reader.static.items() if k != "mode"})
+        layout = Layout.model_validate({k: v for k, v in reader.static.items() if k not in ("mode", *BORROWED)})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

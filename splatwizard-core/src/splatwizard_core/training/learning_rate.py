@@ -6,7 +6,7 @@ import math
 
 
 def exponential_lr(
-    step: int, *, init: float, final: float, max_steps: int, delay_steps: int = 0, delay_mult: float = 1.0
+    step: float, *, init: float, final: float, max_steps: int, delay_steps: int = 0, delay_mult: float = 1.0
 ) -> float:
     """From `init` to `final`, log-linearly over `max_steps`, constant afterwards; 0 for step < 0 or init = 0.
 

@@ -1,6 +1,6 @@
 """Typed configuration: what belongs to the run, and what belongs to the method."""
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -11,9 +11,6 @@ class ReadsFile:
 
 InputFile = Annotated[str, ReadsFile()]
 """The type of a field for the path of a file that training reads; empty for none."""
-
-FULL_RUN_ITERATIONS = 30_000
-"""The run length that published plans are written for."""
 
 
 class Params(BaseModel):
@@ -48,18 +45,25 @@ class PipelineParams(Params):
 
 
 class OptimizationParams(Params):
-    """Hyper-parameters of a method (`opt` in the paper's signature); each method subclasses it."""
+    """Hyper-parameters of a method (`opt` in the paper's signature); each method subclasses it.
+
+    FULL_ITERATIONS     the run length that the method's plans are written for
+    """
+
+    FULL_ITERATIONS: ClassVar[int] = 30_000
 
     iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     scale_schedule: bool = Field(
-        False, description="multiply every plan bound and interval, and lr max_steps, by iterations / 30000"
+        False,
+        description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run",
     )
 
     @property
     def schedule_scale(self) -> float:
-        """Factor on plan bounds, intervals and lr max_steps: iterations / 30000 with scale_schedule, else 1.
+        """Factor on plan bounds, intervals and lr max_steps: iterations / FULL_ITERATIONS with scale_schedule, else 1.
 
         A stage applies it to what it registers, `plan.scaled(when, opt.schedule_scale)`, and to what it reads
-        itself (lr max_steps, "not before step 3000" rules).
+        itself (lr max_steps, "not before step 3000" rules). In a method of several stages `iterations` is the length
+        of the longest one; the others are scaled along.
         """
-        return self.iterations / FULL_RUN_ITERATIONS if self.scale_schedule else 1.0
+        return self.iterations / self.FULL_ITERATIONS if self.scale_schedule else 1.0

@@ -13,8 +13,24 @@ from splatwizard_core.scene.camera import Camera
 
 
 class Pruner(Protocol):
-    """Scores primitives; how many go is the caller's business."""
+    """Scores primitives; how many go is the caller's business (training/pruning.py).
 
-    def score(self, model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer) -> Tensor:
-        """[N] float32, one for each row of the model, higher = keep."""
+    What is registered is a class whose settings all have defaults, so that any method can use any pruner:
+    `plugins.pruners.load(name)()`.
+
+    uses_statistics     the score reads the model's screen-space gradient statistics (`grad_accum`, `denom`): whoever
+                        uses this pruner has them collected in the steps before
+    """
+
+    uses_statistics: bool
+
+    def score(
+        self, model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None = None
+    ) -> Tensor:
+        """[N] float, one for each row of the model, higher = keep; -inf for what no camera sees.
+
+        background  [3] what the scene is drawn on, 0..1; None: black
+
+        Leaves the model as it is, gradients included. Every camera counts once, whatever the order.
+        """
         ...

@@ -1,0 +1,39 @@
+"""The files of 3DGS as codecs that any method of explicit Gaussians may ask for by name (coding/gaussian_codec.py)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sw_3dgs import exact, quantized
+from sw_3dgs.config import Codec
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.model import GaussianModel
+    from splatwizard_core.plugins import PluginManager
+
+
+class Exact:
+    """float32 as trained, 236 bytes a Gaussian at SH degree 3."""
+
+    def __init__(self, plugins: PluginManager) -> None:
+        pass
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        exact.encode(model, writer)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return exact.decode(reader)
+
+
+class Quantized:
+    """Octree positions, all else on a lattice and range coded; settings: `sw_3dgs.config.Codec` (defaults: rate r5)."""
+
+    def __init__(self, plugins: PluginManager, **settings: Any) -> None:
+        self.plugins, self.codec = plugins, Codec(mode="quantized", **settings)
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        quantized.encode(model, writer, self.codec, self.plugins)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return quantized.decode(reader, self.plugins)

@@ -1,0 +1,29 @@
+"""The plainest pruner, which the others are compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from splatwizard_core.gaussians.model import GaussianModel
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.rendering.rasterizer import Rasterizer
+    from splatwizard_core.scene.camera import Camera
+
+
+class Opacity:
+    """Keeps what is opaque; looks at no view."""
+
+    uses_statistics = False
+
+    def score(
+        self, model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None = None
+    ) -> Tensor:
+        """[N] opacities, 0..1. Raises TypeError for a model without opacities of its own."""
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"the pruner 'opacity' scores a GaussianModel, not a {type(model).__name__}")
+        return model.opacities.detach()

@@ -1,0 +1,97 @@
+"""How many primitives go and which: by the scores of a pruner that any plugin may provide."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import EmptyModel, ShapeError
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.pruner import Pruner
+from splatwizard_core.training.stage import CameraIterator
+
+log = logging.getLogger(__name__)
+
+
+def removal_count(n: int, fraction: float) -> int:
+    """How many of n primitives a removal of `fraction` (0..1) takes: floor(fraction n), unharmed by binary fractions.
+
+    0.3 of 10 is 3, though 0.3 * 10 may come out below 3 in floating point.
+    """
+    return min(n, math.floor(fraction * n + 1e-9))
+
+
+def lowest(scores: Tensor, count: int) -> Tensor:
+    """[N] bool, True for the `count` lowest of `scores` [N]; of equal ones the first rows go. -inf is the lowest.
+
+    Raises ValueError for NaN.
+    """
+    if bool(torch.isnan(scores).any()):
+        raise ValueError("a score is not a number")
+    order = torch.sort(scores, stable=True).indices
+    doomed = torch.zeros(len(scores), dtype=torch.bool, device=scores.device)
+    doomed[order[:count]] = True
+    return doomed
+
+
+class PruneByScore:
+    """Schedule task: scores every primitive over the training views and removes the lowest.
+
+    pruner      whose scores
+    fractions   share that goes, 0..1: of the count at that step. A number, or step -> number
+    carry_grad  the survivors are still updated in this step; otherwise their gradient is gone with the old tensors,
+                as in most published code
+
+    Gradients of the step stay what they are: scoring leaves them alone. Raises EmptyModel if nothing would be left.
+    """
+
+    def __init__(self, pruner: Pruner, fractions: float | Mapping[int, float], *, carry_grad: bool = False) -> None:
+        self.pruner, self.fractions, self.carry_grad = pruner, fractions, carry_grad
+
+    def __call__(
+        self,
+        model: SplatModel,
+        optimizer: SplatOptimizer,
+        cameras: CameraIterator,
+        rasterizer: Rasterizer,
+        scene: Scene,
+        step: int,
+    ) -> None:
+        scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
+        fraction = self.fractions[step] if isinstance(self.fractions, Mapping) else self.fractions
+        before = model.num_rows
+        doomed = lowest(scores, removal_count(before, fraction))
+        left = before - int(doomed.sum())
+        if left == 0:
+            raise EmptyModel(step)
+        optimizer.keep_rows(model, ~doomed, carry_grad=self.carry_grad)
+        log.info("step %d: pruned %d of %d primitives, %d left", step, before - left, before, left)
+
+
+@torch.no_grad()
+def scores_of(
+    pruner: Pruner, model: SplatModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene
+) -> Tensor:
+    """[N], one score a row of the model, on the background that the scene is evaluated on.
+
+    Raises ShapeError or ValueError for what cannot be scores.
+    """
+    background = scene.background.to(model.device)
+    scores = pruner.score(model, [view.camera for view in cameras], rasterizer, background)
+    name = type(pruner).__name__
+    if scores.shape != (model.num_rows,):
+        raise ShapeError(
+            f"pruner {name} gave scores {list(scores.shape)} for {model.num_rows} primitives",
+            actual=scores.shape,
+            expected=(model.num_rows,),
+        )
+    if bool(torch.isnan(scores).any()):
+        raise ValueError(f"a score of pruner {name} is not a number")
+    return scores
