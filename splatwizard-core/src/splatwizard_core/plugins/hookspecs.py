@@ -29,7 +29,7 @@ def register_rasterizers(registry: Registry) -> None:
 
 @hookspec
 def register_pruners(registry: Registry) -> None:
-    """Add pruners: objects with score(model, cameras, rasterizer) -> [N], higher = keep."""
+    """Add pruners: classes whose objects have score(model, cameras, rasterizer, background) -> [N], higher = keep."""
 
 
 @hookspec
