@@ -514,6 +514,42 @@ def plain_positions(data: bytes, *, unzstd: Callable[[bytes], bytes] | None = No
     return points
 
 
+def byte_planes(data: bytes, dtype: str, shape: tuple[int, ...], unzstd: Callable[[bytes], bytes]) -> np.ndarray:
+    file = Bytes(data)
+    version, form = file.unpack("BB")
+    crc, body = file.one("I"), file.rest()
+    check(version == 1 and form in (0, 1), "version of the byte planes")
+    if form == 1:
+        size, rows = np.dtype(dtype).itemsize, shape[0]
+        planes, columns_ = unzstd(body), int(np.prod(shape[1:]))
+        body = bytes(
+            planes[(byte * columns_ + column) * rows + row]
+            for row in range(rows)
+            for column in range(columns_)
+            for byte in range(size)
+        )
+    check(zlib.crc32(body) == crc, "CRC of the values")
+    return np.frombuffer(body, "<" + dtype).reshape(shape)
+
+
+def float_delta(data: bytes, shape: tuple[int, int], unzstd: Callable[[bytes], bytes]) -> np.ndarray:
+    stored, found = byte_planes(data, "u4", shape, unzstd), np.empty(shape, "<u4")
+    for column in range(shape[1]):
+        r = 0
+        for row in range(shape[0]):
+            s = int(stored[row, column])
+            r = (r + ((s >> 1) ^ (0xFFFFFFFF if s & 1 else 0))) % 2**32
+            found[row, column] = r - 2**31 if r >= 2**31 else 2**32 - 1 - r
+    return found.view("<f4")
+
+
+def packed_bits(data: bytes, n: int, w: int) -> list[int]:
+    check(len(data) == -(-n * w // 8), "length of the packed bits")
+    digits = "".join(f"{byte:08b}" for byte in data)
+    check("1" not in digits[n * w :], "padding")
+    return [int(digits[i * w : (i + 1) * w], 2) for i in range(n)]
+
+
 # 6 The files of each method
 
 

@@ -107,6 +107,7 @@ def test_it_decodes_the_payload_of_every_coder_and_entropy_model(name):
     numbers = cases.tables.index.tolist()
     contexts = [getattr(cases.context, field).tolist() for field in ("mean", "scale", "multiplier")]
     exact = page.ExactTables((CODECS / "src" / "sw_codecs" / "data" / "exact_tables.bin").read_bytes())
+    unzstd = zstandard.ZstdDecompressor().decompress
     decoders = {
         "columns_v1": lambda data: np.transpose(page.columns(data, *cases.matrix.shape)),
         "categorical_v1": lambda data: page.categorical(data, 9, 3, cases.categorical.index.tolist()),
@@ -115,7 +116,11 @@ def test_it_decodes_the_payload_of_every_coder_and_entropy_model(name):
         "laplace_exact_v1": lambda data: page.exact(data, "laplace", exact, *contexts),
         "octree_v1": page.octree,
         "morton_delta_v1": page.plain_positions,
-        "raw_v1": lambda data: page.plain_positions(data, unzstd=zstandard.ZstdDecompressor().decompress),
+        "raw_v1": lambda data: page.plain_positions(data, unzstd=unzstd),
+        "byte_planes_v1": lambda data: page.byte_planes(data, "i2", cases.halves.shape, unzstd),
+        "byte_planes_plain_v1": lambda data: page.byte_planes(data, "i8", cases.hashes.shape, unzstd),
+        "float_delta_v1": lambda data: page.float_delta(data, cases.floats.shape, unzstd),
+        "packed_bits_v1": lambda data: page.packed_bits(data, 300, 12),
         **{
             coder: lambda data, coder=coder: page.coder_symbols(coder, data, tables, numbers)
             for coder in ("range", "rans", "huffman")

@@ -10,6 +10,7 @@ import pytest
 
 from sw_codecs import morton
 from sw_codecs.bernoulli import Bernoulli
+from sw_codecs.byte_planes import BytePlanes, FloatDelta
 from sw_codecs.categorical import Categorical, CategoricalContext
 from sw_codecs.coders import RangeCoder, RansCoder
 from sw_codecs.columns import Columns
@@ -17,6 +18,7 @@ from sw_codecs.gaussian_exact import GaussianExact, IntegerContext, LaplaceExact
 from sw_codecs.huffman_coder import HuffmanCoder
 from sw_codecs.model_spec import Tables
 from sw_codecs.octree import Octree
+from sw_codecs.packed_bits import PackedBits
 from sw_codecs.position_codecs import MortonDelta, RawPositions
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -42,6 +44,12 @@ matrix = np.stack(
     ],
     axis=1,
 )
+halves = np.stack([mixed // 16, i * 7 - 1000, mixed & 3], 1).astype(np.int16).reshape(100, 3, 3)
+hashes = (i.astype(np.uint64) + np.uint64(1)) * np.uint64(0x9E3779B97F4A7C15)
+hashes = ((hashes ^ (hashes >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)).view(np.int64)  # nothing for zstd
+# Ascending, both signs, and every kind of float but NaN: 0, -0, a denormal, the largest, an infinity.
+floats = (np.stack([mixed - 2048, i * 3, -i], 1) / 64).astype(np.float32)
+floats[:5, 0] = [0.0, -0.0, 1e-45, 3.4028235e38, -np.inf]
 categorical = CategoricalContext(9, index=i % 3, tables=3)
 
 CASES = {
@@ -65,6 +73,18 @@ CASES = {
     "octree_v1": (lambda: Octree().encode(points, 16), Octree().decode, points),
     "morton_delta_v1": (lambda: MortonDelta().encode(points, 16), MortonDelta().decode, points),
     "raw_v1": (lambda: RawPositions().encode(points, 16), RawPositions().decode, points),
+    "byte_planes_v1": (
+        lambda: BytePlanes().encode(halves),
+        lambda d: BytePlanes().decode(d, halves.dtype, halves.shape),
+        halves,
+    ),
+    "byte_planes_plain_v1": (
+        lambda: BytePlanes().encode(hashes),
+        lambda d: BytePlanes().decode(d, hashes.dtype, hashes.shape),
+        hashes,
+    ),
+    "float_delta_v1": (lambda: FloatDelta().encode(floats), lambda d: FloatDelta().decode(d, floats.shape), floats),
+    "packed_bits_v1": (lambda: PackedBits().encode(mixed, 12), lambda d: PackedBits().decode(d, 300, 12), mixed),
     "range": (lambda: RangeCoder().encode(symbols, tables), lambda d: RangeCoder().decode(d, 300, tables), symbols),
     "rans": (lambda: RansCoder().encode(symbols, tables), lambda d: RansCoder().decode(d, 300, tables), symbols),
     "huffman": (

@@ -25,6 +25,7 @@ from sw_codecs.ordering import spatial_order
 VERSION = 1
 PLAIN, PLANES = 0, 1
 KINDS = "fiu"
+OWN_STATISTICS = 4096  # rows from which on a plane gains more from statistics of its own than these cost
 SIGN = np.uint32(1 << 31)
 
 
@@ -46,7 +47,7 @@ class BytePlanes:
         if values.dtype.kind not in KINDS or values.ndim == 0:
             raise ValueError(f"byte planes are of floats or integers [N, ...], not {values.dtype} {list(values.shape)}")
         plain = values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
-        frame = zstd_frame.compress(_transposed(plain, len(values)))
+        frame = zstd_frame.compress(*_planes(plain, len(values), values.dtype.itemsize))
         form, body = (PLANES, frame) if len(frame) < len(plain) else (PLAIN, plain)
         return bytes([VERSION, form]) + zlib.crc32(plain).to_bytes(4, "little") + body
 
@@ -67,7 +68,8 @@ class BytePlanes:
             raise BitstreamError(f"byte planes of version {version}, form {form} are not known: upgrade sw-codecs")
         body = reader.take(reader.left)
         if form == PLANES:
-            plain = _transposed(zstd_frame.decompress(body, size), size // max(shape[0], 1))
+            planes = np.frombuffer(zstd_frame.decompress(body, size), np.uint8)
+            plain = planes.reshape(wanted.itemsize, -1, shape[0]).T.tobytes() if size else b""
         elif len(body) == size:
             plain = bytes(body)
         else:
@@ -109,6 +111,11 @@ class FloatDelta:
         return np.where(ranks & SIGN, ranks ^ SIGN, ~ranks).view(np.float32)
 
 
-def _transposed(data: bytes, rows: int) -> bytes:
-    """Bytes [rows, k] turned into [k, rows]."""
-    return np.frombuffer(data, np.uint8).reshape(rows, -1).T.tobytes() if data else b""
+def _planes(plain: bytes, rows: int, itemsize: int) -> list[bytes]:
+    """The bytes of each weight, least significant first, column after column: in parts of one plane, or of a weight."""
+    if not plain:
+        return [b""]
+    planes = np.frombuffer(plain, np.uint8).reshape(rows, -1, itemsize).T  # [weight, column, row]
+    if rows < OWN_STATISTICS:
+        return [weight.tobytes() for weight in planes]
+    return [plane.tobytes() for weight in planes for plane in weight]

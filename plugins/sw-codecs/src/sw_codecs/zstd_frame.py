@@ -9,9 +9,13 @@ from splatwizard_core.errors import BitstreamError
 LEVEL = 19
 
 
-def compress(plain: bytes, level: int = LEVEL) -> bytes:
-    """A frame that states its content size."""
-    return zstandard.ZstdCompressor(level=level).compress(plain)
+def compress(*parts: bytes) -> bytes:
+    """A frame that states its content size. Each part gets blocks, thus symbol statistics, of its own."""
+    stream = zstandard.ZstdCompressor(level=LEVEL).compressobj(size=sum(map(len, parts)))
+    out = []
+    for part in parts[:-1]:
+        out += [stream.compress(part), stream.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)]
+    return b"".join([*out, stream.compress(parts[-1]), stream.flush()])
 
 
 def decompress(frame: bytes | memoryview, size: int) -> bytes:
