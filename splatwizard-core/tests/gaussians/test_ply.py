@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply, load_ply, property_names, save_ply
+from splatwizard_core.gaussians.ply import export_ply, from_ply, load_ply, property_names, save_ply, to_ply
 from splatwizard_core.gaussians.splat_model import SplatModel
 
 DATA = Path(os.environ.get("SPLATWIZARD_TEST_DATA", Path(__file__).parents[4] / "shared" / "data")) / "model"
@@ -77,6 +77,15 @@ def test_layout_is_the_one_that_viewers_read(tmp_path):
     assert np.array_equal(table[:, 39:54], model.sh_rest[:, :, 2].detach().numpy())
     assert np.array_equal(table[:, 54], model.opacity_logits.detach().numpy())
     assert np.array_equal(table[:, 58:], model.quats.detach().numpy())
+
+
+def test_the_bytes_are_those_of_a_public_writer_and_can_be_made_and_read_without_a_file(tmp_path):
+    model = random_model(5, 2, 7)
+    save_ply(model, tmp_path / "ours.ply")
+    table = PlyData.read(tmp_path / "ours.ply")["vertex"].data
+    PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(tmp_path / "plyfile.ply"))
+    assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "plyfile.ply").read_bytes() == to_ply(model)
+    assert bits(from_ply(to_ply(model), "somewhere")) == bits(model)
 
 
 def test_ascii_double_and_any_order_are_read(tmp_path):

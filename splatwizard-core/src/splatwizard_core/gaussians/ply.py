@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from plyfile import PlyData, PlyElement
+from plyfile import PlyData
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError, SceneError
@@ -45,33 +45,46 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
     """
     path = Path(path)
-    count = _check_header(path)
     try:
         with path.open("rb") as file:
-            vertex = PlyData.read(io.BytesIO(file.read()))["vertex"].data
+            # Before the rest is read: it may be anything.
+            _check_header(file.read(MAX_HEADER), os.fstat(file.fileno()).st_size, str(path))
+            file.seek(0)
+            return from_ply(file.read(), str(path))
+    except OSError as error:
+        raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
+
+
+def from_ply(data: bytes, path: str) -> GaussianModel:
+    """`load_ply` of the bytes of a file.
+
+    path    what errors call it: where it lies, if it lies anywhere
+    """
+    name = Path(path).name
+    count = _check_header(data[:MAX_HEADER], len(data), path)
+    try:
+        vertex = PlyData.read(io.BytesIO(data))["vertex"].data
     except Exception as error:  # plyfile raises many kinds for damaged files, MemoryError and IndexError among them
         reason = " ".join(str(error).split()) or type(error).__name__
-        raise BitstreamError(f"{path.name}: not a readable .ply: {reason}", section="vertex") from error
+        raise BitstreamError(f"{name}: not a readable .ply: {reason}", section="vertex") from error
     if len(vertex) != count:
-        raise BitstreamError(f"{path.name}: {len(vertex)} vertices, header says {count}", section="vertex")
+        raise BitstreamError(f"{name}: {len(vertex)} vertices, header says {count}", section="vertex")
     names = set(vertex.dtype.names or ())
-    rest = sum(1 for name in names if re.fullmatch(r"f_rest_\d+", name))
+    rest = sum(1 for each in names if re.fullmatch(r"f_rest_\d+", each))
     degree = math.isqrt(rest // 3 + 1) - 1
     if rest % 3 or (degree + 1) ** 2 != rest // 3 + 1 or degree > 3:
-        raise SceneError(
-            f"{path.name}: {rest} f_rest properties; 0, 9, 24 or 45 (SH degree 0 to 3) are possible", path=str(path)
-        )
-    needed = [name for name in property_names(rest // 3) if name not in ("nx", "ny", "nz")]
-    missing = [name for name in needed if name not in names]
+        raise SceneError(f"{name}: {rest} f_rest properties; 0, 9, 24 or 45 (SH degree 0 to 3) are possible", path=path)
+    needed = [each for each in property_names(rest // 3) if each not in ("nx", "ny", "nz")]
+    missing = [each for each in needed if each not in names]
     if missing:
         raise SceneError(
-            f"{path.name}: not a 3DGS model, property '{missing[0]}' is missing ({len(missing)} in all)", path=str(path)
+            f"{name}: not a 3DGS model, property '{missing[0]}' is missing ({len(missing)} in all)", path=path
         )
 
     def columns(*wanted: str) -> Tensor:
         table = np.empty((count, len(wanted)), dtype=np.float32)
-        for i, name in enumerate(wanted):
-            table[:, i] = vertex[name]
+        for i, each in enumerate(wanted):
+            table[:, i] = vertex[each]
         return torch.from_numpy(table)
 
     # f_rest is channel-major: all K-1 coefficients of red, then green, then blue.
@@ -91,6 +104,24 @@ def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
 
     The file is complete or absent: it is written beside `path` and then renamed.
     """
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.write(ply_header(model.num_rows, model.sh_rest.shape[1]))
+        file.write(_rows(model).data)
+
+
+def to_ply(model: GaussianModel) -> bytes:
+    """The bytes that `save_ply` writes."""
+    return ply_header(model.num_rows, model.sh_rest.shape[1]) + _rows(model).tobytes()
+
+
+def ply_header(count: int, sh_rest: int) -> bytes:
+    """The text in front of the rows of `count` Gaussians with `sh_rest` = K - 1 higher SH coefficients a channel."""
+    properties = "".join(f"property float {name}\n" for name in property_names(sh_rest))
+    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode("ascii")
+
+
+def _rows(model: GaussianModel) -> NDArray[np.float32]:
+    """[N, 17 + 3 (K - 1)] little-endian, columns as `property_names`."""
     n = model.num_rows
     parts = [
         model.means,
@@ -101,16 +132,13 @@ def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
         model.log_scales,
         model.quats,
     ]
-    names = property_names(model.sh_rest.shape[1])
-    table: NDArray[np.float32] = np.empty((n, len(names)), dtype="<f4")
+    table: NDArray[np.float32] = np.empty((n, sum(part.shape[1] for part in parts)), dtype="<f4")
     column = 0
     for part in parts:
         width = part.shape[1]
         table[:, column : column + width] = part.detach().cpu().float().numpy()
         column += width
-    rows = table.view([(name, "<f4") for name in names])[:, 0]
-    with replacing(path) as temporary:
-        PlyData([PlyElement.describe(rows, "vertex")], text=False, byte_order="<").write(str(temporary))
+    return table
 
 
 def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
@@ -122,17 +150,12 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     save_ply(model, path)
 
 
-def _check_header(path: Path) -> int:
-    """The vertex count that the header claims, checked against the size of the file before anything is allocated."""
-    try:
-        size = path.stat().st_size
-        with path.open("rb") as file:
-            head = file.read(MAX_HEADER)
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
+def _check_header(head: bytes, size: int, path: str) -> int:
+    """The vertex count that a header claims, checked against the size of the file before anything is allocated."""
+    name = Path(path).name
     match = re.search(rb"(?:^|\n)end_header\r?\n", head)
     if not head.startswith(b"ply") or match is None:
-        raise BitstreamError(f"{path.name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
+        raise BitstreamError(f"{name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
     binary, element = False, None
     counts: dict[str, int] = {}
     widths: dict[str, int] = {}
@@ -142,23 +165,21 @@ def _check_header(path: Path) -> int:
             binary = len(words) > 1 and words[1].startswith("binary")
         elif words[:1] == ["element"]:
             if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]):
-                raise BitstreamError(f"{path.name}: bad header line '{line[:60]}'", section="header")
+                raise BitstreamError(f"{name}: bad header line '{line[:60]}'", section="header")
             element = words[1]
             counts[element], widths[element] = int(words[2]), 0
         elif words[:1] == ["property"] and element is not None:
             if len(words) != 3 or words[1] not in _SIZES:
-                raise BitstreamError(
-                    f"{path.name}: property '{line[:60]}' has no place in a 3DGS model", section="header"
-                )
+                raise BitstreamError(f"{name}: property '{line[:60]}' has no place in a 3DGS model", section="header")
             widths[element] += _SIZES[words[1]] if binary else 2
     if "vertex" not in counts:
-        raise SceneError(f"{path.name}: not a 3DGS model: the header names no element 'vertex'", path=str(path))
+        raise SceneError(f"{name}: not a 3DGS model: the header names no element 'vertex'", path=path)
     # An ASCII value takes two bytes at least; an element without properties would loop for nothing.
-    claimed = sum(counts[name] * max(widths[name], 1) for name in counts)
+    claimed = sum(counts[each] * max(widths[each], 1) for each in counts)
     have = size - match.end()
     if claimed > have + (0 if binary else 1):
         raise BitstreamError(
-            f"{path.name}: the header claims {claimed:,} bytes of data, the file holds {have:,}: it is truncated",
+            f"{name}: the header claims {claimed:,} bytes of data, the file holds {have:,}: it is truncated",
             section="vertex",
         )
     return counts["vertex"]
