@@ -9,7 +9,14 @@ from splatwizard_core.plugins import load_plugins
 
 NAMES = {
     "quantizers": {"uniform", "ste-round", "uniform-noise", "ste-binary", "ste-mask", "vq"},
-    "entropy_models": {"columns", "categorical", "bernoulli", "gaussian-exact", "laplace-exact"},
+    "entropy_models": {
+        "columns",
+        "categorical",
+        "bernoulli",
+        "gaussian-exact",
+        "laplace-exact",
+        "conditional-gaussian",
+    },
     "context_models": {"integer-mlp"},
     "coders": {
         "range",

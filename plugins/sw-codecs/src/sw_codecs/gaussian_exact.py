@@ -21,7 +21,7 @@ from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.coders import CHUNK, HEADER
 from sw_codecs.exact_tables import FRACTIONS, Family, exact_tables
 from sw_codecs.model_spec import as_symbols
-from sw_codecs.rates import gaussian_bits, laplace_bits
+from sw_codecs.rates import CODER_FLOOR, gaussian_bits, laplace_bits
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
 
 UNIT = 4096  # 12 fractional bits
@@ -31,11 +31,15 @@ PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits
 
 @dataclass(frozen=True)
 class FloatContext:
-    """What `bits` takes: mean, scale, step as float tensors that broadcast with the values, in the same unit."""
+    """What `bits` takes: mean, scale, step as float tensors that broadcast with the values, in the same unit.
+
+    smallest_probability    floor of the probability of a value; the default is the coder's, HAC trains with 1e-6
+    """
 
     mean: Tensor | float
     scale: Tensor | float
     step: Tensor | float = 1.0
+    smallest_probability: float = CODER_FLOOR
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,7 @@ class IntegerContext:
     """What `encode` and `decode` take: integers [n] in units of the base step with 12 fractional bits.
 
     mean, scale     int64 [n], |value| < 2^48; a scale below the smallest level (0.05 steps) counts as that level
-    multiplier      64..8192 [n] or one number: the step is base step * multiplier / 4096 (`step_multipliers`)
+    multiplier      64..16384 [n] or one number: the step is base step * multiplier / 4096 (`step_multipliers`)
 
     They must be computed exactly, or the decoder falls out of step: floats rounded to integers are not exact.
     """
@@ -147,7 +151,7 @@ class GaussianExact(ExactModel):
     family = "gaussian"
 
     def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
-        return gaussian_bits(symbols, context.mean, context.scale, context.step)
+        return gaussian_bits(symbols, context.mean, context.scale, context.step, p_min=context.smallest_probability)
 
 
 class LaplaceExact(ExactModel):
@@ -156,7 +160,7 @@ class LaplaceExact(ExactModel):
     family = "laplace"
 
     def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
-        return laplace_bits(symbols, context.mean, context.scale, context.step)
+        return laplace_bits(symbols, context.mean, context.scale, context.step, p_min=context.smallest_probability)
 
 
 def _check_symbols(symbols: Any) -> np.ndarray:
@@ -174,8 +178,8 @@ def _lattice(context: IntegerContext, n: int) -> tuple[np.ndarray, np.ndarray]:
             raise ValueError(f"{name} must be {n} integers, not {array.dtype} of shape {list(array.shape)}")
         if array.size and (array.min() <= -PARAMETER_LIMIT or array.max() >= PARAMETER_LIMIT):
             raise ValueError(f"{name} is beyond 2^48")
-    if multiplier.size and (multiplier.min() < 64 or multiplier.max() > 2 * UNIT):
-        raise ValueError("multiplier leaves 64..8192")
+    if multiplier.size and (multiplier.min() < 64 or multiplier.max() > 4 * UNIT):
+        raise ValueError("multiplier leaves 64..16384")
     mean, scale, m = (each.astype(np.int64) for each in np.broadcast_arrays(mean, scale, multiplier))
     eighths = (8 * mean + m // 2) // m
     centre = (eighths + 4) // 8

@@ -25,6 +25,8 @@ def register_entropy_models(registry: Registry) -> None:
                  summary="mean and scale per symbol, integers only: decodes on any machine")  # fmt: skip
     registry.add("laplace-exact", "sw_codecs.gaussian_exact:LaplaceExact",
                  summary="as gaussian-exact, Laplacian")  # fmt: skip
+    registry.add("conditional-gaussian", "sw_codecs.conditional:ConditionalGaussian",
+                 summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
 
 
 @hookimpl

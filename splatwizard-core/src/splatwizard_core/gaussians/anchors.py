@@ -1,4 +1,7 @@
-"""Anchors that spawn k Gaussians per view through small networks: the model of Scaffold-GS and what builds on it."""
+"""Anchors that spawn k Gaussians per view through small networks: the model of Scaffold-GS and what builds on it.
+
+`AnchorSplats` is the decoding alone, `AnchorModel` what is trained; see also `coded_anchors` and `decoded_anchors`.
+"""
 
 from __future__ import annotations
 
@@ -64,14 +67,88 @@ class AnchorSelection:
         return self.rows[self.drawn // k] * k + self.drawn % k
 
 
-class AnchorModel(SplatModel):
+class AnchorSplats(SplatModel):
+    """Anchors whose Gaussians exist only for a camera: how they are chosen and decoded. A subclass says what is stored.
+
+    mlp_opacity, mlp_cov, mlp_color     from (feature, direction, distance) to k values, 7 k, 3 k; one hidden layer
+
+    Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530).
+    """
+
+    NETWORKS: tuple[str, ...] = ("mlp_opacity", "mlp_cov", "mlp_color")
+
+    mlp_opacity: nn.Sequential
+    mlp_cov: nn.Sequential
+    mlp_color: nn.Sequential
+
+    def make_networks(self, features: int, offsets: int, hidden: int, generator: torch.Generator, like: Tensor) -> None:
+        """The three networks, at random from `generator`, with device and dtype of `like`."""
+        for name, outputs in zip(self.NETWORKS, (1, _GEOMETRY, 3), strict=True):
+            setattr(self, name, two_layers(features + 4, hidden, outputs * offsets, generator).to(like))
+
+    @property
+    def num_offsets(self) -> int:
+        """k, Gaussians an anchor can spawn."""
+        raise NotImplementedError
+
+    def positions(self) -> Tensor:
+        """[N,3] where the anchors are taken to be, in rendering and growth alike."""
+        raise NotImplementedError
+
+    def reach(self) -> Tensor:
+        """[N,3] world units: the ball about an anchor within which its offsets lie, for the test of visibility."""
+        raise NotImplementedError
+
+    def attributes(self, rows: Tensor) -> AnchorAttributes:
+        """What the networks see of the anchors `rows` [V]; differentiable."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def visible_anchors(self, camera: Camera, rasterizer: Rasterizer) -> Tensor:
+        """[V] int64: anchors whose ball of offset scales reaches the picture."""
+        positions = self.positions()
+        n = len(positions)
+        identity = positions.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
+        balls = GaussianInputs(positions, positions.new_ones(n), self.reach(), identity, colors=positions)
+        return torch.nonzero(rasterizer.visible_filter(balls, camera) > 0).squeeze(1)
+
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """The Gaussians of the visible anchors; `extras["anchors"]` is the AnchorSelection."""
+        return self.decode(camera, self.visible_anchors(camera, rasterizer))
+
+    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
+        """The Gaussians of the anchors `rows` [V] as `camera` sees them; those of opacity <= 0 are left out."""
+        a = self.attributes(rows)
+        k = self.num_offsets
+        toward = a.positions - camera.center.to(a.positions)
+        distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
+        context = torch.cat([a.features, toward / distance, distance], dim=1)  # [V, F+4]
+
+        opacities = torch.tanh(self.mlp_opacity(context))  # [V,k]
+        if a.masks is not None:
+            opacities = opacities * a.masks
+        drawn = torch.nonzero(opacities.detach().reshape(-1) > 0).squeeze(1)  # [M]
+        owner = drawn // k
+        geometry = self.mlp_cov(context).reshape(-1, _GEOMETRY)[drawn]
+        scales = a.scales[owner]  # [M,6]
+        return GaussianInputs(
+            means=a.positions[owner] + a.offsets.reshape(-1, 3)[drawn] * scales[:, :3],
+            opacities=opacities.reshape(-1)[drawn],
+            # Noise or rounding may take a base scale through zero: a Gaussian of scale -s is that of scale s.
+            scales=scales[:, 3:].abs() * torch.sigmoid(geometry[:, :3]),
+            quats=torch.nn.functional.normalize(geometry[:, 3:], dim=1),
+            colors=torch.sigmoid(self.mlp_color(context)).reshape(-1, 3)[drawn],
+            extras={**a.extras, "anchors": AnchorSelection(rows, opacities.detach(), drawn)},
+        )
+
+
+class AnchorModel(AnchorSplats):
     """N anchors with k offsets each; Gaussians exist only for a camera.
 
     anchors         [N,3] world units, on a lattice of `voxel_size` when made from points
     features        [N,F]
     offsets         [N,k,3]
     log_scales      [N,6]
-    mlp_opacity, mlp_cov, mlp_color     from (feature, direction, distance) to k values, 7 k, 3 k
     opacity_accum, anchor_denom         [N] buffers: sum of max(opacity, 0) of an anchor's offsets, views seen in
     offset_grad_accum, offset_denom     [N,k] buffers: sum of screen-space gradients (NDC), views drawn in
 
@@ -132,10 +209,7 @@ class AnchorModel(SplatModel):
         ):  # fmt: skip
             self.register_buffer(name, torch.zeros(shape, dtype=anchors.dtype, device=anchors.device))
         self.voxel_size = voxel_size
-        width = features.shape[1] + 4
-        self.mlp_opacity = _network(width, hidden, k, generator).to(anchors)
-        self.mlp_cov = _network(width, hidden, _GEOMETRY * k, generator).to(anchors)
-        self.mlp_color = _network(width, hidden, 3 * k, generator).to(anchors)
+        self.make_networks(features.shape[1], k, hidden, generator, anchors)
 
     @classmethod
     def from_points(
@@ -179,7 +253,6 @@ class AnchorModel(SplatModel):
 
     @property
     def num_offsets(self) -> int:
-        """k, Gaussians an anchor can spawn."""
         return self.offsets.shape[1]
 
     def counts(self) -> dict[str, int]:
@@ -187,11 +260,12 @@ class AnchorModel(SplatModel):
         return {"num_anchors": self.num_rows, "num_gaussians": self.num_rows * self.num_offsets}
 
     def positions(self) -> Tensor:
-        """[N,3] where the anchors are taken to be, in rendering and growth alike."""
         return self.anchors
 
+    def reach(self) -> Tensor:
+        return self.log_scales[:, :3].exp()
+
     def attributes(self, rows: Tensor) -> AnchorAttributes:
-        """What the networks see of the anchors `rows` [V]; differentiable."""
         return AnchorAttributes(
             self.positions()[rows], self.features[rows], self.offsets[rows], self.log_scales[rows].exp()
         )
@@ -206,45 +280,6 @@ class AnchorModel(SplatModel):
             "log_scales": positions.new_full((m, 6), math.log(size)),
         }
 
-    @torch.no_grad()
-    def visible_anchors(self, camera: Camera, rasterizer: Rasterizer) -> Tensor:
-        """[V] int64: anchors whose ball of offset scales reaches the picture."""
-        positions = self.positions()
-        n = len(positions)
-        identity = positions.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
-        balls = GaussianInputs(
-            positions, positions.new_ones(n), self.log_scales[:, :3].exp(), identity, colors=positions
-        )
-        return torch.nonzero(rasterizer.visible_filter(balls, camera) > 0).squeeze(1)
-
-    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
-        """The Gaussians of the visible anchors; `extras["anchors"]` is the AnchorSelection."""
-        return self.decode(camera, self.visible_anchors(camera, rasterizer))
-
-    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
-        """The Gaussians of the anchors `rows` [V] as `camera` sees them; those of opacity <= 0 are left out."""
-        a = self.attributes(rows)
-        k = self.num_offsets
-        toward = a.positions - camera.center.to(a.positions)
-        distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
-        context = torch.cat([a.features, toward / distance, distance], dim=1)  # [V, F+4]
-
-        opacities = torch.tanh(self.mlp_opacity(context))  # [V,k]
-        if a.masks is not None:
-            opacities = opacities * a.masks
-        drawn = torch.nonzero(opacities.detach().reshape(-1) > 0).squeeze(1)  # [M]
-        owner = drawn // k
-        geometry = self.mlp_cov(context).reshape(-1, _GEOMETRY)[drawn]
-        scales = a.scales[owner]  # [M,6]
-        return GaussianInputs(
-            means=a.positions[owner] + a.offsets.reshape(-1, 3)[drawn] * scales[:, :3],
-            opacities=opacities.reshape(-1)[drawn],
-            scales=scales[:, 3:] * torch.sigmoid(geometry[:, :3]),
-            quats=torch.nn.functional.normalize(geometry[:, 3:], dim=1),
-            colors=torch.sigmoid(self.mlp_color(context)).reshape(-1, 3)[drawn],
-            extras={**a.extras, "anchors": AnchorSelection(rows, opacities.detach(), drawn)},
-        )
-
     def state_dict_extra(self) -> dict[str, Any]:
         """The size of a cell, which may come from the points."""
         return {"voxel_size": self.voxel_size}
@@ -254,7 +289,7 @@ class AnchorModel(SplatModel):
         self.voxel_size = float(extra["voxel_size"])
 
 
-def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
+def two_layers(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
     """inputs -> hidden, ReLU -> outputs; weights and biases uniform within 1/sqrt(fan-in), as torch's default."""
     # skip_init: torch's own initialisation would draw from the global generator.
     layers: list[nn.Linear] = [
