@@ -553,15 +553,54 @@ def packed_bits(data: bytes, n: int, w: int) -> list[int]:
 # 6 The files of each method
 
 
-def decode(data: bytes) -> dict[str, np.ndarray]:
-    """The parameters of the Gaussians in a file of 3dgs, f32."""
+def decode(data: bytes, unzstd: Callable[[bytes], bytes]) -> dict[str, np.ndarray]:
+    """The parameters of the Gaussians in a file, f32."""
     header, sections = container(data)
-    check(header["method"] == "3dgs" and header["method_version"] == 1, "not layout 1 of 3dgs")
+    check(header["method_version"] == 1, "layout version")
     static = header["static"]
-    if static["mode"] == "exact":
-        return {name: array(section) for name, section in sections.items()}
-    check(static["mode"] == "quantized", "mode")
-    return quantized(static, sections)
+    if header["method"] == "3dgs":
+        check(static["mode"] in ("exact", "quantized"), "mode")
+        return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
+    check(header["method"] in ("trimming-the-fat", "pup-3dgs"), "method")
+    if static["codec"] == "gaussians-ply":
+        return ply(static, sections["ply"])
+    if static["codec"] == "gaussians-zstd":
+        return packed(static, sections, unzstd)
+    check(static["codec"] in ("gaussians-exact", "gaussians-quantized"), "codec")
+    return exact_mode(static, sections) if static["codec"] == "gaussians-exact" else quantized(static, sections)
+
+
+def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    return {name: array(section) for name, section in sections.items()}
+
+
+def ply(static: dict[str, Any], section: bytes) -> dict[str, np.ndarray]:
+    n, r = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(3 * r)),
+             "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    file = Bytes(section)
+    for line in lines:
+        check(file.take(len(line) + 1) == f"{line}\n".encode("ascii"), "header of the .ply")
+    table = np.frombuffer(file.rest(), "<f4").reshape(n, len(names))
+    return {
+        "means": table[:, :3],
+        "sh_dc": table[:, None, 6:9],
+        "sh_rest": table[:, 9 : 9 + 3 * r].reshape(n, 3, r).transpose(0, 2, 1),
+        "opacity_logits": table[:, 9 + 3 * r],
+        "log_scales": table[:, 10 + 3 * r : 13 + 3 * r],
+        "quats": table[:, 13 + 3 * r :],
+    }
+
+
+def packed(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    n, r = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1
+    tails = {"sh_dc": (1, 3), "sh_rest": (r, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
+    planes = {name: byte_planes(sections[name], "f4", (n, *tail), unzstd) for name, tail in tails.items()}
+    return {"means": float_delta(sections["means"], (n, 3), unzstd), **planes}
 
 
 def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:

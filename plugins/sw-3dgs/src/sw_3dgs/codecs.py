@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from sw_3dgs import exact, quantized
+from sw_3dgs import exact, lossless, ply_section, quantized
 from sw_3dgs.config import Codec
 
 if TYPE_CHECKING:
@@ -37,3 +37,29 @@ class Quantized:
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
         return quantized.decode(reader, self.plugins)
+
+
+class Ply:
+    """The .ply of 3DGS as it is, 248 bytes a Gaussian at SH degree 3: the size that pruning papers report."""
+
+    def __init__(self, plugins: PluginManager) -> None:
+        pass
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        ply_section.encode(model, writer)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return ply_section.decode(reader)
+
+
+class Lossless:
+    """float32 as trained, in spatial order, byte planes and zstd: every bit comes back."""
+
+    def __init__(self, plugins: PluginManager) -> None:
+        self.plugins = plugins
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        lossless.encode(model, writer, self.plugins)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return lossless.decode(reader, self.plugins)

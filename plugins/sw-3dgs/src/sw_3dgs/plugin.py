@@ -44,3 +44,7 @@ def register_coders(registry: Registry) -> None:
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip
     registry.add("gaussians-quantized", "sw_3dgs.codecs:Quantized", codes="gaussians",
                  summary="whole Gaussian models on a lattice, octree positions, range coded")  # fmt: skip
+    registry.add("gaussians-ply", "sw_3dgs.codecs:Ply", codes="gaussians",
+                 summary="whole Gaussian models, the .ply of 3DGS bit for bit")  # fmt: skip
+    registry.add("gaussians-zstd", "sw_3dgs.codecs:Lossless", codes="gaussians",
+                 summary="whole Gaussian models, float32 as trained, packed without loss")  # fmt: skip

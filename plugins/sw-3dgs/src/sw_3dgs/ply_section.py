@@ -1,0 +1,42 @@
+"""A file that holds the .ply of 3DGS as it is: what most pruning papers count as their size, 248 bytes a Gaussian.
+
+Bit for bit what `sw export` writes and viewers read; 12 bytes a Gaussian are normals that are always zero.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.ply import from_ply, ply_header, property_names, to_ply
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+
+
+def encode(model: GaussianModel, writer: ContainerWriter) -> None:
+    """Section `ply`. A .ply knows no inactive SH bands: they are written as zeros, which draws the same."""
+    writer.raster["sh_degree"] = model.max_sh_degree
+    writer.static["num_gaussians"] = model.num_rows
+    writer.static["max_sh_degree"] = model.max_sh_degree
+    active = (model.active_sh_degree + 1) ** 2 - 1
+    if active < model.sh_rest.shape[1]:
+        rest = model.sh_rest.detach().clone()
+        rest[:, active:] = 0
+        raw = (model.means, model.sh_dc, rest, model.opacity_logits, model.log_scales, model.quats)
+        model = GaussianModel(*(tensor.detach() for tensor in raw))
+    writer.add("ply", to_ply(model))
+
+
+def decode(reader: ContainerReader) -> GaussianModel:
+    """The model, all its SH bands active. Raises BitstreamError, also for any other .ply than `encode` writes."""
+    n = reader.integer("num_gaussians", low=0, high=2**32 - 1)
+    rest = (reader.integer("max_sh_degree", low=0, high=3) + 1) ** 2 - 1
+    header, row = ply_header(n, rest), 4 * len(property_names(rest))
+    with reader.decoding("ply") as data:
+        if data[: len(header)] != header:
+            raise BitstreamError(f"is no .ply of {n:,} Gaussians with {rest} higher SH coefficients")
+        if len(data) != len(header) + n * row:
+            raise BitstreamError(f"is {len(data):,} bytes, {n:,} Gaussians take {len(header) + n * row:,}")
+        return from_ply(data, f"{reader.name}: ply")
