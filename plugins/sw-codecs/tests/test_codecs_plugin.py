@@ -17,7 +17,7 @@ NAMES = {
         "laplace-exact",
         "conditional-gaussian",
     },
-    "context_models": {"integer-mlp"},
+    "context_models": {"integer-mlp", "triplane", "spatial-ar", "channel-ar"},
     "coders": {
         "range",
         "rans",

@@ -33,6 +33,14 @@ def register_entropy_models(registry: Registry) -> None:
 def register_context_models(registry: Registry) -> None:
     registry.add("integer-mlp", "sw_codecs.integer_mlp:IntegerMlp",
                  summary="ReLU network evaluated in exact integer arithmetic")  # fmt: skip
+    registry.add("triplane", "sw_codecs.triplane:Triplane",
+                 summary="features of a place from three planes at several scales; exact in integers")  # fmt: skip
+    registry.add("spatial-ar", "sw_codecs.spatial_ar:SpatialAr",
+                 summary="integers of a plane from their causal neighbours, coded along wavefronts")  # fmt: skip
+    registry.add("channel-ar", "sw_codecs.channel_ar:ChannelAr",
+                 summary="channels in slices, each from the slices before it")  # fmt: skip
+    registry.add("hash-grid", "sw_codecs.hash_grid:MixedHashGrid",
+                 summary="binary features of a position, from grids of many resolutions; integers in the file")  # fmt: skip
 
 
 @hookimpl
