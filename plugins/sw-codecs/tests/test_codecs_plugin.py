@@ -17,7 +17,7 @@ NAMES = {
         "laplace-exact",
         "conditional-gaussian",
     },
-    "context_models": {"integer-mlp", "triplane", "spatial-ar", "channel-ar"},
+    "context_models": {"hash-grid", "integer-mlp", "triplane", "spatial-ar", "channel-ar"},
     "coders": {
         "range",
         "rans",

@@ -40,7 +40,7 @@ def register_context_models(registry: Registry) -> None:
     registry.add("channel-ar", "sw_codecs.channel_ar:ChannelAr",
                  summary="channels in slices, each from the slices before it")  # fmt: skip
     registry.add("hash-grid", "sw_codecs.hash_grid:MixedHashGrid",
-                 summary="binary features of a position, from grids of many resolutions; integers in the file")  # fmt: skip
+                 summary="learned signs on grids of many resolutions, looked up by position")  # fmt: skip
 
 
 @hookimpl
