@@ -37,7 +37,7 @@ from splatwizard_core.evaluation.evaluate import evaluate
 from splatwizard_core.experiments.config import resolve
 from splatwizard_core.experiments.device import device_reason
 from splatwizard_core.experiments.session import Session
-from splatwizard_core.experiments.training_run import make_method
+from splatwizard_core.experiments.start import make_method
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.streams import stream
@@ -118,7 +118,7 @@ def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: W
     session = Session(plugins, torch.device("cuda"), lambda line: print(line, file=sys.stderr))
     session.load_kernels()
     scene = session.scene(resolved)
-    method = make_method(session, resolved)
+    method = make_method(plugins, resolved)
     rasterizer = NegotiatedRasterizer(plugins, device=session.device)
     ppl = resolved.ppl
     stages = list(method.stages())

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 TOY = '''
-"""Two methods for tests: `toy` trains Gaussians for a few steps; `toy-student` starts from a trained toy scene."""
+"""Methods for tests: `toy` trains Gaussians for a few steps; `toy-student` starts from a trained toy scene."""
 
 import os
 import sys
@@ -96,6 +96,35 @@ class Student(Toy):
 
     def stages(self):
         return [StudentStage(self.config)]
+
+
+class TaughtStage(ToyStage):
+    name = "taught"
+    taught_by = ("toy",)
+
+    def begin(self, context):
+        assert not any(p.requires_grad for p in context.trained("toy").parameters())
+        return context.model
+
+
+class Taught(Toy):
+    """A student that its teacher teaches once more."""
+
+    name = "toy-taught"
+
+    def stages(self):
+        return [StudentStage(self.config), TaughtStage(self.config)]
+
+
+class SecretStage(TaughtStage):
+    taught_by = ()
+
+
+class Secret(Toy):
+    name = "toy-secret"
+
+    def stages(self):
+        return [SecretStage(self.config)]
 '''
 
 DEATH = """
@@ -152,6 +181,8 @@ if "TOY_DEATH" in os.environ:
 def register_methods(registry):
     registry.add("toy", "toy_method:Toy", summary="for tests")
     registry.add("toy-student", "toy_method:Student", summary="for tests")
+    registry.add("toy-taught", "toy_method:Taught", summary="for tests")
+    registry.add("toy-secret", "toy_method:Secret", summary="for tests")
 
 
 @hookimpl

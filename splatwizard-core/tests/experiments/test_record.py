@@ -40,8 +40,10 @@ def content(**changes: Any) -> dict[str, Any]:
         "train": {
             "train_s": 1.0, "stages": [{"name": "toy", "seconds": 1.0}], "with_pretraining_s": 1.0, "steps": 3,
             "peak_bytes": 5, "memory_kind": "rss", "breakdown_s": None, "trained_in": "r1",
-            "pictures_in": "host",
+            "pictures_in": "host", "pretraining": {},
         },
+        "phases": [{"phase": "train: toy", "provided_by": [
+            {"kind": "stage", "name": "toy", "distribution": "sw-toy", "version": "0.1"}]}],
         "plan": [], "rasterizers": {"train": {"BACKWARD": "reference"}}, "environment": {"python": "3"},
         "flags": ["rss"],
         "unknown": {
@@ -57,7 +59,7 @@ def test_a_record_survives_its_file(tmp_path: Path):
     record = Record.model_validate(content())
     record.write(tmp_path / "metrics.json")
     assert read_record(tmp_path / "metrics.json") == record
-    assert json.loads((tmp_path / "metrics.json").read_text())["schema_version"] == 2
+    assert json.loads((tmp_path / "metrics.json").read_text())["schema_version"] == 3
 
 
 def test_every_null_has_its_reason():
@@ -70,7 +72,7 @@ def test_every_null_has_its_reason():
     "change",
     [
         {"unheard_of": 1},
-        {"schema_version": 3},
+        {"schema_version": 4},
         {"visible_gaussians": float("nan")},
         {"file": {"bytes": 0, "sha256": "", "sections": {}, "digest": ""}},
         {"metrics": {"psnr": {"mean": 1.0, "per_view": [], "direction": "up"}}},
@@ -86,16 +88,23 @@ def test_a_damaged_record_is_named_with_its_field(tmp_path: Path):
     damaged = content()
     del damaged["file"]["bytes"]
     path.write_text(json.dumps(damaged))
-    with pytest.raises(UserInputError, match=r"not a result record of schema 2: file\.bytes: Field required"):
+    with pytest.raises(UserInputError, match=r"not a result record of schema 3: file\.bytes: Field required"):
         read_record(path)
     path.write_text("{")
     with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
         read_record(path)
 
 
+def as_schema_2(content: dict[str, Any]) -> dict[str, Any]:
+    """What a release wrote of the same run that did not say who served what."""
+    found: dict[str, Any] = json.loads(json.dumps({**content, "schema_version": 2}))
+    del found["phases"], found["train"]["pretraining"]
+    return found
+
+
 def as_schema_1(content: dict[str, Any]) -> dict[str, Any]:
     """What the first release wrote of the same run."""
-    found: dict[str, Any] = json.loads(json.dumps({**content, "schema_version": 1}))
+    found = {**as_schema_2(content), "schema_version": 1}
     for block, names in {
         "speed": ("jit_s", "load_s", "repeats", "spread"), "memory": ("peak_load_bytes",),
         "codec": ("decode_spread", "jit_s"), "train": ("pictures_in",),
@@ -110,7 +119,7 @@ def test_a_record_of_schema_1_is_read_and_says_what_it_does_not_hold(tmp_path: P
     path = tmp_path / "metrics.json"
     path.write_text(json.dumps(as_schema_1(content())))
     record = read_record(path)
-    assert record.schema_version == 2
+    assert record.schema_version == 3
     assert (record.speed.fps, record.speed.repeats, record.speed.load_s) == (10.0, 1, None)
     assert "schema 1" in record.unknown["speed.load_s"]
     assert missing_reasons(record) == []
@@ -124,5 +133,30 @@ def test_a_record_of_schema_1_is_read_and_says_what_it_does_not_hold(tmp_path: P
 def test_a_damaged_record_of_schema_1_is_refused(tmp_path: Path, damage: dict[str, Any]):
     path = tmp_path / "metrics.json"
     path.write_text(json.dumps({**as_schema_1(content()), **damage}))
+    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
+        read_record(path)
+
+
+def test_a_record_of_schema_2_is_read_and_says_what_it_does_not_hold(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(as_schema_2(content())))
+    record = read_record(path)
+    assert (record.schema_version, record.phases, record.train.pretraining) == (3, None, None)
+    assert "schema 2" in record.unknown["phases"]
+    assert (record.speed.load_s, record.train.train_s) == (0.3, 1.0)
+    assert missing_reasons(record) == []
+
+
+def test_what_a_scene_was_trained_with_may_hold_null_and_what_is_unknown_of_it_needs_a_reason():
+    scene = {"file": {}, "preset": None, "config": {"cap": None}, "steps": 3, "train_s": 1.0, "made_by": {}}
+    found = content()
+    found["train"] = {**found["train"], "pretraining": {"3dgs": scene}}
+    assert missing_reasons(Record.model_validate(found)) == ["train.pretraining.3dgs.preset"]
+
+
+@pytest.mark.parametrize("damage", [{"unknown": None}, {"train": None}])
+def test_a_damaged_record_of_schema_2_is_refused(tmp_path: Path, damage: dict[str, Any]):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps({**as_schema_2(content()), **damage}))
     with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
         read_record(path)

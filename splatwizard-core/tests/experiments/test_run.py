@@ -166,15 +166,15 @@ def test_a_decoder_that_throws_dice_is_found_out(toy_plugins: PluginManager, tmp
 def test_a_trained_scene_is_made_once_for_all_who_start_from_it(toy_plugins: PluginManager, tmp_path: Path):
     invocation = Run(toy_plugins, tmp_path)
     first, _ = train_only(invocation.session, invocation.request(method="toy-student"))
-    assert sum("starts from a trained toy scene" in line for line in invocation.said) == 1
+    assert invocation.said.count("no trained toy scene for this configuration yet: training it first") == 1
     (cached,) = (tmp_path / ".trained").iterdir()
     assert cached.name.startswith("demo-tiny-toy-")
-    assert set(first.facts["pretraining_s"]) == {"toy"}
+    assert first.facts["pretraining"]["toy"]["steps"] == 6  # its own preset `quick`
 
     again = Run(toy_plugins, tmp_path)
     resolved = config(toy_plugins, "iterations=2", method="toy-student")
     base = trained_scene(again.session, "toy", resolved, tmp_path)
-    assert again.said == []
+    assert again.said == [f"toy-student starts from the trained toy scene in {cached}"]
     assert not any(p.requires_grad for p in base.model.parameters())
 
 

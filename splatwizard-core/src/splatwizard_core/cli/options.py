@@ -15,6 +15,13 @@ if TYPE_CHECKING:
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+
+def _not_empty(_context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
+    if value is not None and not value.strip():
+        raise click.UsageError(f"--{parameter.name} is empty: name a file, or leave it out")
+    return value
+
+
 scene_option = click.option(
     "--scene", metavar="SCENE", shell_complete=complete.scenes,
     help="A folder (COLMAP, Blender, ...; the format is detected), `demo`, or `dataset/scene` under "
@@ -43,6 +50,11 @@ config_option = click.option(
 set_option = click.option(
     "--set", "sets", multiple=True, metavar="KEY=VALUE", shell_complete=complete.nothing,
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
+)  # fmt: skip
+init_option = click.option(
+    "--init", metavar="FILE.ply", shell_complete=complete.files, callback=_not_empty,
+    help="Start from this trained scene, for methods that start from one; for 3dgs its key `init`.  "
+    "[default: it is trained first, or taken from an earlier run]",
 )  # fmt: skip
 device_option = click.option(
     "--device", type=click.Choice(["auto", "cpu", "cuda"]),

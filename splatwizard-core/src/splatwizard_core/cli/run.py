@@ -18,6 +18,7 @@ from splatwizard_core.cli.options import (
     debug_option,
     device_option,
     images_option,
+    init_option,
     json_option,
     lpips_option,
     options,
@@ -58,7 +59,7 @@ FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
         "--rate", "rates", metavar="NAME[,NAME]", shell_complete=complete.rates,
         help="Rate points: r1 (smallest file) .. rN, or low, default, high, all.  [default: default]",
     ),
-    preset_option, config_option, set_option,
+    preset_option, init_option, config_option, set_option,
     click.option(
         "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.folders,
         help="Root of the run directories, DIR/<scene>/<method>/<rate>.",
@@ -72,6 +73,7 @@ def run(
     images: str | None,
     rates: str | None,
     preset: str | None,
+    init: str | None,
     config_file: str | None,
     sets: tuple[str, ...],
     out: str,
@@ -93,7 +95,7 @@ def run(
     from splatwizard_core.plugins import load_plugins
 
     plugins = load_plugins()
-    values = assignments(sets, images=images, device=device, seed=seed)
+    values = assignments(sets, images=images, device=device, seed=seed, init=init)
     resolved = resolve_all(
         plugins, method_names(methods, config_file), rates,
         preset=preset, config_file=config_file, values=values, scene=scene,

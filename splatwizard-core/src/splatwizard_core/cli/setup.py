@@ -62,12 +62,13 @@ def resolve_all(
 ) -> list[ResolvedConfig]:
     """One configuration for every method and rate point that was asked for; wrong input fails before anything runs."""
     from splatwizard_core.experiments.config import rate_points, resolve
+    from splatwizard_core.experiments.start import settled
 
     found = []
     for name in methods:
         cls = load_method(plugins, name)
         for rate in rate_points(cls, rates) if rates is not None else [None]:
-            found.append(resolve(cls, preset, rate, config_file, values, scene=scene))
+            found.append(settled(plugins, resolve(cls, preset, rate, config_file, values, scene=scene)))
     return found
 
 

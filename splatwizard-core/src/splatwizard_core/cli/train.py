@@ -14,6 +14,7 @@ from splatwizard_core.cli.options import (
     debug_option,
     device_option,
     images_option,
+    init_option,
     json_option,
     method_option,
     options,
@@ -30,7 +31,7 @@ from splatwizard_core.cli.setup import open_session, output_folder, resolve_one,
 
 @click.command(short_help="train one method on one scene")
 @options(
-    method_option, scene_option, images_option, rate_option, preset_option, config_option, set_option,
+    method_option, scene_option, images_option, rate_option, preset_option, init_option, config_option, set_option,
     click.option(
         "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.folders,
         help="Root of the run directories, DIR/<scene>/<method>/<rate>; `sw run` with the same options goes on there.",
@@ -43,6 +44,7 @@ def train(
     images: str | None,
     rate: str | None,
     preset: str | None,
+    init: str | None,
     config_file: str | None,
     sets: tuple[str, ...],
     out: str,
@@ -57,7 +59,7 @@ def train(
     from splatwizard_core.plugins import load_plugins
 
     plugins = load_plugins()
-    values = assignments(sets, images=images, device=device, seed=seed)
+    values = assignments(sets, images=images, device=device, seed=seed, init=init)
     resolved = resolve_one(plugins, method, rate, preset=preset, config_file=config_file, values=values, scene=scene)
     output_folder(out)
     session = open_session(resolved.ppl, plugins)

@@ -2,59 +2,63 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
-from splatwizard_core.experiments.config import ResolvedConfig, apply_overrides, resolve
-from splatwizard_core.experiments.keys import field_at
-from splatwizard_core.experiments.lock import directory_lock
+from splatwizard_core.experiments.config import ResolvedConfig
+from splatwizard_core.experiments.lock import directory_lock, is_held
 from splatwizard_core.experiments.session import Session, TrainedModel
+from splatwizard_core.experiments.start import base_config, first_scene, make_method, training_key
 from splatwizard_core.experiments.steps import StepLog
-from splatwizard_core.experiments.training_run import STEP, holds_training, train, training_key
+from splatwizard_core.experiments.training_run import BEGUN, CHECKPOINTS, STEP, holds_training, train
 from splatwizard_core.files import sweep
-from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.checkpoint import CheckpointStore
 
 FOLDER = ".trained"  # inside the output root: what is trained for a run stays with the runs
 
 
-def base_config(session: Session, name: str, outer: ResolvedConfig) -> ResolvedConfig:
-    """How a scene that `outer` starts from is trained: same preset if the method has it, same run and scene options."""
-    cls = session.plugins.methods.load(name)
-    preset = outer.preset if outer.preset in cls.PRESETS else "paper"
-    base = resolve(cls, preset)
-    # What a preset says about the run (clamped renders, say) belongs to the base method; the rest is as outside.
-    said = {key: value for key, value in cls.PRESETS[preset].items() if field_at(PipelineParams, key) is not None}
-    ppl = apply_overrides(outer.ppl, said, source=f"preset '{preset}' of '{name}'")
-    return replace(base, ppl=ppl, scene=outer.scene, scene_spec=outer.scene_spec)
-
-
 def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path) -> TrainedModel:
-    """The trained scene of method `name`, frozen: from an ordinary run under `out`, from the cache, or trained now.
+    """The trained scene of method `name`, frozen: the file that `outer` names, from an ordinary run under `out`, from
+    the cache, or trained now.
 
     Two processes that want the same one train it once: the second waits for the first.
     """
-    resolved = base_config(session, name, outer)
+    if outer.init and name == first_scene(make_method(session.plugins, outer)):
+        session.say(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
+        return session.given(Path(outer.init))
+    resolved = base_config(session.plugins, name, outer)
     key = training_key(session, resolved)
-    scene = session.scene(resolved)
 
     def nested(inner: str) -> TrainedModel:
         return trained_scene(session, inner, resolved, out)
 
-    directory = _ordinary_run(out / scene.name / name, key)
+    directory = _ordinary_run(out / session.scene(resolved).name / name, key)
     if directory is None:
-        directory = out / FOLDER / f"{scene.name}-{name}-{key[:16]}"
+        directory = cached_directory(session, resolved, out, key)
     with directory_lock(directory, wait=True, on_wait=session.say, say=session.say):
         sweep(directory)
-        if StepLog(directory).done(STEP, key) is None:
-            session.say(f"{outer.method} starts from a trained {name} scene; none is there yet, so it is trained first")
+        if StepLog(directory).done(STEP, key) is not None:
+            session.say(f"{outer.method} starts from the trained {name} scene in {directory}")
+        elif CheckpointStore(directory / CHECKPOINTS).paths():
+            session.say(f"the trained {name} scene for this configuration is not finished yet: going on with it first")
+        else:
+            session.say(f"no trained {name} scene for this configuration yet: training it first")
         found = train(session, resolved, directory, trained=nested)
     found.model.eval().requires_grad_(False)
     return found
 
 
+def cached_directory(session: Session, resolved: ResolvedConfig, out: Path, key: str) -> Path:
+    """Where the trained scene of a configuration is kept for those that start from it."""
+    return out / FOLDER / f"{session.scene(resolved).name}-{resolved.method}-{key[:16]}"
+
+
 def _ordinary_run(parent: Path, key: str) -> Path | None:
-    """A run directory that holds this training, finished."""
-    for directory in sorted(parent.iterdir()) if parent.is_dir() else []:
+    """A run directory that holds this training, finished; else one in which another process is making it right now."""
+    directories = sorted(parent.iterdir()) if parent.is_dir() else []
+    for directory in directories:
         if holds_training(directory, key):
+            return directory
+    for directory in directories:
+        if StepLog(directory).done(BEGUN, key) is not None and is_held(directory):
             return directory
     return None

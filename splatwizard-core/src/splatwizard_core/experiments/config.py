@@ -9,7 +9,7 @@ import json
 import os
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -18,6 +18,7 @@ from pydantic import TypeAdapter, ValidationError
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.experiments.keys import (
     block_keys,
+    dotted,
     field_at,
     flatten,
     input_files,
@@ -43,7 +44,9 @@ ParamsT = TypeVar("ParamsT", bound=Params)
 
 RESERVED = ("method", "preset", "rate", "scene")
 # The seed of a scene's start points is the seed of the run.
-SCENE_KEYS = tuple(field.name for field in dataclasses.fields(SceneOptions) if field.name != "seed")
+SCENE_KEYS = tuple(f.name for f in dataclasses.fields(SceneOptions) if f.name != "seed")
+PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
+INIT = "init"  # a .ply in place of that scene; a method that has a key of this name means its own
 RATE_ALIASES = ("low", "default", "high", "all")
 
 
@@ -119,6 +122,8 @@ class ResolvedConfig:
     ppl                     run parameters
     scene                   how the scene is read
     provenance              dotted key -> "preset 'quick'", "rate 'r2'", a file name or "--set"; absent: the default
+    init                    a .ply that the run starts from in place of a trained scene; empty: none
+    pretrained              values by dotted key of the method whose trained scene it starts from, and its "preset"
     """
 
     method: str
@@ -129,10 +134,12 @@ class ResolvedConfig:
     ppl: PipelineParams
     scene: SceneOptions
     provenance: Mapping[str, str]
+    init: str = ""
+    pretrained: Mapping[str, Any] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values by block, None included; what the record keeps."""
-        return {
+        found = {
             "method": self.method,
             "preset": self.preset,
             "rate": self.rate,
@@ -141,6 +148,17 @@ class ResolvedConfig:
             "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
             "provenance": dict(self.provenance),
         }
+        if self.init:
+            found["init"] = self.init
+        if self.pretrained:
+            found["pretrained"] = self._pretrained_tables()
+        return found
+
+    def _pretrained_tables(self) -> dict[str, Any]:
+        tables: dict[str, Any] = {}
+        for key, value in self.pretrained.items():
+            set_at(tables, key, value)
+        return tables
 
     def toml(self) -> str:
         """A file that makes the same run again when given as `--config`."""
@@ -154,13 +172,17 @@ class ResolvedConfig:
         config = self.config.model_dump(mode="json")
         for key, path in self._input_files().items():
             set_at(config, key, os.path.abspath(path))
+        if self.init:
+            content[INIT] = os.path.abspath(self.init)
+        if self.pretrained:
+            content["pretrained"] = self._pretrained_tables()
         content |= config
         return tomli_w.dumps(_spell_none(content))
 
     def training_content(self) -> dict[str, Any]:
         """Everything that training depends on: not the `codec` block, the device or the rate's name.
 
-        A file that it reads counts by what it holds.
+        A file that it reads counts by what it holds. What it starts from is told apart (`experiments.start`).
         """
         config = self.config_content()
         config.pop("codec", None)
@@ -281,7 +303,8 @@ def resolve(
     preset, rate    names; None: what the file says, else "quick" on the demo scene and "paper" elsewhere, and the
                     method's DEFAULT_RATE
     config_file     TOML; keys as in `sets`, tables for blocks, besides the reserved `method`, `preset`, `rate`, `scene`
-    sets            by dotted key: a key of the method's config, else of PipelineParams, else a scene option
+    sets            by dotted key: a key of the method's config, else of PipelineParams, else a scene option, else
+                    `init` or `pretrained.KEY`, which `experiments.start.settled` checks
     scene           "demo", a folder, or dataset/scene; None: what the file says, else "demo"
 
     Raises ConfigError.
@@ -320,10 +343,12 @@ def resolve(
         ("--set", sets or {}),
     ]
     config: OptimizationParams = method.Config()
+    init, pretrained = "", dict[str, Any]()
     ppl, scene_options = PipelineParams(), SceneOptions()
     known = {**dict.fromkeys(SCENE_KEYS, ""), **block_keys(PipelineParams), **block_keys(method.Config)}
     provenance: dict[str, str] = {}
-    for source, values in layers:
+    for source, layer in layers:
+        values = _with_dotted_tables(layer)
         parts: tuple[dict[str, Any], dict[str, Any], dict[str, Any]] = ({}, {}, {})
         for key, value in values.items():
             if field_at(method.Config, key) is not None:
@@ -332,6 +357,10 @@ def resolve(
                 parts[1][key] = value
             elif key in SCENE_KEYS:
                 parts[2][key] = value
+            elif key == INIT and isinstance(value, str):
+                init = value
+            elif key.startswith(PRETRAINED) and key != PRETRAINED:
+                pretrained[key.removeprefix(PRETRAINED)] = value
             else:
                 raise unknown_key(key, known, source)
             provenance[key] = source
@@ -339,7 +368,19 @@ def resolve(
         ppl = apply_overrides(ppl, parts[1], source=source)
         scene_options = _scene_options(scene_options, parts[2], source)
     scene_options = dataclasses.replace(scene_options, seed=ppl.seed)
-    return ResolvedConfig(method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance)
+    return ResolvedConfig(
+        method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained
+    )
+
+
+def _with_dotted_tables(values: Mapping[str, Any]) -> dict[str, Any]:
+    """The values, the table `pretrained` of a file as dotted keys."""
+    found = dict(values)
+    table = found.get(PRETRAINED.rstrip("."))
+    if isinstance(table, Mapping):
+        del found[PRETRAINED.rstrip(".")]
+        found |= dotted(table, PRETRAINED)
+    return found
 
 
 def _scene_options(options: SceneOptions, values: Mapping[str, Any], source: str) -> SceneOptions:

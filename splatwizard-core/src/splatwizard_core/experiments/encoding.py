@@ -15,11 +15,14 @@ from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
+from splatwizard_core.experiments.cache import cached_directory, trained_scene
 from splatwizard_core.experiments.config import ResolvedConfig
 from splatwizard_core.experiments.lock import directory_lock
 from splatwizard_core.experiments.method import Method
+from splatwizard_core.experiments.phases import part_of, unique
 from splatwizard_core.experiments.session import Session, TrainedModel
-from splatwizard_core.experiments.training_run import finished_directory, make_method, train, training_key
+from splatwizard_core.experiments.start import make_method, training_key
+from splatwizard_core.experiments.training_run import finished_directory, train
 from splatwizard_core.experiments.versions import CORE, made_by
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -32,7 +35,7 @@ NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder"
 def encode(
     method: Method, model: SplatModel, raster: dict[str, Any], path: Path, device: torch.device
 ) -> dict[str, Any]:
-    """Write one file; {"encode_s", "bytes", "sha256", "made_by"}, the last being versions by distribution.
+    """Write one file; {"encode_s", "bytes", "sha256", "made_by", "parts"}: versions by distribution, who took part.
 
     raster  what the header asks of a rasterizer
     device  where the model is
@@ -58,6 +61,7 @@ def encode(
         "bytes": size,
         "sha256": file_sha256(path),
         "made_by": made_by(method.plugins, loaded),
+        "parts": unique(part_of(entry) for entry in loaded),
     }
 
 
@@ -77,12 +81,21 @@ def requirements(entries: Iterable[Entry]) -> list[Requirement]:
 def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
     """The finished training of a run directory. Raises UserInputError if it is not finished."""
     key = training_key(session, resolved)
-    if finished_directory(directory, key) is None:  # asked before the lock too, which is a file in the directory
+    parents = directory.resolve().parents
+    root = parents[min(2, len(parents) - 1)]  # of <scene>/<method>/<rate>
+    cached = cached_directory(session, resolved, root, key)
+    if (
+        finished_directory(directory, key, cached) is None
+    ):  # asked before the lock too, which is a file in the directory
         raise _not_finished(directory)
     with directory_lock(directory, say=session.say):
-        if finished_directory(directory, key) is None:
+        if finished_directory(directory, key, cached) is None:
             raise _not_finished(directory)
-        return train(session, resolved, directory, trained=_nothing_to_start_from)
+        # Its stages begin with what they began with, before the checkpoint takes its place.
+        return train(
+            session, resolved, directory,
+            trained=lambda name: trained_scene(session, name, resolved, root), cached=cached,
+        )  # fmt: skip
 
 
 def _not_finished(directory: Path) -> UserInputError:
@@ -97,7 +110,8 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
     trained = load_finished(session, resolved, directory)
     inside = target.resolve().parent == directory.resolve()
     with directory_lock(directory) if inside else contextlib.nullcontext():
-        return encode(make_method(session, resolved), trained.model, trained.facts["raster"], target, session.device)
+        method = make_method(session.plugins, resolved)
+        return encode(method, trained.model, trained.facts["raster"], target, session.device)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
@@ -108,17 +122,13 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     if path.suffix != ".ply":
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
     model = load_ply(path).to(session.device).eval().requires_grad_(False)
-    method = make_method(session, resolved)
+    method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
     raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))
     try:
         return encode(method, model, raster, target, session.device)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error
-
-
-def _nothing_to_start_from(name: str) -> TrainedModel:
-    raise SplatwizardError(f"a finished training asked for a trained '{name}' scene")
 
 
 def _synchronize(device: torch.device) -> None:

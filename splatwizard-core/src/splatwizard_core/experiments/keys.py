@@ -66,7 +66,10 @@ def input_files(cls: type[BaseModel], prefix: str = "") -> list[str]:
 
 
 def field_at(cls: type[BaseModel], key: str) -> Any:
-    """The type that stands at a dotted key; None if there is no such key. Keys of a dict field are free."""
+    """The type that stands at a dotted key; None if there is no such key.
+
+    Keys of a dict field are free; below one of `Any` they are free all the way down.
+    """
     annotation: Any = cls
     for part in key.split("."):
         block = block_of(annotation)
@@ -79,6 +82,8 @@ def field_at(cls: type[BaseModel], key: str) -> Any:
         if mapping is None:
             return None
         annotation = typing.get_args(mapping)[1]
+        if annotation is Any:
+            return Any
     return annotation
 
 
@@ -104,6 +109,14 @@ def flatten(cls: type[BaseModel], tables: Mapping[str, Any], prefix: str = "") -
             found |= {f"{prefix}{name}.{k}": v for k, v in value.items()}
         else:
             found[prefix + name] = value
+    return found
+
+
+def dotted(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+    """Nested tables as dotted keys, all the way down."""
+    found: dict[str, Any] = {}
+    for name, value in table.items():
+        found |= dotted(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
     return found
 
 

@@ -101,6 +101,20 @@ def directory_lock(
         os.close(descriptor)
 
 
+def is_held(directory: Path) -> bool:
+    """Whether a process of this machine seems to hold a directory. Takes no lock, so nobody is refused meanwhile."""
+    holder = read_holder(directory / NAME)
+    if holder is None or holder.boot != _boot():
+        return False
+    try:
+        os.kill(holder.pid, 0)
+    except PermissionError:
+        return True  # it lives, and belongs to another user
+    except OSError:
+        return False
+    return True
+
+
 def _try(descriptor: int, directory: Path, path: Path) -> tuple[str, str] | None:
     """Take the lock; None if it is ours now, else who holds it, and what to do."""
     try:

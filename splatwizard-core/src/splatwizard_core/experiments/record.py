@@ -15,7 +15,7 @@ from splatwizard_core.errors import UserInputError
 from splatwizard_core.experiments.record_versions import upgraded
 from splatwizard_core.files import write_atomic
 
-SCHEMA: Literal[2] = 2
+SCHEMA: Literal[3] = 3
 FILE_NAME = "metrics.json"
 
 
@@ -95,12 +95,24 @@ class StageBlock(Part):
     seconds: float
 
 
+class PretrainingBlock(Part):
+    """The trained scene of another method that a training started from, or was taught by."""
+
+    file: dict[str, str] = Field(description="name and sha256 of the .ply that it came from; empty: trained here")
+    preset: str | None
+    config: dict[str, Any] | None = Field(description="every value of the method that trained it")
+    steps: int | None
+    train_s: float | None = Field(description="with what it started from itself")
+    made_by: dict[str, str] = Field(description="distribution -> version")
+
+
 class TrainBlock(Part):
     """Training: wall clock of the loop without evaluation, checkpoints and loading."""
 
     train_s: float | None
     stages: list[StageBlock]
     with_pretraining_s: float | None = Field(description="with the training of the scenes it starts from")
+    pretraining: dict[str, PretrainingBlock] | None = Field(description="method -> its scene that this one used")
     steps: int | None
     peak_bytes: int | None = Field(description="over the loop; without evaluation and checkpoints since schema 2")
     memory_kind: Literal["cuda", "rss"] | None
@@ -133,10 +145,26 @@ class RecordFile(Part):
     digest: str = Field(description="SHA-256 of the decoded model, equal in the decoding and the evaluating process")
 
 
+class ProvidedBlock(Part):
+    """Who served: a registered thing by its kind and name, a training `stage`, or a `task` of another package."""
+
+    kind: str
+    name: str
+    distribution: str = Field(description="pip distribution; empty: of none that is installed")
+    version: str
+
+
+class PhaseBlock(Part):
+    """One phase of a run."""
+
+    phase: str = Field(description='"train: NAME" (a stage), "train" (asked for before the first), "encode", "render"')
+    provided_by: list[ProvidedBlock]
+
+
 class Record(Part):
     """One scene, one method, one rate point, one file."""
 
-    schema_version: Literal[2] = SCHEMA
+    schema_version: Literal[3] = SCHEMA
     method: str
     method_version: int
     distribution: str = Field(description="pip distribution and version that the method comes from")
@@ -161,6 +189,7 @@ class Record(Part):
     geometry: dict[str, float] | None = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
+    phases: list[PhaseBlock] | None = Field(description="who served each phase, with distribution and version")
     environment: dict[str, Any]
     flags: list[str] = Field(description="fit, rss, ...")
     unknown: dict[str, str] = Field(description="dotted name of each null -> why")
@@ -200,5 +229,7 @@ def missing_reasons(record: Record) -> list[str]:
     for free in ("config", "environment", "unknown", "flags", "plan"):  # what they hold is described elsewhere
         if content.get(free) is not None:
             content.pop(free)
+    for scene in (content["train"]["pretraining"] or {}).values():
+        scene.update(config={} if scene["config"] is not None else None)
     walk(content, "")
     return found

@@ -6,6 +6,7 @@ import json
 from typing import Any
 
 OF_SCHEMA_1 = "the record is of schema 1, which did not hold it"
+OF_SCHEMA_2 = "the record is of schema 2 or older, which did not hold it"
 NEW_IN_2 = {
     "speed": ("jit_s", "load_s", "spread"),
     "memory": ("peak_load_bytes",),
@@ -21,9 +22,11 @@ def upgraded(text: str) -> str:
     except (ValueError, RecursionError):
         return text  # whoever reads it says what is wrong
     version = content.get("schema_version") if isinstance(content, dict) else None
-    if type(version) is not int or version != 1:  # true is a 1 to Python
+    if type(version) is not int or version not in (1, 2):  # true is a 1 to Python
         return text
-    return json.dumps(_from_1_to_2(content))
+    if version == 1:
+        content = _from_1_to_2(content)
+    return json.dumps(_from_2_to_3(content))
 
 
 def _from_1_to_2(content: dict[str, Any]) -> dict[str, Any]:
@@ -39,3 +42,17 @@ def _from_1_to_2(content: dict[str, Any]) -> dict[str, Any]:
         found["unknown"] |= {f"{block}.{name}": OF_SCHEMA_1 for name in names}
     found["speed"]["repeats"] = 1
     return found
+
+
+def _from_2_to_3(content: dict[str, Any]) -> dict[str, Any]:
+    """Schema 3 says what a training started from, and who served each phase."""
+    unknown, train = content.get("unknown"), content.get("train")
+    if content.get("schema_version") != 2 or not isinstance(unknown, dict) or not isinstance(train, dict):
+        return content
+    return {
+        **content,
+        "schema_version": 3,
+        "train": {**train, "pretraining": None},
+        "phases": None,
+        "unknown": {**unknown, "train.pretraining": OF_SCHEMA_2, "phases": OF_SCHEMA_2},
+    }

@@ -14,16 +14,18 @@ from typing import Any
 
 from splatwizard_core.errors import SceneError, SplatwizardError, UserInputError
 from splatwizard_core.experiments.asked import Asked, what_is_asked
-from splatwizard_core.experiments.cache import trained_scene
+from splatwizard_core.experiments.cache import cached_directory, trained_scene
 from splatwizard_core.experiments.config import SCENE_KEYS, ResolvedConfig, absolute_spec, content_hash
 from splatwizard_core.experiments.decoding import REPEATS
 from splatwizard_core.experiments.encoding import encode
 from splatwizard_core.experiments.fresh import decode_fresh, run_fresh
 from splatwizard_core.experiments.lock import directory_lock
+from splatwizard_core.experiments.phases import phases_of_run
 from splatwizard_core.experiments.record import FILE_NAME, SCHEMA, Record, missing_reasons, read_record
 from splatwizard_core.experiments.session import Session, TrainedModel
+from splatwizard_core.experiments.start import make_method, training_key
 from splatwizard_core.experiments.steps import StepLog
-from splatwizard_core.experiments.training_run import CHECKPOINTS, make_method, train, training_key
+from splatwizard_core.experiments.training_run import CHECKPOINTS, pretraining, train
 from splatwizard_core.experiments.versions import changes, installed, providers
 from splatwizard_core.files import file_sha256, remove_folder, sweep, write_atomic
 from splatwizard_core.scene.images import check_pictures, decode_all
@@ -77,7 +79,7 @@ def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
         else:
             trained = train_in(session, request, directory)
             steps = StepLog(directory)  # training has written into it
-            method = make_method(session, resolved)
+            method = make_method(session.plugins, resolved)
             facts = encode(method, trained.model, trained.facts["raster"], encoded, session.device)
             session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
             steps.finish("encode", encode_key, facts)
@@ -119,9 +121,11 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
     def start(name: str) -> TrainedModel:
         return trained_scene(session, name, request.resolved, request.out)
 
+    key = training_key(session, request.resolved)
     found = train(
         session, request.resolved, directory,
         trained=start, resume=request.resume, allow_changed_plan=request.allow_changed_plan, stop_after=stop_after,
+        cached=cached_directory(session, request.resolved, request.out, key),
     )  # fmt: skip
     write_config(directory, request.resolved)
     return found
@@ -301,6 +305,10 @@ def _assemble(
         unknown["train.peak_bytes"] = "not measured"
     if measured["memory"]["peak_reserved_bytes"] is None:
         unknown["memory.peak_reserved_bytes"] = "a CPU has no such pool"
+    before, seconds = _pretraining(training, unknown)
+    phases = phases_of_run(session.plugins, training, encoding, measured["rasterizers"])
+    if phases is None:
+        unknown["phases"] = "trained or encoded by a release that did not note them"
     record = Record(
         method=resolved.method,
         method_version=decoded["method_version"],
@@ -330,10 +338,12 @@ def _assemble(
         train={
             **{k: training[k] for k in _FROM_TRAINING},
             "pictures_in": training.get("pictures_in"),
-            "with_pretraining_s": training["train_s"] + sum(training["pretraining_s"].values()),
+            "pretraining": before,
+            "with_pretraining_s": seconds,
         },
         plan=training["plan"],
         rasterizers={"train": training["rasterizers"], "render": measured["rasterizers"]},
+        phases=phases,
         environment=measured["environment"],
         unknown=unknown,
         date=datetime.now(timezone.utc).isoformat(timespec="seconds"),
@@ -342,6 +352,23 @@ def _assemble(
     if without:
         raise SplatwizardError(f"the record has null without a reason: {', '.join(without)}")
     return record
+
+
+def _pretraining(training: dict[str, Any], unknown: dict[str, str]) -> tuple[dict[str, Any], float | None]:
+    """What a run started from, and the seconds of its training with theirs; reasons for nulls go into `unknown`."""
+    found, total = {}, training["train_s"]
+    for name, facts in pretraining(training).items():
+        came = "it came from a file, which does not say" if facts.get("file") else "a release that did not note it"
+        found[name] = {"file": {}, "made_by": {}, **dict.fromkeys(("preset", "config", "steps", "train_s")), **facts}
+        for key in ("preset", "config", "steps", "train_s"):
+            if found[name][key] is None:
+                unknown[f"train.pretraining.{name}.{key}"] = came
+        if facts["train_s"] is None:
+            unknown["train.with_pretraining_s"] = f"the {name} scene that it started from came from a file"
+            total = None
+        elif total is not None:
+            total += facts["train_s"]
+    return found, total
 
 
 _FROM_EVALUATION = (

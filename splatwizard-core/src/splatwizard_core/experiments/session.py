@@ -14,6 +14,7 @@ from splatwizard_core.errors import NativeBuildError
 from splatwizard_core.experiments.config import ResolvedConfig
 from splatwizard_core.experiments.file_digests import FileDigests
 from splatwizard_core.experiments.identity import scene_digest
+from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.native.build import declared_modules, resolve_module
 from splatwizard_core.native.loader import cache_root
@@ -44,7 +45,9 @@ class Session:
     say: Callable[[str], None]
     _scenes: dict[tuple[str, SceneOptions], Scene] = field(default_factory=dict)
     _digests: dict[tuple[str, SceneOptions], str] = field(default_factory=dict)
+    _file_digests: dict[Path, str] = field(default_factory=dict)
     _last_trained: TrainedModel | None = None
+    _given: TrainedModel | None = None
     _kernels_loaded: bool = False
 
     def scene(self, resolved: ResolvedConfig) -> Scene:
@@ -66,6 +69,22 @@ class Session:
             scene = self.scene(resolved)
             self._digests[key] = scene_digest(scene, FileDigests(_digest_store(scene)))
         return self._digests[key]
+
+    def file_digest(self, path: Path) -> str:
+        """SHA-256 of a file, read once."""
+        if path not in self._file_digests:
+            self._file_digests[path] = file_sha256(path)
+        return self._file_digests[path]
+
+    def given(self, path: Path) -> TrainedModel:
+        """The explicit Gaussians of a .ply as a trained scene, frozen; read once. Nobody knows how it was trained."""
+        from splatwizard_core.experiments.start import check_model
+
+        digest = self.file_digest(path)
+        if self._given is None or self._given.key != digest:
+            model = check_model(str(path)).to(self.device).eval().requires_grad_(False)
+            self._given = TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
+        return self._given
 
     def load_kernels(self) -> None:
         """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.

@@ -7,14 +7,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, raster_header
 from splatwizard_core.evaluation.metrics import default_metrics
-from splatwizard_core.experiments.config import ResolvedConfig, content_hash
-from splatwizard_core.experiments.method import Method
+from splatwizard_core.experiments.config import ResolvedConfig
+from splatwizard_core.experiments.phases import StageParts
 from splatwizard_core.experiments.session import Session, TrainedModel
+from splatwizard_core.experiments.start import IDENTITY, base_config, make_method, named_scenes, starts, training_key
 from splatwizard_core.experiments.steps import StepLog
 from splatwizard_core.experiments.versions import changes, made_by
+from splatwizard_core.files import write_atomic
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import Entry
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.scene.scene import Scene
@@ -24,19 +28,8 @@ from splatwizard_core.training.pipeline import train_stages
 
 CHECKPOINTS = "checkpoints"
 STEP = "train"
-IDENTITY = 2  # raised when checkpoints come to say something else of what they were made from
-
-
-def make_method(session: Session, resolved: ResolvedConfig) -> Method:
-    """The configured method."""
-    method: Method = session.plugins.methods.load(resolved.method)(session.plugins, resolved.config)
-    return method
-
-
-def training_key(session: Session, resolved: ResolvedConfig) -> str:
-    """What a training was made from: equal keys mean an interchangeable model."""
-    cls = session.plugins.methods.load(resolved.method)
-    return content_hash([IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version])
+BEGUN = "begun"
+LOG = "log.jsonl"
 
 
 def train(
@@ -48,6 +41,7 @@ def train(
     resume: bool = True,
     allow_changed_plan: bool = False,
     stop_after: int | None = None,
+    cached: Path | None = None,
 ) -> TrainedModel:
     """The trained model of this configuration on this scene, from wherever it already exists.
 
@@ -55,22 +49,24 @@ def train(
     resume      False: neither a checkpoint nor another rate point's training is used, only what this session trained
     trained     (method name) -> the trained scene that a stage starts from
     stop_after  end the process's part of the training after this many steps (raises KeyboardInterrupt then)
+    cached      where it lies if another method's run has made it to start from
     """
     key = training_key(session, resolved)
     in_memory = session.trained(key)
     if in_memory is not None:
         return _share(session, in_memory, directory, resolved)
     # Starting again takes nothing old, least of all from a neighbour that the same command is about to clear.
-    home = (finished_directory(directory, key) if resume else None) or directory
+    home = (finished_directory(directory, key, cached) if resume else None) or directory
     scene = session.scene(resolved)
     steps = StepLog(home)
     done = steps.done(STEP, key) if holds_training(home, key) else None
     if done is None:
         resume = resume and not _is_of_an_older_release(session, home)
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
+        steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
     with session.plugins.recording() as loaded:
         outcome_model, facts = run_stages(
-            session, resolved, scene, home,
+            session, resolved, scene, home, loaded,
             trained=trained, resume=resume or done is not None, allow_changed_plan=allow_changed_plan,
             stop_after=stop_after,
         )  # fmt: skip
@@ -87,7 +83,11 @@ def train(
             session.say(f"{home} was trained with {', '.join(changed)}; it is used as it is (--fresh trains again)")
     found = TrainedModel(outcome_model, key, facts)
     session.remember(found)
-    return _share(session, found, directory, resolved) if home != directory else found
+    if home == directory:
+        return found
+    if home == cached and not (directory / LOG).exists():
+        write_atomic(directory / LOG, (home / LOG).read_text("utf-8"))  # reports look for it here
+    return _share(session, found, directory, resolved)
 
 
 def _is_of_an_older_release(session: Session, directory: Path) -> bool:
@@ -106,16 +106,20 @@ def _share(session: Session, found: TrainedModel, directory: Path, resolved: Res
     """Note in this rate point's directory whose training it uses."""
     steps = StepLog(directory)
     if steps.done(STEP, found.key) is None:
-        session.say(f"rate point {resolved.rate} shares the training of {found.facts.get('trained_in')}")
+        other = found.facts.get("trained_in")
+        made = "that others started from" if other == resolved.rate else f"of {other}"
+        session.say(f"rate point {resolved.rate} shares the training {made}")
         steps.finish(STEP, found.key, {**found.facts, "checkpoints": "elsewhere"})
     return found
 
 
-def finished_directory(directory: Path, key: str) -> Path | None:
-    """The run directory (this, or that of another rate point beside it) that holds this very training, finished."""
+def finished_directory(directory: Path, key: str, cached: Path | None = None) -> Path | None:
+    """The directory (this, that of another rate point beside it, or `cached`) that holds this training, finished."""
     candidates = [directory]
     if directory.parent.is_dir():
         candidates += sorted(p for p in directory.parent.iterdir() if p.is_dir() and p != directory)
+    if cached is not None:
+        candidates.append(cached)
     for candidate in candidates:
         if holds_training(candidate, key):
             return candidate
@@ -135,16 +139,21 @@ def run_stages(
     resolved: ResolvedConfig,
     scene: Scene,
     directory: Path,
+    loaded: list[Entry],
     *,
     trained: Callable[[str], TrainedModel],
     resume: bool,
     allow_changed_plan: bool,
     stop_after: int | None,
 ) -> tuple[SplatModel, dict[str, Any]]:
-    """Train (or load, where the checkpoints say it is finished); the model and what is reported of the training."""
+    """Train (or load, where the checkpoints say it is finished); the model and what is reported of the training.
+
+    loaded      what the registries are asked for meanwhile, as it grows
+    """
     session.load_kernels()
-    method = make_method(session, resolved)
+    method = make_method(session.plugins, resolved)
     stages = list(method.stages())
+    scenes = named_scenes(method)
     ppl = resolved.ppl
     suggested = list(dict.fromkeys(name for stage in stages for name in stage.prefer))
     rasterizer = NegotiatedRasterizer(
@@ -154,11 +163,18 @@ def run_stages(
         forbid=ppl.raster.forbid,
         suggested=suggested,
     )
-    before: dict[str, float] = {}
+    parts = StageParts(session.plugins, stages, ppl, loaded, rasterizer)
+    before: dict[str, dict[str, Any]] = {}
 
     def frozen(name: str) -> SplatModel:
-        source = trained(name)
-        before[name] = source.facts["train_s"]
+        if name not in scenes:
+            raise SplatwizardError(
+                f"a stage of '{resolved.method}' asks for a trained '{name}' scene, which no stage names in "
+                "`starts_from` or `taught_by`: its training could not be told from one with another such scene"
+            )
+        with parts.elsewhere():
+            source = trained(name)
+        before[name] = _told_of(source, base_config(session.plugins, name, resolved))
         return source.model
 
     def create_model() -> SplatModel:
@@ -180,6 +196,7 @@ def run_stages(
         )
         return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}
 
+    scenes_before = starts(session, resolved)
     if ppl.eval_every:
         decode_all(scene.test)  # here, so that they do not count as memory of the training
     outcome = train_stages(
@@ -195,20 +212,22 @@ def run_stages(
             "identity": IDENTITY,
             "method_version": method.version,
             "scene content": session.scene_digest(resolved),
+            **({"starts from": scenes_before} if scenes_before else {}),
         },
         trained=frozen,
         stop_after=stop_after,
         resume=resume,
         allow_changed_plan=allow_changed_plan,
         evaluate=test_views,
-        log_path=directory / "log.jsonl",
+        log_path=directory / LOG,
+        provided=parts.since_asked,
     )
     background = scene.background
     last = stages[-1]
     facts = {
         "train_s": outcome.train_s,
         "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
-        "pretraining_s": before,
+        "pretraining": before,
         "steps": outcome.steps,
         "peak_bytes": outcome.peak_memory,
         "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
@@ -216,6 +235,33 @@ def run_stages(
         "breakdown_s": outcome.stage_breakdown,
         "plan": outcome.plan,
         "rasterizers": outcome.rasterizers,
+        "phases": parts.phases(outcome.provided),
         "raster": raster_header(last.raster_options(last.iterations, background)),
     }
     return outcome.model, facts
+
+
+def _told_of(source: TrainedModel, base: ResolvedConfig) -> dict[str, Any]:
+    """What is reported of a scene that a training started from; what nobody knows of a file is None."""
+    facts = source.facts
+    if "file" in facts:
+        return {
+            "file": facts["file"], "made_by": {}, "preset": None, "config": None, "steps": None, "train_s": None
+        }  # fmt: skip
+    inner = [each["train_s"] for each in pretraining(facts).values()]
+    return {
+        "file": {},
+        "made_by": facts["made_by"],
+        "preset": base.preset,
+        "config": base.config.model_dump(mode="json"),
+        "steps": facts["steps"],
+        "train_s": None if None in inner else facts["train_s"] + sum(inner),
+    }
+
+
+def pretraining(facts: dict[str, Any]) -> dict[str, Any]:
+    """What a training started from, by method; of one of an older release its seconds alone."""
+    if "pretraining" in facts:
+        found: dict[str, Any] = facts["pretraining"]
+        return found
+    return {name: {"train_s": seconds} for name, seconds in facts.get("pretraining_s", {}).items()}

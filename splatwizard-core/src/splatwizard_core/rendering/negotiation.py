@@ -112,6 +112,8 @@ class NegotiatedRasterizer:
         self.device = torch.device(device)
         self.choices: dict[str, str] = {}
         """What was asked for (feature names joined by "+", "plain" for none) -> who served it."""
+        self.served: set[str] = set()
+        """Names of those that did something since somebody cleared this."""
         self._registry = plugins.registries["rasterizer"]
         self._prefer = [self._registry.entry(name).name for name in prefer]
         self._prefer += [name for name in suggested if name in self._registry and name not in self._prefer]
@@ -180,9 +182,12 @@ class NegotiatedRasterizer:
         while True:
             rasterizer = self.select(wanted)
             try:
-                return call(rasterizer)
+                result = call(rasterizer)
             except NativeBuildError as error:  # kernels may be built by the first call
                 self._fail(rasterizer.info.name, error)
+            else:
+                self.served.add(rasterizer.info.name)
+                return result
 
     def _fail(self, name: str, error: Exception) -> None:
         if self._forced is not None:

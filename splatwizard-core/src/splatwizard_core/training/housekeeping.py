@@ -38,6 +38,7 @@ class Progress:
     peak_memory     bytes
     rasterizers     features asked for -> who served them
     pictures_in     where the training pictures were: "host" or "cuda"
+    provided        stage name -> what served it, as whoever started the training tells (JSON-able)
     """
 
     stage_seconds: dict[str, float] = field(default_factory=dict)
@@ -46,6 +47,7 @@ class Progress:
     peak_memory: int = 0
     rasterizers: dict[str, str] = field(default_factory=dict)
     pictures_in: str = "host"
+    provided: dict[str, list[dict[str, str]]] = field(default_factory=dict)
 
     @property
     def steps(self) -> int:

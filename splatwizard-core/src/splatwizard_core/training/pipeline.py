@@ -49,6 +49,7 @@ class TrainOutcome:
     plan            of each stage: name, steps, and its tasks as printed
     rasterizers     features asked for -> who served them
     pictures_in     where the training pictures were: "host" or "cuda"
+    provided        stage name -> what served it, as `train_stages(provided=...)` told
     """
 
     model: SplatModel
@@ -60,6 +61,7 @@ class TrainOutcome:
     plan: list[dict[str, Any]]
     rasterizers: dict[str, str]
     pictures_in: str = "host"
+    provided: dict[str, list[dict[str, str]]] = field(default_factory=dict)
 
 
 @dataclass
@@ -75,6 +77,7 @@ class _Run:
     trained: Callable[[str], SplatModel]
     store: CheckpointStore | None
     allow_changed_plan: bool
+    provided: Callable[[], list[dict[str, str]]]
     names: list[str] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -189,6 +192,7 @@ def train_stages(
     on_step: Callable[[StepRecord], None] | None = None,
     evaluate: Evaluate | None = None,
     log_path: Path | None = None,
+    provided: Callable[[], list[dict[str, str]]] = list,
 ) -> TrainOutcome:
     """Train all stages, or what an earlier process has left of them; a run that is finished is only loaded.
 
@@ -204,6 +208,7 @@ def train_stages(
     evaluate        (model, step of the stage) -> metrics for the log, every `ppl.eval_every` steps, without gradient,
                     in eval mode, with the process-wide random states kept
     log_path        of log.jsonl; default: in `directory`
+    provided        () -> what served (rasterizers, pruners, ...) since it was last asked: kept by stage
 
     A Ctrl-C is answered after the step with a checkpoint of it, then KeyboardInterrupt. On a CPU, stopping and
     resuming gives bit for bit what an uninterrupted run gives.
@@ -216,7 +221,7 @@ def train_stages(
         log_path = directory / "log.jsonl"
     store = None if directory is None else CheckpointStore(directory, ppl.keep_checkpoints)
     run_log = RunLog(log_path)
-    run = _Run(stages, create_model, scene, ppl, rasterizer, identity, trained, store, allow_changed_plan)
+    run = _Run(stages, create_model, scene, ppl, rasterizer, identity, trained, store, allow_changed_plan, provided)
     if not resume:
         if store is not None:
             store.clear()
@@ -233,6 +238,7 @@ def train_stages(
         else:
             trainer = run.restore(saved)
             run_log.rewind(saved.stage, saved.step)
+            provided()  # what began the stage is known from the process that began it
         plans = [run.describe(index) for index in range(0 if saved is None else saved.stage)]
         saved = None  # its tensors are as large as the model and its optimizer
         with run_log:
@@ -260,6 +266,7 @@ def train_stages(
         plans,
         dict(progress.rasterizers),
         progress.pictures_in,
+        {name: progress.provided.get(name, []) for name in run.names},
     )
 
 
@@ -280,6 +287,8 @@ def _run_stage(
     until = iterations if stop_after is None else min(iterations, stop_after - before)
 
     def save(finished: bool) -> None:
+        known = progress.provided.setdefault(name, [])
+        known += [part for part in run.provided() if part not in known]
         if run.store is not None:
             run.store.write(run.checkpoint(trainer, progress, finished=finished))
 

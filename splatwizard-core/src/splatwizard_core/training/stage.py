@@ -83,8 +83,8 @@ class StageContext:
     ppl         run parameters
     rasterizer  what the trainer renders with; a stage whose loss renders too (a teacher) keeps it
     generator   (stream name) -> an independent seeded torch.Generator: "init", "split", "method", ...
-    trained     (method name) -> a frozen, trained model of this scene, from the cache or trained first;
-                for stages that start from, or are taught by, a trained 3DGS scene
+    trained     (method name) -> a frozen, trained model of this scene: from the cache, trained first, or from the
+                .ply of --init; for stages that start from, or are taught by, a trained 3DGS scene
     """
 
     model: SplatModel
@@ -119,6 +119,15 @@ class Stage:
         None: it goes on from the stage before.
         """
         return None
+
+    @property
+    def taught_by(self) -> tuple[str, ...]:
+        """Names of further methods whose trained scenes it asks `context.trained` for (teachers).
+
+        What a training depends on is known before it begins: a scene that no stage of the method names here or in
+        `starts_from` is refused.
+        """
+        return ()
 
     @property
     def prefer(self) -> tuple[str, ...]:

@@ -51,7 +51,14 @@ def record_content(**changes: Any) -> dict[str, Any]:
                    "peak_reserved_bytes": None},
         "train": {"train_s": 60.0, "stages": [{"name": "toy", "seconds": 60.0}], "with_pretraining_s": 60.0,
                   "steps": 300, "peak_bytes": 5_000_000, "memory_kind": "rss", "breakdown_s": None,
-                  "trained_in": "r1", "pictures_in": "host"},
+                  "trained_in": "r1", "pictures_in": "host", "pretraining": {}},
+        "phases": [
+            {"phase": "train: toy", "provided_by": [
+                {"kind": "stage", "name": "toy", "distribution": "sw-toy", "version": "0.1"},
+                {"kind": "rasterizer", "name": "standard", "distribution": "sw-rasterizers", "version": "0.2"}]},
+            {"phase": "encode", "provided_by": [
+                {"kind": "method", "name": "toy", "distribution": "sw-toy", "version": "0.1"}]},
+        ],
         "plan": [], "rasterizers": {"train": {"BACKWARD": "standard"}, "render": {"SPLIT_SH": "standard"}},
         "environment": {"python": "3.11", "device": "cpu", "cpu": "A Processor", "threads": 2, "gpu": None,
                         "packages": {"sw-toy": "0.1"}},
