@@ -1,0 +1,209 @@
+"""Coder `importance-vq`: vectors of little importance share a codebook, the others keep their own in float16.
+
+Source: LightGaussian (arXiv 2311.17245), section on vector quantisation.
+
+Parts (docs/bitstream.md):
+
+    header      u8 version, u8 form of the indices (0 packed bits, 1 range coded), u32 codebook entries, u32 own vectors
+    mask        a bit a vector, 1 where it keeps its own; `packed-bits`, these through `byte-planes`
+    indices     of the other vectors, in order: `packed-bits`, or `categorical` where that is shorter
+    codebook    float16 [K, d], `byte-planes`
+    own         float16 [k, d], `byte-planes`
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatwizard_core.errors import BitstreamError
+from sw_lightgaussian.codebook import Training, train_codebook
+
+if TYPE_CHECKING:
+    from splatwizard_core.plugins import PluginManager
+
+VERSION = 1
+PACKED, RANGE_CODED = 0, 1
+HEADER = struct.Struct("<BBII")
+HALF_MAX = 65504.0
+MAX_CODES = 1 << 16
+
+
+@dataclass(frozen=True)
+class CodedVectors:
+    """What a file holds of n vectors of d numbers.
+
+    codes       [n] int64: entry of the codebook, -1 for a vector that keeps its own
+    codebook    [K, d] float16
+    own         [k, d] float16, of the vectors with code -1 in their order
+    """
+
+    codes: NDArray[np.int64]
+    codebook: NDArray[np.float16]
+    own: NDArray[np.float16]
+
+    def vectors(self) -> NDArray[np.float32]:
+        """[n, d] float32."""
+        found = np.empty((len(self.codes), self.own.shape[1]), np.float32)
+        keeps = self.codes < 0
+        found[keeps] = self.own
+        found[~keeps] = self.codebook[self.codes[~keeps]]
+        return found
+
+
+class ImportanceVQ:
+    """Float vectors to five byte strings and back.
+
+    ratio           share of the vectors that is vector-quantised, 0..1: the least important ones
+    size            codebook entries at most, up to 2^16
+    rows_per_code   and no more than the largest power of two with so many vectors for each entry
+    iterations, batch, decay, reseed, training  of the codebook: `train_codebook`, and the quantizer `vq`
+    """
+
+    def __init__(
+        self,
+        plugins: PluginManager,
+        *,
+        ratio: float = 0.6,
+        size: int = 8192,
+        rows_per_code: float = 4,
+        iterations: int = 1000,
+        batch: int = 80_000,
+        decay: float = 0.8,
+        reseed: int = 10,
+        training: Training = "ema",
+    ) -> None:
+        if not 0 <= ratio <= 1 or not 1 <= size <= MAX_CODES:
+            raise ValueError(f"ratio {ratio} and size {size} must be in 0..1 and 1..{MAX_CODES:,}")
+        self.plugins, self.ratio, self.size, self.rows_per_code = plugins, ratio, size, rows_per_code
+        self.iterations, self.batch, self.decay, self.reseed, self.training = (
+            iterations, batch, decay, reseed, training,
+        )  # fmt: skip
+
+    def encode(self, vectors: NDArray[Any], importance: NDArray[Any], seed: int = 0) -> dict[str, bytes]:
+        """The parts for `vectors` [n, d], clamped to the range of float16; equal arguments give equal bytes.
+
+        importance  [n], any finite numbers and -inf; of equal ones the first vectors count as more important
+        seed        of the codebook's training
+
+        Raises ValueError for a NaN.
+        """
+        return self.pack(self.quantize(vectors, importance, seed))
+
+    def decode(self, parts: Mapping[str, bytes], n: int, d: int) -> NDArray[np.float32]:
+        """The vectors, [n, d]. Raises BitstreamError.
+
+        It takes a few times the memory of the result: an n that comes from a file must be held against
+        `reader.allow` first.
+        """
+        return self.unpack(parts, n, d).vectors()
+
+    def quantize(self, vectors: NDArray[Any], importance: NDArray[Any], seed: int = 0) -> CodedVectors:
+        """Which vectors keep their own, and which entry of a newly trained codebook stands for each other one."""
+        x = np.clip(np.asarray(vectors, np.float32), -HALF_MAX, HALF_MAX)
+        importance = np.asarray(importance, np.float64)
+        if x.ndim != 2 or importance.shape != x.shape[:1]:
+            raise ValueError(f"vectors [n, d] and importance [n], not {list(x.shape)} and {list(importance.shape)}")
+        if np.isnan(x).any() or np.isnan(importance).any():
+            raise ValueError("a vector or its importance is not a number")
+        # Half a billionth more, since 1 - 0.9 is not 0.1.
+        keep = math.floor((1 - self.ratio) * len(x) + 1e-9)
+        keeps = np.zeros(len(x), bool)
+        keeps[np.argsort(-importance, kind="stable")[:keep]] = True
+        codes, codebook = np.full(len(x), -1), np.empty((0, x.shape[1]), np.float16)
+        if keep < len(x):
+            codes[~keeps], codebook = self._codebook(x[~keeps], np.maximum(importance[~keeps], 0), seed)
+        return CodedVectors(codes, codebook, x[keeps].astype(np.float16))
+
+    def codebook_size(self, n: int) -> int:
+        """Entries that are trained for n vectors."""
+        return min(self.size, 1 << int(math.log2(max(2.0, n / self.rows_per_code))))
+
+    def _codebook(
+        self, x: NDArray[np.float32], importance: NDArray[np.float64], seed: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
+        """Codes [n] and the codebook, of which only entries stay that a vector uses."""
+        quantizer = self.plugins.quantizers.load("vq")(self.codebook_size(len(x)), decay=self.decay, half=True)
+        rows = torch.from_numpy(x)
+        train_codebook(
+            quantizer, rows, torch.from_numpy(importance),
+            iterations=self.iterations, batch=self.batch, reseed=self.reseed, training=self.training,
+            generator=torch.Generator().manual_seed(seed),
+        )  # fmt: skip
+        index, side = quantizer.encode(rows)
+        used, codes = np.unique(index.numpy(), return_inverse=True)
+        return codes.astype(np.int64), side["codebook"][used]
+
+    def pack(self, coded: CodedVectors) -> dict[str, bytes]:
+        """The parts; the inverse of `unpack`, byte for byte."""
+        load = self.plugins.coders.load
+        planes, bits = load("byte-planes")(), load("packed-bits")()
+        keeps = coded.codes < 0
+        codes, size = coded.codes[~keeps], len(coded.codebook)
+        form, indices = PACKED, bits.encode(codes, bits.width(max(size, 1)))
+        ranged = self._range(size, len(codes))
+        if len(codes) and len(shorter := ranged[0].encode(codes.astype(np.int32), ranged[1])) < len(indices):
+            form, indices = RANGE_CODED, shorter
+        mask = np.frombuffer(bits.encode(keeps.astype(np.uint8), 1), np.uint8)
+        return {
+            "header": HEADER.pack(VERSION, form, size, len(coded.own)),
+            "mask": planes.encode(mask),
+            "indices": indices,
+            "codebook": planes.encode(coded.codebook),
+            "own": planes.encode(coded.own),
+        }
+
+    def unpack(self, parts: Mapping[str, bytes], n: int, d: int) -> CodedVectors:
+        """What the parts hold, checked. Raises BitstreamError."""
+        form, size, own = self._header(parts, n)
+        load = self.plugins.coders.load
+        planes, bits = load("byte-planes")(), load("packed-bits")()
+        mask = planes.decode(_part(parts, "mask"), np.uint8, ((n + 7) // 8,))
+        keeps = bits.decode(mask.tobytes(), n, 1).astype(bool)
+        if int(keeps.sum()) != own:
+            raise BitstreamError(f"the mask keeps {int(keeps.sum()):,} vectors, the header says {own:,}")
+        if form == PACKED:
+            found = bits.decode(_part(parts, "indices"), n - own, bits.width(max(size, 1)))
+        else:
+            model, context = self._range(size, n - own)
+            found = model.decode(_part(parts, "indices"), context).astype(np.int64)
+        if len(found) and not 0 <= int(found.min()) <= int(found.max()) < size:
+            raise BitstreamError(f"an index is outside the codebook of {size:,} entries")
+        codes = np.full(n, -1, np.int64)
+        codes[~keeps] = found
+        codebook = planes.decode(_part(parts, "codebook"), np.float16, (size, d))
+        kept = planes.decode(_part(parts, "own"), np.float16, (own, d))
+        if not np.isfinite(codebook).all() or not np.isfinite(kept).all():
+            raise BitstreamError("a vector is not finite")
+        return CodedVectors(codes, codebook, kept)
+
+    def _header(self, parts: Mapping[str, bytes], n: int) -> tuple[int, int, int]:
+        """Form of the indices, entries of the codebook, own vectors."""
+        data = _part(parts, "header")
+        if len(data) != HEADER.size:
+            raise BitstreamError(f"the header of the vectors is {len(data)} bytes, must be {HEADER.size}")
+        version, form, size, own = HEADER.unpack(data)
+        if version != VERSION or form not in (PACKED, RANGE_CODED):
+            raise BitstreamError(f"vectors of version {version}, form {form} are not known: upgrade sw-lightgaussian")
+        coded = n - own
+        if coded < 0 or size > min(coded, MAX_CODES) or (coded > 0 and size == 0):
+            raise BitstreamError(f"{size:,} codebook entries and {own:,} own vectors cannot be of {n:,} vectors")
+        return form, size, own
+
+    def _range(self, size: int, n: int) -> tuple[Any, Any]:
+        """The entropy model for n indices into `size` entries, and its context."""
+        model = self.plugins.entropy_models.load("categorical")
+        return model(), model.Context(max(size, 1), n)
+
+
+def _part(parts: Mapping[str, bytes], name: str) -> bytes:
+    if name not in parts:
+        raise BitstreamError(f"the part '{name}' of the vectors is missing")
+    return parts[name]
