@@ -173,8 +173,8 @@ def test_more_codes_lose_less(make):
 
 
 def forged(parts, **header):
-    version, form, size, own = HEADER.unpack(parts["header"])
-    fields = {"version": version, "form": form, "size": size, "own": own, **header}
+    names = ("version", "form", "n", "size", "own")
+    fields = {**dict(zip(names, HEADER.unpack(parts["header"]), strict=True)), **header}
     return {**parts, "header": HEADER.pack(*fields.values())}
 
 

@@ -4,7 +4,8 @@ Source: LightGaussian (arXiv 2311.17245), section on vector quantisation.
 
 Parts (docs/bitstream.md):
 
-    header      u8 version, u8 form of the indices (0 packed bits, 1 range coded), u32 codebook entries, u32 own vectors
+    header      u8 version, u8 form of the indices (0 packed bits, 1 range coded), u32 vectors n, u32 entries K of the
+                codebook, u32 own vectors k
     mask        a bit a vector, 1 where it keeps its own; `packed-bits`, these through `byte-planes`
     indices     of the other vectors, in order: `packed-bits`, or `categorical` where that is shorter
     codebook    float16 [K, d], `byte-planes`
@@ -31,7 +32,7 @@ if TYPE_CHECKING:
 
 VERSION = 1
 PACKED, RANGE_CODED = 0, 1
-HEADER = struct.Struct("<BBII")
+HEADER = struct.Struct("<BBIII")
 HALF_MAX = 65504.0
 MAX_CODES = 1 << 16
 
@@ -153,7 +154,7 @@ class ImportanceVQ:
             form, indices = RANGE_CODED, shorter
         mask = np.frombuffer(bits.encode(keeps.astype(np.uint8), 1), np.uint8)
         return {
-            "header": HEADER.pack(VERSION, form, size, len(coded.own)),
+            "header": HEADER.pack(VERSION, form, len(coded.codes), size, len(coded.own)),
             "mask": planes.encode(mask),
             "indices": indices,
             "codebook": planes.encode(coded.codebook),
@@ -189,9 +190,11 @@ class ImportanceVQ:
         data = _part(parts, "header")
         if len(data) != HEADER.size:
             raise BitstreamError(f"the header of the vectors is {len(data)} bytes, must be {HEADER.size}")
-        version, form, size, own = HEADER.unpack(data)
+        version, form, stated, size, own = HEADER.unpack(data)
         if version != VERSION or form not in (PACKED, RANGE_CODED):
             raise BitstreamError(f"vectors of version {version}, form {form} are not known: upgrade sw-lightgaussian")
+        if stated != n:
+            raise BitstreamError(f"there are {stated:,} vectors, expected {n:,}")
         coded = n - own
         if coded < 0 or size > min(coded, MAX_CODES) or (coded > 0 and size == 0):
             raise BitstreamError(f"{size:,} codebook entries and {own:,} own vectors cannot be of {n:,} vectors")
