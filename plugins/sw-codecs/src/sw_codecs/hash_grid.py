@@ -12,12 +12,13 @@ has the same features. Source: specification of the codec library, context model
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sw_codecs.rates import mask_bits
@@ -69,9 +70,9 @@ class HashGrid(nn.Module):
         binary      signs, without border vertices; else the numbers with all vertices
         """
         super().__init__()
-        if dimensions not in (2, 3) or not levels or features < 1 or not 1 <= log2_size <= 30:
-            raise ValueError("a hash grid has 2 or 3 axes, at least one level and feature, and tables of 2^1..2^30")
-        self.dimensions, self.features, self.binary = dimensions, features, binary
+        if dimensions not in (2, 3) or not levels or features < 1 or not 3 <= log2_size <= 30:
+            raise ValueError("a hash grid has 2 or 3 axes, at least one level and feature, and tables of 2^3..2^30")
+        self.dimensions, self.features, self.binary, self.log2_size = dimensions, features, binary, log2_size
         self.levels: list[Level] = []
         start = 0
         for scale, resolution in levels:
@@ -82,15 +83,18 @@ class HashGrid(nn.Module):
             self.levels.append(Level(scale, resolution, size, start, vertices <= size))
             start += size
         self.table = nn.Parameter((torch.rand(start, features, generator=generator) * 2 - 1) * INITIAL)
-        for name, values in (
-            ("scale", [level.scale for level in self.levels]),
-            ("resolution", [level.resolution for level in self.levels]),
-            ("size", [level.size for level in self.levels]),
-            ("start", [level.start for level in self.levels]),
-            ("dense", [level.dense for level in self.levels]),
-            ("corners", [[(c >> axis) & 1 for axis in range(dimensions)] for c in range(1 << dimensions)]),
+        # Dense levels come first in the buffers below; `order` brings features back into the order of the levels.
+        dense_first = sorted(range(len(self.levels)), key=lambda i: not self.levels[i].dense)
+        chosen = [self.levels[i] for i in dense_first]
+        self._dense = sum(level.dense for level in chosen)
+        self._in_order = dense_first == list(range(len(chosen)))
+        order = sorted(range(len(chosen)), key=lambda i: dense_first[i])
+        for name, values, dtype in (
+            ("scale", [level.scale for level in chosen], torch.float64),
+            ("last", [level.resolution - 1 for level in chosen], torch.int64),
+            ("start", [level.start for level in chosen], torch.int32),
+            ("order", order, torch.int64),
         ):
-            dtype = {"scale": torch.float64, "dense": torch.bool}.get(name, torch.int64)
             self.register_buffer(f"_{name}", torch.tensor(values, dtype=dtype), persistent=False)
 
     @classmethod
@@ -135,29 +139,29 @@ class HashGrid(nn.Module):
         values  `self.values()`, if the caller has them already
         """
         values = self.values() if values is None else values
-        n, levels, corners = len(x), len(self.levels), len(self._corners)
+        n, levels = len(x), len(self.levels)
         if n == 0:
             return values.new_zeros(0, self.width)
-        inside = ((x >= 0) & (x <= 1)).all(dim=1)
-        place = x.clamp(0, 1)[:, None] * self._scale.to(x.dtype)[:, None] + 0.5  # [n,L,d]
-        cell = torch.floor(place.detach())
-        part = place - cell
-        vertices = cell.to(torch.int64)[:, :, None] + self._corners  # [n,L,2^d,d]
-        factors = torch.where(self._corners > 0, part[:, :, None], 1 - part[:, :, None])
-        weights = _product(factors)
-        if self.binary:
-            weights = weights * self._not_border(vertices)
-            total = weights.sum(dim=2, keepdim=True)
-            weights = weights / torch.where(total > 0, total, torch.ones_like(total))
-            weights = weights * inside[:, None, None]
-        index = self._entries(vertices)
-        found = F.embedding_bag(
-            index.view(n * levels, corners),
-            values,
-            per_sample_weights=weights.reshape(n * levels, corners).to(values.dtype),
-            mode="sum",
-        )
-        return found.view(n, self.width)
+        inside = ((x >= 0) & (x <= 1)).all(dim=1, keepdim=True)
+        lower, ends = [], []
+        for coordinate in x.clamp(0, 1).unbind(1):
+            place = coordinate[:, None] * self._scale.to(x.dtype) + 0.5  # [n,L]
+            cell = torch.floor(place.detach())
+            part = place - cell
+            lower.append(cell.to(torch.int64))
+            near, far = 1 - part, part
+            if self.binary:
+                # A corner counts if none of its coordinates is on the border, so weights can be set to 0, and brought
+                # to sum 1, axis by axis.
+                near, far = self._off_border(near, far, lower[-1])
+                total = near + far
+                total = torch.where(total > 0, total, torch.ones_like(total))
+                near, far = near / total * inside, far / total * inside
+            ends.append((near, far))
+        weights = _corners(ends, torch.mul).to(values.dtype)
+        index = self._entries(lower)
+        found = _WeightedRows.apply(values, index.view(n * levels, -1), weights.view(n * levels, -1), levels)
+        return self._sorted(found.view(n, levels, self.features))
 
     def integer_features(self, codes: Tensor) -> Tensor:
         """[n, width] int64 with 12 fractional bits, of 16-bit codes [n,d] (x = code / 65535); integers alone.
@@ -168,42 +172,54 @@ class HashGrid(nn.Module):
             raise ValueError("only a binary hash grid is looked up in integers")
         if codes.shape[1:] != (self.dimensions,) or codes.is_floating_point():
             raise ValueError(f"position codes must be integers [n, {self.dimensions}], not {list(codes.shape)}")
-        signs = torch.where(self.table.detach() >= 0, 1, -1).to(torch.int64)
+        signs = torch.where(self.table.detach() >= 0, 1.0, -1.0).to(torch.float64)
         blocks = [self._integer_block(block, signs) for block in codes.to(torch.int64).split(INTEGER_ROWS)]
         return torch.cat(blocks) if blocks else codes.new_zeros(0, self.width, dtype=torch.int64)
 
     def _integer_block(self, codes: Tensor, signs: Tensor) -> Tensor:
-        n = len(codes)
         inside = ((codes >= 0) & (codes <= POSITION_TOP)).all(dim=1)
-        cells = (self._resolution - 2)[:, None]
-        at = codes.clamp(0, POSITION_TOP)[:, None] * cells << FRACTION  # below 2^44
-        place = torch.div(at, POSITION_TOP, rounding_mode="floor") + (1 << (FRACTION - 1))  # [n,L,d]
-        cell, part = place >> FRACTION, place & ((1 << FRACTION) - 1)
-        vertices = cell[:, :, None] + self._corners
-        factors = torch.where(self._corners > 0, part[:, :, None], (1 << FRACTION) - part[:, :, None])
-        weights = _product(factors) * self._not_border(vertices)  # [n,L,2^d], below 2^37
-        total = weights.sum(dim=2)
-        found = (signs[self._entries(vertices)] * weights[..., None]).sum(dim=2)  # [n,L,F]
+        lower, ends = [], []
+        for coordinate in codes.clamp(0, POSITION_TOP).unbind(1):
+            at = coordinate[:, None] * (self._last - 1) << FRACTION  # below 2^44
+            place = torch.div(at, POSITION_TOP, rounding_mode="floor") + (1 << (FRACTION - 1))  # [n,L]
+            part = place & ((1 << FRACTION) - 1)
+            lower.append(place >> FRACTION)
+            ends.append(self._off_border((1 << FRACTION) - part, part, lower[-1]))
+        weights = _corners(ends, torch.mul)  # [n,L,2^d]
+        total = weights.sum(dim=2)  # at most 2^36
+        # In float64, which is exact for sums of integers below 2^53, in whatever order.
+        index = self._entries(lower).flatten(0, 1)
+        sums = F.embedding_bag(index, signs, per_sample_weights=weights.flatten(0, 1).to(torch.float64), mode="sum")
+        found = sums.to(torch.int64).view(*total.shape, self.features)
         found = torch.div(found << FRACTION, total.clamp(min=1)[..., None], rounding_mode="floor")
-        return (found * inside[:, None, None]).reshape(n, self.width)
+        return self._sorted(found * inside[:, None, None])
 
-    def _not_border(self, vertices: Tensor) -> Tensor:
-        """[n,L,2^d] bool."""
-        last = (self._resolution - 1)[:, None, None]
-        return ((vertices > 0) & (vertices < last)).all(dim=3)
+    def _off_border(self, near: Tensor, far: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights [n,L] of the two ends of an axis, 0 where the end is a border vertex."""
+        return near * (lower > 0), far * (lower + 1 < self._last)
 
-    def _entries(self, vertices: Tensor) -> Tensor:
-        """[n,L,2^d] int64: entries of the table for vertices [n,L,2^d,d]; beyond the last vertex counts as it."""
-        last = (self._resolution - 1)[:, None, None]
-        p = torch.minimum(vertices.clamp(min=0), last)
-        resolution, size = self._resolution[:, None], self._size[:, None]
-        straight, hashed = p[..., 0], p[..., 0]
-        stride = resolution
-        for axis in range(1, self.dimensions):
-            straight = straight + p[..., axis] * stride
-            stride = stride * resolution
-            hashed = hashed ^ (p[..., axis] * PRIMES[axis] & 0xFFFFFFFF)
-        return torch.where(self._dense[:, None], straight, hashed % size) + self._start[:, None]
+    def _entries(self, lower: Sequence[Tensor]) -> Tensor:
+        """[n,L,2^d] int32: entries of the table for the corners of cells, [n,L] for each axis; beyond the last vertex
+        counts as it."""
+        dense, last = self._dense, self._last
+        straight, hashed = [], []
+        # All hashed tables have one size, a power of two: the remainder is a mask, which may be taken early.
+        mask = (1 << self.log2_size) - 1
+        for axis, cell in enumerate(lower):
+            ends = torch.minimum(cell, last), torch.minimum(cell + 1, last)
+            stride = (last[:dense] + 1) ** axis
+            straight.append(tuple((end[:, :dense] * stride).int() for end in ends))
+            hashed.append(tuple((end[:, dense:] * PRIMES[axis] & mask).int() for end in ends))
+        found = [_corners(straight, torch.add)] if dense else []
+        if dense < len(last):
+            found.append(_corners(hashed, torch.bitwise_xor))
+        return torch.cat(found, dim=1).add_(self._start[:, None])
+
+    def _sorted(self, found: Tensor) -> Tensor:
+        """[n, width] from [n,L,F] in the order of the buffers."""
+        if not self._in_order:
+            found = found[:, self._order]
+        return found.reshape(len(found), self.width)
 
     def extra_repr(self) -> str:
         kind = "binary" if self.binary else "real"
@@ -294,9 +310,39 @@ class MixedHashGrid(nn.Module):
         return [grid for grid in self.grids if isinstance(grid, HashGrid)]
 
 
-def _product(factors: Tensor) -> Tensor:
-    """Product over the last axis, factor by factor: its gradient needs no division."""
-    found = factors[..., 0]
-    for axis in range(1, factors.shape[-1]):
-        found = found * factors[..., axis]
-    return found
+def _corners(ends: Sequence[Sequence[Tensor]], combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """[n,L,2^d] from two tensors [n,L] for each axis; the first axis changes fastest."""
+    found = list(ends[0])
+    for axis in ends[1:]:
+        found = [combine(one, end) for end in axis for one in found]
+    return torch.stack(found, dim=2)
+
+
+class _WeightedRows(torch.autograd.Function):
+    """sum_c weights[b,c] values[index[b,c]]: torch's embedding_bag, with a backward that takes a seventh of its time.
+
+    Bag b belongs to level b % levels; the gradient is summed level by level, to bound memory.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, index: Tensor, weights: Tensor, levels: int) -> Tensor:
+        ctx.save_for_backward(values, index, weights)
+        ctx.levels = levels
+        return F.embedding_bag(index, values, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        values, index, weights = ctx.saved_tensors
+        features = values.shape[1]
+        for_values = for_weights = None
+        if ctx.needs_input_grad[0]:
+            for_values = torch.zeros_like(values)
+            flat, columns = for_values.view(-1), torch.arange(features, device=index.device)
+            for level in range(ctx.levels):
+                part = slice(level, None, ctx.levels)
+                places = index[part].to(torch.int64)[..., None] * features + columns
+                flat.scatter_add_(0, places.reshape(-1), (weights[part, :, None] * grad[part, None]).reshape(-1))
+        if ctx.needs_input_grad[2]:
+            for_weights = (values[index.to(torch.int64)] * grad[:, None]).sum(dim=2)
+        return for_values, None, for_weights, None
