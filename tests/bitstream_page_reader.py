@@ -61,6 +61,10 @@ class Bytes:
     def rest(self) -> bytes:
         return self.take(len(self.data) - self.at)
 
+    def bits(self) -> Iterator[str]:
+        """The rest, each byte from its least significant bit."""
+        return iter(f"{byte >> i & 1}" for byte in self.rest() for i in range(8))
+
     def done(self) -> None:
         check(self.at == len(self.data), "bytes are left")
 
@@ -399,6 +403,35 @@ class ExactTables:
         file.done()
 
 
+def escape(bits: Iterator[str]) -> tuple[bool, int]:
+    """A sign bit and an Exp-Golomb code."""
+    negative, zeros = next(bits) == "1", 0
+    while next(bits) == "0":
+        zeros += 1
+    return negative, int("1" + "".join(next(bits) for _ in range(zeros)), 2) - 1
+
+
+def density_tables(data: bytes, rows: int, width: int) -> list[list[int]]:
+    """`factorised` and `mixture`: the columns of the matrix."""
+    file = Bytes(data)
+    check(file.unpack("BIH") == (1, rows, width), "head of density tables")
+    crc = file.one("I")
+    spans = [(file.signed(), file.varint()) for _ in range(width)]
+    tables = stored_tables(file, [length + 1 for _, length in spans])
+    chunks = Bytes(file.take(file.varint()))
+    entries = coded_classes(chunks, tables, rows)
+    chunks.done()
+    bits, found = file.bits(), []
+    for (a, length), column in zip(spans, entries, strict=True):
+        values = [a + i for i in column]
+        for row in [row for row, i in enumerate(column) if i == length]:
+            negative, v = escape(bits)
+            values[row] = a - 1 - v if negative else a + length + v
+        found.append(values)
+    check(crc_i64([v for column in found for v in column]) == crc, "CRC of density tables")
+    return found
+
+
 def exact(
     data: bytes, family: str, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
 ) -> list[int]:
@@ -420,16 +453,13 @@ def exact(
         words = RangeWords(chunk.take(chunk.varint()))
         part = numbers[start : start + count]
         entries = symbols_by_table(words, tables.tables[family], part)
-        bits = iter(f"{byte >> i & 1}" for byte in chunk.rest() for i in range(8))
+        bits = chunk.bits()
         values = [0] * count
         for i in sorted(range(count), key=lambda i: part[i]):  # stable: table by table, in order
             radius = tables.radius[family][part[i] // 8]
             values[i] = entries[i] - radius
             if entries[i] == 2 * radius + 1:
-                negative, zeros = next(bits) == "1", 0
-                while next(bits) == "0":
-                    zeros += 1
-                v = int("1" + "".join(next(bits) for _ in range(zeros)), 2) - 1
+                negative, v = escape(bits)
                 values[i] = -(v + radius + 1) if negative else v + radius + 1
         values = [value + centre for value, centre in zip(values, centres[start : start + count], strict=True)]
         check(crc_i32(values) == crc, "CRC of a chunk")

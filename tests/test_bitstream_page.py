@@ -111,6 +111,8 @@ def test_it_decodes_the_payload_of_every_coder_and_entropy_model(name):
     decoders = {
         "columns_v1": lambda data: np.transpose(page.columns(data, *cases.matrix.shape)),
         "categorical_v1": lambda data: page.categorical(data, 9, 3, cases.categorical.index.tolist()),
+        "mixture_v1": lambda data: np.transpose(page.density_tables(data, 300, 2)),
+        "factorised_v1": lambda data: page.density_tables(data, 300, 1)[0],
         "bernoulli_v1": lambda data: page.bernoulli(data, 300),
         "gaussian_exact_v1": lambda data: page.exact(data, "gaussian", exact, *contexts),
         "laplace_exact_v1": lambda data: page.exact(data, "laplace", exact, *contexts),

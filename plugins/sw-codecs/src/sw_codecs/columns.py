@@ -41,7 +41,7 @@ class Columns:
 
         symbols [N, C] or [N] integers; float64 of the same shape, without the tables (about 100 bytes a column).
         """
-        matrix = _matrix(symbols.detach().cpu().numpy())
+        matrix = as_matrix(symbols.detach().cpu().numpy())
         found = np.zeros(matrix.shape)
         for c, column in enumerate(matrix.T):
             plan = choose_plan(np.ascontiguousarray(column))
@@ -54,7 +54,7 @@ class Columns:
 
     def encode(self, symbols: np.ndarray, context: Any = None) -> bytes:
         """Bytes of `symbols`. Raises ValueError for values beyond 2^60 or more than 2^30 elements."""
-        matrix = _matrix(symbols)
+        matrix = as_matrix(symbols)
         rows, columns = matrix.shape
         plans, tables, classes_of, raw, crc = [], [], [], [], 0
         for values in matrix.T:
@@ -68,7 +68,7 @@ class Columns:
             tables.append(np.bincount(classes, minlength=plan.size))
             classes_of.append(classes)
             raw.append(_pack_raw(codes, extra, plan.parameter))
-        chunks = _encode_classes(classes_of, [Table(rounded_counts(t)) for t in tables])
+        chunks = encode_classes(classes_of, [Table(rounded_counts(t)) for t in tables])
         head = bytes([VERSION]) + rows.to_bytes(4, "little") + columns.to_bytes(2, "little") + crc.to_bytes(4, "little")
         return b"".join(
             [head, *(p.pack() for p in plans), pack_tables(tables), write_varint(len(chunks)), chunks, *raw]
@@ -92,7 +92,7 @@ class Columns:
             tables.append(Table(counts))
         chunks = ByteReader(bytes(reader.take(reader.varint(reader.left))))
         matrix = np.empty((columns, rows), np.int64)
-        classes_of = _decode_classes(chunks, rows, tables)
+        classes_of = decode_classes(chunks, rows, tables)
         found_crc = 0
         for column, plan in zip(matrix, plans, strict=True):
             if plan.kind == CONSTANT:
@@ -111,7 +111,8 @@ class Columns:
         return matrix.T.reshape(context)
 
 
-def _matrix(symbols: np.ndarray) -> np.ndarray:
+def as_matrix(symbols: np.ndarray) -> np.ndarray:
+    """`symbols` as int64 [N, C]. Raises ValueError for what `columns` does not take."""
     symbols = np.asarray(symbols)
     if symbols.ndim not in (1, 2) or not np.issubdtype(symbols.dtype, np.integer):
         raise ValueError(f"columns take integers [N, C] or [N], not {symbols.dtype} {list(symbols.shape)}")
@@ -123,7 +124,7 @@ def _matrix(symbols: np.ndarray) -> np.ndarray:
     return matrix.astype(np.int64, copy=False)
 
 
-def _encode_classes(classes_of: list[np.ndarray], tables: list[Table]) -> bytes:
+def encode_classes(classes_of: list[np.ndarray], tables: list[Table]) -> bytes:
     """Chunks of at most 2^20 symbols: u32 byte length, u32 CRC-32 of the classes, range-coded words."""
     parts: list[bytes] = []
     writer = SymbolWriter()
@@ -145,7 +146,7 @@ def _encode_classes(classes_of: list[np.ndarray], tables: list[Table]) -> bytes:
     return b"".join(parts)
 
 
-def _decode_classes(chunks: ByteReader, rows: int, tables: list[Table]) -> Iterator[np.ndarray]:
+def decode_classes(chunks: ByteReader, rows: int, tables: list[Table]) -> Iterator[np.ndarray]:
     """The classes of each coded column, int64 [rows]; checks each chunk's CRC when it has been used up."""
     reader, crc = None, 0
     for number, table in enumerate(tables, 1):

@@ -34,12 +34,18 @@ class FloatContext:
     """What `bits` takes: mean, scale, step as float tensors that broadcast with the values, in the same unit.
 
     smallest_probability    floor of the probability of a value; the default is the coder's, HAC trains with 1e-6
+    grad_below_bound        whether what lies below the floor is still pulled (`sw_codecs.rates.lower_bound`)
     """
 
     mean: Tensor | float
     scale: Tensor | float
     step: Tensor | float = 1.0
     smallest_probability: float = CODER_FLOOR
+    grad_below_bound: bool = True
+
+    @property
+    def bound(self) -> dict[str, Any]:
+        return {"p_min": self.smallest_probability, "grad_below_bound": self.grad_below_bound}
 
 
 @dataclass(frozen=True)
@@ -151,7 +157,7 @@ class GaussianExact(ExactModel):
     family = "gaussian"
 
     def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
-        return gaussian_bits(symbols, context.mean, context.scale, context.step, p_min=context.smallest_probability)
+        return gaussian_bits(symbols, context.mean, context.scale, context.step, **context.bound)
 
 
 class LaplaceExact(ExactModel):
@@ -160,7 +166,7 @@ class LaplaceExact(ExactModel):
     family = "laplace"
 
     def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
-        return laplace_bits(symbols, context.mean, context.scale, context.step, p_min=context.smallest_probability)
+        return laplace_bits(symbols, context.mean, context.scale, context.step, **context.bound)
 
 
 def _check_symbols(symbols: Any) -> np.ndarray:

@@ -25,6 +25,12 @@ def register_entropy_models(registry: Registry) -> None:
                  summary="mean and scale per symbol, integers only: decodes on any machine")  # fmt: skip
     registry.add("laplace-exact", "sw_codecs.gaussian_exact:LaplaceExact",
                  summary="as gaussian-exact, Laplacian")  # fmt: skip
+    registry.add("gaussian", "sw_codecs.float_models:GaussianFloat",
+                 summary="float mean and scale per symbol: for training and comparison, same machine kind")  # fmt: skip
+    registry.add("laplace", "sw_codecs.float_models:LaplaceFloat", summary="as gaussian, Laplacian")
+    registry.add("mixture", "sw_codecs.mixture:Mixture", summary="weighted Gaussians or Laplacians, counts in the file")
+    registry.add("factorised", "sw_codecs.factorised:Factorised",
+                 summary="trained density per channel, counts in the file")  # fmt: skip
     registry.add("conditional-gaussian", "sw_codecs.conditional:ConditionalGaussian",
                  summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
 

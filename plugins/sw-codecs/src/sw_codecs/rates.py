@@ -1,4 +1,4 @@
-"""Rate estimates for training: bits per element under Gaussian, Laplace, Bernoulli and categorical models.
+"""Rate estimates for training: bits per element under Gaussian, Laplace, mixture, Bernoulli and categorical models.
 
 All are differentiable in every float argument, on any device. Source: specification of the codec library, entropy
 models (rate estimators).
@@ -39,8 +39,31 @@ def lower_bound(p: Tensor, bound: float, *, grad_below_bound: bool = True) -> Te
     return _LowerBound.apply(p, bound, grad_below_bound)
 
 
-def _bits(p: Tensor, p_min: float, grad_below_bound: bool) -> Tensor:
+def bits_of(p: Tensor, p_min: float, grad_below_bound: bool) -> Tensor:
+    """-log2 of probabilities, bounded below by p_min as `lower_bound` does it."""
     return -torch.log2(lower_bound(p, p_min, grad_below_bound=grad_below_bound))
+
+
+def gaussian_mass(x: Tensor, mu: Tensor | float, sigma: Tensor | float, step: Tensor | float = 1.0) -> Tensor:
+    """Probability of the bin [x - step/2, x + step/2] under N(mu, sigma).
+
+    Stable at any distance: |x - mu| is used, so no two numbers near 1 are subtracted.
+    """
+    away = (x - mu).abs()
+    scale = 1 / (torch.as_tensor(sigma, dtype=x.dtype, device=x.device) * math.sqrt(2))
+    return 0.5 * (torch.erfc((away - step / 2) * scale) - torch.erfc((away + step / 2) * scale))
+
+
+def laplace_mass(x: Tensor, mu: Tensor | float, b: Tensor | float, step: Tensor | float = 1.0) -> Tensor:
+    """Probability of the bin [x - step/2, x + step/2] under the density exp(-|x - mu| / b) / 2b; stable likewise."""
+    away = (x - mu).abs()
+    near, far = (away - step / 2) / b, (away + step / 2) / b
+    # Mirrored to the right of the mean: P = S(near) - S(far), S(t) = 1/2 exp(-t) for t >= 0, else 1 - 1/2 exp(t).
+    upper = torch.where(near >= 0, 0.5 * torch.exp(-near.clamp_min(0)), 1 - 0.5 * torch.exp(near.clamp_max(0)))
+    return upper - 0.5 * torch.exp(-far)
+
+
+MASSES = {"gaussian": gaussian_mass, "laplace": laplace_mass}
 
 
 def gaussian_bits(
@@ -54,13 +77,9 @@ def gaussian_bits(
 ) -> Tensor:
     """Bits of the bin [x - step/2, x + step/2] under N(mu, sigma); shape of x.
 
-    Stable at any distance: |x - mu| is used, so no two numbers near 1 are subtracted.
     p_min   HAC: 1e-6; 2^-24 compares with the coder
     """
-    away = (x - mu).abs()
-    scale = 1 / (torch.as_tensor(sigma, dtype=x.dtype, device=x.device) * math.sqrt(2))
-    p = 0.5 * (torch.erfc((away - step / 2) * scale) - torch.erfc((away + step / 2) * scale))
-    return _bits(p, p_min, grad_below_bound)
+    return bits_of(gaussian_mass(x, mu, sigma, step), p_min, grad_below_bound)
 
 
 def laplace_bits(
@@ -73,11 +92,29 @@ def laplace_bits(
     grad_below_bound: bool = True,
 ) -> Tensor:
     """Bits of the bin [x - step/2, x + step/2] under the density exp(-|x - mu| / b) / 2b; shape of x."""
-    away = (x - mu).abs()
-    near, far = (away - step / 2) / b, (away + step / 2) / b
-    # Mirrored to the right of the mean: P = S(near) - S(far), S(t) = 1/2 exp(-t) for t >= 0, else 1 - 1/2 exp(t).
-    upper = torch.where(near >= 0, 0.5 * torch.exp(-near.clamp_min(0)), 1 - 0.5 * torch.exp(near.clamp_max(0)))
-    return _bits(upper - 0.5 * torch.exp(-far), p_min, grad_below_bound)
+    return bits_of(laplace_mass(x, mu, b, step), p_min, grad_below_bound)
+
+
+def mixture_bits(
+    x: Tensor,
+    logits: Tensor,
+    mu: Tensor,
+    scale: Tensor,
+    step: Tensor | float = 1.0,
+    *,
+    family: str = "gaussian",
+    p_min: float = CODER_FLOOR,
+    grad_below_bound: bool = True,
+) -> Tensor:
+    """Bits of the bin [x - step/2, x + step/2] under sum_i softmax(logits)_i N(mu_i, scale_i); shape of x.
+
+    logits, mu, scale   [..., K], the leading axes broadcast with x; K components
+    step                a number, or broadcasts with x
+    family              "gaussian" or "laplace"
+    """
+    width = step[..., None] if isinstance(step, Tensor) and step.ndim else step
+    mass = MASSES[family](x[..., None], mu, scale, width)
+    return bits_of((torch.softmax(logits, -1) * mass).sum(-1), p_min, grad_below_bound)
 
 
 def bernoulli_bits(symbols: Tensor, p: Tensor | float) -> Tensor:
