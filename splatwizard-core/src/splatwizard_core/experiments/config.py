@@ -180,12 +180,13 @@ class ResolvedConfig:
         return tomli_w.dumps(_spell_none(content))
 
     def training_content(self) -> dict[str, Any]:
-        """Everything that training depends on: not the `codec` block, the device or the rate's name.
+        """Everything that training depends on: not the `ENCODING` fields, the device or the rate's name.
 
         A file that it reads counts by what it holds. What it starts from is told apart (`experiments.start`).
         """
         config = self.config_content()
-        config.pop("codec", None)
+        for name in type(self.config).ENCODING:
+            config.pop(name, None)
         run = self.ppl.model_dump(mode="json", include={"seed", "random_background", "clamp_render", "raster"})
         return {
             "method": self.method,

@@ -48,9 +48,11 @@ class OptimizationParams(Params):
     """Hyper-parameters of a method (`opt` in the paper's signature); each method subclasses it.
 
     FULL_ITERATIONS     the run length that the method's plans are written for
+    ENCODING            fields that only `encode` reads: rate points that differ in these alone share their training
     """
 
     FULL_ITERATIONS: ClassVar[int] = 30_000
+    ENCODING: ClassVar[tuple[str, ...]] = ("codec",)
 
     iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     scale_schedule: bool = Field(
