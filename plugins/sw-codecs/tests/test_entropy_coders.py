@@ -85,6 +85,23 @@ def test_huffman_turns_densities_into_tables(family, spec):
     assert bits - 500 < 8 * len(data) < bits + 500 + 8 * 24
 
 
+def test_huffman_bits_are_those_of_the_library_one_symbol_at_a_time():
+    r = rng(7)
+    fibonacci = [1, 1]
+    while len(fibonacci) < 72:  # codes of up to 71 bits: longer than a machine word
+        fibonacci.append(sum(fibonacci[-2:]))
+    for counts, n in ((np.exp(r.uniform(0, 20, (5, 30))).astype(int), 2000), (np.array([fibonacci]), 300)):
+        index, symbols = r.integers(0, len(counts), n), r.integers(0, counts.shape[1], n)
+        spec = Tables(counts, index)
+        trees = [constriction.symbol.huffman.EncoderHuffmanTree(row.astype(np.float32)) for row in counts]
+        encoder = constriction.symbol.QueueEncoder()
+        for symbol, table in zip(symbols, index, strict=True):
+            encoder.encode_symbol(int(symbol), trees[table])
+        data = HuffmanCoder().encode(symbols, spec)
+        assert data[coders.HEADER.size :] == encoder.get_compressed_and_bitrate()[0].astype("<u4").tobytes()
+        assert np.array_equal(HuffmanCoder().decode(data, n, spec), symbols)
+
+
 def test_huffman_refuses_what_has_no_table():
     with pytest.raises(ValueError, match="takes tables, not Bernoulli"):
         HuffmanCoder().encode(np.array([0, 1]), Bernoulli(0.5))

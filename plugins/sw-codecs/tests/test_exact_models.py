@@ -148,7 +148,7 @@ def test_another_context_is_found():
         IntegerContext(np.zeros(3), np.ones(3, int)),
         IntegerContext(np.zeros(2, int), np.ones(3, int)),
         IntegerContext(np.zeros(3, int), np.ones(3, int), 63),
-        IntegerContext(np.zeros(3, int), np.ones(3, int), 8193),
+        IntegerContext(np.zeros(3, int), np.ones(3, int), 16385),
         IntegerContext(np.full(3, 2**48), np.ones(3, int)),
         IntegerContext(np.full(3, 2**44), np.ones(3, int)),
     ],

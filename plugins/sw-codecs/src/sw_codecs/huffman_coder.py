@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import repeat
+
 import constriction
 import numpy as np
 import torch
@@ -23,13 +25,9 @@ class HuffmanCoder(ChunkedCoder):
 
     def _encode_chunk(self, symbols: np.ndarray, spec: ModelSpec) -> bytes:
         tables, index, low = _as_tables(spec, len(symbols))
-        encoder = constriction.symbol.QueueEncoder()
+        entry = index.astype(np.int64) * tables.shape[1] + (symbols - low)
         with guarded(ValueError, "Huffman coding"):
-            trees = [constriction.symbol.huffman.EncoderHuffmanTree(table) for table in tables]
-            for symbol, table in zip((symbols - low).tolist(), index.tolist(), strict=True):
-                encoder.encode_symbol(symbol, trees[table])
-            words, _ = encoder.get_compressed_and_bitrate()
-        return words.astype("<u4").tobytes()
+            return _written(tables, entry)
 
     def _decode_chunk(self, payload: memoryview, count: int, spec: ModelSpec) -> np.ndarray:
         if len(payload) % 4:
@@ -37,9 +35,41 @@ class HuffmanCoder(ChunkedCoder):
         tables, index, low = _as_tables(spec, count)
         with guarded(BitstreamError, "Huffman decoding"):
             trees = [constriction.symbol.huffman.DecoderHuffmanTree(table) for table in tables]
-            decoder = constriction.symbol.QueueDecoder(np.frombuffer(payload, "<u4").astype(np.uint32))
-            symbols = [decoder.decode_symbol(trees[table]) for table in index.tolist()]
+            decode = constriction.symbol.QueueDecoder(np.frombuffer(payload, "<u4").astype(np.uint32)).decode_symbol
+            which = repeat(trees[0], count) if len(trees) == 1 else map(trees.__getitem__, index.tolist())
+            symbols = list(map(decode, which))
         return np.array(symbols, np.int32) + np.int32(low)
+
+
+def _written(tables: np.ndarray, entry: np.ndarray) -> bytes:
+    """The codes of entries (table * alphabet + symbol) one after another, bits filling u32 words from the lowest."""
+    trees = [constriction.symbol.huffman.EncoderHuffmanTree(table) for table in tables]
+    is_used = np.bincount(entry) > 0
+    used = np.flatnonzero(is_used)
+    code, length = np.zeros(len(used), np.uint64), np.zeros(len(used), np.int64)
+    for i, (table, symbol) in enumerate(
+        zip(*(part.tolist() for part in np.divmod(used, tables.shape[1])), strict=True)
+    ):
+        alone = constriction.symbol.QueueEncoder()
+        alone.encode_symbol(symbol, trees[table])
+        words, length[i] = alone.get_compressed_and_bitrate()
+        code[i] = int.from_bytes(words[:2].astype("<u4").tobytes(), "little")
+    if length.max() > 64:  # counts that grow like Fibonacci numbers: rare enough to take the slow way
+        together = constriction.symbol.QueueEncoder()
+        for table, symbol in zip(*(part.tolist() for part in np.divmod(entry, tables.shape[1])), strict=True):
+            together.encode_symbol(symbol, trees[table])
+        return bytes(together.get_compressed_and_bitrate()[0].astype("<u4").tobytes())
+    which = (np.cumsum(is_used) - 1)[entry]
+    ends = np.cumsum(length[which])
+    starts = ends - length[which]
+    word, shift = starts >> 6, (starts & 63).astype(np.uint64)
+    out = np.zeros((int(ends[-1]) >> 6) + 1, np.uint64)
+    # At least one code starts in every word, for none is longer; at most one runs on from a word into the next.
+    firsts = np.flatnonzero(np.diff(word, prepend=-1))
+    out[word[firsts]] = np.bitwise_or.reduceat(code[which] << shift, firsts)
+    across = np.flatnonzero((ends - 1) >> 6 != word)
+    out[word[across] + 1] |= code[which[across]] >> (np.uint64(64) - shift[across])
+    return out.astype("<u8").tobytes()[: (int(ends[-1]) + 31) // 32 * 4]
 
 
 def _as_tables(spec: ModelSpec, n: int) -> tuple[np.ndarray, np.ndarray, int]:
