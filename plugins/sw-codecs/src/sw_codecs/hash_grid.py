@@ -79,7 +79,7 @@ class HashGrid(nn.Module):
             if not 2 <= resolution <= 1 << 16 or not 0 < scale <= resolution:
                 raise ValueError(f"a level of {resolution} vertices and scale {scale} is out of range")
             vertices = resolution**dimensions
-            size = -(-min(1 << log2_size, vertices) // 8) * 8
+            size = table_size(resolution, dimensions, log2_size)
             self.levels.append(Level(scale, resolution, size, start, vertices <= size))
             start += size
         self.table = nn.Parameter((torch.rand(start, features, generator=generator) * 2 - 1) * INITIAL)
@@ -260,6 +260,12 @@ class MixedHashGrid(nn.Module):
             for axes in self.AXES
         )
 
+    @staticmethod
+    def count(space: Sequence[int], planes: Sequence[int], *, features: int, log2_space: int, log2_planes: int) -> int:
+        """`entries` of such a grid, before anything is allocated."""
+        sizes = [table_size(r, 3, log2_space) for r in space] + 3 * [table_size(r, 2, log2_planes) for r in planes]
+        return features * sum(sizes)
+
     @property
     def width(self) -> int:
         """Number of outputs."""
@@ -308,6 +314,11 @@ class MixedHashGrid(nn.Module):
 
     def _all(self) -> list[HashGrid]:
         return [grid for grid in self.grids if isinstance(grid, HashGrid)]
+
+
+def table_size(resolution: int, dimensions: int, log2_size: int) -> int:
+    """Entries of a level: an entry for every vertex if they fit, a multiple of 8."""
+    return -(-min(1 << log2_size, resolution**dimensions) // 8) * 8
 
 
 def _corners(ends: Sequence[Sequence[Tensor]], combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:

@@ -35,11 +35,13 @@ class AnchorContext:
 
     means, scales   [V,C] of each group: mean and standard deviation of every number; scales may be <= 0 (see `rate`)
     steps           [V,1] of each group: quantiser step of the anchor
+    own_bits        scalar, differentiable: bits of all that the context model itself stores, if it has come along
     """
 
     means: Triple
     scales: Triple
     steps: Triple
+    own_bits: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -50,11 +52,13 @@ class AnchorRate:
                 anchors that are kept; 0 for an empty sample
     by_group    [3] bits of features, scales and offsets in the sample, detached
     numbers     how many numbers the sample has
+    own_bits    of the context
     """
 
     bits: Tensor
     by_group: Tensor
     numbers: int
+    own_bits: Tensor | None = None
 
 
 class CodedAnchors(AnchorModel):
@@ -236,7 +240,7 @@ class CodedAnchors(AnchorModel):
         numbers = len(drawn) * sum(v.shape[1] for v in values)
         if numbers == 0:
             nothing = self.mask_logits.new_zeros(())
-            return AnchorRate(nothing, nothing.new_zeros(3), 0)
+            return AnchorRate(nothing, nothing.new_zeros(3), 0, context.own_bits)
         # An anchor's three coordinates of an offset share its mask.
         factors = (None, None, masks[drawn].repeat_interleave(3, dim=1))
         bits = []
@@ -250,7 +254,7 @@ class CodedAnchors(AnchorModel):
             bits.append((found if factor is None else found * factor).sum())
         share = kept.to(bits[0]).mean()
         total = torch.stack(bits)
-        return AnchorRate(total.sum() / numbers * share, total.detach(), numbers)
+        return AnchorRate(total.sum() / numbers * share, total.detach(), numbers, context.own_bits)
 
     # State
 

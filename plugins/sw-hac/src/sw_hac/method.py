@@ -1,0 +1,69 @@
+"""HAC as a method: what it starts from, how it trains, and what its file is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.experiments.method import Method
+from sw_hac import codec
+from sw_hac.config import HACConfig
+from sw_hac.model import HACAnchors
+from sw_hac.presets import PRESETS, RATES
+from sw_hac.stage import HACStage
+
+if TYPE_CHECKING:
+    import torch
+
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.scene.scene import Scene
+    from splatwizard_core.training.stage import Stage
+
+
+class HAC(Method):
+    """Chen, Wu, Lin, Harandi, Cai: HAC: Hash-grid Assisted Context for 3D Gaussian Splatting Compression, ECCV 2024.
+
+    Source: arXiv 2403.14530.
+    """
+
+    name: ClassVar[str] = "hac"
+    version: ClassVar[int] = 1
+    Config = HACConfig
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
+    DEFAULT_RATE: ClassVar[str] = "r4"
+
+    def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
+        """An anchor for every voxel with a start point of the scene."""
+        if scene.points is None or len(scene.points) == 0:
+            raise SceneError(
+                f"scene '{scene.name}' has no start points: HAC needs SfM points or random ones", path=scene.path
+            )
+        c: HACConfig = self.config
+        grid = self.plugins.context_models.load("hash-grid")(
+            c.grid.space, c.grid.planes, features=c.grid.features, log2_space=c.grid.log2_space,
+            log2_planes=c.grid.log2_planes, generator=generator,
+        )  # fmt: skip
+        return HACAnchors.from_points(
+            scene.points, voxel_size=c.voxel_size, num_offsets=c.num_offsets, feature_dim=c.feature_dim,
+            hidden=c.hidden, margin=c.bound_margin, sample=c.rate.sample, generator=generator,
+            entropy=self.plugins.entropy_models.load("gaussian-exact")(), grid=grid, grid_hidden=c.grid.hidden,
+        )  # fmt: skip
+
+    def stages(self) -> Sequence[Stage]:
+        return [HACStage(self.config)]
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        if not isinstance(model, HACAnchors):
+            raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
+        codec.encode(model, writer, self.config.codec, self.plugins)
+
+    def decode(self, reader: ContainerReader) -> SplatModel:
+        if reader.version != self.version:
+            raise BitstreamError(
+                f"{reader.name}: hac layout version {reader.version} is unknown, this installation reads "
+                f"{self.version}: upgrade sw-hac"
+            )
+        return codec.decode(reader, self.plugins)

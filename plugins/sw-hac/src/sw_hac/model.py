@@ -1,0 +1,89 @@
+"""The model: anchors, a binary hash grid over their positions, and a network that makes distributions of both.
+
+For an anchor at u in [0,1]^3 the network gives mean and deviation of its F features, 6 scales and 3k coordinates of
+offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t) with Q0 = 1, 0.001 and 0.2.
+Source: HAC (arXiv 2403.14530), section 4.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.gaussians.anchor_lattice import TOP
+from splatwizard_core.gaussians.anchors import two_layers
+from splatwizard_core.gaussians.coded_anchors import AnchorContext, CodedAnchors
+
+BASE_STEPS = (1.0, 0.001, 0.2)
+"""Q0 of features, scales and offsets."""
+SMALLEST_STEP = 1 / 64
+"""Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
+
+
+def group_widths(feature_dim: int, num_offsets: int) -> tuple[int, int, int]:
+    """Numbers an anchor has in each group."""
+    return feature_dim, 6, 3 * num_offsets
+
+
+def output_widths(feature_dim: int, num_offsets: int) -> list[int]:
+    """Outputs of the network in order: mean and deviation of each group, then the three steps; 175 as published."""
+    return [w for width in group_widths(feature_dim, num_offsets) for w in (width, width)] + [1, 1, 1]
+
+
+class HACAnchors(CodedAnchors):
+    """CodedAnchors with the grid and its network.
+
+    grid        hash grid over the box of the anchors, signs
+    mlp_grid    from its features to `output_widths`
+    """
+
+    mlp_grid: nn.Sequential
+
+    def __init__(
+        self, *tensors: Tensor, grid: Any, grid_hidden: int, generator: torch.Generator, **kwargs: Any
+    ) -> None:
+        """As CodedAnchors.
+
+        grid        a MixedHashGrid of the registry's context model `hash-grid`
+        grid_hidden width of the network behind it
+        """
+        super().__init__(*tensors, generator=generator, base_steps=BASE_STEPS, **kwargs)
+        widths = output_widths(self.features.shape[1], self.num_offsets)
+        self.grid = grid.to(self.features)
+        self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
+
+    def networks(self) -> dict[str, nn.Module]:
+        """What the file holds besides the grid, in its order."""
+        return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
+
+    def predict(self, rows: Tensor) -> AnchorContext:
+        features, bits = self.grid.with_bits(self.codes()[rows].to(self.features) / TOP)
+        return context_of(self.mlp_grid(features), self.features.shape[1], self.num_offsets, own_bits=bits)
+
+    @torch.no_grad()
+    def start_from_statistics(self) -> None:
+        """Let the network predict mean and deviation of each number over all kept anchors, wherever they are.
+
+        Its last layer keeps a hundredth of its weights, so that the grid has a gradient from the first step on.
+        """
+        rows = torch.nonzero(self.kept()).squeeze(1)
+        if len(rows) < 2:
+            return
+        last = self.mlp_grid[2]
+        last.weight.mul_(0.01)
+        found = []
+        for values, step in zip(self.raw(rows), BASE_STEPS, strict=True):
+            found += [values.mean(dim=0), values.std(dim=0).clamp(min=step)]
+        last.bias.copy_(torch.cat([*found, last.bias.new_zeros(3)]))
+
+
+def context_of(outputs: Tensor, feature_dim: int, num_offsets: int, *, own_bits: Tensor | None = None) -> AnchorContext:
+    """The context in float outputs [V, sum of output_widths]."""
+    parts: Sequence[Tensor] = torch.split(outputs, output_widths(feature_dim, num_offsets), dim=1)
+    steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(BASE_STEPS, parts[6:], strict=True)]
+    return AnchorContext(
+        (parts[0], parts[2], parts[4]), (parts[1], parts[3], parts[5]), (steps[0], steps[1], steps[2]), own_bits
+    )

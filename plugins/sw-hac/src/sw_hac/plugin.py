@@ -1,0 +1,11 @@
+"""What this package provides: the method hac."""
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("hac", "sw_hac.method:HAC",
+                 summary="anchors whose attributes a binary hash grid predicts (Chen et al. 2024)",
+                 presets=["paper", "quick"],
+                 rates=["r1", "r2", "r3", "r4", "r5"])  # fmt: skip
