@@ -9,7 +9,13 @@ import torch
 from PIL import Image
 
 from splatwizard_core.errors import BitstreamError, CapabilityError, SceneError
-from splatwizard_core.evaluation.evaluate import evaluate, png_names, raster_header, render_options
+from splatwizard_core.evaluation.evaluate import (
+    evaluate,
+    png_names,
+    raster_header,
+    render_options,
+    suggested_rasterizers,
+)
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins.registry import Registry
@@ -156,3 +162,14 @@ def test_a_file_that_asks_for_nonsense_is_refused(raster: dict[str, object]):
 
 def test_what_a_file_says_to_its_method_does_not_disturb():
     assert raster_header(render_options({"sh_degree": 3, "eps2d": 1}, None)) == {"eps2d": 1.0}
+
+
+def test_a_file_may_suggest_rasterizers_by_name():
+    assert suggested_rasterizers({}) == ()
+    assert suggested_rasterizers({"prefer": ["flash", "standard"]}) == ("flash", "standard")
+
+
+@pytest.mark.parametrize("prefer", ["flash", [1], ["x"] * 17, ["x" * 65], {"flash": 1}, None])
+def test_suggestions_that_are_no_short_list_of_names_are_refused(prefer):
+    with pytest.raises(BitstreamError, match="prefers the rasterizers"):
+        suggested_rasterizers({"prefer": prefer})

@@ -172,6 +172,15 @@ def test_approximate_results_must_be_accepted(plugins, scene):
     assert (default.choices["plain"], lenient.choices["plain"]) == ("reference", "half")
 
 
+@pytest.mark.parametrize("how", ["prefer", "suggested"])
+def test_an_approximate_one_serves_whoever_asks_for_it_by_name(plugins, scene, how):
+    plugins.install("half", exactness="approx-fp16", speed=50)
+    plugins.install("quarter", exactness="approx-uint8", speed=60)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu", **{how: ["half"]})
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices["plain"] == "half"
+
+
 def test_forbidden_combinations_are_respected(plugins, scene):
     plugins.install("either", "ALPHA_MAP", "DEPTH_MEDIAN", combos_forbidden=[["ALPHA_MAP", "DEPTH_MEDIAN"]])
     rasterizer = NegotiatedRasterizer(plugins, device="cpu")

@@ -92,6 +92,17 @@ def render_options(raster: Mapping[str, Any], background: Tensor | None) -> Rast
     return RasterOptions(background=background, **asked)
 
 
+def suggested_rasterizers(raster: Mapping[str, Any]) -> tuple[str, ...]:
+    """Names of the rasterizers that a file would like to be drawn with, `prefer` in its header, best first.
+
+    What is not installed or cannot run here is passed over. Raises BitstreamError if that is no short list of names.
+    """
+    names = raster.get("prefer", [])
+    if not isinstance(names, list) or len(names) > 16 or not all(isinstance(n, str) and len(n) <= 64 for n in names):
+        raise BitstreamError(f"the file prefers the rasterizers {names!r:.80}, which is no list of at most 16 names")
+    return tuple(names)
+
+
 def raster_header(options: RasterOptions) -> dict[str, Any]:
     """The inverse of `render_options`: what of `options` belongs into the file, since it changes the picture."""
     default = RasterOptions()

@@ -101,7 +101,7 @@ def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -
 def _not_finished(directory: Path) -> UserInputError:
     return UserInputError(
         f"{directory} holds no finished training of this configuration: "
-        f"`sw train --config {directory}/config.toml` makes it (only `codec` keys may differ)"
+        f"`sw train --config {directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
     )
 
 

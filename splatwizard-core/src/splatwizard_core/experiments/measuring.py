@@ -19,6 +19,7 @@ from splatwizard_core.evaluation.evaluate import (
     render_options,
     render_view,
     save_png,
+    suggested_rasterizers,
 )
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.experiments.decoding import import_method, open_model
@@ -74,7 +75,7 @@ def measure(
     scene = load_scene()
     background = scene.background.to(device)
     options = render_options(raster, background)
-    rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=ppl.raster.prefer, forbid=ppl.raster.forbid)
+    rasterizer = _rasterizer_for(raster, plugins, device, ppl)
     views = scene.test
 
     meter.start()
@@ -195,6 +196,19 @@ def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable
     return open_file
 
 
+def _rasterizer_for(
+    raster: dict[str, Any], plugins: PluginManager, device: torch.device, ppl: PipelineParams
+) -> NegotiatedRasterizer:
+    """What draws a decoded scene: the user's choice first, then the file's."""
+    return NegotiatedRasterizer(
+        plugins,
+        device=device,
+        prefer=ppl.raster.prefer,
+        forbid=ppl.raster.forbid,
+        suggested=suggested_rasterizers(raster),
+    )
+
+
 def render_views(
     model: SplatModel,
     raster: dict[str, Any],
@@ -207,7 +221,7 @@ def render_views(
 ) -> list[str]:
     """Draw views as PNG into `folder`; the file names."""
     options = render_options(raster, background.to(device))
-    rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=ppl.raster.prefer, forbid=ppl.raster.forbid)
+    rasterizer = _rasterizer_for(raster, plugins, device, ppl)
     folder.mkdir(parents=True, exist_ok=True)
     names = png_names([view.name for view in views])
     model.prepare()

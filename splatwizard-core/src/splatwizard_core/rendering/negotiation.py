@@ -89,8 +89,8 @@ class NegotiatedRasterizer:
     device      where the tensors will be
     prefer      names to take first if they can serve, best first (the user's choice)
     forbid      names never to take
-    exactness   which kinds of result are acceptable
-    suggested   further names to prefer, after `prefer`, ignored where not installed (a method's own choice)
+    exactness   which kinds of result are acceptable from one that nobody prefers by name
+    suggested   further names to prefer, after `prefer`, ignored where not installed (a method's or a file's own choice)
 
     Order: preferred ones; then fast ones that serve directly; then fast ones behind an adapter; then those of speed
     0, the oracle. Within each, the higher speed. A rasterizer whose native module cannot be built is left out with
@@ -217,7 +217,9 @@ class NegotiatedRasterizer:
         return [
             (entry, info.on(self.device.type))
             for entry, info in self._readable
-            if self.device.type in info.devices and entry.name not in self._forbid and info.exactness in self._exactness
+            if self.device.type in info.devices
+            and entry.name not in self._forbid
+            and (info.exactness in self._exactness or entry.name in self._prefer)
         ]
 
     def _best(self, wanted: frozenset[str]) -> tuple[_Candidate, str | None]:
@@ -272,7 +274,7 @@ class NegotiatedRasterizer:
             + (f" lacks {', '.join(sorted(wanted - i.features))}" if wanted - i.features else "")
             + (f" draws nothing without {', '.join(sorted(i.needs - wanted))}" if i.needs - wanted else "")
             + (" is forbidden" if i.name in self._forbid else "")
-            + (f" is {i.exactness}" if i.exactness not in self._exactness else "")
+            + (f" is {i.exactness}" if i.exactness not in self._exactness and i.name not in self._prefer else "")
             for i in near
         ]
         reasons = [f"{name}: {reason}" for name, reason in unavailable]
