@@ -1,0 +1,75 @@
+"""LightGaussian: prune a trained 3DGS scene by global significance, distil it, vector-quantise its colours."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.gaussians.model import GaussianModel
+from sw_lightgaussian.config import LightGaussianConfig
+from sw_lightgaussian.presets import PRESETS, RATES
+from sw_lightgaussian.significance import Significance
+from sw_lightgaussian.stages import DistillStage, PruneStage
+
+if TYPE_CHECKING:
+    import torch
+
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.scene.scene import Scene
+    from splatwizard_core.training.pruner import Pruner
+    from splatwizard_core.training.stage import Stage
+
+
+class LightGaussian(Method):
+    """Fan, Wang, Wen, Zhu, Xu, Wang: LightGaussian: Unbounded 3D Gaussian Compression with 15x Reduction and 200+ FPS.
+
+    Source: arXiv 2311.17245 (NeurIPS 2024), and facts about the authors' code where the two differ.
+    """
+
+    name: ClassVar[str] = "lightgaussian"
+    version: ClassVar[int] = 1
+    Config = LightGaussianConfig
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
+    DEFAULT_RATE: ClassVar[str] = "r3"
+
+    def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
+        """Of no use to the first stage, which starts from a trained 3DGS scene: the start of such a scene."""
+        return create_method(self.plugins, "3dgs").create_model(scene, generator)
+
+    def stages(self) -> Sequence[Stage]:
+        return [PruneStage(self.config, self._pruner()), DistillStage(self.config, self._significance())]
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"lightgaussian encodes a GaussianModel, not a {type(model).__name__}")
+        codec = self.config.codec
+        settings = {
+            "ratio": codec.vq_ratio, "size": codec.codebook_size, "iterations": codec.vq_iterations,
+            "batch": codec.vq_batch, "decay": codec.vq_decay, "reseed": codec.vq_reseed,
+            "training": codec.vq_training,
+        }  # fmt: skip
+        encode_gaussians(self.plugins, codec.name, model, writer, **(settings if codec.name == "vectree" else {}))
+
+    def decode(self, reader: ContainerReader) -> SplatModel:
+        if reader.version != self.version:
+            raise BitstreamError(
+                f"{reader.name}: lightgaussian layout version {reader.version} is unknown, this installation reads "
+                f"{self.version}: upgrade sw-lightgaussian"
+            )
+        return decode_gaussians(self.plugins, reader)
+
+    def _significance(self) -> Significance:
+        return Significance(**self.config.score.model_dump())
+
+    def _pruner(self) -> Pruner:
+        """The one that the config names; settings are known of the own one alone."""
+        name: str = self.config.prune.pruner
+        if name == "lightgaussian":
+            return self._significance()
+        pruner: Pruner = self.plugins.pruners.load(name)()
+        return pruner

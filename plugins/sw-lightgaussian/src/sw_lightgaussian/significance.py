@@ -1,0 +1,104 @@
+"""Pruner `lightgaussian`: how much light each Gaussian may catch over all training views, times a power of its volume.
+
+Source: LightGaussian (arXiv 2311.17245), section on global significance, and facts about the authors' code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Literal
+
+import torch
+
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.rendering.rasterizer import Rasterizer
+    from splatwizard_core.scene.camera import Camera
+
+Kind = Literal["v_important_score", "important_score", "max_v_important_score", "count", "opacity"]
+VolumeNorm = Literal["unclamped", "paper_clamp"]
+
+
+class Significance:
+    """Scores by name as in the authors' code; sums run over every pixel of every view that a Gaussian is blended into.
+
+    kind                v_important_score: sum of opacity x transmittance, times (volume / reference)^v_pow;
+                        important_score: that sum; max_v_important_score: it times the largest scale;
+                        count: how many pixels; opacity: the opacity of what is seen at all
+    v_pow               0: the volume does not count
+    volume_norm         unclamped: the reference, a small volume, changes no order; paper_clamp: it is the 90th
+                        percentile, and no ratio is above 1
+    use_transmittance   False: the sum is of opacities alone (the scores of early versions of the paper)
+
+    It is the opacity itself, not alpha: a hit at the rim of a splat counts as much as one at its centre.
+    """
+
+    uses_statistics = False
+
+    def __init__(
+        self,
+        *,
+        kind: Kind = "v_important_score",
+        v_pow: float = 0.1,
+        volume_norm: VolumeNorm = "unclamped",
+        use_transmittance: bool = True,
+    ) -> None:
+        self.kind, self.v_pow, self.volume_norm, self.use_transmittance = kind, v_pow, volume_norm, use_transmittance
+
+    def score(
+        self, model: SplatModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None = None
+    ) -> Tensor:
+        """[N] float64 >= 0; -inf for what no camera sees. Raises TypeError for a model without Gaussians of its own."""
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"the pruner 'lightgaussian' scores a GaussianModel, not a {type(model).__name__}")
+        hits, caught = self._sums(model, cameras, rasterizer, background)
+        if self.kind == "count":
+            found = hits.double()
+        elif self.kind == "opacity":
+            found = model.opacities.detach().double()
+        else:
+            found = caught * self._factor(model.log_scales.detach().double())
+        return torch.where(hits > 0, found, -torch.inf)
+
+    def _factor(self, log_scales: Tensor) -> Tensor | float:
+        """[N], what the sum is multiplied by."""
+        if self.kind == "max_v_important_score":
+            return log_scales.amax(dim=1).exp()
+        return volume_factor(log_scales, self.v_pow, self.volume_norm) if self.kind == "v_important_score" else 1.0
+
+    @torch.no_grad()
+    def _sums(
+        self, model: GaussianModel, cameras: Sequence[Camera], rasterizer: Rasterizer, background: Tensor | None
+    ) -> tuple[Tensor, Tensor]:
+        """[N] int64 pixels and [N] float64 sum of opacity x transmittance, over all views."""
+        kind = "opacity_T" if self.use_transmittance else "opacity"
+        options = RasterOptions(background=background, scores=(ScoreSpec("hits", "hits"), ScoreSpec("caught", kind)))
+        hits = torch.zeros(model.num_rows, dtype=torch.int64, device=model.device)
+        caught = torch.zeros(model.num_rows, dtype=torch.float64, device=model.device)
+        for camera in cameras:
+            camera = camera.to(model.device)
+            # One view at a time: a rasterizer returns its sums as int32 and float32.
+            view = rasterizer.accumulate(model.gaussians(camera, rasterizer), [camera], options).scores
+            hits += view["hits"]
+            caught += view["caught"]
+        return hits, caught
+
+
+def volume_factor(log_scales: Tensor, v_pow: float, norm: VolumeNorm = "unclamped") -> Tensor:
+    """(V / V_ref)^v_pow [N] for log_scales [N,3], V their exponential's product; V_ref and norm: see Significance."""
+    log_volume = log_scales.sum(dim=1)
+    n = len(log_volume)
+    if n == 0:
+        return log_volume
+    descending = log_volume.sort(descending=True).values
+    # Logarithms, since the volume of three tiny scales underflows.
+    if norm == "paper_clamp":
+        ratio = (log_volume - descending[min(int(0.1 * n), n - 1)]).clamp_max(0)
+    else:
+        ratio = log_volume - descending[int(0.9 * n)]
+    return (v_pow * ratio).exp()

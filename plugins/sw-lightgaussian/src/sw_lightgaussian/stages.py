@@ -1,0 +1,126 @@
+"""The two training stages: prune and recover, then distil into fewer SH bands."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.training.distillation import DistillationStage
+from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
+from splatwizard_core.training.pruner import Pruner
+from splatwizard_core.training.pruning import PruneByScore, scores_of
+from splatwizard_core.training.stage import CameraIterator
+from sw_lightgaussian.config import LightGaussianConfig
+
+if TYPE_CHECKING:
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.training.params import OptimizationParams, PipelineParams
+    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.training.stage import StageContext
+
+log = logging.getLogger(__name__)
+
+
+class PruneStage(FineTuningStage):
+    """Removes the least significant Gaussians of a trained 3DGS scene at its first step, and trains the others on."""
+
+    name = "prune"
+    rates_plan = range(5_000)
+
+    def __init__(self, config: LightGaussianConfig, pruner: Pruner) -> None:
+        super().__init__(config, config.prune.lr, lambda_dssim=config.lambda_dssim)
+        self.config, self.pruner = config, pruner
+        self.statistics = pruner.uses_statistics
+
+    @property
+    def iterations(self) -> int:
+        return max(1, round(self.config.prune.iterations * self.opt.schedule_scale))
+
+    def fractions(self) -> dict[int, float]:
+        """Step of this run -> share that goes."""
+        prune = self.config.prune
+        steps = self.when(list(prune.steps))
+        assert isinstance(steps, list)
+        if len(steps) < len(set(prune.steps)) or 0 in steps:
+            raise ConfigError(
+                f"prune.steps {prune.steps} must be steps from 1 on that do not fall together in this run"
+            )
+        return {step: prune.percent * prune.decay**i for i, step in enumerate(sorted(steps))}
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        fractions = self.fractions()
+        if self.statistics and fractions:
+            scheduler.register_task(range(max(fractions) + 1), collect_statistics, name="collect gradient statistics")
+        steps = list(fractions)
+        when = steps[0] if len(steps) == 1 else steps
+        scheduler.register_task(when, PruneByScore(self.pruner, fractions), name="prune")
+
+
+class ScoredGaussians(GaussianModel):
+    """Gaussians that know how significant each one is.
+
+    importance  [N] buffer, >= 0; zeros until it is computed
+    """
+
+    ROWS = (*GaussianModel.ROWS, "importance")
+
+    importance: Tensor
+
+    def __init__(self, *tensors: Tensor, active_sh_degree: int | None = None) -> None:
+        super().__init__(*tensors, active_sh_degree=active_sh_degree)
+        self.register_buffer("importance", torch.zeros_like(self.opacity_logits))
+
+
+class KeepImportance:
+    """Schedule task: scores every Gaussian over the training views and lets the model keep it."""
+
+    def __init__(self, pruner: Pruner) -> None:
+        self.pruner = pruner
+
+    def __call__(self, model: GaussianModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
+        found = scores_of(self.pruner, model, cameras, rasterizer, scene)
+        assert isinstance(model, ScoredGaussians)
+        model.importance.copy_(found.clamp_min(0))
+
+
+class DistillStage(DistillationStage):
+    """Drops the highest SH bands and learns from the renders of the unpruned scene, also from moved poses."""
+
+    rates_plan = range(5_000)
+
+    def __init__(self, config: LightGaussianConfig, significance: Pruner) -> None:
+        distill = config.distill
+        super().__init__(
+            config,
+            distill.lr,
+            distill_loss=distill.loss,
+            lambda_dssim=config.lambda_dssim,
+            pseudo_view_std=distill.pseudo_view_std,
+            pseudo_view_every=3 if distill.pseudo_views else 1,
+        )
+        self.sh_degree, self.significance = distill.sh_degree, significance
+
+    def begin(self, context: StageContext) -> SplatModel:
+        """The model with its lower bands, before there is an optimizer: what is cut later is never trained."""
+        model = super().begin(context)
+        assert isinstance(model, GaussianModel)
+        return truncated(model, self.sh_degree)
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        # The last step makes no update, so the score belongs to the parameters that are encoded.
+        scheduler.register_task(self.iterations, KeepImportance(self.significance), name="calculate importance score")
+
+
+def truncated(model: GaussianModel, degree: int) -> ScoredGaussians:
+    """The Gaussians without the SH bands above `degree`; copies."""
+    degree = min(degree, model.max_sh_degree)
+    rest = model.sh_rest[:, : (degree + 1) ** 2 - 1]
+    tensors = (model.means, model.sh_dc, rest, model.opacity_logits, model.log_scales, model.quats)
+    return ScoredGaussians(*(t.detach().clone() for t in tensors))
