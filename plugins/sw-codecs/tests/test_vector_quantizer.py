@@ -33,11 +33,11 @@ def test_assignment_is_the_brute_force_nearest():
 def test_kmeans_error_falls_and_ends_at_the_cluster_means():
     x, _, _ = blobs()
     vq = VectorQuantizer(60, block=300)
-    errors = vq.fit(x, generator=gen(), iterations=12)
+    errors = vq.fit(x, generator=gen(), iterations=12, spread=False)
     assert (errors.diff() <= 1e-6).all()
     assert errors[-1] < 0.8 * errors[0]
-    index = vq.assign(x)
-    vq.fit(x, generator=gen(), iterations=200)
+    assert vq.fit(x, generator=gen(), iterations=1) < 0.8 * errors[0]  # what the better start is for
+    vq.fit(x, generator=gen(), iterations=60)
     index = vq.assign(x)
     for j in index.unique():
         torch.testing.assert_close(vq.codebook[j], x[index == j].mean(0), rtol=1e-4, atol=1e-4)

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError, ShapeError
-
-EPSILON = 1e-5  # Laplace smoothing of the EMA counts
+from sw_codecs.codebook_training import RULES, smoothed, train_codebook
+from sw_codecs.kmeans import kmeans
+from sw_codecs.nearest import nearest
+from sw_codecs.stored_codebook import read_codebook, settled
+from sw_codecs.straight_through import straight_through
+from sw_codecs.weighted_rows import draw, gather
 
 
 class VectorQuantizer:
@@ -20,11 +24,12 @@ class VectorQuantizer:
     decay       gamma of the EMA update, in 0..1
     commitment  beta of the commitment loss
     dead        entries whose EMA count falls below it are re-seeded from the data
-    block       rows per block of the search: it needs block * K floats, never N * K
+    block       rows per tile of the search: it needs block * K floats, never N * K; None: what makes 64 MB on a CPU
     half        store the codebook as float16
 
-    State: codebook [K, d], EMA counts [K] and sums [K, d], on the device of the data it was fitted to.
-    Source: specification of the codec library, quantisers (VQ).
+    The codebook is made by `fit` (k-means, the better one) or `train` (weighted batches, as published methods do), or
+    set. State: codebook [K, d], EMA counts [K] and sums [K, d], on the device of the data it was fitted to.
+    Source: van den Oord et al. (arXiv 1711.00937) for the straight-through gradient, commitment and EMA.
     """
 
     def __init__(
@@ -34,10 +39,10 @@ class VectorQuantizer:
         decay: float = 0.8,
         commitment: float = 0.25,
         dead: float = 1e-3,
-        block: int = 1 << 14,
+        block: int | None = None,
         half: bool = False,
     ) -> None:
-        if size < 1 or not 0 <= decay < 1 or block < 1:
+        if size < 1 or not 0 <= decay < 1 or (block is not None and block < 1):
             raise ValueError(f"size {size}, decay {decay}, block {block}: must be >= 1, in 0..1, >= 1")
         self.size, self.decay, self.commitment, self.dead, self.block, self.half = (
             size, decay, commitment, dead, block, half,
@@ -47,79 +52,116 @@ class VectorQuantizer:
         self.sums: Tensor | None = None
 
     def fit(
-        self, x: Tensor, *, generator: torch.Generator, weights: Tensor | None = None, iterations: int = 10
+        self,
+        x: Tensor,
+        *,
+        generator: torch.Generator,
+        weights: Tensor | None = None,
+        iterations: int = 10,
+        spread: bool = True,
+        label: str = "codebook",
     ) -> Tensor:
-        """k-means on x [N, d]; the mean squared distance after each iteration, [iterations].
+        """k-means on x [N, d]; the weighted mean squared distance before the update of each iteration, [iterations].
 
-        generator   seeds the start (rows drawn by weight, without replacement) and the re-seeding of empty entries
+        generator   seeds the start and where entries move; on CPU the result depends only on the arguments
         weights     [N] >= 0, importance of each row; None: all equal
+        iterations  passes over x, of N * K distances each
+        spread      start from rows far from each other; False: rows drawn by weight, without replacement
+        label       what the progress display calls it
 
-        With N < K the rows themselves become entries and the rest repeat the last one. On CPU the result depends only
-        on the arguments.
+        With N < K the rows themselves become entries and the rest repeat the last one. Raises ShapeError for no rows,
+        ValueError for values that are not finite.
         """
-        x, weights = self._rows(x), self._weights(x, weights)
-        if len(x) == 0:
-            raise ShapeError("a codebook cannot be fitted to no rows", actual=x.shape, expected=("N", "d"))
-        chosen = self._draw(weights, min(self.size, len(x)), generator)
-        self.codebook = x[chosen]
-        if len(chosen) < self.size:
-            self.codebook = torch.cat([self.codebook, self.codebook[-1:].expand(self.size - len(chosen), -1)])
-        errors = []
-        for _ in range(iterations):
-            index, distance = self._search(x)
-            counts, sums = self._gather(x, weights, index)
-            used = counts > 0
-            means = sums / torch.where(used, counts, 1.0)[:, None]
-            self.codebook = torch.where(used[:, None], means, self.codebook).to(x.dtype)
-            errors.append((distance * weights).sum() / weights.sum())
-            empty = torch.nonzero(~used).squeeze(1)
-            if len(empty) and len(x) > self.size:
-                # An empty entry goes where the error is: rows drawn by their weighted distance.
-                fresh = self._draw((distance * weights).clamp_min(0), len(empty), generator)
-                self.codebook[empty[: len(fresh)]] = x[fresh]
-        index, _ = self._search(x)
-        self.counts, self.sums = self._gather(x, weights, index)
-        return torch.stack(errors) if errors else x.new_zeros(0)
+        x, weights = self._training_rows(x, weights)
+        self.codebook, self.counts, self.sums, errors = kmeans(
+            x, weights, size=self.size, iterations=iterations, generator=generator, spread=spread, block=self.block,
+            label=label,
+        )  # fmt: skip
+        return errors
+
+    def train(
+        self,
+        x: Tensor,
+        weights: Tensor | None = None,
+        iterations: int = 1000,
+        batch: int = 80_000,
+        *,
+        generator: torch.Generator,
+        rule: str = "ema",
+        reseed: int = 10,
+        start: Tensor | None = None,
+        project: Callable[[Tensor], Tensor] | None = None,
+        label: str = "codebook",
+    ) -> Tensor:
+        """Train on weighted batches of x [N, d]; the weighted error of each batch before its update, [iterations].
+
+        weights     [N] >= 0, importance of each row; None: all equal
+        batch       rows drawn with replacement for each iteration, at most N
+        generator   seeds the start and the batches
+        rule        "ema", "official" or "batch-mean": start and update, see sw_codecs.codebook_training
+        reseed      entries at most that are overwritten after an iteration, those of the smallest counts, with the
+                    batch's rows of the largest weights. "ema": only entries with less than 5 % of the mean count, and
+                    none in the last tenth; "official": always; "batch-mean": never
+        start       [K, d], instead of the start of the rule
+        project     codebook -> codebook, applied after each iteration (shapes with trace 1, say)
+        label       what the progress display calls it
+
+        An iteration costs batch * K distances. Source: LightGaussian (arXiv 2311.17245) for the loop. Raises as `fit`.
+        """
+        x, weights = self._training_rows(x, weights)
+        if rule not in RULES:
+            raise ValueError(f"rule '{rule}': must be one of {', '.join(RULES)}")
+        if iterations < 0 or batch < 1 or reseed < 0:
+            raise ValueError(f"iterations {iterations}, batch {batch}, reseed {reseed}: must be >= 0, >= 1, >= 0")
+        if start is not None and start.shape != (self.size, x.shape[1]):
+            raise ShapeError(f"start has shape {list(start.shape)}", actual=start.shape, expected=(self.size, "d"))
+        self.codebook, self.counts, self.sums, errors = train_codebook(
+            x, weights, size=self.size, rule=rule, iterations=iterations, batch=batch, decay=self.decay, reseed=reseed,
+            generator=generator, start=start, project=project, block=self.block, label=label,
+        )  # fmt: skip
+        return errors
 
     @torch.no_grad()
     def update(self, x: Tensor, *, generator: torch.Generator, weights: Tensor | None = None) -> None:
         """One EMA step with x [N, d]: counts, sums and codebook move by 1 - decay towards this batch."""
         x, weights = self._rows(x), self._weights(x, weights)
-        codebook = self._fitted()
+        codebook = self._fitted().detach()
         if len(x) == 0:
             return
-        index, _ = self._search(x)
-        counts, sums = self._gather(x, weights, index)
+        index, _ = nearest(x, codebook.to(x.dtype), block=self.block)
+        counts, sums = gather(x, weights, index, self.size)
         assert self.counts is not None
         assert self.sums is not None
         self.counts = self.decay * self.counts + (1 - self.decay) * counts
         self.sums = self.decay * self.sums + (1 - self.decay) * sums
-        total = self.counts.sum()
-        smooth = (self.counts + EPSILON) / (total + self.size * EPSILON) * total
         alive = self.counts >= self.dead
-        codebook = torch.where(alive[:, None], self.sums / smooth.clamp_min(1e-30)[:, None], codebook)
+        codebook = torch.where(alive[:, None], self.sums / smoothed(self.counts)[:, None], codebook)
         lost = torch.nonzero(~alive).squeeze(1)
         if len(lost):
-            fresh = self._draw(weights, min(len(lost), len(x)), generator)
+            fresh = draw(weights, min(len(lost), len(x)), generator)
             lost = lost[: len(fresh)]
             codebook[lost] = x[fresh].to(codebook.dtype)
             self.counts[lost], self.sums[lost] = 1.0, x[fresh].to(self.sums.dtype)
         self.codebook = codebook.to(x.dtype)
 
     def assign(self, x: Tensor) -> Tensor:
-        """Index [N] int64 of the nearest entry, the first one if several are equally near."""
-        return self._search(self._rows(x))[0]
+        """Index [N] int64 of the nearest entry."""
+        rows = self._rows(x)
+        return nearest(rows, self._fitted().detach().to(rows.dtype), block=self.block)[0]
 
     def forward(self, x: Tensor) -> Tensor:
         """The nearest entries [N, d]; the gradient passes straight through to x."""
-        nearest = self._fitted()[self.assign(x)].to(x.dtype)
-        return x + (nearest - x).detach()
+        return straight_through(x, self._fitted()[self.assign(x)])
 
     __call__ = forward
 
     def commitment_loss(self, x: Tensor) -> Tensor:
-        """beta * mean squared distance of x to its (constant) entries; a scalar."""
+        """beta * mean squared distance of x to its (constant) entries; a scalar. It moves x."""
         return self.commitment * (x - self._fitted()[self.assign(x)].detach()).square().mean()
+
+    def codebook_loss(self, x: Tensor) -> Tensor:
+        """Mean squared distance of (constant) x to its entries; a scalar. It moves a codebook that requires grad."""
+        return (x.detach() - self._fitted()[self.assign(x)]).square().mean()
 
     def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Indices [N] int64, and {"codebook"} [K, d] float32 (float16 with `half`) as a numpy array.
@@ -127,23 +169,25 @@ class VectorQuantizer:
         Searches in the codebook as it is stored, so that `decode` gives the nearest stored entry. Raises ValueError for
         values that are not finite.
         """
-        if not bool(torch.isfinite(x).all()):
+        rows = self._rows(x).to(torch.float32)
+        if not bool(torch.isfinite(rows).all()):
             raise ValueError("values to quantize must be finite")
         codebook = self._fitted().detach().to(torch.float16 if self.half else torch.float32)
         if not bool(torch.isfinite(codebook).all()):
             raise ValueError("the codebook holds values that are not finite in its stored precision")
-        index, _ = self._search(self._rows(x), codebook.to(torch.float32))
-        return index, {"codebook": codebook.cpu().numpy()}
+        entries = codebook.to(torch.float32)
+        index, _ = nearest(rows, entries, block=self.block)
+        return settled(index, entries, block=self.block), {"codebook": codebook.cpu().numpy()}
 
     @staticmethod
     def decode(symbols: Tensor, side: dict[str, Any]) -> Tensor:
         """[N, d] float32. Raises BitstreamError for an index outside the codebook."""
-        codebook = np.asarray(side.get("codebook"))
-        if codebook.ndim != 2 or codebook.dtype.kind != "f" or not np.isfinite(codebook).all():
-            raise BitstreamError("a codebook is missing, has a wrong shape or is not finite")
+        codebook = read_codebook(side, "codebook", 2)
+        if symbols.ndim != 1:
+            raise BitstreamError(f"codebook indices have shape {list(symbols.shape)}, must be [N]")
         if symbols.numel() and not 0 <= int(symbols.min()) <= int(symbols.max()) < len(codebook):
             raise BitstreamError(f"a codebook index is outside 0..{len(codebook) - 1}")
-        return torch.from_numpy(codebook.astype(np.float32)).to(symbols.device)[symbols.to(torch.int64)]
+        return torch.from_numpy(codebook).to(symbols.device)[symbols.to(torch.int64)]
 
     def _fitted(self) -> Tensor:
         if self.codebook is None:
@@ -154,43 +198,22 @@ class VectorQuantizer:
         width = None if self.codebook is None else self.codebook.shape[1]
         if x.ndim != 2 or (width is not None and x.shape[1] != width):
             raise ShapeError(f"rows have shape {list(x.shape)}", actual=x.shape, expected=("N", width or "d"))
-        return x.detach()
+        return x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)
+
+    def _training_rows(self, x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Rows of any width, and weights of mean 1."""
+        if x.ndim != 2 or len(x) == 0:
+            raise ShapeError("a codebook cannot be fitted to no rows", actual=x.shape, expected=("N", "d"))
+        if not bool(torch.isfinite(x).all()):
+            raise ValueError("values to quantize must be finite")
+        x = x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)
+        weights = self._weights(x, weights).to(torch.float64)
+        return x, (weights / weights.mean()).to(x.dtype)
 
     def _weights(self, x: Tensor, weights: Tensor | None) -> Tensor:
         if weights is None:
             return torch.ones(len(x), dtype=x.dtype, device=x.device)
-        if weights.shape != x.shape[:1] or bool((weights < 0).any()) or (len(x) and not float(weights.sum()) > 0):
-            raise ValueError("weights must be one number >= 0 per row, not all zero")
-        return weights.detach().to(x.dtype)
-
-    @torch.no_grad()
-    def _search(self, x: Tensor, codebook: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Nearest entry [N] int64 and its squared distance [N], `block` rows at a time."""
-        entries = (self._fitted() if codebook is None else codebook).to(x.dtype)
-        norms = entries.square().sum(1)
-        index = torch.empty(len(x), dtype=torch.int64, device=x.device)
-        distance = torch.empty(len(x), dtype=x.dtype, device=x.device)
-        for start in range(0, len(x), self.block):
-            rows = x[start : start + self.block]
-            found = torch.addmm(norms, rows, entries.T, alpha=-2).argmin(1)  # |c|^2 - 2 x.c: |x|^2 changes no order
-            index[start : start + self.block] = found
-            distance[start : start + self.block] = (rows - entries[found]).square().sum(1)
-        return index, distance
-
-    def _gather(self, x: Tensor, weights: Tensor, index: Tensor) -> tuple[Tensor, Tensor]:
-        """Weighted counts [K] and sums [K, d] of the rows of each entry, float64."""
-        counts = torch.zeros(self.size, dtype=torch.float64, device=x.device)
-        sums = torch.zeros(self.size, x.shape[1], dtype=torch.float64, device=x.device)
-        for start in range(0, len(x), self.block):
-            part = slice(start, start + self.block)
-            weight = weights[part].to(torch.float64)
-            counts.index_add_(0, index[part], weight)
-            sums.index_add_(0, index[part], x[part].to(torch.float64) * weight[:, None])
-        return counts, sums
-
-    @staticmethod
-    def _draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        """`count` distinct rows (fewer if fewer have weight), by weight: the largest of u^(1/w). Any N, no limit."""
-        u = torch.rand(len(weights), generator=generator, device=generator.device, dtype=torch.float64)
-        keys = torch.log(u.clamp_min(1e-300)).to(weights.device) / weights.to(torch.float64)  # w = 0: -inf
-        return torch.topk(keys, min(count, int((weights > 0).sum()))).indices
+        good = weights.shape == x.shape[:1] and bool(torch.isfinite(weights).all() and (weights >= 0).all())
+        if not good or (len(x) and not float(weights.sum()) > 0):
+            raise ValueError("weights must be one number >= 0 per row, finite, not all zero")
+        return weights.detach().to(x)
