@@ -127,6 +127,69 @@ class Secret(Toy):
         return [SecretStage(self.config)]
 '''
 
+HELPER = '''
+"""What another distribution lends: a stage, a task, a pruner, a coder. And `borrower`, a method made of such."""
+
+import toy_method
+from splatwizard_core.experiments.method import create_method
+from splatwizard_core.plugins import hookimpl
+from splatwizard_core.training.optimizer import SplatOptimizer
+
+
+@hookimpl
+def register_methods(registry):
+    registry.add("borrower", "toy_helper:Borrower", summary="for tests")
+
+
+@hookimpl
+def register_pruners(registry):
+    registry.add("toy-pruner", "toy_helper:ToyPruner", summary="for tests")
+
+
+@hookimpl
+def register_coders(registry):
+    registry.add("toy-coder", "toy_helper:ToyPruner", summary="for tests")
+
+
+class ToyPruner:
+    pass
+
+
+def look(optimizer: SplatOptimizer) -> None:
+    pass
+
+
+class Second(toy_method.ToyStage):
+    name = "second"
+
+    def __init__(self, opt, plugins):
+        super().__init__(opt)
+        self.plugins = plugins
+
+    def begin(self, context):
+        self.plugins.pruners.load("toy-pruner")
+        return context.model
+
+
+class Borrower(toy_method.Toy):
+    name = "borrower"
+
+    def stages(self):
+        (first,) = create_method(self.plugins, "toy", {"iterations": 3}).stages()
+        register = first.register_pre_task
+
+        def with_look(scheduler, ppl, opt):
+            register(scheduler, ppl, opt)
+            scheduler.register_task(2, look, name="look")
+
+        first.register_pre_task = with_look
+        return [first, Second(self.config, self.plugins)]
+
+    def encode(self, model, writer):
+        self.plugins.coders.load("toy-coder")
+        super().encode(model, writer)
+'''
+
 DEATH = """
 import os
 import sys
@@ -204,27 +267,39 @@ def absent(render, truth):
 
 @pytest.fixture(scope="session")
 def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder for PYTHONPATH that holds the distribution sw-toy."""
+    """A folder for PYTHONPATH that holds the distributions sw-toy and sw-helper."""
     site = tmp_path_factory.mktemp("site")
     (site / "toy_method.py").write_text(TOY)
     (site / "toy_plugin.py").write_text(PLUGIN)
     (site / "toy_death.py").write_text(DEATH)
-    info = site / "sw_toy-0.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-toy\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text("[splatwizard]\ntoy = toy_plugin\n")
+    (site / "toy_helper.py").write_text(HELPER)
+    for name, version, key, module in (("toy", "0.1", "toy", "toy_plugin"), ("helper", "0.7", "helper", "toy_helper")):
+        info = site / f"sw_{name}-{version}.dist-info"
+        info.mkdir()
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: sw-{name}\nVersion: {version}\n")
+        (info / "entry_points.txt").write_text(f"[splatwizard]\n{key} = {module}\n")
     return site
 
 
 @pytest.fixture(scope="module")
 def toy_plugins(toy_site: Path):
     """The plugin manager with the core and sw-toy alone, here and in every process started from here."""
+    yield from _restricted(toy_site, "toy")
+
+
+@pytest.fixture(scope="module")
+def helped_plugins(toy_site: Path):
+    """The same with sw-helper."""
+    yield from _restricted(toy_site, "toy,helper")
+
+
+def _restricted(toy_site: Path, only: str):
     from splatwizard_core.plugins import load_plugins
 
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(toy_site))
         # The kernels of installed plugins stay out of it: these tests are about the run.
-        patch.setenv("SW_PLUGINS", "toy")
+        patch.setenv("SW_PLUGINS", only)
         patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, [str(toy_site), os.environ.get("PYTHONPATH", "")])))
         patch.setenv("SPLATWIZARD_DATA", str(toy_site))
         patch.setenv("SPLATWIZARD_CACHE", str(toy_site / "cache"))

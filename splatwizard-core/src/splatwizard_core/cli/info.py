@@ -24,8 +24,8 @@ from splatwizard_core.cli.options import (
 @click.argument("path", metavar="PATH", shell_complete=complete.scene_or_file)
 @options(images_option, set_option, json_option, debug_option)
 def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) -> None:
-    """What is in PATH: a .swz file (bytes by section), a run directory (its file), a .ply, or a scene (folder, `demo`,
-    dataset/scene)."""
+    """What is in PATH: a .swz file (bytes by section), a run directory (its file), a metrics.json (scores, and who
+    served which phase), a .ply, or a scene (folder, `demo`, dataset/scene)."""
     if not path.strip():
         raise click.UsageError("PATH is empty")
     where = Path(path)
@@ -33,6 +33,8 @@ def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) ->
         where = where / "scene.swz"
     if where.suffix == ".swz" or (where.is_file() and _starts_with(where, b"SPWZ")):
         facts = {"kind": "file", **file_facts(where)}
+    elif where.suffix == ".json" and where.is_file():
+        facts = {"kind": "record", **_record_facts(where)}
     elif where.suffix == ".ply":
         facts = {"kind": "ply", **_ply_facts(where)}
     else:
@@ -40,7 +42,8 @@ def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) ->
     if as_json:
         print_json(facts)
     else:
-        {"file": _print_file, "ply": _print_plain, "scene": _print_plain}[facts["kind"]](facts)
+        printers = {"file": _print_file, "record": _print_record, "ply": _print_plain, "scene": _print_plain}
+        printers[facts["kind"]](facts)
 
 
 def _starts_with(path: Path, magic: bytes) -> bool:
@@ -63,6 +66,51 @@ def file_facts(path: Path) -> dict[str, Any]:
     missing = {f"{kind} {name}": str(missing_plugin(reader, plugins, kind, name))
                for kind, name in missing_parts(reader, plugins)}  # fmt: skip
     return {"path": str(path), **reader.summary(), "missing": missing}
+
+
+def _record_facts(path: Path) -> dict[str, Any]:
+    """The gist of a result record: what was run, its scores, and who served which phase."""
+    from splatwizard_core.experiments.record import read_record
+
+    record = read_record(path)
+    return {
+        "path": str(path),
+        **record.model_dump(
+            mode="json", include={"method", "distribution", "preset", "rate", "scene", "date", "counts"}
+        ),
+        "protocol": record.protocol.id,
+        "metrics": {n: m.mean for n, m in record.metrics.items() if not m.diagnostic and m.mean is not None},
+        "bytes": record.file.bytes,
+        **record.model_dump(mode="json", include={"phases"}),
+        "train": record.train.model_dump(
+            mode="json", include={"steps", "train_s", "with_pretraining_s", "pretraining"}
+        ),
+    }
+
+
+def _print_record(facts: dict[str, Any]) -> None:
+    from rich.markup import escape
+    from rich.table import Table
+
+    from splatwizard_core.experiments.report.facts import PhaseFacts, TrainFacts
+    from splatwizard_core.experiments.report.results_tables import started_from
+
+    train = TrainFacts.model_validate(facts["train"])
+    gist = {k: v for k, v in facts.items() if k not in ("phases", "train")} | {"steps": train.steps}
+    gist["starts from"] = started_from(train)
+    _print_plain({k: v for k, v in gist.items() if v != ""})
+    if facts["phases"] is None:
+        console().print("who served which phase is not known of this record")
+        return
+    table = Table()
+    for name in ("phase", "provided by", "from"):
+        table.add_column(name, overflow="fold")
+    for phase in facts["phases"]:
+        served = PhaseFacts.model_validate(phase).by_distribution() or {"": ["-"]}
+        for i, (owner, parts) in enumerate(served.items()):
+            name = "" if i else phase["phase"]
+            table.add_row(escape(name), escape(", ".join(parts)), escape(owner), end_section=i == len(served) - 1)
+    console().print(table)
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -17,6 +17,9 @@ from splatwizard_core.cli.options import (
     rate_option,
     set_option,
 )
+
+if TYPE_CHECKING:
+    from splatwizard_core.training.stage import Stage
 
 
 @click.command(short_help="a method's plan as a table")
@@ -39,7 +42,10 @@ def schedule(
     verbose: bool,
     as_json: bool,
 ) -> None:
-    """Print the plan that METHOD executes, stage by stage; needs no data, no device, no training."""
+    """Print the plan that METHOD executes, stage by stage; needs no data, no device, no training.
+
+    A stage says what trained scene it starts from, and a stage or task of another package which one that is.
+    """
     import json
 
     from splatwizard_core.cli.setup import resolve_one
@@ -52,23 +58,45 @@ def schedule(
     resolved = resolve_one(
         plugins, method, rate, preset=preset, config_file=config_file, values=assignments(sets), scene=None
     )
-    cls = plugins.methods.load(method)
-    stages = list(cls(plugins, resolved.config).stages())
+    from splatwizard_core.experiments.phases import stage_parts
+    from splatwizard_core.plugins.origins import Origins
+
+    entry, origins = plugins.methods.entry(method), Origins(plugins)
+    stages = list(plugins.methods.load(method)(plugins, resolved.config).stages())
     found: list[dict[str, Any]] = []
-    texts: list[str] = []
     for stage in stages:
         pre, post = build_schedulers(stage, resolved.ppl)
+        parts = stage_parts(origins, stage, resolved.ppl)
         if as_json:
             rows = json.loads(format_plan(pre, post, style="json", total=stage.iterations, verbose=verbose))
             found.append(
-                {"stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from, "plan": rows}
-            )
-        else:
-            texts.append(format_plan(pre, post, total=stage.iterations, verbose=verbose))
+                {
+                    "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,
+                    "taught_by": list(stage.taught_by), "provided_by": parts, "plan": rows,
+                }
+            )  # fmt: skip
+            continue
+        notes = _notes(stage, (entry.distribution, entry.version), origins.of(stage))
+        if len(stages) > 1 or notes:
+            click.echo(f"{stage.name}: {'; '.join([f'{stage.iterations:,} steps', *notes])}")
+        own = origins.of(stage)[0]
+
+        def owner(task: Any, own: str = own) -> str:
+            found = origins.of(task)[0]
+            return "" if found == own else found
+
+        click.echo(format_plan(pre, post, total=stage.iterations, verbose=verbose, origin=owner))
     if as_json:
         print_json({"method": method, "preset": resolved.preset, "rate": resolved.rate, "stages": found})
-        return
-    for stage, text in zip(stages, texts, strict=True):
-        if len(stages) > 1:
-            click.echo(f"{stage.name}: {stage.iterations:,} steps")
-        click.echo(text)
+
+
+def _notes(stage: Stage, method: tuple[str, str], owner: tuple[str, str]) -> list[str]:
+    """What the plan of a stage does not show: what it starts from, and whose it is if not the method's own."""
+    notes = []
+    if stage.starts_from is not None:
+        notes.append(f"starts from a trained {stage.starts_from} scene")
+    if stage.taught_by:
+        notes.append(f"taught by a trained {' and '.join(stage.taught_by)} scene")
+    if owner not in (method, ("", "")):
+        notes.append(f"of {' '.join(owner)}")
+    return notes

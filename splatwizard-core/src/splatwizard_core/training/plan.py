@@ -150,7 +150,7 @@ def plan_rows(
     """
     rows = []
     for title, registrations in (("Pre", pre), ("Post", post)):
-        ordered = sorted(registrations, key=lambda r: (r.priority, r.order))
+        ordered = _in_order(registrations)
         for row in ordered:
             steps = row.fires_in(start, total)
             rows.append(
@@ -168,6 +168,10 @@ def plan_rows(
     return rows
 
 
+def _in_order(registrations: Sequence[Registration]) -> list[Registration]:
+    return sorted(registrations, key=lambda r: (r.priority, r.order))
+
+
 def _overlap(a: Registration, b: Registration, start: int, total: int | None) -> bool:
     if a.task != b.task:
         return False
@@ -176,7 +180,14 @@ def _overlap(a: Registration, b: Registration, start: int, total: int | None) ->
 
 
 def format_plan(
-    pre: Any, post: Any, style: str = "table", start: int = 0, total: int | None = None, *, verbose: bool = False
+    pre: Any,
+    post: Any,
+    style: str = "table",
+    start: int = 0,
+    total: int | None = None,
+    *,
+    verbose: bool = False,
+    origin: Callable[[Any], str] | None = None,
 ) -> str:
     """The plan that will be executed, as text.
 
@@ -186,6 +197,7 @@ def format_plan(
     start       steps that are over (a resumed run)
     total       last step T; None: as far as the plans reach
     verbose     also first step, last step and number of executions inside (start, total]
+    origin      (task) -> whose it is, a column of the table if any of them is somebody else's; "" for the stage's own
     """
     rows = plan_rows(pre.registrations, post.registrations, start=start, total=total)
     if style == "json":
@@ -197,6 +209,10 @@ def format_plan(
         plan = f"{row.plan} (overlaps)" if row.overlaps else row.plan
         extra = ["-" if v is None else str(v) for v in (row.first, row.last, row.count)] if verbose else []
         cells.append([row.stage, row.task, plan, *extra])
+    if origin is not None:
+        owners = [origin(r.task) for part in (pre, post) for r in _in_order(part.registrations)]
+        if any(owners):
+            cells = [[*line, owner] for line, owner in zip(cells, ["From", *owners], strict=True)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
     lines = [" | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
     lines.insert(1, "-+-".join("-" * w for w in widths))
@@ -217,7 +233,7 @@ def plan_lines(pre: Sequence[Registration], post: Sequence[Registration]) -> lis
     """What identifies a plan: stage, name, every step and the priority of each registration, in order of execution."""
     lines = []
     for registrations in (pre, post):
-        for r in sorted(registrations, key=lambda r: (r.priority, r.order)):
+        for r in _in_order(registrations):
             # describe_when abbreviates lists; what identifies a plan may not.
             steps = describe_when(r.when) if isinstance(r.when, int | range) else str(sorted(r.when))
             lines.append(f"{r.stage} | {r.name} | {steps} | priority {r.priority}")

@@ -11,9 +11,11 @@ from splatwizard_core.experiments.report.results_tables import (
     environment_table,
     means_table,
     missing_metrics,
+    phases_table,
     protocol_table,
     runs_table,
     served_table,
+    started_from,
 )
 from splatwizard_core.experiments.report.runs import collect
 
@@ -264,3 +266,31 @@ def test_the_fields_own_lpips_comes_first():
     assert numbers.ordered_metrics(names) == ["psnr", "ssim", "lpips_vgg_3dgs", "lpips_vgg", "l1", "toy"]
     assert numbers.main_lpips(names) == "lpips_vgg_3dgs"
     assert numbers.main_lpips(["psnr"]) is None
+
+
+def test_phases_say_who_served_by_distribution(make_run, tmp_path):
+    make_run("r1")
+    make_run("r2", size=2000)
+    make_run("r1", method="other", change=lambda content: content.update(phases=None))
+    who = "garden toy r1, garden toy r2"
+    assert texts(phases_table(collect([tmp_path]).runs)) == [
+        ["toy", who, "train: toy", "sw-toy 0.1: stage toy; sw-rasterizers 0.2: rasterizer standard"],
+        ["toy", who, "encode", "sw-toy 0.1: method toy"],
+    ]
+
+
+def test_records_that_do_not_tell_phases_have_no_such_table(make_run, tmp_path):
+    make_run(change=lambda content: content.update(phases=None))
+    (run,) = collect([tmp_path]).runs
+    assert phases_table([run]) is None
+
+
+def test_what_a_training_started_from_is_said(make_run, tmp_path):
+    trained = {"file": {}, "preset": "quick", "config": {}, "steps": 2000, "train_s": 45.0, "made_by": {}}
+    given = {"file": {"name": "a.ply", "sha256": "00"}, "preset": None, "config": None, "steps": None, "train_s": None,
+             "made_by": {}}  # fmt: skip
+    for rate, scene in (("r1", trained), ("r2", given)):
+        make_run(rate, change=lambda content, scene=scene: content["train"].update(pretraining={"3dgs": scene}))
+    told = {run.facts.rate: started_from(run.facts.train) for run in collect([tmp_path]).runs}
+    assert told["r1"] == "a trained 3dgs scene (quick preset, 2,000 steps, 45.0 s)"
+    assert told["r2"] == "a trained 3dgs scene from the file a.ply"

@@ -90,14 +90,46 @@ class MemoryFacts(Facts):
     peak_render_bytes: int | None = None
 
 
+class PretrainingFacts(Facts):
+    """A trained scene that a training started from; `file` is name and sha256 where it came from one."""
+
+    file: dict[Text, Text] = {}
+    preset: Text | None = None
+    steps: int | None = None
+    train_s: float | None = None
+
+
 class TrainFacts(Facts):
     train_s: float | None = None
+    pretraining: dict[Text, PretrainingFacts] | None = None
     with_pretraining_s: float | None = None
     steps: int | None = None
     peak_bytes: int | None = None
     memory_kind: Text | None = None
     breakdown_s: dict[Text, dict[Text, float]] | None = None
     trained_in: Text | None = None
+
+
+class PartFacts(Facts):
+    """One that served: a rasterizer, a stage, a coder, ..., and the distribution that it comes from."""
+
+    kind: Text
+    name: Text
+    distribution: Text = ""
+    version: Text = ""
+
+
+class PhaseFacts(Facts):
+    phase: Text
+    provided_by: list[PartFacts] = []
+
+    def by_distribution(self) -> dict[str, list[str]]:
+        """`sw-codecs 0.1` -> what of it served, such as `coder octree`."""
+        found: dict[str, list[str]] = {}
+        for part in self.provided_by:
+            owner = f"{part.distribution} {part.version}".strip() or "no distribution"
+            found.setdefault(owner, []).append(f"{part.kind} {part.name}")
+        return found
 
 
 class RunFacts(Facts):
@@ -126,6 +158,7 @@ class RunFacts(Facts):
     train: TrainFacts = TrainFacts()
     geometry: dict[Text, float] | None = None
     rasterizers: dict[Text, dict[Text, Text]] = {}
+    phases: list[PhaseFacts] = []
     environment: dict[Text, Any] = {}
     flags: list[Text] = []
     unknown: dict[Text, Text] = {}

@@ -257,8 +257,10 @@ def _sentence(missing: Sequence[str]) -> str:
 
 
 def _provenance(runs: Sequence[Run]) -> Section:
+    phases = tables.phases_table(runs)
     parts = [
         Part("Served by", table=tables.served_table(runs)),
+        *([Part("Phases", table=phases)] if phases is not None else []),
         Part("Protocol", table=tables.protocol_table(runs)),
         Part("Environment", table=tables.environment_table(runs)),
     ]

@@ -9,7 +9,7 @@ from splatwizard_core.experiments.report import numbers
 from splatwizard_core.experiments.report.aggregate import DatasetTable
 from splatwizard_core.experiments.report.blocks import Cell, Row, Table, columns, row
 from splatwizard_core.experiments.report.distortion import BdCell, BdTable
-from splatwizard_core.experiments.report.facts import RunFacts, clean
+from splatwizard_core.experiments.report.facts import RunFacts, TrainFacts, clean
 from splatwizard_core.experiments.report.runs import Run, machine
 
 
@@ -216,6 +216,34 @@ def served_table(runs: Sequence[Run]) -> Table:
     return Table("Served by", columns(heads, text=heads, long=heads[1:]), rows)
 
 
+def phases_table(runs: Sequence[Run]) -> Table | None:
+    """Who served each phase, by distribution; None if no record says so."""
+    groups: dict[tuple[str, str, str], list[Run]] = {}
+    for run in runs:
+        for phase in run.facts.phases:
+            served = "; ".join(f"{owner}: {', '.join(parts)}" for owner, parts in phase.by_distribution().items())
+            groups.setdefault((run.variant, phase.phase, served or numbers.MISSING), []).append(run)
+    if not groups:
+        return None
+    # The phases of one method stand together, however its runs differ.
+    ordered = sorted(groups.items(), key=lambda item: list(dict.fromkeys(r.variant for r in runs)).index(item[0][0]))
+    rows = [row([variant, _who(group, len(runs)), phase, served]) for (variant, phase, served), group in ordered]
+    heads = ["method", "runs", "phase", "provided by"]
+    return Table("Phases", columns(heads, text=heads, long=(heads[1], heads[3])), rows)
+
+
+def started_from(train: TrainFacts) -> str:
+    """What the training of a run started from, in words; empty: nothing that was trained."""
+    found = []
+    for name, scene in (train.pretraining or {}).items():
+        steps = "" if scene.steps is None else f", {numbers.count(scene.steps)} steps"
+        seconds = "" if scene.train_s is None else f", {numbers.seconds(scene.train_s)} s"
+        preset = "" if scene.preset is None else f" ({scene.preset} preset{steps}{seconds})"
+        origin = f" from the file {scene.file['name']}" if "name" in scene.file else preset
+        found.append(f"a trained {name} scene{origin}")
+    return "; ".join(found)
+
+
 def cost_table(facts: RunFacts) -> Table:
     """Times and memory of one run."""
     kind = {"rss": "growth of the resident set", "cuda": "CUDA allocator"}
@@ -231,7 +259,7 @@ def cost_table(facts: RunFacts) -> Table:
     drawn = "" if speed.image_size is None else f"at {speed.image_size[0]} × {speed.image_size[1]} px"
     entries = [
         ("training", time(facts.train.train_s), f"{numbers.count(facts.train.steps)} steps"),
-        ("training, with what it starts from", time(facts.train.with_pretraining_s), ""),
+        ("training, with what it starts from", time(facts.train.with_pretraining_s), started_from(facts.train)),
         ("training memory", *size(facts.train.peak_bytes, facts.train.memory_kind)),
         ("encoding", time(facts.codec.encode_s), ""),
         ("decoding", time(facts.codec.decode_s), "median, fresh process"),
@@ -275,7 +303,8 @@ def config_table(facts: RunFacts) -> Table | None:
             continue
         for key, value in _flat(values) if isinstance(values, dict) else [("", values)]:
             name = f"{block}.{key}" if key and block != "config" else key or block
-            rows.append(row([clean(name), plain(value), plain(known.get(key, "default"))]))
+            own = key if block in ("config", "pipeline", "scene") else name
+            rows.append(row([clean(name), plain(value), plain(known.get(own, "default"))]))
     return Table("Configuration", columns(["key", "value", "set by"], text=["value", "set by"], long=["value"]), rows)
 
 
