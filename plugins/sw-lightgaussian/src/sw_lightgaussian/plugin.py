@@ -18,7 +18,7 @@ def register_pruners(registry: Registry) -> None:
 
 @hookimpl
 def register_coders(registry: Registry) -> None:
-    registry.add("importance-vq", "sw_lightgaussian.importance_vq:ImportanceVQ",
+    registry.add("importance-vq", "sw_lightgaussian.importance_vq:ImportanceVQ", codes="vectors",
                  summary="float vectors: a codebook for the least important, float16 for the rest")  # fmt: skip
     registry.add("vectree", "sw_lightgaussian.vectree:VecTree", codes="gaussians",
                  summary="whole Gaussian models: exact positions, vector-quantised colours")  # fmt: skip
