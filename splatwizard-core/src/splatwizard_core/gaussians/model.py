@@ -47,7 +47,7 @@ class GaussianModel(SplatModel):
     active_sh_degree    bands above it are neither drawn nor trained
     """
 
-    ROWS = (
+    ROWS: tuple[str, ...] = (
         "means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats",
         "grad_accum", "denom", "max_radii2d",
     )  # fmt: skip
