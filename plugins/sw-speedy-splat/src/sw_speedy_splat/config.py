@@ -1,0 +1,31 @@
+"""Hyper-parameters of Speedy-Splat: when and how much it prunes. All the rest is 3DGS', under `base`."""
+
+from typing import Any, Literal
+
+from pydantic import Field
+
+from splatwizard_core.training.params import OptimizationParams, Params
+
+
+class Prune(Params):
+    """Removals while the scene densifies ("soft": it grows back) and after that ("hard": it does not)."""
+
+    pruner: str = Field("speedy-splat", description="whose scores; any registered pruner, with its own settings")
+    channel_mode: Literal["sum", "per_channel"] = Field(
+        "sum", description="square the derivative of R + G + B, as published, or of each channel (three times the work)"
+    )
+    soft: float = Field(0.80, ge=0, lt=1, description="share that goes each time before `base.densify.stop`")
+    hard: float = Field(0.30, ge=0, lt=1, description="share that goes each time from `base.densify.stop` on")
+    start: int = Field(6_000, ge=1, description="first removal")
+    stop: int = Field(30_000, ge=0, description="no removal from this step on, nor at the last step of a run")
+    interval: int = Field(3_000, ge=1, description="steps between removals")
+
+
+class SpeedySplatConfig(OptimizationParams):
+    """Everything that can be set for Speedy-Splat."""
+
+    prune: Prune = Field(Prune(), description="what is removed when")
+    base: dict[str, Any] = Field(
+        {}, description="values of 3dgs by its keys (base.densify.start=600), and its preset (base.preset=inria)"
+    )
+    codec: str = Field("gaussians-exact", description="codec of the file, by name")

@@ -1,0 +1,60 @@
+"""Speedy-Splat: Fast 3D Gaussian Splatting with Sparse Pixels and Sparse Primitives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.experiments.keys import dotted
+from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.gaussians.model import GaussianModel
+from sw_speedy_splat.config import SpeedySplatConfig
+from sw_speedy_splat.presets import PRESETS, RATES
+from sw_speedy_splat.stage import SpeedySplatStage
+
+if TYPE_CHECKING:
+    import torch
+
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.scene.scene import Scene
+    from splatwizard_core.training.stage import Stage
+
+
+class SpeedySplat(Method):
+    """Hanson, Tu, Lin, Singla, Zwicker, Goldstein: Speedy-Splat, CVPR 2025 (arXiv 2412.00578)."""
+
+    name: ClassVar[str] = "speedy-splat"
+    version: ClassVar[int] = 1
+    Config = SpeedySplatConfig
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
+    DEFAULT_RATE: ClassVar[str] = "r3"  # the published shares
+
+    def _base(self) -> Method:
+        """The configured 3DGS: its start and its stage."""
+        values = dotted(self.config.base, "")
+        preset = str(values.pop("preset", "paper"))
+        length = {"iterations": self.config.iterations, "scale_schedule": self.config.scale_schedule}
+        return create_method(self.plugins, "3dgs", {**length, **values}, preset=preset)
+
+    def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
+        return self._base().create_model(scene, generator)
+
+    def stages(self) -> Sequence[Stage]:
+        return [SpeedySplatStage(self.config, self._base(), self.plugins)]
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"speedy-splat encodes a GaussianModel, not a {type(model).__name__}")
+        encode_gaussians(self.plugins, self.config.codec, model, writer)
+
+    def decode(self, reader: ContainerReader) -> SplatModel:
+        if reader.version != self.version:
+            raise BitstreamError(
+                f"{reader.name}: speedy-splat layout version {reader.version} is unknown, this installation reads "
+                f"{self.version}: upgrade sw-speedy-splat"
+            )
+        return decode_gaussians(self.plugins, reader)

@@ -1,0 +1,17 @@
+"""What this package provides: the method speedy-splat, and its score as a pruner for any method."""
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("speedy-splat", "sw_speedy_splat.method:SpeedySplat",
+                 summary="3DGS pruned hard while and after it densifies (Hanson et al. 2025)",
+                 presets=["paper", "inria", "quick"],
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
+
+
+@hookimpl
+def register_pruners(registry: Registry) -> None:
+    registry.add("speedy-splat", "sw_speedy_splat.score:SpeedyScore",
+                 summary="keeps what pictures change with: squared derivatives by a Gaussian's value")  # fmt: skip
