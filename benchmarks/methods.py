@@ -1,0 +1,175 @@
+"""Methods side by side on real scenes: quality, size, speed and memory in one table, and what the papers claim.
+
+    python benchmarks/methods.py ../shared/data/fox:images_2 out/methods
+    python benchmarks/methods.py ../shared/data/mug ../shared/data/lego out/methods --shrink 3
+    python benchmarks/methods.py demo out/methods --preset quick --methods 3dgs,lightgaussian,chimerags --rates all
+
+A scene is what `--scene` takes, with `:PICTURES` for a COLMAP scene's picture folder. Runs are those of `sw run`:
+finished ones are not repeated, and the trained 3DGS scene that many methods start from is trained once. --shrink K
+divides every plan and iteration count by K; the records say so.
+
+The claims compare with 3DGS of the same run: a trained scene of 30,000 steps (or its K-th part). A float32 .ply has 248
+bytes a Gaussian. BD-rates and the plot: `sw report OUT`, which `sw run` has written to OUT/<scene>/report.html.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from splatwizard_core.experiments.start import named_scenes
+from splatwizard_core.plugins.manager import load_plugins
+
+EXPLICIT = ("3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "chimerags")
+ANCHORS = ("hac", "cat-3dgs")
+SWEEPS = ("3dgs",)  # whose rate points all share one training
+PLY_BYTES = 248
+
+console = Console(width=150)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a record says, in the units of the table."""
+
+    method: str
+    rate: str
+    psnr: float
+    ssim: float
+    size: int
+    gaussians: int
+    record: dict[str, Any]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="SCENE[:PICTURES]")
+    parser.add_argument("out", type=Path, help="where the runs are kept")
+    parser.add_argument("--methods", default=",".join((*EXPLICIT, *ANCHORS)), help="comma list (default: all)")
+    parser.add_argument("--rates", default="", help="of every method (default: all of 3dgs, the default of the others)")
+    parser.add_argument("--preset", default="paper", help="of every method (default: paper)")
+    parser.add_argument("--shrink", type=int, default=1, help="divide every schedule by this (default: 1)")
+    parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
+    parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE", help="for all runs")
+    args = parser.parse_args()
+    for scene in args.scenes:
+        spec, _, pictures = scene.partition(":")
+        for method in args.methods.split(","):
+            rates = args.rates or ("all" if method in SWEEPS else "default")
+            command = [sys.executable, "-m", "splatwizard_core", "run", "--method", method, "--scene", spec]
+            command += ["--rate", rates, "--preset", args.preset, "--device", args.device, "--out", str(args.out)]
+            command += ["--images", pictures] if pictures else []
+            for value in (*shrunk(method, args.shrink), *args.sets):
+                command += ["--set", value]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        runs = read(args.out / Path(spec).name)
+        print_table(Path(spec).name, runs)
+        print_claims(runs)
+
+
+def shrunk(method: str, factor: int) -> list[str]:
+    """The settings that divide all schedules of a method, and of the scene that it starts from, by `factor`."""
+    if factor == 1:
+        return []
+    plugins = load_plugins()
+    cls = plugins.methods.load(method)
+    found = ["scale_schedule=true", f"iterations={cls.Config.FULL_ITERATIONS // factor}"]
+    for base in named_scenes(cls(plugins, cls.Config())):
+        full = plugins.methods.load(base).Config.FULL_ITERATIONS
+        found += ["pretrained.scale_schedule=true", f"pretrained.iterations={full // factor}"]
+    return found
+
+
+def read(folder: Path) -> list[Run]:
+    """The records of a scene by method and rate, methods in the order of this file."""
+    found = []
+    for path in folder.glob("*/*/metrics.json"):
+        record = json.loads(path.read_text())
+        metrics = record["metrics"]
+        found.append(
+            Run(
+                record["method"], record["rate"], metrics["psnr"]["mean"], metrics["ssim"]["mean"],
+                record["file"]["bytes"], record["counts"].get("num_gaussians", 0), record,
+            )
+        )  # fmt: skip
+    order = (*EXPLICIT, *ANCHORS)
+    return sorted(found, key=lambda r: (order.index(r.method) if r.method in order else len(order), r.size))
+
+
+def print_table(scene: str, runs: list[Run]) -> None:
+    first = runs[0].record
+    device = first["environment"].get("device")
+    table = Table(title=f"{scene}, {first['protocol']['id']}, {device}", title_justify="left")
+    for column in ("method", "rate", "PSNR dB", "SSIM", "bytes", "Gaussians", "encode s", "decode s", "FPS",
+                   "train s", "with base s", "peak MiB"):  # fmt: skip
+        table.add_column(column, justify="left" if column in ("method", "rate") else "right")
+    for run in runs:
+        record, train = run.record, run.record["train"]
+        table.add_row(
+            run.method, run.rate, f"{run.psnr:.3f}", f"{run.ssim:.4f}", f"{run.size:,}", f"{run.gaussians:,}",
+            f"{record['codec']['encode_s']:.2f}", f"{record['codec']['decode_s']:.2f}", f"{record['speed']['fps']:.0f}",
+            _number(train["train_s"], 1), _number(train["with_pretraining_s"], 1),
+            _number(None if train["peak_bytes"] is None else train["peak_bytes"] / 2**20, 0),
+        )  # fmt: skip
+    console.print(table)
+
+
+def print_claims(runs: list[Run]) -> None:
+    """What the papers say of their methods, and what is measured here."""
+    of = {(run.method, run.rate): run for run in runs}
+    default = {name: _default(name, of) for name in (*EXPLICIT, *ANCHORS)}
+    base = default["3dgs"]
+    if base is None:
+        return
+    table = Table(title="claims", title_justify="left")
+    for column in ("method", "claim", "measured", ""):
+        table.add_column(column)
+
+    def row(method: str, claim: str, measured: str, holds: bool) -> None:
+        table.add_row(method, claim, measured, "holds" if holds else "does NOT hold")
+
+    ply = base.gaussians * PLY_BYTES
+    if speedy := default["speedy-splat"]:
+        gone, lost = 1 - speedy.gaussians / base.gaussians, base.psnr - speedy.psnr
+        row("speedy-splat", "removes >= 85 % for <= 0.8 dB", f"{gone:.1%}, {lost:+.2f} dB",
+            gone >= 0.85 and lost <= 0.8)  # fmt: skip
+    if light := default["lightgaussian"]:
+        ratio, lost = ply / light.size, base.psnr - light.psnr
+        row("lightgaussian", ">= 12x below the float32 .ply for <= 0.5 dB", f"{ratio:.1f}x, {lost:+.2f} dB",
+            ratio >= 12 and lost <= 0.5)  # fmt: skip
+    chimera = default["chimerags"]
+    if chimera and light:
+        row("chimerags", "fewer bytes than lightgaussian at no less PSNR",
+            f"{chimera.size / light.size:.2f} of the bytes, {chimera.psnr - light.psnr:+.2f} dB",
+            chimera.size < light.size and chimera.psnr >= light.psnr)  # fmt: skip
+    if hac := default["hac"]:
+        good = [r for r in runs if r.method == "hac" and r.psnr >= base.psnr - 0.3]
+        best = min(good, key=lambda r: r.size, default=hac)
+        ratio, lost = ply / best.size, base.psnr - best.psnr
+        row("hac", "3DGS - 0.3 dB at <= 1/40 of the float32 .ply", f"{ratio:.1f}x, {lost:+.2f} dB",
+            ratio >= 40 and lost <= 0.3)  # fmt: skip
+    console.print(table)
+
+
+def _default(method: str, of: dict[tuple[str, str], Run]) -> Run | None:
+    """The run at a method's default rate point, if there is one."""
+    plugins = load_plugins()
+    if method not in plugins.methods:
+        return None
+    return of.get((method, plugins.methods.load(method).DEFAULT_RATE))
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+if __name__ == "__main__":
+    main()
