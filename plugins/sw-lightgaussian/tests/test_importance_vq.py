@@ -8,7 +8,6 @@ from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
-from sw_lightgaussian.codebook import train_codebook
 from sw_lightgaussian.importance_vq import HEADER, RANGE_CODED
 
 PARTS = ["header", "mask", "indices", "codebook", "own"]
@@ -137,30 +136,26 @@ def test_unseen_vectors_have_no_weight_and_no_importance_at_all_is_fine(make):
     make(ratio=0.5).encode(vectors, np.full(100, -np.inf))
 
 
-def weighted_error(plugins, training, vectors, importance, size=32):
-    quantizer = plugins.quantizers.load("vq")(size, decay=0.8, half=True)
-    x, weights = torch.from_numpy(vectors), torch.from_numpy(importance)
-    train_codebook(quantizer, x, weights, iterations=100, batch=1000, reseed=10, training=training,
-                   generator=torch.Generator().manual_seed(0))  # fmt: skip
-    index, side = quantizer.encode(x)
-    distance = ((torch.from_numpy(side["codebook"]).float()[index] - x) ** 2).sum(1)
-    return float((weights * distance).sum() / weights.sum()), len(index.unique()) / size
+def weighted_error(make, training, seed):
+    vectors, importance = clusters(2000, count=40, spread=0.2, seed=seed)
+    coder = make(ratio=1.0, size=32, iterations=100 if training != "kmeans" else 5, training=training)
+    coded = coder.quantize(vectors, importance)
+    distance = ((coded.vectors() - vectors) ** 2).sum(1)
+    return float((importance * distance).sum() / importance.sum()), len(coded.codebook) / 32
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_default_training_is_no_worse_than_that_of_the_authors_code(plugins, seed):
-    vectors, importance = clusters(2000, count=40, spread=0.2, seed=seed)
-    error, used = weighted_error(plugins, "ema", vectors, importance)
-    assert error <= weighted_error(plugins, "official", vectors, importance)[0]
+def test_the_default_training_is_no_worse_than_that_of_the_authors_code(make, seed):
+    error, used = weighted_error(make, "ema", seed)
+    assert error <= weighted_error(make, "official", seed)[0]
+    assert weighted_error(make, "kmeans", seed)[0] < 1.2 * error
     assert used > 0.9
 
 
-def test_a_single_code_is_the_weighted_mean(plugins):
+def test_a_single_code_is_the_mean_of_the_batches(make):
     vectors, _ = clusters(500)
-    quantizer = plugins.quantizers.load("vq")(1, decay=0.8)
-    train_codebook(quantizer, torch.from_numpy(vectors), torch.ones(500, dtype=torch.float64), iterations=60,
-                   batch=100_000, reseed=0, training="ema", generator=torch.Generator().manual_seed(0))  # fmt: skip
-    assert quantizer.codebook[0].numpy() == pytest.approx(vectors.mean(0), abs=0.06)  # of batches
+    coded = make(ratio=1.0, size=1, iterations=60, batch=100_000).quantize(vectors, np.ones(500))
+    assert coded.codebook[0] == pytest.approx(vectors.mean(0), abs=0.06)
 
 
 def test_more_codes_lose_less(make):

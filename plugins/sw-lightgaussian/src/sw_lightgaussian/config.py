@@ -7,7 +7,7 @@ from pydantic import Field
 from splatwizard_core.training.distillation import DistillLoss
 from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
-from sw_lightgaussian.codebook import Training
+from sw_lightgaussian.importance_vq import Training
 from sw_lightgaussian.significance import Kind, VolumeNorm
 
 

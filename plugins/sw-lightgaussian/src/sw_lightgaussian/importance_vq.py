@@ -18,14 +18,13 @@ import math
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.errors import BitstreamError
-from sw_lightgaussian.codebook import Training, train_codebook
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
@@ -35,6 +34,8 @@ PACKED, RANGE_CODED = 0, 1
 HEADER = struct.Struct("<BBIII")
 HALF_MAX = 65504.0
 MAX_CODES = 1 << 16
+
+Training = Literal["ema", "official", "kmeans"]
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,10 @@ class ImportanceVQ:
     ratio           share of the vectors that is vector-quantised, 0..1: the least important ones
     size            codebook entries at most, up to 2^16
     rows_per_code   and no more than the largest power of two with so many vectors for each entry
-    iterations, batch, decay, reseed, training  of the codebook: `train_codebook`, and the quantizer `vq`
+    iterations      updates of the codebook while it is trained
+    training        by the quantizer `vq`: "ema" or "official" (the authors' rule), weighted batches of `batch` rows
+                    with `decay` and up to `reseed` entries that start afresh each time; "kmeans", passes over all rows
+    device          where it is trained: "cpu", where equal arguments give equal bytes, or "cuda"
     """
 
     def __init__(
@@ -80,13 +84,13 @@ class ImportanceVQ:
         decay: float = 0.8,
         reseed: int = 10,
         training: Training = "ema",
+        device: torch.device | str = "cpu",
     ) -> None:
         if not 0 <= ratio <= 1 or not 1 <= size <= MAX_CODES:
             raise ValueError(f"ratio {ratio} and size {size} must be in 0..1 and 1..{MAX_CODES:,}")
         self.plugins, self.ratio, self.size, self.rows_per_code = plugins, ratio, size, rows_per_code
-        self.iterations, self.batch, self.decay, self.reseed, self.training = (
-            iterations, batch, decay, reseed, training,
-        )  # fmt: skip
+        self.iterations, self.batch, self.decay, self.reseed = iterations, batch, decay, reseed
+        self.training, self.device = training, device
 
     def encode(self, vectors: NDArray[Any], importance: NDArray[Any], seed: int = 0) -> dict[str, bytes]:
         """The parts for `vectors` [n, d], clamped to the range of float16; equal arguments give equal bytes.
@@ -132,14 +136,19 @@ class ImportanceVQ:
     ) -> tuple[NDArray[np.int64], NDArray[np.float16]]:
         """Codes [n] and the codebook, of which only entries stay that a vector uses."""
         quantizer = self.plugins.quantizers.load("vq")(self.codebook_size(len(x)), decay=self.decay, half=True)
-        rows = torch.from_numpy(x)
-        train_codebook(
-            quantizer, rows, torch.from_numpy(importance),
-            iterations=self.iterations, batch=self.batch, reseed=self.reseed, training=self.training,
-            generator=torch.Generator().manual_seed(seed),
-        )  # fmt: skip
+        rows, weights = torch.from_numpy(x).to(self.device), None
+        if importance.any():
+            weights = torch.from_numpy(importance / importance.max()).to(self.device)
+        generator = torch.Generator().manual_seed(seed)
+        if self.training == "kmeans":
+            quantizer.fit(rows, weights=weights, iterations=self.iterations, generator=generator)
+        else:
+            quantizer.train(
+                rows, weights, self.iterations, self.batch,
+                generator=generator, rule=self.training, reseed=self.reseed,
+            )  # fmt: skip
         index, side = quantizer.encode(rows)
-        used, codes = np.unique(index.numpy(), return_inverse=True)
+        used, codes = np.unique(index.cpu().numpy(), return_inverse=True)
         return codes.astype(np.int64), side["codebook"][used]
 
     def pack(self, coded: CodedVectors) -> dict[str, bytes]:
