@@ -1,0 +1,88 @@
+"""Hyper-parameters of ChimeraGS: which parts it is made of, and its own stage in between.
+
+Defaults: the code of the Splatwizard paper's authors and the two methods whose parts these are; the paper has none.
+"""
+
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from splatwizard_core.training.distillation import DistillLoss
+from splatwizard_core.training.fine_tuning import FineTuningRates
+from splatwizard_core.training.params import OptimizationParams, Params
+
+
+class Train(Params):
+    """Stage 1: whose training makes the student."""
+
+    method: str = Field("speedy-splat", description="any installed method of explicit Gaussians; its stages run first")
+    soft: float = Field(0.80, ge=0, lt=1, description="`prune.soft` of speedy-splat; of no use to others")
+    hard: float = Field(0.30, ge=0, lt=1, description="`prune.hard` of speedy-splat; of no use to others")
+
+
+class Mask(Params):
+    """The mask on the coefficients of SH degree 3, one logit a Gaussian."""
+
+    init: float = Field(-4.5951, description="logit at the start: just on, sigmoid(-4.5951) = 0.0100002")
+    threshold: float = Field(0.01, gt=0, lt=1, description="a mask is on where its sigmoid is above this")
+    lr: float = Field(1e-3, ge=0, description="Adam step size of the logits")
+    weight: float = Field(1e-2, ge=0, description="weight of the mean sigmoid in the loss (with loss l2 about 2e-4)")
+
+
+class Distill(Params):
+    """Stage 2: the student learns from a frozen teacher, and which Gaussians need degree 3."""
+
+    iterations: int = Field(5_000, ge=1, description="steps of the stage, of the full run")
+    teacher: str = Field(
+        "3dgs", description="the method whose trained scene teaches; student_initial: what stage 1 left"
+    )
+    loss: DistillLoss = Field("l1_ssim", description="between the two renders; l2: as the paper has it")
+    lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in l1_ssim; the rest is that of L1")
+    pseudo_views: bool = Field(True, description="move the camera in two steps of three")
+    pseudo_view_std: float = Field(0.05, ge=0, description="standard deviation of its centre along each axis")
+    pseudo_view_extent: float = Field(
+        0, ge=0, description="scene extent for which that is meant, it scales along; 0: it is in world units"
+    )
+    lr: FineTuningRates = Field(FineTuningRates(), description="step sizes")
+
+
+class Score(Params):
+    """What each Gaussian matters for the file."""
+
+    pruner: str = Field("lightgaussian", description="whose scores: any registered pruner, with its own settings")
+    v_pow: float = Field(0.1, ge=0, description="power of the volume in the score of lightgaussian")
+
+
+class VQ(Params):
+    """The vectors of colour, each group with a codebook of its own."""
+
+    codec: str = Field("importance-vq", description="coder of vectors, by name; the keys below are those of this one")
+    preset: Literal["own", "toolkit"] = Field(
+        "own", description="toolkit: the codebook is trained by the rule of the authors' code"
+    )
+    ratio2: float = Field(0.8, ge=0, le=1, description="share of the degree-2 group that shares the codebook")
+    ratio3: float = Field(0.6, ge=0, le=1, description="the same of the degree-3 group")
+    size: int = Field(8192, ge=2, le=1 << 16, description="entries of each codebook, at most one for 4 such vectors")
+    iterations: int = Field(1_000, ge=0, description="updates of the codebook")
+    batch: int = Field(80_000, ge=1, description="vectors of each update")
+
+
+class ChimeraConfig(OptimizationParams):
+    """Everything that can be set for ChimeraGS."""
+
+    ENCODING: ClassVar[tuple[str, ...]] = ("vq", "xyz", "prefer")
+
+    train: Train = Field(Train(), description="stage 1")
+    student: dict[str, Any] = Field(
+        {}, description="values of `train.method` by its keys (student.prune.interval=500), and its preset"
+    )
+    distill: Distill = Field(Distill(), description="stage 2")
+    mask: Mask = Field(Mask(), description="which Gaussians keep SH degree 3")
+    score: Score = Field(Score(), description="whose colours are kept")
+    vq: VQ = Field(VQ(), description="the colours in the file")
+    xyz: Literal["float32", "float16", "uniform16"] = Field(
+        "float32", description="positions in the file: without loss, rounded, or on 2^16 steps of the bounding box"
+    )
+    prefer: list[str] = Field(
+        ["flash", "tcgs", "speedy", "standard"], description="what should draw the file, best first; the others do else"
+    )

@@ -1,0 +1,190 @@
+"""The file: two groups of Gaussians, those whose mask is off (SH degree 2) and the others (degree 3).
+
+Sections of a group `sh2`, `sh3`, rows in Morton order (docs/methods/chimerags.md); an empty group has none:
+
+    xyz         `float-delta` of float32 [n,3]; float16: `byte-planes`; uniform16: `byte-planes` of uint16, and `box`
+    box         float64 [2,3]: lowest and highest coordinate, of `uniform16`
+    attributes  float16 [n,8], `byte-planes`: opacity logit, three log scales, four quaternion components, raw
+    vq/...      the parts of the vector coder: n vectors of 27 or 48 numbers, SH band 0, then channel by channel
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from splatwizard_core.errors import BitstreamError, ConfigError, SplatwizardError
+from splatwizard_core.gaussians.model import GaussianModel
+from sw_chimerags.model import DEGREE, LOWER, TENSORS, MaskedGaussians
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.plugins import PluginManager
+
+GROUPS = {"sh2": LOWER, "sh3": (DEGREE + 1) ** 2 - 1}
+"""Group -> coefficients behind band 0 that its Gaussians have, in the order of the decoded model."""
+
+POSITIONS = ("float32", "float16", "uniform16")
+HALF_MAX = 65504.0
+CELLS = 21  # bits an axis of the Morton codes
+STEPS = (1 << 16) - 1
+ROW_BYTES = 4 * (3 + 8 + 3 * (DEGREE + 1) ** 2)  # of a decoded Gaussian
+
+Arrays = dict[str, NDArray[Any]]
+
+
+def vector_coders(plugins: PluginManager) -> list[str]:
+    """Names of the installed coders of vectors by importance: those that are declared `codes="vectors"`."""
+    return [entry.name for entry in plugins.coders if entry.declared.get("codes") == "vectors"]
+
+
+def encode(
+    model: MaskedGaussians,
+    writer: ContainerWriter,
+    plugins: PluginManager,
+    *,
+    coder: str,
+    settings: Mapping[str, Mapping[str, Any]],
+    xyz: str,
+) -> None:
+    """Write both groups; the model stays as it is.
+
+    coder       name of the vector coder
+    settings    group -> what its coder is made with
+    xyz         one of POSITIONS
+
+    Raises ConfigError for a coder that there is not, SplatwizardError for values that are not finite and for a model
+    whose importance is not that of its Gaussians.
+    """
+    if coder not in vector_coders(plugins):
+        raise ConfigError(
+            f"no coder of vectors is called '{coder}'; installed: {', '.join(vector_coders(plugins))}", key="vq.codec"
+        )
+    if not model.has_importance():
+        raise SplatwizardError(
+            "the model was changed since the importance of its Gaussians was computed: `distill` computes it at its end"
+        )
+    arrays = _arrays(model)
+    on = model.mask_on().cpu().numpy()
+    writer.raster["sh_degree"] = DEGREE
+    writer.static.update(vq=coder, xyz=xyz)
+    for group, rows in (("sh2", ~on), ("sh3", on)):
+        writer.static[f"num_{group}"] = int(rows.sum())
+        if rows.any():
+            ordered = _in_order({name: array[rows] for name, array in arrays.items()}, plugins)
+            vectors = plugins.coders.load(coder)(plugins, **settings.get(group, {}))
+            _write_group(group, ordered, writer, plugins, vectors, xyz)
+    writer.allow(ROW_BYTES * len(on), f"a model of {len(on):,} Gaussians")
+
+
+def _arrays(model: MaskedGaussians) -> Arrays:
+    """The tensors and the importance on the host; float16 will hold their values."""
+    found: Arrays = {}
+    for name in TENSORS:
+        array = getattr(model, name).detach().float().cpu().numpy()
+        if not np.isfinite(array).all():
+            rows = int((~np.isfinite(array)).reshape(len(array), -1).any(1).sum())
+            raise SplatwizardError(f"'{name}' of {rows:,} Gaussians is not finite: they cannot be encoded")
+        found[name] = array if name == "means" else array.clip(-HALF_MAX, HALF_MAX)
+    found["importance"] = model.importance.double().cpu().numpy()
+    return found
+
+
+def _in_order(arrays: Arrays, plugins: PluginManager) -> Arrays:
+    """Rows along a Morton curve through their own bounding box, x in the lowest bit."""
+    points = arrays["means"].astype(np.float64)
+    low = points.min(0)
+    width = np.maximum(points.max(0) - low, 1e-300)
+    cells = ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
+    order = plugins.coders.load("float-delta").sort(cells)
+    return {name: array[order] for name, array in arrays.items()}
+
+
+def _write_group(
+    group: str, arrays: Arrays, writer: ContainerWriter, plugins: PluginManager, coder: Any, xyz: str
+) -> None:
+    planes = plugins.coders.load("byte-planes")()
+    means, rest = arrays["means"], arrays["sh_rest"][:, : GROUPS[group]]
+    if xyz == "float32":
+        writer.add(f"{group}/xyz", plugins.coders.load("float-delta")().encode(means))
+    elif xyz == "float16":
+        writer.add(f"{group}/xyz", planes.encode(means.clip(-HALF_MAX, HALF_MAX).astype(np.float16)))
+    else:
+        box = np.stack([means.min(0), means.max(0)]).astype(np.float64)
+        width = np.maximum(box[1] - box[0], 1e-300)
+        writer.add_array(f"{group}/box", box)
+        writer.add(f"{group}/xyz", planes.encode(np.rint((means - box[0]) / width * STEPS).astype(np.uint16)))
+    columns = [arrays["opacity_logits"][:, None], arrays["log_scales"], arrays["quats"]]
+    writer.add(f"{group}/attributes", planes.encode(np.concatenate(columns, 1).astype(np.float16)))
+    n = len(means)
+    colors = np.concatenate([arrays["sh_dc"].reshape(n, 3), rest.transpose(0, 2, 1).reshape(n, -1)], 1)
+    for part, data in coder.encode(colors, arrays["importance"]).items():
+        writer.add(f"{group}/vq/{part}", data)
+
+
+def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
+    """The model of a file. Raises BitstreamError."""
+    counts = {group: reader.integer(f"num_{group}", low=0, high=2**32 - 1) for group in GROUPS}
+    total = sum(counts.values())
+    reader.allow(ROW_BYTES * total, f"a model of {total:,} Gaussians")
+    xyz = reader.text("xyz", choices=POSITIONS)
+    coder = plugins.coders.load(reader.text("vq", choices=vector_coders(plugins)))(plugins)
+    groups = [_read_group(group, n, reader, plugins, coder, xyz) for group, n in counts.items()]
+    tensors = [torch.cat([group[i] for group in groups]) for i in range(len(TENSORS))]
+    return GaussianModel(*tensors, active_sh_degree=DEGREE)
+
+
+def _read_group(
+    group: str, n: int, reader: ContainerReader, plugins: PluginManager, coder: Any, xyz: str
+) -> list[Tensor]:
+    """The tensors of a group in the order of TENSORS; bands that it lacks are zero."""
+    rest = np.zeros((n, GROUPS["sh3"], 3), np.float32)
+    if n == 0:
+        vectors, attributes, means = np.zeros((0, 3 + 3 * GROUPS[group])), np.zeros((0, 8)), np.zeros((0, 3))
+    else:
+        means = _positions(group, n, reader, plugins, xyz)
+        with reader.decoding(f"{group}/attributes") as data:
+            attributes = _finite(plugins.coders.load("byte-planes")().decode(data, np.float16, (n, 8)))
+        vectors = _vectors(group, n, 3 + 3 * GROUPS[group], reader, coder)
+    rest[:, : GROUPS[group]] = vectors[:, 3:].reshape(n, 3, GROUPS[group]).transpose(0, 2, 1)
+    found = (means, vectors[:, None, :3], rest, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:])
+    return [torch.from_numpy(np.ascontiguousarray(array, np.float32)) for array in found]
+
+
+def _positions(group: str, n: int, reader: ContainerReader, plugins: PluginManager, xyz: str) -> NDArray[Any]:
+    if xyz == "float32":
+        with reader.decoding(f"{group}/xyz") as data:
+            return _finite(plugins.coders.load("float-delta")().decode(data, (n, 3)))
+    planes = plugins.coders.load("byte-planes")()
+    if xyz == "float16":
+        with reader.decoding(f"{group}/xyz") as data:
+            return _finite(planes.decode(data, np.float16, (n, 3)))
+    box = reader.array(f"{group}/box", dtype="float64", shape=(2, 3), finite=True)
+    with reader.decoding(f"{group}/xyz") as data:
+        steps = planes.decode(data, np.uint16, (n, 3)).astype(np.float64)
+        with np.errstate(over="ignore", invalid="ignore"):
+            return _finite((box[0] + steps / STEPS * (box[1] - box[0])).astype(np.float32))
+
+
+def _vectors(group: str, n: int, d: int, reader: ContainerReader, coder: Any) -> NDArray[Any]:
+    prefix = f"{group}/vq/"
+    parts = {name.removeprefix(prefix): reader.section(name) for name in reader.sections if name.startswith(prefix)}
+    if not parts:
+        raise BitstreamError(f"{reader.name}: there is no section {prefix}...")
+    first = prefix + next(iter(parts))
+    with reader.decoding(first):
+        found = np.asarray(coder.decode(parts, n, d))
+        if found.shape != (n, d):
+            raise BitstreamError(f"the coder of vectors gave {list(found.shape)}, expected {[n, d]}")
+        return _finite(found)
+
+
+def _finite(array: NDArray[Any]) -> NDArray[Any]:
+    if not np.isfinite(array).all():
+        raise BitstreamError("holds values that are not finite")
+    return array

@@ -1,0 +1,97 @@
+"""ChimeraGS, the method of the Splatwizard paper: parts of several methods, asked for by name, in one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.experiments.keys import dotted
+from splatwizard_core.experiments.method import Method, create_method
+from sw_chimerags import file
+from sw_chimerags.config import ChimeraConfig
+from sw_chimerags.model import MaskedGaussians
+from sw_chimerags.presets import PRESETS, RATES
+from sw_chimerags.stage import MaskedDistillation
+
+if TYPE_CHECKING:
+    import torch
+
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.scene.scene import Scene
+    from splatwizard_core.training.pruner import Pruner
+    from splatwizard_core.training.stage import Stage
+
+
+class ChimeraGS(Method):
+    """Splatwizard: A Benchmark Toolkit for 3D Gaussian Splatting Compression, section on ChimeraGS.
+
+    1. TRAIN    the stages of another method, Speedy-Splat's by default, make a small student
+    2. DISTILL  a frozen teacher, with pseudo views; a learned mask takes SH degree 3 from who does not need it
+    3. ENCODE   both groups apart: vectors of colour by importance (LightGaussian's coder), all else in halves
+    4. RENDER   plain Gaussians of degree 3, by the fastest forward rasterizer that is there
+    """
+
+    name: ClassVar[str] = "chimerags"
+    version: ClassVar[int] = 1
+    Config = ChimeraConfig
+    PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
+    DEFAULT_RATE: ClassVar[str] = "r2"
+
+    def _student(self) -> Method:
+        """The configured method of stage 1."""
+        config: ChimeraConfig = self.config
+        name = config.train.method
+        if name == self.name:
+            raise ConfigError("train.method is chimerags itself: name the method that makes the student", key="train")
+        full = self.plugins.methods.load(name).Config.FULL_ITERATIONS
+        values: dict[str, Any] = {"scale_schedule": config.scale_schedule}
+        if full == config.FULL_ITERATIONS:
+            values["iterations"] = config.iterations
+        elif config.scale_schedule:
+            values["iterations"] = max(1, round(full * config.schedule_scale))
+        if name == "speedy-splat":
+            values |= {"prune.soft": config.train.soft, "prune.hard": config.train.hard}
+        values |= dotted(config.student, "")
+        preset = str(values.pop("preset", "paper"))
+        return create_method(self.plugins, name, values, preset=preset)
+
+    def _pruner(self) -> Pruner:
+        """Whose scores say how well the file keeps a Gaussian."""
+        score = self.config.score
+        if score.pruner not in self.plugins.pruners:
+            known = ", ".join(sorted(entry.name for entry in self.plugins.pruners))
+            raise ConfigError(f"no pruner is called '{score.pruner}'; installed: {known}", key="score.pruner")
+        own = {"v_pow": score.v_pow} if score.pruner == "lightgaussian" else {}
+        pruner: Pruner = self.plugins.pruners.load(score.pruner)(**own)
+        return pruner
+
+    def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
+        return self._student().create_model(scene, generator)
+
+    def stages(self) -> Sequence[Stage]:
+        quantizer = self.plugins.quantizers.load("ste-mask")(self.config.mask.threshold)
+        return [*self._student().stages(), MaskedDistillation(self.config, quantizer, self._pruner())]
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        if not isinstance(model, MaskedGaussians):
+            raise TypeError(f"chimerags encodes what it has distilled, not a {type(model).__name__}")
+        vq = self.config.vq
+        settings: dict[str, dict[str, Any]] = {}
+        if vq.codec == "importance-vq":
+            training = "official" if vq.preset == "toolkit" else "ema"
+            shared = {"size": vq.size, "iterations": vq.iterations, "batch": vq.batch, "training": training}
+            settings = {"sh2": {"ratio": vq.ratio2, **shared}, "sh3": {"ratio": vq.ratio3, **shared}}
+        file.encode(model, writer, self.plugins, coder=vq.codec, settings=settings, xyz=self.config.xyz)
+        if self.config.prefer:
+            writer.raster["prefer"] = list(self.config.prefer)
+
+    def decode(self, reader: ContainerReader) -> SplatModel:
+        if reader.version != self.version:
+            raise BitstreamError(
+                f"{reader.name}: chimerags layout version {reader.version} is unknown, this installation reads "
+                f"{self.version}: upgrade sw-chimerags"
+            )
+        return file.decode(reader, self.plugins)

@@ -1,0 +1,11 @@
+"""What this package provides: the method chimerags. Its parts are asked for by name, from whoever has them."""
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_methods(registry: Registry) -> None:
+    registry.add("chimerags", "sw_chimerags.method:ChimeraGS",
+                 summary="Speedy-Splat's training, masked distillation, vectors by importance, fast renderers",
+                 presets=["paper", "inria", "quick"],
+                 rates=["r1", "r2", "r3", "r4"])  # fmt: skip
