@@ -8,7 +8,19 @@ import pytest
 from splatwizard_core.plugins import load_plugins
 
 NAMES = {
-    "quantizers": {"uniform", "ste-round", "uniform-noise", "ste-binary", "ste-mask", "vq"},
+    "quantizers": {
+        "uniform",
+        "ste-round",
+        "uniform-noise",
+        "ste-binary",
+        "ste-mask",
+        "fake-quant",
+        "lsq",
+        "position-grid",
+        "vq",
+        "residual-vq",
+        "ecvq",
+    },
     "entropy_models": {
         "columns",
         "categorical",

@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.rounding import SteBinary, SteMask, SteRound, UniformNoise
+from sw_codecs.binary import SteBinary, SteMask
+from sw_codecs.rounding import SteRound, UniformNoise
 from sw_codecs.uniform import Uniform
 
 

@@ -21,8 +21,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sw_codecs.binary import SteBinary
 from sw_codecs.rates import mask_bits
-from sw_codecs.rounding import SteBinary
 
 PRIMES = (1, 2654435761, 805459861)
 INITIAL = 1e-4

@@ -9,10 +9,18 @@ def register_quantizers(registry: Registry) -> None:
                  summary="affine, bits and range per channel; rounding or noise")  # fmt: skip
     registry.add("ste-round", "sw_codecs.rounding:SteRound", summary="multiples of a step, straight-through gradient")
     registry.add("uniform-noise", "sw_codecs.rounding:UniformNoise", summary="noise of one step in training")
-    registry.add("ste-binary", "sw_codecs.rounding:SteBinary", summary="the sign, +1 or -1")
-    registry.add("ste-mask", "sw_codecs.rounding:SteMask", summary="a learned mask with a threshold")
+    registry.add("ste-binary", "sw_codecs.binary:SteBinary", summary="the sign, +1 or -1")
+    registry.add("ste-mask", "sw_codecs.binary:SteMask", summary="a learned mask with a threshold")
+    registry.add("fake-quant", "sw_codecs.fake_quant:FakeQuantAffine",
+                 summary="affine with a zero point, range observed in training")  # fmt: skip
+    registry.add("lsq", "sw_codecs.lsq:Lsq", summary="a step learned by gradient")
+    registry.add("position-grid", "sw_codecs.position_grid:PositionQuantizer", summary="positions on a grid over a box")
     registry.add("vq", "sw_codecs.vector_quantizer:VectorQuantizer",
-                 summary="nearest codebook entry; k-means or EMA, bounded memory")  # fmt: skip
+                 summary="nearest codebook entry; k-means or weighted batches, bounded memory")  # fmt: skip
+    registry.add("residual-vq", "sw_codecs.residual_quantizer:ResidualVectorQuantizer",
+                 summary="a sum of entries, a codebook for each stage")  # fmt: skip
+    registry.add("ecvq", "sw_codecs.entropy_constrained:EntropyConstrainedQuantizer",
+                 summary="nearest entry with a price on its bits")  # fmt: skip
 
 
 @hookimpl
@@ -57,6 +65,8 @@ def register_coders(registry: Registry) -> None:
     registry.add("octree", "sw_codecs.octree:Octree", summary="point positions as octree occupancy")
     registry.add("morton-delta", "sw_codecs.position_codecs:MortonDelta", summary="point positions as Morton steps")
     registry.add("raw", "sw_codecs.position_codecs:RawPositions", summary="point positions as they are, zstd")
+    registry.add("draco", "sw_codecs.draco:Draco", available="sw_codecs.draco:unavailable",
+                 summary="point positions by Draco (pip install 'sw-codecs[draco]')")  # fmt: skip
     registry.add("byte-planes", "sw_codecs.byte_planes:BytePlanes",
                  summary="float or integer arrays without loss: byte planes, zstd")  # fmt: skip
     registry.add("float-delta", "sw_codecs.byte_planes:FloatDelta",

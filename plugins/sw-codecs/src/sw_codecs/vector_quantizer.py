@@ -14,7 +14,7 @@ from sw_codecs.kmeans import kmeans
 from sw_codecs.nearest import nearest
 from sw_codecs.stored_codebook import read_codebook, settled
 from sw_codecs.straight_through import straight_through
-from sw_codecs.weighted_rows import draw, gather
+from sw_codecs.weighted_rows import draw, gather, training_rows
 
 
 class VectorQuantizer:
@@ -72,7 +72,7 @@ class VectorQuantizer:
         With N < K the rows themselves become entries and the rest repeat the last one. Raises ShapeError for no rows,
         ValueError for values that are not finite.
         """
-        x, weights = self._training_rows(x, weights)
+        x, weights = training_rows(x, weights)
         self.codebook, self.counts, self.sums, errors = kmeans(
             x, weights, size=self.size, iterations=iterations, generator=generator, spread=spread, block=self.block,
             label=label,
@@ -108,7 +108,7 @@ class VectorQuantizer:
 
         An iteration costs batch * K distances. Source: LightGaussian (arXiv 2311.17245) for the loop. Raises as `fit`.
         """
-        x, weights = self._training_rows(x, weights)
+        x, weights = training_rows(x, weights)
         if rule not in RULES:
             raise ValueError(f"rule '{rule}': must be one of {', '.join(RULES)}")
         if iterations < 0 or batch < 1 or reseed < 0:
@@ -124,10 +124,12 @@ class VectorQuantizer:
     @torch.no_grad()
     def update(self, x: Tensor, *, generator: torch.Generator, weights: Tensor | None = None) -> None:
         """One EMA step with x [N, d]: counts, sums and codebook move by 1 - decay towards this batch."""
-        x, weights = self._rows(x), self._weights(x, weights)
         codebook = self._fitted().detach()
-        if len(x) == 0:
+        if len(self._rows(x)) == 0:
             return
+        weights = torch.ones(len(x), device=x.device) if weights is None else weights
+        training_rows(x, weights)  # EMA counts need weights on one scale over all batches: checked, not rescaled
+        x, weights = self._rows(x), weights.detach().to(x)
         index, _ = nearest(x, codebook.to(x.dtype), block=self.block)
         counts, sums = gather(x, weights, index, self.size)
         assert self.counts is not None
@@ -199,21 +201,3 @@ class VectorQuantizer:
         if x.ndim != 2 or (width is not None and x.shape[1] != width):
             raise ShapeError(f"rows have shape {list(x.shape)}", actual=x.shape, expected=("N", width or "d"))
         return x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)
-
-    def _training_rows(self, x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
-        """Rows of any width, and weights of mean 1."""
-        if x.ndim != 2 or len(x) == 0:
-            raise ShapeError("a codebook cannot be fitted to no rows", actual=x.shape, expected=("N", "d"))
-        if not bool(torch.isfinite(x).all()):
-            raise ValueError("values to quantize must be finite")
-        x = x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)
-        weights = self._weights(x, weights).to(torch.float64)
-        return x, (weights / weights.mean()).to(x.dtype)
-
-    def _weights(self, x: Tensor, weights: Tensor | None) -> Tensor:
-        if weights is None:
-            return torch.ones(len(x), dtype=x.dtype, device=x.device)
-        good = weights.shape == x.shape[:1] and bool(torch.isfinite(weights).all() and (weights >= 0).all())
-        if not good or (len(x) and not float(weights.sum()) > 0):
-            raise ValueError("weights must be one number >= 0 per row, finite, not all zero")
-        return weights.detach().to(x)

@@ -1,9 +1,11 @@
-"""Sums over the rows of each codebook entry, and rows drawn by weight."""
+"""Rows with weights: checked, summed over the rows of each codebook entry, drawn."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
+
+from splatwizard_core.errors import ShapeError
 
 ROWS = {"cpu": 1 << 12, "cuda": 1 << 18}  # rows whose float64 copies are held at a time
 
@@ -30,3 +32,22 @@ def log_uniform(count: int, generator: torch.Generator, device: torch.device) ->
     """log u, float64, u uniform in (0, 1): drawn where the generator lives."""
     u = torch.rand(count, generator=generator, device=generator.device, dtype=torch.float64)
     return torch.log(u.clamp_min(1e-300)).to(device)
+
+
+def training_rows(x: Tensor, weights: Tensor | None) -> tuple[Tensor, Tensor]:
+    """x [N, d] without gradient, at least float32, and its weights [N], of mean 1; None: all equal.
+
+    Raises ShapeError for no rows, ValueError for values that are not finite and for weights that are none.
+    """
+    if x.ndim != 2 or len(x) == 0:
+        raise ShapeError("a codebook cannot be fitted to no rows", actual=x.shape, expected=("N", "d"))
+    if not bool(torch.isfinite(x).all()):
+        raise ValueError("values to quantize must be finite")
+    x = x.detach() if x.dtype == torch.float64 else x.detach().to(torch.float32)
+    if weights is None:
+        return x, torch.ones(len(x), dtype=x.dtype, device=x.device)
+    good = weights.shape == x.shape[:1] and bool(torch.isfinite(weights).all() and (weights >= 0).all())
+    if not good or not float(weights.sum()) > 0:
+        raise ValueError("weights must be one number >= 0 per row, finite, not all zero")
+    found = weights.detach().to(x.device, torch.float64)
+    return x, (found / found.mean()).to(x.dtype)
