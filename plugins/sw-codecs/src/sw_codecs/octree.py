@@ -20,8 +20,8 @@ import numpy.typing as npt
 from splatwizard_core.errors import BitstreamError
 from sw_codecs import morton
 from sw_codecs.bits import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
-from sw_codecs.columns import Columns
 from sw_codecs.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
+from sw_codecs.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.model_spec import Tables
 from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
@@ -54,10 +54,10 @@ class Octree:
         Raises ValueError if they are not, SplatwizardError for more points than a reader accepts (`point_limit`).
         """
         codes = morton.sorted_codes(points, bits)
-        leaves, extra = _without_duplicates(codes)
+        leaves, extra = without_duplicates(codes)
         out = bytes([VERSION, bits]) + write_varint(len(codes)) + write_varint(len(leaves))
         if len(leaves):
-            out += _encode_tree(leaves, bits) + _encode_duplicates(extra)
+            out += _encode_tree(leaves, bits) + encode_duplicates(extra)
         out += zlib.crc32(codes.astype("<i8", copy=False)).to_bytes(4, "little")
         return check_written(len(codes), out, self.max_points)
 
@@ -76,19 +76,12 @@ class Octree:
         codes = np.empty(0, np.int64)
         if distinct:
             leaves = _decode_tree(reader, bits, distinct)
-            codes = np.repeat(leaves, _decode_duplicates(reader, count, distinct))
+            codes = np.repeat(leaves, decode_duplicates(reader, count, distinct))
         crc = reader.integer(4)
         reader.finish()
         if zlib.crc32(codes.astype("<i8", copy=False)) != crc:
             raise BitstreamError("the decoded points do not match their CRC-32")
         return morton.decode(codes)
-
-
-def _without_duplicates(codes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Distinct codes, and how many more points each of them stands for."""
-    is_first = np.diff(codes, prepend=-1) != 0
-    starts = np.flatnonzero(is_first)
-    return codes[is_first], np.diff(starts, append=len(codes)) - 1
 
 
 def _encode_tree(leaves: np.ndarray, bits: int) -> bytes:
@@ -187,29 +180,3 @@ def _bits(histogram: np.ndarray, table: np.ndarray) -> float:
     if (table > 0).sum() == 1 and (used & (table == 0)).any():
         return float("inf")  # a table with a single symbol can code nothing else
     return float((histogram[used] * -np.log2(np.maximum(table[used] / table.sum(), 2.0**-24))).sum())
-
-
-def _encode_duplicates(extra: np.ndarray) -> bytes:
-    """varint number of duplicated points; if any, varint length and a `columns` matrix of index steps and counts."""
-    places = np.flatnonzero(extra)
-    if not len(places):
-        return write_varint(0)
-    body = Columns().encode(np.stack([np.diff(places, prepend=0), extra[places]], 1))
-    return write_varint(len(places)) + write_varint(len(body)) + body
-
-
-def _decode_duplicates(reader: ByteReader, count: int, distinct: int) -> np.ndarray:
-    """How often each distinct point occurs; int64 [distinct], sums to `count`."""
-    times = np.ones(distinct, np.int64)
-    places = reader.varint(distinct)
-    if places:
-        steps, extra = Columns().decode(bytes(reader.take(reader.varint(reader.left))), (places, 2)).T
-        index = np.cumsum(steps)
-        if steps[0] < 0 or (steps[1:] <= 0).any() or index[-1] >= distinct or index.min() < 0:
-            raise BitstreamError("the indices of duplicated points are out of range")
-        if extra.min() <= 0 or extra.max() > count:
-            raise BitstreamError("the number of duplicates is out of range")
-        times[index] += extra
-    if times.sum() != count:
-        raise BitstreamError(f"{times.sum():,} points with duplicates, {count:,} were announced")
-    return times
