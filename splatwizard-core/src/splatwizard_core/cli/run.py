@@ -14,7 +14,6 @@ from splatwizard_core.cli.options import (
     assignments,
     changed_plan_option,
     config_option,
-    console,
     debug_option,
     device_option,
     images_option,
@@ -30,6 +29,7 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
+from splatwizard_core.cli.results import print_results
 from splatwizard_core.cli.setup import (
     lpips_folder,
     method_names,
@@ -43,9 +43,6 @@ from splatwizard_core.cli.setup import (
 if TYPE_CHECKING:
     from splatwizard_core.experiments.record import Record
     from splatwizard_core.scene.scene import Scene
-
-FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
-"""Metrics that stand first in the table, in this order."""
 
 
 @click.command(short_help="train, encode, decode, evaluate, report: one scene")
@@ -87,7 +84,8 @@ def run(
 ) -> None:
     """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
 
-    Finished steps are not done again; an interrupted run goes on from its last checkpoint.
+    Finished steps are not done again; an interrupted run goes on from its last checkpoint. Several runs end in one
+    table, one page and rd.svg, their rate-distortion curves, in the folder above theirs.
     """
     from splatwizard_core.experiments.config import is_demo
     from splatwizard_core.experiments.run import RunRequest
@@ -117,15 +115,12 @@ def run(
         )  # fmt: skip
         done.append(run_one(session, request))
         pages += page_of_run(done[-1][1], partial(session.scene, each))
-    pages += page_above([directory for _, directory in done])
+    above = above_runs([directory for _, directory in done])
     if as_json:
-        print_json({"runs": [{"directory": str(d), "record": r.model_dump(mode="json")} for r, d in done]})
+        runs = [{"directory": str(d), "record": r.model_dump(mode="json")} for r, d in done]
+        print_json({"runs": runs, "written": [str(path) for path in above]})
     else:
-        from rich.markup import escape
-
-        print_results(done)
-        for page in pages:
-            console().print(escape(str(page)), soft_wrap=True)
+        print_results(done, above or pages)
 
 
 def page_of_run(directory: Path, open_scene: Callable[[], Scene]) -> list[Path]:
@@ -141,79 +136,11 @@ def page_of_run(directory: Path, open_scene: Callable[[], Scene]) -> list[Path]:
     return [] if page is None else [page]
 
 
-def page_above(directories: list[Path]) -> list[Path]:
-    """The page about all that one command ran, in the folder above; the broadest of all."""
+def above_runs(directories: list[Path]) -> list[Path]:
+    """What is about all that one command ran, in the folder above: the page, and rate and distortion as a file."""
     try:
-        from splatwizard_core.experiments.report.after_run import report_above
+        from splatwizard_core.experiments.report.after_run import plot_above, report_above
     except ModuleNotFoundError:
         return []  # told already
-    page = report_above(directories, say)
-    return [] if page is None else [page]
-
-
-def print_results(done: list[tuple[Record, Path]]) -> None:
-    """One row a run, on stdout."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    out = console()
-    first = done[0][0]
-    # A metric that nobody could compute has its reason below, and no column.
-    names = list(dict.fromkeys(
-        name for record, _ in done for name, metric in record.metrics.items()
-        if not metric.diagnostic and (metric.mean is not None or metric.per_view)
-    ))  # fmt: skip
-    names.sort(key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
-    table = Table(
-        title=f"{escape(first.scene)}: {first.test_views} test views, protocol {escape(first.protocol.id)}",
-        title_justify="left",
-    )
-    table.add_column("method")
-    table.add_column("rate")
-    for column in (*(_heading(n) for n in names), "MB", "primitives", "train s", "encode s", "decode s", "FPS"):
-        table.add_column(column, justify="right")
-    for record, _ in done:
-        means = [record.metrics[n].mean if n in record.metrics else None for n in names]
-        table.add_row(
-            escape(record.method),
-            escape(record.rate or "-"),
-            *(_number(n, value) for n, value in zip(names, means, strict=True)),
-            f"{record.file.bytes / 1e6:.3f}",
-            " / ".join(f"{n:,}" for n in record.counts.values()),
-            _seconds(record.train.train_s),
-            _seconds(record.codec.encode_s),
-            _seconds(record.codec.decode_s),
-            f"{record.speed.fps:.1f}",
-        )
-    out.print(table)
-    for reason, affected in reasons_of_metrics([record for record, _ in done]).items():
-        out.print(escape(f"{', '.join(affected)}: {reason}"), soft_wrap=True)
-    for _, directory in done:
-        out.print(f"{escape(str(directory))}/metrics.json", soft_wrap=True)
-
-
-def reasons_of_metrics(records: list[Record]) -> dict[str, list[str]]:
-    """Why metrics have no mean -> which ones."""
-    from splatwizard_core.evaluation.metrics import short_reason
-
-    found: dict[str, dict[str, None]] = {}
-    for record in records:
-        for key, why in record.unknown.items():
-            block, _, name = key.partition(".")
-            if block == "metrics":
-                found.setdefault(short_reason(why), {})[name.removesuffix(".mean")] = None
-    return {why: list(names) for why, names in found.items()}
-
-
-def _heading(metric: str) -> str:
-    return {"psnr": "PSNR dB", "ssim": "SSIM", "l1": "L1"}.get(metric, metric)
-
-
-def _number(metric: str, value: float | None) -> str:
-    if value is None:
-        return "-"
-    return f"{value:.3f}" if metric == "psnr" else f"{value:.4f}"
-
-
-def _seconds(value: float | None) -> str:
-    return "-" if value is None else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
+    found = [report_above(directories, say), plot_above(directories, say)]
+    return [path for path in found if path is not None]

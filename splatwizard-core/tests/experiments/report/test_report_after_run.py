@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.experiments.report.after_run import report_above, report_run
+from splatwizard_core.experiments.report.after_run import plot_above, report_above, report_run
 from splatwizard_core.experiments.run import OWN_FILES
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
@@ -75,3 +75,31 @@ def test_a_page_that_cannot_be_made_never_fails_the_run(make_run):
     (line,) = told
     assert line.startswith(f"warning: {directory / 'report.html'} was not written: the scene went away")
     assert not (directory / "report.html").exists()
+
+
+def test_the_plot_above_shows_the_runs_of_the_scene_and_is_drawn_again_when_one_is_new(make_curve, make_run, tmp_path):
+    runs = make_curve()
+    others = make_curve("other", saving=0.5)
+    plot = plot_above([*runs, *others], print)
+    assert plot == tmp_path / "out" / "garden" / "rd.svg"
+    assert ">other<" in plot.read_text()
+    for directory in (*runs, *others):
+        age(directory / "metrics.json")
+    before = plot.stat().st_mtime_ns
+    assert plot_above([*runs, *others], print) == plot
+    assert plot.stat().st_mtime_ns == before
+    third = make_curve("third", saving=0.2)
+    plot_above([*runs, *others], print)
+    assert ">third<" in plot.read_text()
+    assert plot_above(third[:1], print) is None
+
+
+def test_runs_of_another_protocol_are_not_in_the_plot(make_curve, make_run):
+    def half(content):
+        content["protocol"] = {**content["protocol"], "id": "colmap/images_2/r-1/every8/black/pp-center/q8"}
+
+    runs = make_curve()
+    make_run("r1", method="halved", change=half)
+    text = plot_above(runs, print).read_text()
+    assert "halved" not in text
+    assert "Rate and distortion of toy on garden" in text

@@ -1,4 +1,5 @@
-"""What `sw run` leaves besides the record: the photographs that its page shows, and the page; also above its folder."""
+"""What `sw run` leaves besides the record: the photographs that its page shows, and the page; also above its folder,
+there with rate and distortion as a file of its own."""
 
 from __future__ import annotations
 
@@ -10,8 +11,11 @@ from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.experiments.record import FILE_NAME as RECORD
 from splatwizard_core.experiments.report.facts import read_facts
 from splatwizard_core.experiments.report.page import FILE_NAME, write_page
+from splatwizard_core.experiments.report.rd_file import FILE_NAME as PLOT_NAME
+from splatwizard_core.experiments.report.rd_file import rd_svg
 from splatwizard_core.experiments.report.runs import collect
 from splatwizard_core.experiments.report.truth import keep_truth
+from splatwizard_core.files import write_atomic
 from splatwizard_core.scene.scene import Scene
 
 
@@ -37,14 +41,42 @@ def report_above(directories: Sequence[Path], say: Callable[[str], None]) -> Pat
     """
     if len(directories) < 2:
         return None
-    parents = {directory.parent for directory in directories}
-    folder = parents.pop() if len(parents) == 1 else directories[0].parent.parent
+    folder = folder_above(directories)
     page = folder / FILE_NAME
     with _told(page, say) as made:
         if not _is_newer(page, [path.parent for path in folder.rglob(RECORD)]):
             write_page(collect([folder]), page)
         made.append(page)
     return page if made else None
+
+
+def plot_above(directories: Sequence[Path], say: Callable[[str], None]) -> Path | None:
+    """Write rate and distortion as a file of its own beside that page; None for a single run.
+
+    It shows the runs of the same scene under the same protocol that lie in the folder.
+    """
+    if len(directories) < 2:
+        return None
+    folder = folder_above(directories)
+    plot = folder / PLOT_NAME
+    with _told(plot, say) as made:
+        place = collect(directories[:1]).runs[0].place
+        runs = [run for run in collect([folder]).runs if run.place == place]
+        if not _is_newer(plot, [run.directory for run in runs]):
+            variants = {run.variant for run in runs}
+            whose = f" of {variants.pop()}" if len(variants) == 1 else ""  # one line has no legend
+            drawn = rd_svg(runs, f"Rate and distortion{whose} on {place[0]}")
+            if drawn is None:
+                return None  # no metric has a value: the table says why
+            write_atomic(plot, drawn)
+        made.append(plot)
+    return plot if made else None
+
+
+def folder_above(directories: Sequence[Path]) -> Path:
+    """The folder right above all these run directories."""
+    parents = {directory.parent for directory in directories}
+    return parents.pop() if len(parents) == 1 else directories[0].parent.parent
 
 
 @contextlib.contextmanager

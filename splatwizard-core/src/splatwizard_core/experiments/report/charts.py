@@ -139,7 +139,7 @@ def _series(series: Series, x: Axis, y: Axis) -> Markup:
             Markup('<path class="line{}" d="{}">{}</path>').format(" dashed" if series.dashed else "", line, name)
         )
     if series.marks:
-        shape = MARKERS[series.style % len(MARKERS)]
+        shape = _marker(series.style)
         for (px, py), point in zip(at, series.points, strict=True):
             label = Markup("")
             if point.label:
@@ -157,11 +157,14 @@ def _series(series: Series, x: Axis, y: Axis) -> Markup:
     return Markup('<g class="s{}">{}</g>').format(series.style % STYLES, Markup("").join(parts))
 
 
+def _marker(style: int) -> str:
+    """The shape of a series: colours repeat after STYLES series, then each has another shape than before."""
+    return MARKERS[(style + style // STYLES) % len(MARKERS)]
+
+
 def swatch(style: int, *, dashed: bool = False, marks: bool = True) -> Markup:
     """The key of a series in a legend."""
-    marker = Markup('<g class="point" transform="translate(14,7)"><path d="{}"/></g>').format(
-        MARKERS[style % len(MARKERS)]
-    )
+    marker = Markup('<g class="point" transform="translate(14,7)"><path d="{}"/></g>').format(_marker(style))
     return Markup(
         '<svg class="swatch s{}" viewBox="0 0 28 14" width="28" height="14" aria-hidden="true">'
         '<path class="line{}" d="M1,7H27"/>{}</svg>'
