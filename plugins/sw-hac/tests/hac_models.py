@@ -1,0 +1,71 @@
+"""Small models of HAC with values that follow their predicted distributions, as those of a trained one do."""
+
+import torch
+
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.experiments.config import apply_overrides
+from splatwizard_core.gaussians.coded_anchors import ENTROPY
+from splatwizard_core.plugins import load_plugins
+from sw_hac.config import HACConfig
+from sw_hac.method import HAC
+from sw_hac.model import HACAnchors
+
+PLUGINS = load_plugins()
+SMALL_GRID = {"features": 2, "log2_space": 8, "log2_planes": 8}
+
+
+def generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def method(**values) -> HAC:
+    overrides = {key.replace("__", "."): value for key, value in values.items()}
+    return HAC(PLUGINS, apply_overrides(HACConfig(), overrides, source="test"))
+
+
+def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwargs) -> HACAnchors:
+    """n anchors in front of the test camera; a fifth of the offsets, and anchors 0 to 4, are masked."""
+    g = generator(seed)
+    anchors = torch.rand(n, 3, generator=g) * 2 - torch.tensor([1.0, 1.0, -3.0])
+    grid = PLUGINS.context_models.load("hash-grid")((6, 10, 18), (10, 34), **SMALL_GRID, generator=g)
+    model = HACAnchors(
+        anchors, torch.zeros(n, feature_dim), torch.zeros(n, k, 3), torch.zeros(n, 6), voxel_size=0.01, hidden=8,
+        generator=g, entropy=PLUGINS.entropy_models.load("gaussian-exact")(), grid=grid, grid_hidden=16,
+        margin="extent", **kwargs,
+    )  # fmt: skip
+    with torch.no_grad():
+        for part in model.grid.grids:
+            part.table.copy_(torch.randn(part.table.shape, generator=g))
+        last = model.mlp_grid[2]
+        parts = last.bias.split([feature_dim, feature_dim, 6, 6, 3 * k, 3 * k, 1, 1, 1])
+        # Deviations of some steps, all predicted scales positive, steps of all sizes.
+        for part, center, width in zip(parts, (0, 4, 0.08, 0.01, 0, 0.8, 0.3, -0.4, 0.2),
+                                       (3, 1, 0.02, 0.002, 0.5, 0.2, 0, 0, 0), strict=True):  # fmt: skip
+            part.copy_(center + width * (torch.rand(part.shape, generator=g) * 2 - 1))
+        last.weight[-3:] *= 2
+        last.weight[2 * feature_dim : 2 * feature_dim + 12] *= 0.02
+        if n:
+            context = model.predict(torch.arange(n))
+            features, scales, offsets = (
+                mean + scale.clamp(min=1e-9) * torch.randn(mean.shape, generator=g)
+                for mean, scale in zip(context.means, context.scales, strict=True)
+            )
+            model.features.copy_(features)
+            model.log_scales.copy_(scales.clamp(min=1e-3).log())
+            model.offsets.copy_(offsets.view(n, k, 3))
+            model.mask_logits[torch.rand(n, k, generator=g) < 0.2] = -6
+            model.mask_logits[:5] = -6
+    model.phase = ENTROPY
+    return model.eval()
+
+
+def encoded(model: HACAnchors, **values) -> bytes:
+    writer = ContainerWriter("hac", HAC.version)
+    with torch.no_grad():
+        method(**values).encode(model, writer)
+    return writer.to_bytes()
+
+
+def decoded(data: bytes):
+    with torch.no_grad():
+        return HAC(PLUGINS, None).decode(ContainerReader(data))
