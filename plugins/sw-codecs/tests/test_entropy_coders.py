@@ -157,6 +157,7 @@ def test_a_chunk_under_a_float_model_that_does_not_decode_is_not_written(coder, 
     monkeypatch.setattr(coder, "_decode_chunk", lambda self, payload, count, spec: np.zeros(count, np.int32))
     with pytest.raises(RuntimeError, match="does not decode"):
         coder().encode(np.array([0, 1, 2]), Gaussian(0.0, 1.0, -5, 5))
+    assert coder(verify=False).encode(np.array([0, 1, 2]), Gaussian(0.0, 1.0, -5, 5))
 
 
 @pytest.mark.parametrize("coder", STREAMS)
@@ -244,5 +245,7 @@ def test_symbols_outside_the_model_are_refused(coder):
     for symbols in (np.array([3]), np.array([-1]), np.array([0.5]), np.array([[0]])):
         with pytest.raises(ValueError):
             coder().encode(symbols, Table(np.array([1, 1, 1])))
+    with pytest.raises(ValueError, match="leave the model"):  # not cut off to 32 bits
+        coder().encode(np.array([1 << 32]), Table(np.array([1, 1, 1])))
     with pytest.raises(ValueError, match="2 values"):
         coder().encode(np.zeros(3, int), Tables(np.array([[1, 1]]), np.array([0, 0])))

@@ -8,7 +8,7 @@ machine kind; what must decode anywhere goes through tables of integer counts (`
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Union
+from typing import Any, TypeVar, Union
 
 import numpy as np
 
@@ -34,6 +34,22 @@ def _check_domain(kmin: int, kmax: int) -> None:
         raise ValueError(f"domain {kmin}..{kmax} is wider than 2^24 symbols")
 
 
+Spec = TypeVar("Spec")
+
+
+def unchecked(kind: type[Spec], **fields: Any) -> Spec:
+    """A model made of fields that were checked before: looking at ten million parameters again takes its time."""
+    made = object.__new__(kind)
+    for name, value in fields.items():
+        object.__setattr__(made, name, value)
+    return made
+
+
+def changed(spec: Spec, **fields: Any) -> Spec:
+    """A copy of `spec` with other fields, unchecked."""
+    return unchecked(type(spec), **{**vars(spec), **fields})
+
+
 def _cut(array: np.ndarray, start: int, stop: int) -> np.ndarray:
     return array if array.ndim == 0 else array[start:stop]
 
@@ -53,7 +69,7 @@ class Gaussian:
         _check_domain(self.kmin, self.kmax)
 
     def part(self, start: int, stop: int) -> Gaussian:
-        return Gaussian(_cut(self.mu, start, stop), _cut(self.sigma, start, stop), self.kmin, self.kmax)
+        return changed(self, mu=_cut(self.mu, start, stop), sigma=_cut(self.sigma, start, stop))
 
 
 @dataclass(frozen=True)
@@ -71,7 +87,7 @@ class Laplace:
         _check_domain(self.kmin, self.kmax)
 
     def part(self, start: int, stop: int) -> Laplace:
-        return Laplace(_cut(self.mu, start, stop), _cut(self.b, start, stop), self.kmin, self.kmax)
+        return changed(self, mu=_cut(self.mu, start, stop), b=_cut(self.b, start, stop))
 
 
 def _counts(value: Any, ndim: int) -> np.ndarray:
@@ -119,10 +135,7 @@ class Tables:
         object.__setattr__(self, "index", index)
 
     def part(self, start: int, stop: int) -> Tables:
-        cut = object.__new__(Tables)  # both fields were checked
-        object.__setattr__(cut, "counts", self.counts)
-        object.__setattr__(cut, "index", self.index[start:stop])
-        return cut
+        return changed(self, index=self.index[start:stop])
 
 
 @dataclass(frozen=True)
@@ -139,7 +152,7 @@ class Bernoulli:
         object.__setattr__(self, "p", np.clip(p, 2.0**-24, 1 - 2.0**-24))
 
     def part(self, start: int, stop: int) -> Bernoulli:
-        return Bernoulli(_cut(self.p, start, stop))
+        return changed(self, p=_cut(self.p, start, stop))
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from sw_codecs.model_spec import (
     as_symbols,
     check_length,
     domain,
+    unchecked,
 )
 
 _models = constriction.stream.model
@@ -72,11 +73,10 @@ def _groups(spec: Tables) -> Iterator[tuple[Table, np.ndarray]]:
     """Each table that is used with the positions it codes, in ascending order: far faster than a table per symbol."""
     key = spec.index.astype(np.uint16 if len(spec.counts) <= 1 << 16 else np.int64)  # uint16 takes the radix sort
     order = np.argsort(key, kind="stable")
-    used, starts = np.unique(key[order], return_index=True)
-    for table, positions in zip(used, np.split(order, starts[1:]), strict=True):
-        shared = object.__new__(Table)  # the counts were checked with the spec
-        object.__setattr__(shared, "counts", spec.counts[int(table)])
-        yield shared, positions
+    ends = np.cumsum(np.bincount(key, minlength=1))
+    starts = np.concatenate([[0], ends[:-1]])
+    for table in np.flatnonzero(ends > starts).tolist():
+        yield unchecked(Table, counts=spec.counts[table]), order[starts[table] : ends[table]]
 
 
 def _settled(spec: ModelSpec) -> int | None:
@@ -111,6 +111,10 @@ class SymbolWriter:
         symbols = np.ascontiguousarray(symbols, "<i4")
         self.crc = zlib.crc32(symbols, self.crc)
         self.count += len(symbols)
+        self.put_checked(symbols, spec)
+
+    def put_checked(self, symbols: np.ndarray, spec: ModelSpec) -> None:
+        """As `put`, without a look at the symbols, int32 [n], n > 0, and without `crc` and `count`."""
         if isinstance(spec, Tables):
             for table, positions in _groups(spec):
                 self._code(symbols[positions], table)
@@ -140,7 +144,7 @@ class SymbolWriter:
                 for symbols, model, parameters in reversed(self._puts):
                     stack.encode_reverse(symbols, model, *parameters)
                 words = stack.get_compressed()
-        return words.astype("<u4").tobytes()
+        return bytes(words.astype("<u4", copy=False).tobytes())
 
 
 class SymbolReader:
@@ -152,7 +156,7 @@ class SymbolReader:
     def __init__(self, data: bytes | memoryview, *, last_in_first_out: bool = False) -> None:
         if len(data) % 4:
             raise BitstreamError(f"{len(data):,} coded bytes are not whole 32-bit words")
-        words = np.frombuffer(data, "<u4").astype(np.uint32)
+        words = np.frombuffer(data, "<u4").astype(np.uint32, copy=False)
         with guarded(BitstreamError, "entropy decoding"):
             if last_in_first_out:
                 self._coder = constriction.stream.stack.AnsCoder(words)
@@ -166,14 +170,18 @@ class SymbolReader:
         check_length(spec, count)
         if count == 0:
             return np.empty(0, np.int32)
-        if isinstance(spec, Tables):
-            symbols = np.empty(count, np.int32)
-            for table, positions in _groups(spec):
-                symbols[positions] = self._decode(len(positions), table)
-        else:
-            symbols = self._decode(count, spec)
+        symbols = self.get_unchecked(count, spec)
         self.crc = zlib.crc32(np.ascontiguousarray(symbols, "<i4"), self.crc)
         self.count += count
+        return symbols
+
+    def get_unchecked(self, count: int, spec: ModelSpec) -> np.ndarray:
+        """As `get` for count > 0, without `crc` and `count`."""
+        if not isinstance(spec, Tables):
+            return self._decode(count, spec)
+        symbols = np.empty(count, np.int32)
+        for table, positions in _groups(spec):
+            symbols[positions] = self._decode(len(positions), table)
         return symbols
 
     def _decode(self, count: int, spec: ModelSpec) -> np.ndarray:
