@@ -1,0 +1,102 @@
+"""Hyper-parameters of CAT-3DGS. Defaults are those of the authors' code for Mip-NeRF 360."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field
+
+from splatwizard_core.training.anchor_params import AnchorLearningRates, AnchorParams
+from splatwizard_core.training.params import Params
+
+FULL_RUN = 40_000
+"""Steps of the published plan."""
+
+
+class Phases(Params):
+    """When what is trained begins; steps."""
+
+    quantize: int = Field(3_000, ge=1, description="attributes get noise of fixed steps, masks a regulariser")
+    triplane: int = Field(
+        10_000, ge=1, description="the triplane is set up; one step later noise of predicted steps, and the rate"
+    )
+    warmup: int = Field(15_000, ge=1, description="planes are rounded one step later; their spatial models train alone")
+    scene: int = Field(16_000, ge=1, description="everything but the planes trains")
+    planes: int = Field(19_000, ge=1, description="everything trains")
+    official_warmup: bool = Field(
+        False,
+        description="spatial models stay as they are during the warm-up, as in the authors' code: it does nothing",
+    )
+    rebound: bool = Field(True, description="fit the lattice of positions again at the warm-up, when growth is over")
+
+
+class Context(Params):
+    """The models that predict attributes."""
+
+    channels: int = Field(72, ge=1, le=512, description="channels of each plane")
+    multiples: list[int] = Field([1, 2], min_length=1, max_length=4, description="resolutions of the scales")
+    anchors_per_cell: float = Field(
+        36.0, gt=0, description="the base resolution is sqrt(anchors / this) when the triplane is set up"
+    )
+    hidden: int = Field(100, ge=1, le=512, description="width of the context network")
+    slices: list[int] = Field(
+        [5, 10, 15, 20], min_length=1, max_length=64, description="slices of the features; sums to feature_dim"
+    )
+    slice_hidden: int = Field(100, ge=1, le=512, description="width of the networks of the slices")
+    refine: bool = Field(False, description="also predict scales and offsets better from all features")
+    neighbors: int = Field(50, ge=1, description="neighbours that decide whether an anchor is an outlier")
+    contamination: float = Field(0.05, ge=0, lt=1, description="share of anchors that the triplane's axes ignore")
+
+
+class Rate(Params):
+    """The rate term and the masks."""
+
+    lambda_: float = Field(0.002, ge=0, description="weight of the bits per number of an anchor")
+    triplane: float = Field(10.0, ge=0, description="weight of the bits of the planes, times lambda_")
+    sample: float = Field(
+        0.05, gt=0, le=1, description="share of the visible anchors whose bits are computed each step"
+    )
+    triplane_sample: float = Field(
+        1.0, gt=0, le=1, description="share of the channels whose bits are computed each step"
+    )
+    mask_floor: float = Field(1e-3, ge=0, description="least weight of the mean sigmoid of the mask logits")
+    mask_factor: float = Field(0.3, ge=0, description="that weight over lambda_, where it is more")
+    view_factor: float = Field(1.0, gt=0, description="weight of a mask of an anchor seen as often as the average one")
+
+
+class ContextLearningRates(Params):
+    """Adam step sizes of the context, from when they start; they decay over lr.max_steps."""
+
+    init: float = Field(0.008, gt=0, description="of context network, slices, planes (once trained) at the start")
+    final: float = Field(5e-5, gt=0, description="of those after `lr.max_steps`")
+    planes_init: float = Field(0.0075, gt=0, description="of the planes at the step that sets them up")
+    spatial_init: float = Field(0.005, gt=0, description="of the spatial models before the warm-up")
+
+
+class Codec(Params):
+    """What the file holds."""
+
+    mode: Literal["exact", "float"] = Field(
+        "exact", description="exact: integers, decodes anywhere; float: only where networks give the same floats"
+    )
+    weights: Literal["float32", "float16"] = Field("float32", description="how weights of networks are stored")
+
+
+class CatConfig(AnchorParams):
+    """Everything that can be set for CAT-3DGS."""
+
+    iterations: int = Field(FULL_RUN, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
+    scale_schedule: bool = Field(
+        False, description="multiply every plan bound and interval, and lr max_steps, by iterations / 40000"
+    )
+    lr: AnchorLearningRates = Field(AnchorLearningRates(max_steps=FULL_RUN), description="step sizes")
+    context_lr: ContextLearningRates = Field(ContextLearningRates(), description="step sizes of the context")
+    phases: Phases = Field(Phases(), description="what is trained when")
+    context: Context = Field(Context(), description="the models that predict attributes")
+    rate: Rate = Field(Rate(), description="rate term and masks")
+    codec: Codec = Field(Codec(), description="what the file holds")
+
+    @property
+    def schedule_scale(self) -> float:
+        """Of the published 40,000 steps, unlike most methods."""
+        return self.iterations / FULL_RUN if self.scale_schedule else 1.0

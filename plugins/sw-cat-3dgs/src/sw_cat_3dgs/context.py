@@ -1,0 +1,156 @@
+"""What predicts the attributes of an anchor from its position: triplane, context network, channel slices.
+
+The float form is trained. `places` are integers in training and file alike: both look at the very same spots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.gaussians.coded_anchors import AnchorContext
+
+if TYPE_CHECKING:
+    from splatwizard_core.plugins import PluginManager
+
+BASE_STEPS = (1.0, 0.001, 0.2)
+"""Quantiser steps of features, scales and offsets that predicted ones multiply."""
+STEP_OFFSET = 1.1
+"""A step is its base times (1.1 + tanh t): never zero."""
+PLANES = 3
+FRAME_ROWS = {"mean": slice(0, 1), "axes": slice(1, 4), "std": slice(4, 5), "low": slice(5, 6), "high": slice(6, 7)}
+
+
+@dataclass(frozen=True)
+class ContextShape:
+    """What sizes the networks: features F and offsets k of an anchor, and the fields of `config.Context`."""
+
+    features: int
+    offsets: int
+    channels: int
+    multiples: tuple[int, ...]
+    hidden: int
+    slices: tuple[int, ...]
+    slice_hidden: int
+    refine: bool
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """Numbers of an anchor by group."""
+        return self.features, 6, 3 * self.offsets
+
+    @property
+    def splits(self) -> list[int]:
+        """Outputs of the context network: mean and scale of each group, then three step logits."""
+        return [width for width in self.widths for _ in range(2)] + [PLANES]
+
+
+class CatContext(nn.Module):
+    """The context of all anchors.
+
+    frame       [7,3] buffer: constants of the triplane's frame; zeros until `set_up`
+    triplane    planes of the registry's `triplane`, resolution 0 until `set_up`
+    network     feature of a place -> means, scales, step logits
+    slices      the registry's `channel-ar`
+    arms        one of the registry's `spatial-ar` for each plane orientation
+    rounded     planes are used (and trained) as the file will have them
+    """
+
+    frame: Tensor
+
+    def __init__(self, plugins: PluginManager, shape: ContextShape, generator: torch.Generator) -> None:
+        super().__init__()
+        models = plugins.context_models
+        self.shape = shape
+        self.triplane = models.load("triplane")(0, shape.channels, shape.multiples)
+        self.network = _network(self.triplane.width, shape.hidden, sum(shape.splits), generator)
+        refined = {"scales": 6, "offsets": 3 * shape.offsets} if shape.refine else {}
+        self.slices = models.load("channel-ar")(shape.slices, refined, hidden=shape.slice_hidden, generator=generator)
+        self.arms = nn.ModuleList(models.load("spatial-ar")(generator) for _ in range(PLANES))
+        self.register_buffer("frame", torch.zeros(7, 3))
+        self.rounded = False
+
+    @property
+    def resolution(self) -> int:
+        """Of the coarsest planes; 0 before they are set up."""
+        return int(self.triplane.planes[0].shape[-1]) // self.shape.multiples[0]
+
+    # Set-up
+
+    def fit_frame(self, positions: Tensor, *, neighbors: int = 50, contamination: float = 0.05) -> None:
+        """Lay the axes through the anchors [N,3] of now, N > 0."""
+        xyz = positions.detach().cpu().numpy()
+        state = self.triplane.Frame.fit(xyz, neighbors=neighbors, contamination=contamination).state()
+        rows = np.concatenate([np.atleast_2d(state[name]) for name in FRAME_ROWS])
+        self.frame = torch.from_numpy(rows.astype(np.float32)).to(self.frame)
+
+    def places(self, codes: Tensor, bounds: Tensor) -> Tensor:
+        """Integer places [N,3] of position codes on the lattice `bounds`. Raises ValueError for a senseless frame."""
+        rows = self.frame.detach().cpu().numpy()
+        state = {name: rows[part] if name == "axes" else rows[part][0] for name, part in FRAME_ROWS.items()}
+        low, high = bounds.detach().cpu().numpy().astype(np.float64)
+        step = (high - low) / 65535
+        return self.triplane.Frame.from_state(state).unit(codes, low, np.where(step > 0, step, 1e-6))
+
+    @torch.no_grad()
+    def start_at(self, values: tuple[Tensor, Tensor, Tensor]) -> None:
+        """Let the network predict mean and deviation of each column of the groups, wherever an anchor is."""
+        if not len(values[0]):
+            return
+        bias = self.network[-1].bias
+        start = 0
+        for value, base in zip(values, BASE_STEPS, strict=True):
+            for column in (value.mean(dim=0), value.std(dim=0, unbiased=False).clamp(min=base)):
+                bias[start : start + len(column)] = column
+                start += len(column)
+        bias[start:] = 0
+
+    # Prediction in training
+
+    def forward(self, places: Tensor) -> AnchorContext:
+        """Of anchors at places [V,3]; differentiable."""
+        out = self.network(self.triplane(places, rounded=self.rounded)).split(self.shape.splits, dim=1)
+        steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(BASE_STEPS)  # [V,3]
+        return AnchorContext((out[0], out[2], out[4]), (out[1], out[3], out[5]), tuple(steps.split(1, dim=1)))  # type: ignore[arg-type]
+
+    def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
+        """The context once features [V,F] are known: each slice sees those before it."""
+        found = [self.slices(features, context.means[0], context.scales[0])]
+        for name, mean, scale in zip(("scales", "offsets"), context.means[1:], context.scales[1:], strict=True):
+            found.append(self.slices.refine(name, features, mean, scale) if self.shape.refine else (mean, scale))
+        means, scales = zip(*found, strict=True)
+        return dataclasses.replace(context, means=means, scales=scales)
+
+    def triplane_bits(self, noise: Any, share: float = 1.0) -> Tensor:
+        """Bits of the planes with noise in place of rounding; symbols and their neighbours alike.
+
+        noise   (*shape) -> U(0,1)
+        share   of the channels that are looked at, drawn anew each time; the sum is scaled up
+        """
+        channels = self.shape.channels
+        count = max(1, round(share * channels))
+        chosen = torch.argsort(noise(channels))[:count] if count < channels else None
+        total = self.frame.new_zeros(())
+        for plane in self.triplane.planes:
+            values = 16 * (plane if chosen is None else plane[:, chosen])
+            values = values + noise(*values.shape) - 0.5
+            bits = [arm.bits(each).sum() for arm, each in zip(self.arms, values, strict=True)]
+            total = total + torch.stack(bits).sum()
+        return total * (channels / count)
+
+
+def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
+    """inputs -> hidden, ReLU -> outputs; Xavier-uniform weights, no biases at first."""
+    layers = [nn.utils.skip_init(nn.Linear, *size) for size in ((inputs, hidden), (hidden, outputs))]
+    for layer in layers:
+        bound = math.sqrt(6 / (layer.in_features + layer.out_features))
+        with torch.no_grad():
+            layer.weight.copy_(torch.rand(layer.weight.shape, generator=generator) * 2 * bound - bound)
+            layer.bias.zero_()
+    return nn.Sequential(layers[0], nn.ReLU(), layers[1])

@@ -1,0 +1,90 @@
+"""The anchors of CAT-3DGS as they are trained: masks weighted by how often an anchor is seen, and the context."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any, Literal
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.gaussians.coded_anchors import AnchorContext, CodedAnchors
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.camera import Camera
+from sw_cat_3dgs.context import BASE_STEPS, STEP_OFFSET, CatContext
+
+Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
+
+
+class CatAnchors(CodedAnchors):
+    """CodedAnchors whose context is a CatContext.
+
+    view_weights    [N] buffer: views that see an anchor over their mean, times `view_factor`; multiplies its masks
+    views_stale     anchors came or went since the views were counted
+    context         what predicts attributes
+    trained         which parameters get gradients
+    """
+
+    ROWS = (*CodedAnchors.ROWS, "view_weights")
+
+    view_weights: Tensor
+
+    def __init__(self, *tensors: Tensor, context: CatContext, view_factor: float = 1.0, **kwargs: Any) -> None:
+        """Tensors and other arguments as of CodedAnchors."""
+        super().__init__(*tensors, base_steps=BASE_STEPS, noise_factor=STEP_OFFSET, **kwargs)
+        self.context = context.to(self.anchors.device)
+        self.view_factor = view_factor
+        self.views_stale = True
+        self.trained: Trained = "everything"
+        self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
+        self._places: tuple[Tensor, Tensor, Tensor] | None = None
+
+    def mask_weights(self) -> Tensor:
+        return self.view_weights[:, None]
+
+    @torch.no_grad()
+    def count_views(self, cameras: Iterable[Camera], rasterizer: Rasterizer) -> None:
+        """Weigh each anchor by how many of the cameras see it; what none sees is dropped."""
+        seen = torch.zeros_like(self.view_weights)
+        for camera in cameras:
+            seen[self.visible_anchors(camera.to(self.device), rasterizer)] += 1
+        self.view_weights = self.view_factor * seen / seen.mean().clamp(min=1e-12)
+        self.views_stale = False
+
+    def places(self) -> Tensor:
+        """[N,3] integer places of the anchors in the triplane, kept until anchors or frame are others."""
+        codes, frame = self.codes(), self.context.frame
+        kept = self._places
+        if kept is None or kept[0] is not codes or kept[1] is not frame:
+            kept = self._places = (codes, frame, self.context.places(codes, self.bounds))
+        return kept[2]
+
+    def predict(self, rows: Tensor) -> AnchorContext:
+        found: AnchorContext = self.context(self.places()[rows])
+        return found
+
+    def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
+        return self.context.refine(context, features)
+
+    def train_only(self, trained: Trained) -> None:
+        """Give gradients to these parameters alone."""
+        self.trained = trained
+        self.requires_grad_(trained in ("everything", "all but planes"))
+        if trained == "all but planes":
+            self.context.triplane.requires_grad_(False)
+        if trained == "spatial models":
+            self.context.arms.requires_grad_(True)
+
+    def state_dict_extra(self) -> dict[str, Any]:
+        return {
+            **super().state_dict_extra(),
+            "views_stale": self.views_stale,
+            "trained": self.trained,
+            "rounded": self.context.rounded,
+        }
+
+    def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
+        super().load_state_dict_extra(extra)
+        self.views_stale = bool(extra["views_stale"])
+        self.context.rounded = bool(extra["rounded"])
+        self.train_only(extra["trained"])

@@ -1,0 +1,147 @@
+"""How CAT-3DGS trains: the anchors' stage, with the phases of the triplane and of its spatial models."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from splatwizard_core.gaussians.coded_anchors import ENTROPY, QUANTIZED
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.training.anchor_stage import AnchorStage
+from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.scheduler import PhaseSwitch
+from splatwizard_core.training.stage import CameraIterator, LossPack
+from sw_cat_3dgs.config import CatConfig
+from sw_cat_3dgs.model import CatAnchors, Trained
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.rendering.rasterizer import RenderResult
+    from splatwizard_core.scene.scene import View
+    from splatwizard_core.training.params import OptimizationParams, PipelineParams
+    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.training.stage import StageContext
+
+log = logging.getLogger(__name__)
+
+
+class CatStage(AnchorStage):
+    """One stage of 40,000 steps."""
+
+    name = "cat-3dgs"
+    config: CatConfig
+
+    def begin(self, context: StageContext) -> SplatModel:
+        self.plane_draws = context.generator("triplane")
+        return super().begin(context)
+
+    def at(self, step: int) -> int:
+        """A step of the full plan, in those of this run."""
+        found = self.when(step)
+        assert isinstance(found, int)
+        return found
+
+    # Optimizer
+
+    def learning_rates(self, step: int) -> Mapping[str, float]:
+        rates, phases = self.config.context_lr, self.config.phases
+        since_triplane, since_warmup = step - self.at(phases.triplane), step - self.at(phases.warmup)
+        network = self.decay(max(since_triplane, 0), rates.init, rates.final)
+        return {
+            **super().learning_rates(step),
+            "context.triplane": network if since_triplane > 0 else rates.planes_init,
+            "context.network": network,
+            "context.slices": network,
+            "context.arms": self.decay(since_warmup, rates.init, rates.final)
+            if since_warmup > 0
+            else rates.spatial_init,
+        }
+
+    # Plan
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        phases = self.config.phases
+        scheduler.register_task(self.when(range(self.config.lr.max_steps)), self.update_lr)
+        scheduler.register_task(self.when(range(self.config.lr.max_steps)), self.update_cam_mask)
+        scheduler.register_task(1, self.update_anchor_bound)
+        PhaseSwitch(self.at(phases.quantize), QUANTIZED).register(scheduler)
+        scheduler.register_task(self.at(phases.triplane), self.update_anchor_bound)
+        scheduler.register_task(self.at(phases.triplane), self.setup_triplane)
+        PhaseSwitch(self.at(phases.triplane) + 1, ENTROPY).register(scheduler)
+        if phases.rebound:
+            scheduler.register_task(self.at(phases.warmup), self.update_anchor_bound)
+        scheduler.register_task(self.at(phases.warmup), self.train_spatial_models)
+        scheduler.register_task(self.at(phases.warmup) + 1, self.round_planes)
+        scheduler.register_task(self.at(phases.scene), self.train_all_but_planes)
+        scheduler.register_task(self.at(phases.planes), self.train_everything)
+
+    def update_cam_mask(self, model: CatAnchors, cameras: CameraIterator, rasterizer: Rasterizer) -> None:
+        if model.views_stale:
+            model.count_views([view.camera for view in cameras], rasterizer)
+
+    def adjust_anchor(self, model: CatAnchors, optimizer: SplatOptimizer, step: int) -> None:  # type: ignore[override]
+        super().adjust_anchor(model, optimizer, step)
+        model.views_stale = True  # also if as many came as went
+
+    def setup_triplane(self, model: CatAnchors, optimizer: SplatOptimizer) -> None:
+        settings, context = self.config.context, model.context
+        resolution = base_resolution(model.num_rows, settings.anchors_per_cell)
+        context.fit_frame(model.positions(), neighbors=settings.neighbors, contamination=settings.contamination)
+        for i, plane in enumerate(context.triplane.initial(resolution, self.plane_draws)):
+            optimizer.replace(model, f"context.triplane.planes.{i}", plane)
+        context.start_at(model.raw(torch.nonzero(model.kept()).squeeze(1)))
+        log.debug("triplane of base resolution %d for %d anchors", resolution, model.num_rows)
+
+    def train_spatial_models(self, model: CatAnchors) -> None:
+        alone: Trained = "nothing" if self.config.phases.official_warmup else "spatial models"
+        model.train_only(alone)
+
+    def round_planes(self, model: CatAnchors) -> None:
+        model.context.rounded = True
+
+    def train_all_but_planes(self, model: CatAnchors) -> None:
+        model.train_only("all but planes")
+
+    def train_everything(self, model: CatAnchors) -> None:
+        model.train_only("everything")
+
+    # Loss
+
+    def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Tensor]:
+        rate, terms = self.config.rate, {}
+        if step >= self.at(self.config.phases.quantize):
+            weight = max(rate.mask_floor, rate.mask_factor * rate.lambda_)
+            terms["masks"] = weight * torch.sigmoid(model.mask_logits).mean()
+        if "rate" in result.extras:
+            terms["rate"] = rate.lambda_ * result.extras["rate"].bits
+        if model.context.rounded:
+            terms["triplane"] = rate.lambda_ * rate.triplane * self._plane_bits(model)
+        return terms
+
+    def _plane_bits(self, model: CatAnchors) -> Tensor:
+        """Of the planes, per number of all anchors."""
+        numbers = model.num_rows * sum(model.context.shape.widths)
+        bits: Tensor = model.context.triplane_bits(model.uniform, self.config.rate.triplane_sample) / numbers
+        return bits
+
+    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
+        assert isinstance(model, CatAnchors)
+        if model.trained not in ("spatial models", "nothing"):
+            return super().loss(model, view, result, background, step)
+        # A leaf of its own, so that there is a derivative to take where nothing learns.
+        total = result.image.new_zeros((), requires_grad=True)
+        if not model.context.rounded or model.trained == "nothing":
+            return LossPack(total, {})
+        bits = self._plane_bits(model)
+        return LossPack(total + bits, {"triplane": bits.detach()})
+
+
+def base_resolution(anchors: int, anchors_per_cell: float) -> int:
+    """Of a triplane for so many anchors."""
+    return max(1, round(math.sqrt(anchors / anchors_per_cell)))
