@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -23,21 +23,23 @@ from splatwizard_core.experiments.decoding import decode_model
 from splatwizard_core.experiments.encoding import encode
 from splatwizard_core.experiments.method import create_method
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 
 FOLDER = Path(__file__).resolve().parent
 FACTS = FOLDER / "golden.json"
 
 
-def procedural(n: int, degree: int = 3, active: int | None = None) -> GaussianModel:
-    """Scattered values by integer arithmetic alone: the same floats on every machine, with every library version."""
+class Scattered:
+    """Values by integer arithmetic alone: the same floats on every machine, with every library version."""
+
     drawn = 0
 
-    def values(*shape: int) -> torch.Tensor:
+    def __call__(self, *shape: int) -> torch.Tensor:
         """Multiples of 1/2048 in -1 .. 1, their distribution a triangle."""
-        nonlocal drawn
-        i = np.arange(drawn, drawn + int(np.prod(shape)), dtype=np.uint64)
-        drawn += len(i)
+        i = np.arange(self.drawn, self.drawn + int(np.prod(shape)), dtype=np.uint64)
+        self.drawn += len(i)
         mixed = i * np.uint64(2654435761) % np.uint64(2**32)
         mixed ^= (mixed * np.uint64(40503)) >> np.uint64(9)
         folded = (mixed & np.uint64(2047)).astype(np.int64) - ((mixed >> np.uint64(11)) & np.uint64(2047)).astype(
@@ -45,6 +47,10 @@ def procedural(n: int, degree: int = 3, active: int | None = None) -> GaussianMo
         )
         return torch.from_numpy((folded / 2048).astype(np.float32).reshape(shape))
 
+
+def procedural(n: int, degree: int = 3, active: int | None = None) -> GaussianModel:
+    """Gaussians of scattered values."""
+    values = Scattered()
     coefficients = (degree + 1) ** 2
     return GaussianModel(
         4 * values(n, 3), values(n, 1, 3), values(n, coefficients - 1, 3) / 4, 4 * values(n) + 1, values(n, 3) - 4,
@@ -73,7 +79,29 @@ def orderly() -> GaussianModel:
     return GaussianModel(means, torch.zeros(4096, 1, 3), rest, torch.ones(4096), torch.full((4096, 3), -2.0), quats)
 
 
-Case = tuple[str, str, dict[str, Any], Callable[[], GaussianModel]]
+def hac_anchors(settings: Mapping[str, Any]) -> SplatModel:
+    """Forty anchors of HAC with scattered values and networks, a fifth of the offsets masked."""
+    values = Scattered()
+    points = PointCloud(4 * values(40, 3), 0.5 + values(40, 3) / 2)
+    scene = Scene("scattered", [], [], points, Protocol("test"))
+    model = create_method(load_plugins(), "hac", settings).create_model(scene, torch.Generator())
+    with torch.no_grad():
+        for _, parameter in sorted(model.named_parameters()):
+            parameter.copy_(values(*parameter.shape))
+        model.anchors.mul_(4)
+        model.features.mul_(6)
+        model.log_scales.sub_(4)
+        model.mask_logits.copy_(torch.where(model.mask_logits > -0.4, 1.0, -9.0))
+        model.update_bounds()
+    return model
+
+
+SMALL_HAC = {
+    "voxel_size": 0.01, "num_offsets": 3, "feature_dim": 5, "hidden": 4, "grid.hidden": 6, "grid.features": 2,
+    "grid.space": [6, 18], "grid.planes": [10, 40], "grid.log2_space": 7, "grid.log2_planes": 8,
+}  # fmt: skip
+
+Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
 CASES: dict[str, Case] = {
     **{f"3dgs_{rate}_v1": ("3dgs", rate, {}, lambda: procedural(48)) for rate in ("r1", "r2", "r3", "r4", "r5")},
     "3dgs_exact_v1": ("3dgs", "r6", {}, lambda: procedural(16, 2, 1)),
@@ -83,6 +111,12 @@ CASES: dict[str, Case] = {
     "3dgs_dull_v1": ("3dgs", "r5", {}, lambda: procedural(30, 3, 0)),
     "3dgs_coincident_v1": ("3dgs", "r3", {"codec.position_bits": 9}, coincident),
     "3dgs_classes_v1": ("3dgs", "r1", {"codec.position_bits": 8}, orderly),
+    "trimming_the_fat_ply_v1": ("trimming-the-fat", "r3", {"codec": "gaussians-ply"}, lambda: procedural(5, 1)),
+    "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),
+    "pup_3dgs_exact_v1": ("pup-3dgs", "r3", {}, lambda: procedural(5, 1)),
+    "pup_3dgs_quantized_v1": ("pup-3dgs", "r6", {"codec": "gaussians-quantized"}, lambda: procedural(12, 1)),
+    "hac_exact_v1": ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC)),
+    "hac_half_v1": ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
 }
 """File -> method, rate point, other values of its configuration, model."""
 
@@ -106,7 +140,8 @@ def decoded_facts(data: bytes, name: str) -> dict[str, Any]:
     for key, parameter in sorted(model.named_parameters()):
         sha.update(f"{key}{list(parameter.shape)}{parameter.dtype}".encode())
         sha.update(parameter.detach().numpy().tobytes())
-    return {"parameters": sha.hexdigest(), "rows": model.num_rows, "active_sh_degree": model.active_sh_degree}
+    state = {name: getattr(model, name) for name in ("active_sh_degree",) if hasattr(model, name)}
+    return {"parameters": sha.hexdigest(), "rows": model.num_rows, **state}
 
 
 def main() -> None:
@@ -117,7 +152,7 @@ def main() -> None:
             path.write_bytes(encoded(name))
             file = {"bytes": path.stat().st_size, "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
             facts[name] = {**file, **decoded_facts(path.read_bytes(), name)}
-            print(f"{name}: {file['bytes']:,} bytes, {facts[name]['rows']:,} Gaussians")
+            print(f"{name}: {file['bytes']:,} bytes, {facts[name]['rows']:,} rows")
     FACTS.write_text(json.dumps(facts, indent=2) + "\n")
 
 

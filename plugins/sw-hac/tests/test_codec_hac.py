@@ -47,7 +47,7 @@ def test_the_decoder_has_the_encoders_integers_and_values():
     assert torch.equal(result.positions(), found.places.positions)
     assert torch.equal(result.masks, found.places.masks)
     assert result.counts() == {"num_anchors": 295, "num_gaussians": int(found.places.masks.sum())}
-    predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, "exact", PLUGINS)
+    predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS)
     _, steps = predicts.contexts(found.places.codes)
     for name, symbols, step in zip(("features", "scales", "offsets"), found.symbols, steps, strict=True):
         expected = torch.from_numpy((symbols * step).astype(np.float32))
@@ -74,7 +74,7 @@ def test_the_file_renders_as_the_rounded_model():
     with torch.no_grad():
         rows = torch.nonzero(rounded.kept()).squeeze(1)
         order = codec.morton_order(rounded.codes()[rows], PLUGINS)
-        predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, "exact", PLUGINS)
+        predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS)
         _, steps = predicts.contexts(found.places.codes)
         values = [torch.from_numpy((s * q).astype(np.float32)) for s, q in zip(found.symbols, steps, strict=True)]
         direct = DecodedAnchors(rounded.positions()[rows][order], values[0], values[2].view(-1, 4, 3), values[1],
@@ -139,7 +139,7 @@ def test_the_training_estimate_is_the_size_of_the_file():
 
 def test_exact_contexts_do_not_depend_on_the_batch_or_threads():
     model = make(n=3500)
-    predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, "exact", PLUGINS)
+    predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS)
     codes = model.codes()
     whole, steps = predicts.contexts(codes)
     for size in (1, 7, 3000):
@@ -154,8 +154,12 @@ def test_exact_contexts_do_not_depend_on_the_batch_or_threads():
 
 def test_integers_predict_what_the_float_network_does():
     model = make(n=2000)
-    exact = codec.predictor(model.grid, model.mlp_grid, 8, 4, "exact", PLUGINS).contexts(model.codes())
-    floats = codec.predictor(model.grid, model.mlp_grid, 8, 4, "float", PLUGINS).contexts(model.codes())
+    exact = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS).contexts(
+        model.codes()
+    )
+    floats = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "float", PLUGINS).contexts(
+        model.codes()
+    )
     for g, base in enumerate((1.0, 0.001, 0.2)):
         for field in ("mean", "scale"):
             ours = np.asarray(getattr(exact[0][g], field)) / 4096 * base
@@ -298,7 +302,9 @@ def test_a_damaged_section_is_answered(name, place, value, how):
         ("num_offsets", 5), ("num_gaussians", 0), ("feature_dim", 0), ("feature_dim", 257), ("hidden", 9),
         ("hidden", 1.5), ("grid_hidden", 17), ("grid_features", 3), ("grid_space", []), ("grid_space", [2]),
         ("grid_space", [4096] * 32), ("grid_planes", [10, True]), ("grid_planes", None), ("grid_log2", [8]),
-        ("grid_log2", [22, 22]), ("mode", "fast"), ("mode", "float"), ("weights", "float64"), ("weights", "float16"),
+        ("grid_log2", [22, 22]), ("mode", "fast"),
+        ("base_steps", [1, 1]), ("base_steps", [1, 0, 1]), ("base_steps", [1, "x", 1]),
+        ("mode", "float"), ("weights", "float64"), ("weights", "float16"),
     ],
 )  # fmt: skip
 def test_header_values_of_a_stranger_are_refused(key, value):

@@ -10,7 +10,7 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 from splatwizard_core.testing.rasterizer_checks import front_camera
-from sw_hac.model import BASE_STEPS, group_widths, output_widths
+from sw_hac.model import group_widths, output_widths
 from sw_hac.stage import HACStage
 
 RASTERIZER = ReferenceRasterizer()
@@ -58,7 +58,7 @@ def test_steps_never_vanish():
     model = make()
     with torch.no_grad():
         model.mlp_grid[2].bias[-3:] = -40
-    for step, base in zip(model.predict(torch.arange(300)).steps, BASE_STEPS, strict=True):
+    for step, base in zip(model.predict(torch.arange(300)).steps, model.base_steps, strict=True):
         torch.testing.assert_close(step, torch.full_like(step, base / 64))
 
 
@@ -114,7 +114,7 @@ def test_prediction_may_start_from_statistics():
     kept = torch.nonzero(model.kept()).squeeze(1)
     model.start_from_statistics()
     found, values = model.predict(kept), model.raw(kept)
-    for mean, scale, value, base in zip(found.means, found.scales, values, BASE_STEPS, strict=True):
+    for mean, scale, value, base in zip(found.means, found.scales, values, model.base_steps, strict=True):
         torch.testing.assert_close(mean.mean(0), value.mean(0), atol=0.1 * float(value.std()), rtol=0.1)
         torch.testing.assert_close(scale.mean(0), value.std(0).clamp(min=base), atol=0.05, rtol=0.2)
 

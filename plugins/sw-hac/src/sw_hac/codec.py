@@ -31,7 +31,7 @@ from splatwizard_core.gaussians.anchor_lattice import TOP
 from splatwizard_core.gaussians.anchors import two_layers
 from splatwizard_core.gaussians.coded_anchors import rounded_indices
 from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
-from sw_hac.model import BASE_STEPS, HACAnchors, context_of, group_widths, output_widths
+from sw_hac.model import HACAnchors, context_of, group_widths, output_widths
 
 if TYPE_CHECKING:
     from splatwizard_core.coding.container import ContainerReader, ContainerWriter
@@ -55,6 +55,7 @@ class Predictor:
     mlp_grid: nn.Sequential
     feature_dim: int
     num_offsets: int
+    base_steps: tuple[float, ...]
     mode: str
     integer_mlp: Any
     entropy: Any
@@ -65,7 +66,7 @@ class Predictor:
             return self._exact(codes)
         with _one_thread():
             outputs = self.mlp_grid(self.grid(codes.to(torch.float32) / TOP))
-        found = context_of(outputs, self.feature_dim, self.num_offsets)
+        found = context_of(outputs, self.feature_dim, self.num_offsets, self.base_steps)
         steps = [step.numpy().astype(np.float64) for step in found.steps]
         triples = zip(found.means, found.scales, steps, strict=True)
         return [self.entropy.Context(m.clamp(-1e6, 1e6), s.clamp(1e-9, 1e6), q) for m, s, q in triples], steps
@@ -74,7 +75,7 @@ class Predictor:
         outputs = self.integer_mlp(self.grid.integer_features(codes))
         parts = torch.split(outputs, output_widths(self.feature_dim, self.num_offsets), dim=1)
         contexts, steps = [], []
-        for group, base in enumerate(BASE_STEPS):
+        for group, base in enumerate(self.base_steps):
             multiplier = self.entropy.step_multipliers(parts[6 + group])
             contexts.append(self.entropy.Context(parts[2 * group], parts[2 * group + 1], multiplier))
             steps.append(multiplier * (base / UNIT))
@@ -82,14 +83,20 @@ class Predictor:
 
 
 def predictor(
-    grid: Any, mlp_grid: nn.Sequential, feature_dim: int, num_offsets: int, mode: str, plugins: PluginManager
+    grid: Any,
+    mlp_grid: nn.Sequential,
+    feature_dim: int,
+    num_offsets: int,
+    base_steps: tuple[float, ...],
+    mode: str,
+    plugins: PluginManager,
 ) -> Predictor:
     """Raises ValueError if the network cannot be evaluated exactly."""
-    units = [1 / base for base in BASE_STEPS for _ in range(2)] + [1.0] * 3
+    units = [1 / base for base in base_steps for _ in range(2)] + [1.0] * 3
     scale = np.repeat(units, output_widths(feature_dim, num_offsets))
     integer_mlp = plugins.context_models.load("integer-mlp")
     return Predictor(
-        grid, mlp_grid, feature_dim, num_offsets, mode,
+        grid, mlp_grid, feature_dim, num_offsets, base_steps, mode,
         integer_mlp.from_module(mlp_grid, output_scale=scale) if mode == "exact" else None,
         plugins.entropy_models.load("conditional-gaussian"),
     )  # fmt: skip
@@ -122,7 +129,7 @@ def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec, plugins: Pl
     writer.add("grids", plugins.entropy_models.load("bernoulli")().encode(model.grid.signs().numpy()))
     add_networks(writer, model.networks(), codec.weights)
 
-    predicts = predictor(model.grid, model.mlp_grid, feature_dim, k, codec.mode, plugins)
+    predicts = predictor(model.grid, model.mlp_grid, feature_dim, k, model.base_steps, codec.mode, plugins)
     coder = predicts.entropy(codec.mode)
     coded: list[list[bytes]] = [[], [], []]
     symbols: list[list[np.ndarray]] = [[], [], []]
@@ -148,6 +155,7 @@ def add_header(model: HACAnchors, writer: ContainerWriter, codec: Codec, plugins
     space, planes = model.grid.grids[0], model.grid.grids[1]
     writer.static.update(
         mode=codec.mode,
+        base_steps=list(model.base_steps),
         feature_dim=model.features.shape[1],
         hidden=model.mlp_opacity[0].out_features,
         grid_hidden=model.mlp_grid[0].out_features,
@@ -168,6 +176,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     mode = reader.text("mode", choices=("exact", "float"))
     if mode == "float":
         _check_machine(reader)
+    base_steps = _read_steps(reader)
     k = reader.integer("num_offsets", low=1, high=64)
     places = read_places(reader, plugins, bytes_per_anchor=bytes_per_anchor(feature_dim, k))
     n = len(places.codes)
@@ -181,7 +190,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     mlp_grid = two_layers(grid.width, grid_hidden, sum(output_widths(feature_dim, k)), torch.Generator())
     read_networks(reader, {**{name: getattr(model, name) for name in model.NETWORKS}, "mlp_grid": mlp_grid})
     with reader.decoding("networks"):
-        predicts = predictor(grid, mlp_grid, feature_dim, k, mode, plugins)
+        predicts = predictor(grid, mlp_grid, feature_dim, k, base_steps, mode, plugins)
 
     coder = predicts.entropy(mode)
     cut = coder.blocks(n, max(widths))
@@ -216,6 +225,16 @@ class _Blocks:
     def finish(self) -> None:
         with self._reader.decoding(self._name):
             next(self._blocks, None)  # raises if bytes follow the last block
+
+
+def _read_steps(reader: ContainerReader) -> tuple[float, ...]:
+    steps = reader.static.get("base_steps")
+    fits = isinstance(steps, list) and len(steps) == 3
+    if not fits or any(type(q) not in (int, float) or not 1e-6 <= q <= 1e3 for q in steps):
+        raise BitstreamError(
+            f"{reader.name}: header value 'base_steps' must be three numbers in 1e-6..1e3", section="header"
+        )
+    return tuple(float(q) for q in steps)
 
 
 def _read_grid(reader: ContainerReader, features: int, plugins: PluginManager) -> Any:

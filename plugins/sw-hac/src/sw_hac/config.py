@@ -60,6 +60,19 @@ class Rate(Params):
     )
 
 
+class Steps(Params):
+    """Quantiser steps before they are predicted (Q0); a predicted one is at most twice as large."""
+
+    features: float = Field(1.0, ge=1e-6, le=1e3, description="of the anchor features")
+    scales: float = Field(0.001, ge=1e-6, le=1e3, description="of the scales, world units")
+    offsets: float = Field(0.2, ge=1e-6, le=1e3, description="of the offsets, in units of the first three scales")
+
+    @property
+    def triple(self) -> tuple[float, float, float]:
+        """In the order of the groups."""
+        return self.features, self.scales, self.offsets
+
+
 class Codec(Params):
     """What the file holds."""
 
@@ -79,4 +92,5 @@ class HACConfig(AnchorParams):
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
     rate: Rate = Field(Rate(), description="rate term of the loss")
+    steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
     codec: Codec = Field(Codec(), description="what the file holds")

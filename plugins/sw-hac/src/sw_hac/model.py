@@ -1,7 +1,7 @@
 """The model: anchors, a binary hash grid over their positions, and a network that makes distributions of both.
 
 For an anchor at u in [0,1]^3 the network gives mean and deviation of its F features, 6 scales and 3k coordinates of
-offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t) with Q0 = 1, 0.001 and 0.2.
+offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t); Q0 = 1, 0.001 and 0.2 as published.
 Source: HAC (arXiv 2403.14530), section 4.
 """
 
@@ -17,8 +17,6 @@ from splatwizard_core.gaussians.anchor_lattice import TOP
 from splatwizard_core.gaussians.anchors import two_layers
 from splatwizard_core.gaussians.coded_anchors import AnchorContext, CodedAnchors
 
-BASE_STEPS = (1.0, 0.001, 0.2)
-"""Q0 of features, scales and offsets."""
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
 
@@ -50,7 +48,7 @@ class HACAnchors(CodedAnchors):
         grid        a MixedHashGrid of the registry's context model `hash-grid`
         grid_hidden width of the network behind it
         """
-        super().__init__(*tensors, generator=generator, base_steps=BASE_STEPS, **kwargs)
+        super().__init__(*tensors, generator=generator, **kwargs)
         widths = output_widths(self.features.shape[1], self.num_offsets)
         self.grid = grid.to(self.features)
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
@@ -61,7 +59,8 @@ class HACAnchors(CodedAnchors):
 
     def predict(self, rows: Tensor) -> AnchorContext:
         features, bits = self.grid.with_bits(self.codes()[rows].to(self.features) / TOP)
-        return context_of(self.mlp_grid(features), self.features.shape[1], self.num_offsets, own_bits=bits)
+        outputs = self.mlp_grid(features)
+        return context_of(outputs, self.features.shape[1], self.num_offsets, self.base_steps, own_bits=bits)
 
     @torch.no_grad()
     def start_from_statistics(self) -> None:
@@ -75,15 +74,22 @@ class HACAnchors(CodedAnchors):
         last = self.mlp_grid[2]
         last.weight.mul_(0.01)
         found = []
-        for values, step in zip(self.raw(rows), BASE_STEPS, strict=True):
+        for values, step in zip(self.raw(rows), self.base_steps, strict=True):
             found += [values.mean(dim=0), values.std(dim=0).clamp(min=step)]
         last.bias.copy_(torch.cat([*found, last.bias.new_zeros(3)]))
 
 
-def context_of(outputs: Tensor, feature_dim: int, num_offsets: int, *, own_bits: Tensor | None = None) -> AnchorContext:
+def context_of(
+    outputs: Tensor,
+    feature_dim: int,
+    num_offsets: int,
+    base_steps: Sequence[float],
+    *,
+    own_bits: Tensor | None = None,
+) -> AnchorContext:
     """The context in float outputs [V, sum of output_widths]."""
     parts: Sequence[Tensor] = torch.split(outputs, output_widths(feature_dim, num_offsets), dim=1)
-    steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(BASE_STEPS, parts[6:], strict=True)]
+    steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(base_steps, parts[6:], strict=True)]
     return AnchorContext(
         (parts[0], parts[2], parts[4]), (parts[1], parts[3], parts[5]), (steps[0], steps[1], steps[2]), own_bits
     )
