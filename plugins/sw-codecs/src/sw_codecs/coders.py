@@ -71,7 +71,7 @@ class ChunkedCoder:
         check_length(model, n)
         low, high = domain(model)
         reader = ByteReader(data)
-        found = np.empty(n, np.int32)
+        found: list[np.ndarray] = []
         start = 0
         while start < n:
             count, kmin, kmax, length, crc = HEADER.unpack(reader.take(HEADER.size))
@@ -88,10 +88,10 @@ class ChunkedCoder:
                 chunk = self._decode_chunk(payload, count, _for_chunk(model, start, count, kmin, kmax))
             if zlib.crc32(np.ascontiguousarray(chunk, "<i4")) != crc or chunk.min() != kmin or chunk.max() != kmax:
                 raise BitstreamError("the decoded symbols do not match their CRC-32: damaged data or a wrong model")
-            found[start : start + count] = chunk
+            found.append(chunk)
             start += count
         reader.finish()
-        return found
+        return found[0] if len(found) == 1 else np.concatenate([np.empty(0, np.int32), *found])
 
     def _encode_chunk(self, symbols: np.ndarray, spec: ModelSpec) -> bytes:
         raise NotImplementedError

@@ -1,0 +1,294 @@
+"""Speed and size of the coders, entropy models and position codecs, each beside a yardstick taken in the same run.
+
+    python benchmarks/coders.py [--symbols 1000000 10000000] [--repeats 5] [--only coders models positions]
+
+Coders: millions of symbols a second beside the library `constriction` used plainly on the same arrays, and the ratio
+ours / plain (1.00: our chunks, checks and checksums cost nothing). Float models are decoded again by the encoder, as a
+proof: that time stands apart. Rates: bits a symbol beside the model's entropy and zstd level 19 on the same integers.
+Processor seconds of one thread; the runs of both take turns, and the fastest of each counts.
+"""
+
+import argparse
+import resource
+import time
+import zlib
+
+import constriction
+import numpy as np
+import torch
+import zstandard
+
+from splatwizard_core.plugins import load_plugins
+
+models = constriction.stream.model
+queue, stack = constriction.stream.queue, constriction.stream.stack
+huffman = constriction.symbol.huffman
+ZSTD_SAMPLE = 1_000_000  # symbols: level 19 takes a second for each
+
+
+def cpu_seconds():
+    """Of this process and of those it started (Draco's decoder)."""
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return time.process_time() + children.ru_utime + children.ru_stime
+
+
+def fastest(*functions, repeats):
+    """Seconds of the fastest run of each, and what each returned last."""
+    best, results = [float("inf")] * len(functions), [None] * len(functions)
+    for _ in range(repeats):
+        for i, function in enumerate(functions):
+            start = cpu_seconds()
+            results[i] = function()
+            best[i] = min(best[i], cpu_seconds() - start)
+    return best, results
+
+
+def zstd_bits(symbols):
+    sample = symbols[:ZSTD_SAMPLE]
+    narrow = next(t for t in (np.int8, np.uint8, np.int16, np.int32) if np.array_equal(sample.astype(t), sample))
+    return 8 * len(zstandard.ZstdCompressor(level=19).compress(sample.astype(narrow).tobytes())) / len(sample)
+
+
+def families(n, specs):
+    """Name -> (symbols int32 [n], our model, a plain model, its per-symbol parameters, entropy in bits a symbol)."""
+    r = np.random.default_rng(0)
+    mean, scale = r.normal(0, 10, n), np.exp(r.uniform(np.log(0.2), np.log(20), n))
+    for name, draw, ours, plain in (
+        ("Gaussian, a mean and scale each", r.normal, specs.Gaussian, models.QuantizedGaussian),
+        ("Laplace, a mean and scale each", r.laplace, specs.Laplace, models.QuantizedLaplace),
+    ):
+        k = np.rint(draw(mean, scale)).astype(np.int32)
+        low, high = int(k.min()), int(k.max())
+        yield name, k, ours(mean, scale, low, high), plain(low, high), (mean, scale), None
+    k = np.rint(r.normal(0.3, 4, n)).astype(np.int32)
+    low, high = int(k.min()), int(k.max())
+    yield (
+        "Gaussian, one",
+        k,
+        specs.Gaussian(0.3, 4.0, low, high),
+        models.QuantizedGaussian(low, high, 0.3, 4.0),
+        (),
+        None,
+    )
+    counts = np.bincount(k - low)
+    p = counts / n
+    entropy = -(p[p > 0] * np.log2(p[p > 0])).sum()
+    table = models.Categorical(counts.astype(float), perfect=False)
+    yield f"table of {len(counts)}, one", k - np.int32(low), specs.Table(counts), table, (), entropy
+    tables, index = r.integers(1, 50, (64, 16)), r.integers(0, 64, n)
+    shares = (tables / tables.sum(1, keepdims=True)).cumsum(1)
+    k = (r.random(n)[:, None] > shares[index]).sum(1).clip(0, 15).astype(np.int32) if n <= 2_000_000 else (
+        np.concatenate([(r.random(len(part))[:, None] > shares[part]).sum(1) for part in np.array_split(index, 10)])
+        .clip(0, 15).astype(np.int32))  # fmt: skip
+    rows = tables[index].astype(float) if n <= 2_000_000 else None  # 1.3 GB at 10^7
+    yield (
+        "tables of 16, one of 64 each",
+        k,
+        specs.Tables(tables, index),
+        models.Categorical(perfect=False),
+        (rows,),
+        None,
+    )
+    p = r.uniform(0.01, 0.99, n)
+    yield "Bernoulli, a share each", (r.random(n) < p).astype(np.int32), specs.Bernoulli(p), models.Bernoulli(
+        perfect=False), (p,), -(p * np.log2(p) + (1 - p) * np.log2(1 - p)).mean()  # fmt: skip
+    yield "Bernoulli, one", (r.random(n) < 0.1).astype(np.int32), specs.Bernoulli(0.1), models.Bernoulli(
+        0.1, perfect=False), (), 0.468996  # fmt: skip
+
+
+def plain_coder(name, symbols, model, parameters):
+    """Encoder and decoder that do nothing but call the library."""
+    if name == "range":
+
+        def encode():
+            coder = queue.RangeEncoder()
+            coder.encode(symbols, model, *parameters)
+            return coder.get_compressed()
+
+        def decode(words):
+            coder = queue.RangeDecoder(words)
+            return coder.decode(model, *parameters) if parameters else coder.decode(model, len(symbols))
+
+    else:
+
+        def encode():
+            coder = stack.AnsCoder()
+            coder.encode_reverse(symbols, model, *parameters)
+            return coder.get_compressed()
+
+        def decode(words):
+            coder = stack.AnsCoder(words)
+            return coder.decode(model, *parameters) if parameters else coder.decode(model, len(symbols))
+
+    return encode, decode
+
+
+def plain_huffman(symbols, counts):
+    numbers, p = symbols.tolist(), counts.astype(np.float32)
+
+    def encode():
+        coder, tree = constriction.symbol.QueueEncoder(), huffman.EncoderHuffmanTree(p)
+        for symbol in numbers:
+            coder.encode_symbol(symbol, tree)
+        return coder.get_compressed_and_bitrate()[0]
+
+    def decode(words):
+        coder, tree = constriction.symbol.QueueDecoder(words), huffman.DecoderHuffmanTree(p)
+        return np.array([coder.decode_symbol(tree) for _ in range(len(numbers))], np.int32)
+
+    return encode, decode
+
+
+def bench_coder(name, coder, family, symbols, ours, plain, repeats):
+    """One line. plain: (encode, decode) of the library alone, or None."""
+    n, fast = len(symbols), coder(verify=False)
+    encode, decode = plain or ((lambda: None), (lambda words: None))
+    (ours_s, plain_s), (data, words) = fastest(lambda: fast.encode(symbols, ours), encode, repeats=repeats)
+    (ours_d, plain_d), (found, _) = fastest(lambda: fast.decode(data, n, ours), lambda: decode(words), repeats=repeats)
+    assert np.array_equal(found, symbols)
+    proof = ""
+    if family.startswith(("Gaussian", "Laplace")):
+        (whole,), _ = fastest(lambda: coder().encode(symbols, ours), repeats=2)
+        proof = f"{max(whole - ours_s, 0) / ours_s:8.1f} x"
+    ratios = [f"{p / o:5.2f}" if plain else "    -" for p, o in ((plain_s, ours_s), (plain_d, ours_d))]
+    print(
+        f"{name:<8}{family:<33}{n / ours_s / 1e6:10.1f} {ratios[0]}{n / ours_d / 1e6:16.1f} {ratios[1]}{proof:>10}"
+        f"{8 * len(data) / n:11.4f}",
+        end="",
+    )
+
+
+def bench_coders(plugins, n, repeats):
+    print(f"\n{n:,} symbols: Msymbols/s, and ours / plain")
+    print(f"{'':<41}{'encode':>16}{'decode':>22}{'proof':>10}{'bits/sym':>11}{'entropy':>9}{'zstd-19':>9}")
+    coders = {name: plugins.coders.load(name) for name in ("range", "rans", "huffman")}
+    for family, symbols, ours, model, parameters, entropy in families(n, coders["range"].specs):
+        zstd = zstd_bits(symbols)
+        for name, coder in coders.items():
+            if name == "huffman":
+                if not family.startswith("table of"):
+                    continue
+                plain = plain_huffman(symbols, ours.counts)
+            else:
+                has_plain = all(p is not None for p in parameters)
+                plain = plain_coder(name, symbols, model, parameters) if has_plain else None
+            bench_coder(name, coder, family, symbols, ours, plain, repeats)
+            print(f"{'' if entropy is None else f'{entropy:.4f}':>9}{zstd:9.3f}")
+    (crc,), _ = fastest(lambda: zlib.crc32(symbols), repeats=repeats)
+    print(f"a CRC-32 of the symbols alone: {n / crc / 1e6:.0f} Msymbols/s")
+
+
+def report(name, symbols, encode, decode, expected, yardstick_bytes, yardstick, repeats):
+    (encode_s,), (data,) = fastest(encode, repeats=repeats)
+    (decode_s,), (found,) = fastest(lambda: decode(data), repeats=repeats)
+    assert np.array_equal(found, expected)
+    print(
+        f"{name:<34}{symbols / encode_s / 1e6:10.2f}{symbols / decode_s / 1e6:10.2f}{8 * len(data) / symbols:10.4f}"
+        f"   {len(data) / yardstick_bytes:.4f} of {yardstick}"
+    )
+
+
+def bench_models(plugins, n, repeats):
+    print(f"\nentropy models, {n:,} symbols\n{'':<34}{'enc MS/s':>10}{'dec MS/s':>10}{'bits/sym':>10}   size")
+    r, load = np.random.default_rng(1), lambda name: plugins.entropy_models.load(name)
+    mean, scale = r.normal(0, 20, n), np.exp(r.uniform(np.log(0.2), np.log(20), n))
+    floats = {name: torch.from_numpy(value) for name, value in (("mean", mean), ("scale", scale))}
+    for family, draw in (("gaussian", r.normal), ("laplace", r.laplace)):
+        symbols = np.rint(draw(mean, scale)).astype(np.int64)
+        model, exact = load(family)(), load(f"{family}-exact")()
+        context = model.Context(**floats)
+        ideal = float(model.bits(torch.from_numpy(symbols.astype(float)), context).sum()) / 8
+        integers = exact.IntegerContext(np.rint(4096 * mean).astype(np.int64), np.rint(4096 * scale).astype(np.int64))
+        for coder, given in ((exact, integers), (model, context)):
+            name = family if coder is model else f"{family}-exact"
+            report(name, n, lambda c=coder, g=given, s=symbols: c.encode(s, g),
+                   lambda d, c=coder, g=given: c.decode(d, g), symbols, ideal, "its estimate", repeats)  # fmt: skip
+    symbols = np.rint(np.where(r.random(n) < 0.4, r.normal(-20, 2, n), r.normal(9, 5, n))).astype(np.int64)
+    mixture = load("mixture")()
+    context = mixture.Context(torch.tensor([0.4, 0.6]).log(), torch.tensor([-20.0, 9.0]), torch.tensor([2.0, 5.0]))
+    factorised = load("factorised")(init_scale=30)
+    optimizer = torch.optim.Adam(factorised.parameters(), lr=0.03)
+    for _ in range(300):
+        batch = torch.from_numpy(symbols[r.integers(0, n, 2048)]).float()
+        optimizer.zero_grad()
+        factorised.bits(batch + torch.rand(2048) - 0.5).mean().backward()
+        optimizer.step()
+    for name, model, given in (("mixture", mixture, context), ("factorised", factorised, None)):
+        ideal = float(model.bits(torch.from_numpy(symbols).float(), given).detach().double().sum()) / 8
+        report(name, n, lambda m=model, g=given: m.encode(symbols, g), lambda d, m=model: m.decode(d, (n,)), symbols,
+               ideal, "its estimate", repeats)  # fmt: skip
+    categorical, small = load("categorical")(), np.minimum(r.geometric(0.2, n) - 1, 63)
+    for name, model, given, coded in (
+        ("categorical", categorical, categorical.Context(64, n=n), small),
+        ("bernoulli", load("bernoulli")(), n, small < 3),
+    ):
+        ideal = float(model.bits(torch.from_numpy(coded), given).double().sum()) / 8
+        report(name, n, lambda m=model, g=given, c=coded: m.encode(c, g),
+               lambda d, m=model, g=given: m.decode(d, g), coded, ideal, "its estimate", repeats)  # fmt: skip
+    rows = max(n // 59, 1)
+    scales = r.uniform(5, 40, 59)
+    attributes = np.rint(r.normal(0, 1, (rows, 59)) * scales).clip(-128, 127).astype(np.int64)
+    columns = load("columns")()
+    zstd = len(zstandard.ZstdCompressor(level=19).compress(attributes.T.astype(np.int8).tobytes()))
+    report("columns (59 x 8 bit)", attributes.size, lambda: columns.encode(attributes),
+           lambda d: columns.decode(d, attributes.shape), attributes, zstd, "zstd-19", repeats)  # fmt: skip
+
+
+def bench_positions(plugins, n, repeats):
+    print(
+        f"\npositions and plain numbers, {n:,} points\n{'':<34}{'enc MP/s':>10}{'dec MP/s':>10}{'bits/pt':>10}   size"
+    )
+    r, level_19 = np.random.default_rng(2), zstandard.ZstdCompressor(level=19)
+    u = r.uniform(size=(n, 2)) * 2 * np.pi
+    torus = np.stack(
+        [(2 + np.cos(u[:, 1])) * np.cos(u[:, 0]), (2 + np.cos(u[:, 1])) * np.sin(u[:, 0]), np.sin(u[:, 1])], 1
+    )
+    points = ((torus + 3) / 6 * 65535).astype(np.int64)
+    points = points[plugins.coders.load("octree").sort(points)]
+    yardstick = len(level_19.compress(points.T.astype(np.uint16).tobytes()))
+    for name in ("octree", "morton-delta", "draco"):
+        codec = plugins.coders.load(name)()
+        try:
+            report(f"{name} (torus, 16 bit)", n, lambda c=codec: c.encode(points, 16), codec.decode, points, yardstick,
+                   "zstd-19, sorted", repeats)  # fmt: skip
+        except Exception as error:
+            print(f"{name:<34}{error}")
+    byte_planes, float_delta, packed = (
+        plugins.coders.load(name)() for name in ("byte-planes", "float-delta", "packed-bits")
+    )
+    floats, halves = torus.astype(np.float32), (0.3 * r.normal(size=(n, 3))).astype(np.float16)
+    for curve in ("morton", "hilbert"):
+        ordered = floats[float_delta.sort(floats, curve=curve)]
+        report(f"float-delta (f32, {curve})", n, lambda o=ordered: float_delta.encode(o),
+               lambda d, o=ordered: float_delta.decode(d, o.shape), ordered, ordered.nbytes, "the floats", 1,
+               )  # fmt: skip
+    report("byte-planes (3 x f16)", n, lambda: byte_planes.encode(halves),
+           lambda d: byte_planes.decode(d, halves.dtype, halves.shape), halves,
+           len(level_19.compress(halves.tobytes())), "zstd-19", 1)  # fmt: skip
+    indices = r.integers(0, 8192, n)
+    report("packed-bits (13)", n, lambda: packed.encode(indices, 13), lambda d: packed.decode(d, n, 13), indices,
+           13 * n / 8, "13 bits", repeats)  # fmt: skip
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--symbols", type=int, nargs="+", default=[1_000_000, 10_000_000])
+    parser.add_argument("--repeats", type=int, default=5)
+    parts = {"coders": bench_coders, "models": bench_models, "positions": bench_positions}
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    torch.manual_seed(0)
+    plugins = load_plugins()
+    for n in options.symbols if "coders" in options.only else []:
+        bench_coders(plugins, n, options.repeats)
+    for part in ("models", "positions"):
+        if part in options.only:
+            # Points are three numbers each, and their coders slower: half a million tell as much.
+            parts[part](
+                plugins, min(options.symbols[0], 500_000 if part == "positions" else 4_000_000), options.repeats
+            )
+
+
+if __name__ == "__main__":
+    main()
