@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import bisect
 import heapq
+import itertools
 import json
 import struct
 import zlib
@@ -389,7 +390,8 @@ class ExactTables:
         check(file.take(4) == b"SPWT", "magic of the tables")
         self.version = file.one("H")
         file.one("I")
-        file.take(128 * 2 + 64 * 4)  # step multipliers and scales: for encoders
+        self.multipliers = file.unpack("128H")
+        file.take(64 * 4)  # scales: for encoders
         self.thresholds = file.unpack("63I")
         self.radius, self.tables = {}, {}
         for family in ("gaussian", "laplace"):
@@ -466,6 +468,70 @@ def exact(
         found += values
     file.done()
     return found
+
+
+def conditional(
+    section: bytes,
+    tables: ExactTables,
+    c: int,
+    mean: np.ndarray,
+    scale: np.ndarray,
+    steps: np.ndarray,
+    there: np.ndarray,
+) -> np.ndarray:
+    """`conditional-gaussian`: integers like `mean` [n,C]; 0 where not `there`."""
+    file, found, rows = Bytes(section), np.zeros(mean.shape, np.int64), max(1, (1 << 20) // c)
+    for start in range(0, len(mean), rows):
+        part = slice(start, start + rows)
+        present = there[part]
+        spread = np.broadcast_to(steps[part], mean[part].shape)
+        parameters = [each[present].tolist() for each in (mean[part], scale[part], spread)]
+        found[part][present] = exact(file.take(file.varint()), "gaussian", tables, *parameters)
+    file.done()
+    return found
+
+
+def network(layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+    """A network in integers; `units` of the outputs of the last layer."""
+    a = np.clip(inputs, -(1 << 20), 1 << 20)
+    for i, (weight, bias) in enumerate(layers):
+        u = units if i == len(layers) - 1 else np.ones(len(bias))
+        w = np.rint(weight.astype(np.float64) * u[:, None] * 2.0**12).astype(np.int64)
+        c = np.rint(bias.astype(np.float64) * u * 2.0**24).astype(np.int64)
+        a = (a @ w.T + c) >> 12
+        if i < len(layers) - 1:
+            a = np.clip(a, 0, 1 << 20)
+    return a
+
+
+def hash_grid(bits: Iterator[int], levels: Sequence[int], limit: int, signs: int, codes: np.ndarray) -> np.ndarray:
+    """Outputs of a binary hash grid for `codes` [n,d]; takes its signs from `bits`."""
+    d, found = codes.shape[1], []
+    for r in levels:
+        size = -(-min(1 << limit, r**d) // 8) * 8
+        table = [[2 * next(bits) - 1 for _ in range(signs)] for _ in range(size)]
+        for row, code in enumerate(codes.tolist()):
+            places = [v * (r - 2) * 4096 // 65535 + 2048 for v in code]
+            total, sums = 0, [0] * signs
+            for corner in range(1 << d):
+                ends = [(t >> 12) + (corner >> axis & 1) for axis, t in enumerate(places)]
+                w = 1
+                for axis, (t, p) in enumerate(zip(places, ends, strict=True)):
+                    w *= 0 if p in (0, r - 1) else t % 4096 if corner >> axis & 1 else 4096 - t % 4096
+                if w == 0:
+                    continue
+                if r**d <= size:
+                    entry = sum(p * r**axis for axis, p in enumerate(ends))
+                else:
+                    entry = 0
+                    for p, prime in zip(ends, (1, 2654435761, 805459861), strict=False):
+                        entry ^= p * prime % 2**32
+                    entry %= size
+                total += w
+                sums = [s + w * sign for s, sign in zip(sums, table[entry], strict=True)]
+            found.append((row, [4096 * s // total if total else 0 for s in sums]))
+    n = len(codes)
+    return np.array([[x for _, out in found[row::n] for x in out] for row in range(n)], np.int64).reshape(n, -1)
 
 
 # 5 Positions
@@ -583,11 +649,13 @@ def packed_bits(data: bytes, n: int, w: int) -> list[int]:
 # 6 The files of each method
 
 
-def decode(data: bytes, unzstd: Callable[[bytes], bytes]) -> dict[str, np.ndarray]:
-    """The parameters of the Gaussians in a file, f32."""
+def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -> dict[str, np.ndarray]:
+    """The parameters of the model in a file, f32."""
     header, sections = container(data)
     check(header["method_version"] == 1, "layout version")
     static = header["static"]
+    if header["method"] == "hac":
+        return hac(static, sections, tables)
     if header["method"] == "3dgs":
         check(static["mode"] in ("exact", "quantized"), "mode")
         return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
@@ -691,3 +759,64 @@ def band_columns(section: bytes, n: int, band: int, classes: int, activity: list
                 column[i] = value
     file.done()
     return found
+
+
+def hac(static: dict[str, Any], sections: dict[str, bytes], tables: ExactTables) -> dict[str, np.ndarray]:
+    check(static["mode"] == "exact", "mode")
+    n, k, d, h = (static[name] for name in ("num_anchors", "num_offsets", "feature_dim", "hidden"))
+    bounds = np.frombuffer(sections["anchors"][:24], "<f4").astype(np.float64).reshape(2, 3)
+    codes = octree(sections["anchors"][24:])
+    masks = np.array(bernoulli(sections["masks"], n * k)).reshape(n, k) > 0
+    check(len(codes) == n and masks.sum() == static["num_gaussians"], "number of anchors")
+
+    signs, levels, limits = static["grid_features"], (static["grid_space"], static["grid_planes"]), static["grid_log2"]
+    grids = [(levels[len(axes) == 2], limits[len(axes) == 2], axes) for axes in ([0, 1, 2], [0, 1], [0, 2], [1, 2])]
+    entries = sum(-(-min(1 << limit, r ** len(axes)) // 8) * 8 for shape, limit, axes in grids for r in shape)
+    bits = iter(bernoulli(sections["grids"], signs * entries))
+    seen = np.concatenate(
+        [hash_grid(bits, shape, limit, signs, codes[:, axes]) for shape, limit, axes in grids], axis=1
+    )
+
+    weights = Bytes(sections["networks"])
+    form = {"float32": "<f4", "float16": "<f2"}[static["weights"]]
+
+    def layers(*widths: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        found = []
+        for a, b in itertools.pairwise(widths):
+            numbers = np.frombuffer(weights.take((a * b + b) * int(form[2])), form).astype(np.float32)
+            found.append((numbers[: a * b].reshape(b, a), numbers[a * b :]))
+        return found
+
+    drawing = {
+        "mlp_opacity": layers(d + 4, h, k),
+        "mlp_cov": layers(d + 4, h, 7 * k),
+        "mlp_color": layers(d + 4, h, 3 * k),
+    }
+    groups = (d, 6, 3 * k)
+    predicting = layers(seen.shape[1], static["grid_hidden"], 2 * sum(groups) + 3)
+    weights.done()
+
+    steps = static["base_steps"]
+    units = np.array([1 / q for q, width in zip(steps, groups, strict=True) for _ in range(2 * width)] + [1.0] * 3)
+    outputs, at, values = network(predicting, units, seen), 0, []
+    for g, (name, width) in enumerate(zip(("features", "scalings", "offsets"), groups, strict=True)):
+        numbers = np.clip((outputs[:, [g - 3]] + (1 << 15)) >> 9, 0, 127)
+        m = np.array(tables.multipliers, np.int64)[numbers]
+        there = np.repeat(masks, 3, axis=1) if name == "offsets" else np.ones((n, width), bool)
+        mean, scale = outputs[:, at : at + width], outputs[:, at + width : at + 2 * width]
+        i = conditional(sections[name], tables, max(groups), mean, scale, m, there)
+        values.append((i * (m * (steps[g] / 4096))).astype(np.float32))
+        at += 2 * width
+    step = (bounds[1] - bounds[0]) / 65535
+    return {
+        "anchors": (codes * np.where(step > 0, step, 1e-6) + bounds[0]).astype(np.float32),
+        "features": values[0],
+        "scales": values[1],
+        "offsets": values[2].reshape(n, k, 3),
+        **{
+            f"{name}.{2 * i}.{part}": array_
+            for name, found in drawing.items()
+            for i, layer in enumerate(found)
+            for part, array_ in zip(("weight", "bias"), layer, strict=True)
+        },
+    }
