@@ -78,7 +78,7 @@ class Codec(Params):
     vq_batch: int = Field(80_000, ge=1, description="Gaussians of each update")
     vq_decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook's averages each update keeps")
     vq_reseed: int = Field(10, ge=0, description="entries that may start afresh after an update")
-    vq_training: Training = Field("ema", description="official: the rule of the authors' code")
+    vq_training: Training = Field("ema", description="official: the rule of the authors' code; kmeans: passes over all")
 
 
 class LightGaussianConfig(OptimizationParams):

@@ -14,9 +14,10 @@ Parts (docs/bitstream.md):
 
 from __future__ import annotations
 
+import contextlib
 import math
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -36,6 +37,14 @@ HALF_MAX = 65504.0
 MAX_CODES = 1 << 16
 
 Training = Literal["ema", "official", "kmeans"]
+
+
+class PartError(BitstreamError):
+    """A part is damaged: `part` is its name, `reason` what is wrong with it."""
+
+    def __init__(self, part: str, reason: str) -> None:
+        super().__init__(f"part '{part}': {reason}")
+        self.part, self.reason = part, reason
 
 
 @dataclass(frozen=True)
@@ -171,43 +180,33 @@ class ImportanceVQ:
         }
 
     def unpack(self, parts: Mapping[str, bytes], n: int, d: int) -> CodedVectors:
-        """What the parts hold, checked. Raises BitstreamError."""
-        form, size, own = self._header(parts, n)
+        """What the parts hold, checked. Raises PartError, a BitstreamError."""
+        with _part(parts, "header") as data:
+            form, size, own = _header(data, n)
         load = self.plugins.coders.load
         planes, bits = load("byte-planes")(), load("packed-bits")()
-        mask = planes.decode(_part(parts, "mask"), np.uint8, ((n + 7) // 8,))
-        keeps = bits.decode(mask.tobytes(), n, 1).astype(bool)
-        if int(keeps.sum()) != own:
-            raise BitstreamError(f"the mask keeps {int(keeps.sum()):,} vectors, the header says {own:,}")
-        if form == PACKED:
-            found = bits.decode(_part(parts, "indices"), n - own, bits.width(max(size, 1)))
-        else:
-            model, context = self._range(size, n - own)
-            found = model.decode(_part(parts, "indices"), context).astype(np.int64)
-        if len(found) and not 0 <= int(found.min()) <= int(found.max()) < size:
-            raise BitstreamError(f"an index is outside the codebook of {size:,} entries")
+        with _part(parts, "mask") as data:
+            mask = planes.decode(data, np.uint8, ((n + 7) // 8,))
+            keeps = bits.decode(mask.tobytes(), n, 1).astype(bool)
+            if int(keeps.sum()) != own:
+                raise BitstreamError(f"keeps {int(keeps.sum()):,} vectors, the header says {own:,}")
         codes = np.full(n, -1, np.int64)
-        codes[~keeps] = found
-        codebook = planes.decode(_part(parts, "codebook"), np.float16, (size, d))
-        kept = planes.decode(_part(parts, "own"), np.float16, (own, d))
-        if not np.isfinite(codebook).all() or not np.isfinite(kept).all():
-            raise BitstreamError("a vector is not finite")
-        return CodedVectors(codes, codebook, kept)
-
-    def _header(self, parts: Mapping[str, bytes], n: int) -> tuple[int, int, int]:
-        """Form of the indices, entries of the codebook, own vectors."""
-        data = _part(parts, "header")
-        if len(data) != HEADER.size:
-            raise BitstreamError(f"the header of the vectors is {len(data)} bytes, must be {HEADER.size}")
-        version, form, stated, size, own = HEADER.unpack(data)
-        if version != VERSION or form not in (PACKED, RANGE_CODED):
-            raise BitstreamError(f"vectors of version {version}, form {form} are not known: upgrade sw-lightgaussian")
-        if stated != n:
-            raise BitstreamError(f"there are {stated:,} vectors, expected {n:,}")
-        coded = n - own
-        if coded < 0 or size > min(coded, MAX_CODES) or (coded > 0 and size == 0):
-            raise BitstreamError(f"{size:,} codebook entries and {own:,} own vectors cannot be of {n:,} vectors")
-        return form, size, own
+        with _part(parts, "indices") as data:
+            if form == PACKED:
+                found = bits.decode(data, n - own, bits.width(max(size, 1)))
+            else:
+                model, context = self._range(size, n - own)
+                found = model.decode(data, context)
+            if len(found) and not 0 <= int(found.min()) <= int(found.max()) < size:
+                raise BitstreamError(f"an index is outside the codebook of {size:,} entries")
+            codes[~keeps] = found
+        halves = {}
+        for name, count in (("codebook", size), ("own", own)):
+            with _part(parts, name) as data:
+                halves[name] = planes.decode(data, np.float16, (count, d))
+                if not np.isfinite(halves[name]).all():
+                    raise BitstreamError("holds values that are not finite")
+        return CodedVectors(codes, halves["codebook"], halves["own"])
 
     def _range(self, size: int, n: int) -> tuple[Any, Any]:
         """The entropy model for n indices into `size` entries, and its context."""
@@ -215,7 +214,27 @@ class ImportanceVQ:
         return model(), model.Context(max(size, 1), n)
 
 
-def _part(parts: Mapping[str, bytes], name: str) -> bytes:
+def _header(data: bytes, n: int) -> tuple[int, int, int]:
+    """Form of the indices, entries of the codebook, own vectors."""
+    if len(data) != HEADER.size:
+        raise BitstreamError(f"{len(data)} bytes, must be {HEADER.size}")
+    version, form, stated, size, own = HEADER.unpack(data)
+    if version != VERSION or form not in (PACKED, RANGE_CODED):
+        raise BitstreamError(f"vectors of version {version}, form {form} are not known: upgrade sw-lightgaussian")
+    if stated != n:
+        raise BitstreamError(f"there are {stated:,} vectors, expected {n:,}")
+    coded = n - own
+    if coded < 0 or size > min(coded, MAX_CODES) or (coded > 0 and size == 0):
+        raise BitstreamError(f"{size:,} codebook entries and {own:,} own vectors cannot be of {n:,} vectors")
+    return form, size, own
+
+
+@contextlib.contextmanager
+def _part(parts: Mapping[str, bytes], name: str) -> Iterator[bytes]:
+    """The bytes of a part for a block that decodes them; what goes wrong in it is blamed on the part."""
     if name not in parts:
-        raise BitstreamError(f"the part '{name}' of the vectors is missing")
-    return parts[name]
+        raise PartError(name, "is missing")
+    try:
+        yield parts[name]
+    except (BitstreamError, ValueError, LookupError, ArithmeticError) as error:
+        raise PartError(name, str(error)) from error

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError, SplatwizardError
 from splatwizard_core.gaussians.model import GaussianModel
-from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ
+from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError
 from sw_lightgaussian.significance import volume_factor
 
 if TYPE_CHECKING:
@@ -94,11 +94,10 @@ class VecTree:
             means = _finite(load("float-delta")().decode(data, (n, 3)))
         with reader.decoding("attr") as data:
             attributes = _finite(load("byte-planes")().decode(data, np.float16, (n, ATTRIBUTES))).astype(np.float32)
-        parts = {part: reader.section(section) for part, section in SECTIONS.items()}
-        with reader.decoding(SECTIONS["header"]):
-            coded = self.vq.unpack(parts, n, 3 * (degree + 1) ** 2)
+        bands = (degree + 1) ** 2
+        coded = self._coded(reader, n, 3 * bands)
         colors = coded.vectors()
-        dc, rest = colors[:, None, :3], colors[:, 3:].reshape(n, 3, -1).transpose(0, 2, 1)
+        dc, rest = colors[:, None, :3], colors[:, 3:].reshape(n, 3, bands - 1).transpose(0, 2, 1)
         tensors = (means, dc, rest, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:])
         return CodedGaussians(
             *(torch.from_numpy(np.ascontiguousarray(t)) for t in tensors),
@@ -106,6 +105,16 @@ class VecTree:
             code=torch.from_numpy(coded.codes.astype(np.int32)),
             codebook=torch.from_numpy(coded.codebook.astype(np.float32)),
         )
+
+    def _coded(self, reader: ContainerReader, n: int, d: int) -> CodedVectors:
+        """The colours; what is wrong with a part is blamed on its section."""
+        parts = {part: reader.section(section) for part, section in SECTIONS.items()}
+        try:
+            return self.vq.unpack(parts, n, d)
+        except PartError as error:
+            with reader.decoding(SECTIONS[error.part]):
+                raise BitstreamError(error.reason) from error
+        raise AssertionError  # not reached
 
     def _order(self, means: NDArray[np.float32]) -> NDArray[np.int64]:
         """Indices [N] that bring the Gaussians into Morton order; no picture depends on it."""
@@ -162,7 +171,7 @@ def _arrays(model: GaussianModel) -> dict[str, NDArray[np.float32]]:
 def _colors(dc: NDArray[np.float32], rest: NDArray[np.float32]) -> NDArray[np.float32]:
     """[N, 3K]: band 0, then the other coefficients of red, of green, of blue."""
     n = len(dc)
-    return np.concatenate([dc.reshape(n, 3), rest.transpose(0, 2, 1).reshape(n, -1)], 1)
+    return np.concatenate([dc.reshape(n, 3), rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1])], 1)
 
 
 def _cells(means: NDArray[np.float32]) -> NDArray[np.int64]:
