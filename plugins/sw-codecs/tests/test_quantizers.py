@@ -179,3 +179,85 @@ def test_mask_by_hand():
     soft = torch.sigmoid(x.detach())
     assert torch.allclose(x.grad, soft * (1 - soft))
     assert SteMask(0.01).encode(x, weight=torch.tensor([1.0, 0.0, 1.0]))[0].tolist() == [0, 0, 1]
+
+
+def test_the_limit_of_indices_acts_on_the_index_itself():
+    x = torch.cat([torch.linspace(-20_000, 20_000, 4001), torch.tensor([3e6])])
+    k0 = round(float(x.double().mean()))
+    symbols, _ = SteRound(1.0).encode(x)
+    assert (int(symbols.min()), int(symbols.max())) == (k0 - 15_000, k0 + 15_000)
+    steps = torch.where(torch.arange(len(x)) % 2 == 0, 1.0, 0.5)  # k0 is one for each step
+    symbols, _ = SteRound(steps, index_clamp=100).encode(x)
+    assert int(symbols[0::2].max()) == round(float(x.double().mean())) + 100
+    assert int(symbols[1::2].max()) == round(float(x.double().mean()) / 0.5) + 100
+
+
+def test_parts_of_a_tensor_agree_if_they_name_its_mean():
+    x = torch.cat([torch.zeros(1000), torch.linspace(0, 40_000, 100)])
+    q, mean = SteRound(1.0), x.double().mean()
+    whole, side = q.encode(x)
+    parts = [q.encode(part, mean=mean)[0] for part in x.split(300)]
+    assert torch.equal(torch.cat(parts), whole)
+    assert not torch.equal(torch.cat([q.encode(part)[0] for part in x.split(300)]), whole)
+    assert torch.equal(q.forward(x), q.decode(whole, side))
+    assert torch.equal(torch.cat([q.forward(part, mean=mean) for part in x.split(300)]), q.forward(x))
+    noise = [UniformNoise(1.0).forward(x, generator=gen(), mean=m) for m in (mean, float(mean), None)]
+    assert torch.equal(noise[0], noise[1])
+    assert torch.equal(noise[0], noise[2])
+    assert float(noise[0].max()) <= 15_000 + round(float(mean)) + 0.5
+
+
+def test_gradients_where_the_limit_acts():
+    x = torch.tensor([0.0, 1.3, 50.0, -50.0], dtype=torch.float64, requires_grad=True)
+    step = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
+    SteRound(index_clamp=3, step_gradient=True).forward(x, step).sum().backward()
+    assert x.grad.tolist() == [1, 1, 0, 0]
+    assert float(step.grad) == pytest.approx((1 - 1.3) + 3 - 3)
+    x.grad = None
+    UniformNoise(index_clamp=3).forward(x, step, generator=gen()).sum().backward()
+    assert x.grad.tolist() == [1, 1, 0, 0]
+
+
+@pytest.mark.parametrize("shape", [(), (1,), (4,), (6, 1), (6, 4)])
+def test_steps_per_row_group_and_element_learn_from_the_noise(shape):
+    x = torch.randn(6, 4, dtype=torch.float64, generator=gen())
+    step = (torch.rand(shape, dtype=torch.float64, generator=gen(1)) + 0.5).requires_grad_()
+    q = UniformNoise()
+    u = (q.forward(x, step, generator=gen(2)) - x) / step
+    assert u.abs().max() <= 0.5
+    q.forward(x, step, generator=gen(2)).sum().backward()
+    assert torch.allclose(step.grad, u.detach().sum_to_size(shape))
+    assert torch.autograd.gradcheck(lambda a, s: q.forward(a, s, generator=gen(2)), (x.requires_grad_(), step))
+    symbols, side = q.encode(x, step)
+    assert (q.decode(symbols, side) - x).abs().max() <= 0.5 * step.max() + 1e-6
+
+
+def test_a_step_that_would_enlarge_the_values_is_refused():
+    symbols = torch.zeros(3, dtype=torch.int64)
+    for step in (np.ones((1000, 1)), np.ones((2, 3)), np.float64(1e300)):
+        with pytest.raises(BitstreamError):
+            SteRound.decode(symbols + 1, {"step": step})
+
+
+def test_bits_from_a_file_are_bits():
+    for quantizer, values in ((SteBinary, {0: -1, 1: 1}), (SteMask, {0: 0, 1: 1})):
+        assert quantizer.decode(torch.tensor([0, 1]), {}).tolist() == list(values.values())
+        for bad in (torch.tensor([2]), torch.tensor([-1]), torch.tensor([0.5])):
+            with pytest.raises(BitstreamError):
+                quantizer.decode(bad, {})
+
+
+def test_mask_weights_get_their_gradient():
+    x = torch.tensor([-1.0, 2.0], dtype=torch.float64, requires_grad=True)
+    weight = torch.tensor([0.3, 0.02], dtype=torch.float64, requires_grad=True)
+    out = SteMask(0.01).forward(x, weight)
+    assert out.tolist() == [1, 1]  # to the bit
+    out.sum().backward()
+    soft = torch.sigmoid(x.detach())
+    assert torch.allclose(x.grad, soft * (1 - soft) * weight.detach())
+    assert torch.allclose(weight.grad, soft)
+
+
+def test_a_mask_that_starts_just_above_its_threshold_is_on():
+    # ChimeraGS: sigmoid(-4.5951) = 0.0100002 in float32.
+    assert SteMask(0.01).forward(torch.full((3,), -4.5951)).tolist() == [1, 1, 1]

@@ -14,7 +14,7 @@ from sw_codecs.straight_through import straight_through
 
 MAX_BITS = 16
 SMALLEST_STEP = 1e-12  # of a range without width
-ZERO_LIMIT = 1 << 20  # a zero point beyond it leaves float32 no digits for the index
+ZERO_LIMIT = 1 << 20  # a zero point beyond it would leave float32 no digits for the index: steps are longer then
 
 
 class FakeQuantAffine(nn.Module):
@@ -25,7 +25,7 @@ class FakeQuantAffine(nn.Module):
                ema * old + (1 - ema) * new, starting from the first tensor. 0.99 is usual
     channels   C: a range for each column of x [N, C]; None: one for all of x, which then may have any shape
     blocks     B: a range for each of B contiguous blocks of rows, the first N mod B of which have a row more
-    zero       the range always includes 0, which is then exactly representable
+    zero       the range always includes 0. Without it (and with 0 far outside) steps are at least 2^-20 of the values
 
     `forward` observes x if `observing` is True, then quantizes; its gradient is 1 where round(x / s) + z is within the
     range, 0 outside. Set `observing` to False before evaluation and encoding: the file must hold the range that was
@@ -91,8 +91,8 @@ class FakeQuantAffine(nn.Module):
         if x.numel() and not bool(torch.isfinite(x).all()):
             raise ValueError("values to quantize must be finite")
         scale, zero = self._lattice(x)
-        if not bool(torch.isfinite(scale).all() and (zero.abs() <= ZERO_LIMIT).all()):
-            raise ValueError("the observed range is not finite, or too narrow for its distance from 0")
+        if not bool(torch.isfinite(scale).all()):
+            raise ValueError("the range to quantize is not finite")
         rows = _rows(x)
         index, _ = _quantized(rows, _of_rows(scale, len(rows)), _of_rows(zero, len(rows)), self.bits)
         side = {"scale": scale.cpu().numpy(), "zero": zero.cpu().numpy().astype(np.int32), "bits": np.uint8(self.bits)}
@@ -105,7 +105,7 @@ class FakeQuantAffine(nn.Module):
         shape = np.asarray(side.get("scale")).shape
         if len(shape) != 2 or shape[0] < 1 or (shape[1] != 1 and (symbols.ndim != 2 or shape[1] != symbols.shape[1])):
             raise BitstreamError(f"quantizer scales {list(shape)} do not fit {list(symbols.shape)}")
-        scale = floats(side, "scale", shape, positive=True).astype(np.float32)
+        scale = floats(side, "scale", shape, positive=True, dtype=np.float32)
         zero = integers(side, "zero", shape, -ZERO_LIMIT, ZERO_LIMIT)
         rows = _rows(within(symbols, 0, 2**bits - 1))
         steps, zeros = (_of_rows(torch.as_tensor(array, device=symbols.device), len(rows)) for array in (scale, zero))
@@ -136,6 +136,7 @@ class FakeQuantAffine(nn.Module):
         empty = low > high  # no row, and nothing seen
         low, high = torch.where(empty, 0.0, low), torch.where(empty, 0.0, high)
         scale = ((high - low) / (2**self.bits - 1)).clamp_min(SMALLEST_STEP)
+        scale = torch.maximum(scale, torch.maximum(low.abs(), high.abs()) / ZERO_LIMIT)
         return scale, torch.round(-low / scale)
 
 

@@ -57,10 +57,12 @@ class Lsq(nn.Module):
             raise ValueError(f"bits are {bits}, must be in {2 if signed else 1}..{MAX_BITS}")
         if step is not None and not 0 < step < float("inf"):
             raise ValueError("a quantizer step must be positive and finite")
-        self.low, self.high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+        self.low = -(2 ** (bits - 1)) if signed else 0
+        self.high = self.low + 2**bits - 1
         self.channels = channels
         self.step = nn.Parameter(torch.full(() if channels is None else (channels,), 1.0 if step is None else step))
         self.register_buffer("is_set", torch.tensor(step is not None))
+        self._started = False  # is_set, once it was seen: looking at it each time would make a GPU wait
 
     def forward(self, x: Tensor) -> Tensor:
         """x^ of the shape of x; differentiable in x and the step."""
@@ -90,7 +92,7 @@ class Lsq(nn.Module):
         shape = np.asarray(side.get("step")).shape
         if shape != () and (symbols.ndim != 2 or shape != (symbols.shape[1],)):
             raise BitstreamError(f"quantizer steps {list(shape)} do not fit {list(symbols.shape)}")
-        step = floats(side, "step", shape, positive=True).astype(np.float32)
+        step = floats(side, "step", shape, positive=True, dtype=np.float32)
         low, high = integers(side, "range", (2,), -(1 << MAX_BITS), 1 << MAX_BITS).tolist()
         index = within(symbols, low, high)
         return finite_values(index.to(torch.float32) * torch.as_tensor(step, device=symbols.device))
@@ -100,7 +102,10 @@ class Lsq(nn.Module):
 
     @torch.no_grad()
     def _start(self, x: Tensor) -> None:
-        if not bool(self.is_set) and x.numel():
+        if self._started or x.numel() == 0:
+            return
+        self._started = True
+        if not bool(self.is_set):
             size = x.abs().mean() if self.channels is None else x.abs().mean(0)
             self.step.copy_((2 * size / self.high**0.5).clamp_min(SMALLEST_STEP))
             self.is_set.fill_(True)

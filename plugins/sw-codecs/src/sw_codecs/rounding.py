@@ -24,12 +24,14 @@ class _RoundThrough(torch.autograd.Function):
         ctx: Any, x: Tensor, step: Tensor, low: Tensor | None, high: Tensor | None, step_gradient: bool
     ) -> Tensor:
         index = torch.round(x / step)
+        residual = index - x / step if step_gradient else None
         inside = None
         if low is not None and high is not None:
             inside = (index >= low) & (index <= high)
             index = torch.clamp(index, low, high)
+            residual = None if residual is None else torch.where(inside, residual, index)
         ctx.inside, ctx.step_shape = inside, step.shape
-        ctx.save_for_backward(index - x / step if step_gradient else None)
+        ctx.save_for_backward(residual)
         return index * step
 
     @staticmethod
@@ -44,7 +46,7 @@ class SteRound:
 
     step            > 0, a number or a tensor that broadcasts with x (a step per element, row or group); also an
                     argument of each call
-    step_gradient   gradient (k - x / step) for the step (as in LSQ) instead of none
+    step_gradient   gradient k - x / step for the step, as in LSQ (k where `index_clamp` acts), instead of none
     index_clamp     keep indices within this distance of k0 = round(mean(x) / step), the index of the global mean;
                     None: no limit
 

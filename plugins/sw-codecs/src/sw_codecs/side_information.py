@@ -19,12 +19,15 @@ def fits(shape: tuple[int, ...], target: tuple[int, ...]) -> bool:
         return False
 
 
-def floats(side: dict[str, Any], key: str, shape: tuple[int, ...], *, positive: bool = False) -> np.ndarray:
-    """side[key] as float64. Raises BitstreamError unless it is a finite float array of `shape` (and > 0)."""
+def floats(
+    side: dict[str, Any], key: str, shape: tuple[int, ...], *, positive: bool = False, dtype: Any = np.float64
+) -> np.ndarray:
+    """side[key] as `dtype`. Raises BitstreamError unless it is, as such, a finite float array of `shape` (and > 0)."""
     array = np.asarray(side.get(key))
     if array.dtype.kind != "f" or array.shape != shape:
         raise BitstreamError(f"side information '{key}' is missing or no float array of shape {list(shape)}")
-    found = array.astype(np.float64)
+    with np.errstate(over="ignore", under="ignore"):
+        found = array.astype(dtype)
     if not np.isfinite(found).all() or (positive and not (found > 0).all()):
         raise BitstreamError(f"side information '{key}' is not finite{' and positive' if positive else ''}")
     return found

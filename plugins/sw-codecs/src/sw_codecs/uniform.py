@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, ShapeError
+from splatwizard_core.errors import ShapeError
+from sw_codecs.side_information import finite_values, floats, integers, within
+from sw_codecs.straight_through import straight_through
 
 MAX_BITS = 24
 
@@ -23,8 +25,8 @@ class Uniform:
     noise       forward adds uniform noise of one step instead of rounding (for training with a rate term)
 
     `forward` uses the same lattice, its gradient is 1 inside the range and 0 outside. Arithmetic is float64, results
-    float32. Source: specification of the codec library, quantisers (FakeQuantAffine, SteRound). Unlike FakeQuantAffine
-    the lattice starts at `low` itself, not at a multiple of the step: both ends of the range are lattice points.
+    float32. Unlike that of `fake-quant` the lattice starts at `low` itself, not at a multiple of the step: both ends of
+    the range are lattice points.
     """
 
     def __init__(
@@ -70,7 +72,7 @@ class Uniform:
         """x^ of the shape of x; differentiable."""
         low, step, levels = self._lattice(x)
         columns = _columns(x)
-        top = low + levels * step
+        bottom, top = low.to(x.dtype), (low + levels * step).to(x.dtype)
         with torch.no_grad():
             if self.noise:
                 noise = torch.rand(columns.shape, generator=generator, device=x.device, dtype=x.dtype)
@@ -78,10 +80,9 @@ class Uniform:
             else:
                 index = ((columns.to(torch.float64) - low) / step).round()
                 moved = (low + index * step).to(x.dtype)
-            moved = moved.clamp(low.to(x.dtype), top.to(x.dtype))
-        # The clamp carries the gradient: 1 inside the range, 0 outside.
-        inside = columns.clamp(low.to(x.dtype), top.to(x.dtype))
-        return (inside + (moved - inside).detach()).reshape(x.shape)
+            moved = moved.clamp(bottom, top)
+            inside = (columns >= bottom) & (columns <= top)
+        return straight_through(columns, moved, inside).reshape(x.shape)
 
     __call__ = forward
 
@@ -104,19 +105,13 @@ class Uniform:
     def decode(symbols: Tensor, side: dict[str, Any]) -> Tensor:
         """x^ float32 of the shape of `symbols`. Raises BitstreamError if the side information does not fit."""
         index = _columns(symbols)
-        low, step, bits = (np.asarray(side.get(key)) for key in ("low", "step", "bits"))
-        for array in (low, step, bits):
-            if array.shape != (index.shape[1],):
-                raise BitstreamError(f"quantizer side information has shape {array.shape}, must be [{index.shape[1]}]")
-        if not (np.isfinite(low).all() and np.isfinite(step).all() and (step > 0).all()):
-            raise BitstreamError("quantizer side information is not finite, or a step is not positive")
-        if bits.size and not 1 <= bits.min() <= bits.max() <= MAX_BITS:
-            raise BitstreamError(f"quantizer bits are outside 1..{MAX_BITS}")
-        levels = torch.as_tensor(2 ** bits.astype(np.int64) - 1, device=symbols.device)
-        if bool((index < 0).any() or (index > levels).any()):
-            raise BitstreamError("a quantizer index is outside its range")
-        low64, step64 = (torch.as_tensor(a.astype(np.float64), device=symbols.device) for a in (low, step))
-        return (low64 + index.to(torch.float64) * step64).to(torch.float32).reshape(symbols.shape)
+        shape = (index.shape[1],)
+        low, step = floats(side, "low", shape), floats(side, "step", shape, positive=True)
+        bits = integers(side, "bits", shape, 1, MAX_BITS)
+        levels = torch.as_tensor(2**bits - 1, device=symbols.device)
+        index = within(index, 0, levels)
+        low64, step64 = (torch.as_tensor(array, device=symbols.device) for array in (low, step))
+        return finite_values(low64 + index.to(torch.float64) * step64).reshape(symbols.shape)
 
 
 def _columns(x: Tensor) -> Tensor:
