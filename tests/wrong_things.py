@@ -11,6 +11,37 @@ from pathlib import Path
 from splatwizard_core.cli.main import main
 
 STEPS = 2
+PRUNED = """
+from splatwizard_core.plugins import hookimpl
+
+
+@hookimpl
+def register_methods(registry):
+    registry.add("pruned", "sw_pruned:Pruned", summary="starts from a trained 3dgs scene")
+    registry.add("plain", "sw_pruned:Plain", summary="starts from nothing")
+
+
+def __getattr__(name):
+    from splatwizard_core.experiments.method import Method
+    from splatwizard_core.training.stage import Stage
+
+    class FromTrained(Stage):
+        starts_from = "3dgs"
+
+    class Plain(Method):
+        def stages(self):
+            return [Stage(self.config)]
+
+    class Pruned(Method):
+        def stages(self):
+            return [FromTrained(self.config)]
+
+    Plain.name, Pruned.name = "plain", "pruned"
+    try:
+        return {"Plain": Plain, "Pruned": Pruned}[name]
+    except KeyError:
+        raise AttributeError(name) from None
+"""
 
 
 def make_things(root: Path) -> None:
@@ -118,6 +149,12 @@ def make_models(root: Path) -> None:
     )
     (root / "huge.ply").write_bytes(head.replace(b"vertex 40", b"vertex 4000000000") + b"end_header\n" + body)
     (root / "text.ply").write_text("hello")
+    damaged = GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1)
+    with torch.no_grad():
+        damaged.means[3, 1] = float("nan")
+    save_ply(damaged, root / "nan.ply")
+    (root / "trained" / "point_cloud").mkdir(parents=True)
+    shutil.copyfile(ply, root / "trained" / "point_cloud" / "point_cloud.ply")
 
     sw("encode", ply, "--method", "3dgs", "--out", root / "grey.swz", "--set", "raster.prefer=reference")
     swz = (root / "grey.swz").read_bytes()
@@ -155,7 +192,7 @@ def make_runs(root: Path) -> None:
 
 
 def make_strangers(root: Path) -> None:
-    """site: distributions that a stranger installed. None of them is sound."""
+    """site: distributions that a stranger installed. None of them is sound but sw-pruned."""
     site = root / "site"
     adds = """
 from splatwizard_core.plugins import hookimpl
@@ -169,6 +206,7 @@ def register_{kind}s(registry):
         "sw-late": adds.format(kind="method", name="late", module="no_such_module"),
         "sw-one": adds.format(kind="metric", name="twice", module="sw_one"),
         "sw-two": adds.format(kind="metric", name="twice", module="sw_two"),
+        "sw-pruned": PRUNED,
     }.items():
         module = distribution.replace("-", "_")
         info = site / f"{module}-1.0.dist-info"

@@ -144,7 +144,7 @@ def test_the_preset_of_a_run_is_that_of_what_it_starts_from(toy_plugins, tmp_pat
         ("toy-student", ["pretrained.itertions=3"], "unknown key 'pretrained.itertions'.*'pretrained.iterations'"),
         ("toy-student", ["pretrained.iterations=-3"], "bad value '-3' for 'pretrained.iterations'"),
         ("toy-student", ["pretrained.seed=3"], "'pretrained.seed' is no key of 'toy' but one of the run: give 'seed'"),
-        ("toy-student", ["pretrained.preset=none"], "no preset 'pretrained.none'|no preset 'none'"),
+        ("toy-student", ["pretrained.preset=none"], "no preset 'none'"),
         ("toy-student", ["init=FILE", "pretrained.iterations=3"], "give one of them"),
         ("toy-student", ["pretrained=3"], "unknown key 'pretrained'"),
     ],
@@ -176,6 +176,30 @@ def test_wrong_files(tmp_path, ply):
 def test_a_scene_that_no_stage_names_is_refused(toy_plugins, tmp_path):
     with pytest.raises(SplatwizardError, match="asks for a trained 'toy' scene, which no stage names"):
         Run(toy_plugins, tmp_path).train(method="toy-secret")
+
+
+def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
+    invocation = Run(toy_plugins, tmp_path)
+    first = trained_scene(invocation.session, "toy", invocation.resolved(), tmp_path)
+    second = trained_scene(invocation.session, "toy", invocation.resolved("iterations=3"), tmp_path)
+    assert second is first
+    other = trained_scene(invocation.session, "toy", invocation.resolved("pretrained.iterations=2"), tmp_path)
+    assert other.facts["steps"] == 2
+
+
+def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
+    from splatwizard_core.cli.setup import resolve_all
+
+    def resolved(*methods: str) -> list[ResolvedConfig]:
+        return resolve_all(
+            toy_plugins, methods, None, preset=None, config_file=None, values={"init": str(ply)}, scene="demo:tiny"
+        )
+
+    plain, student = resolved("toy", "toy-student")
+    assert (plain.init, student.init) == ("", str(ply))
+    assert "toy does not start from a trained scene: 'init' is for the others" in capsys.readouterr().err
+    with pytest.raises(ConfigError, match="does not start from a trained scene"):
+        resolved("toy")
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):

@@ -66,8 +66,9 @@ def print_table(records: Sequence[Record], out: Console) -> None:
     names.sort(key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
     best = _best(records, names) if len({record.method for record in records}) > 1 else {}
     columns: dict[str, list[str]] = {}
+    digits = 3 if min(record.file.bytes for record in records) >= 100_000 else 4
     for i, record in enumerate(records):
-        for name, text in _cells(record, names).items():
+        for name, text in _cells(record, names, digits).items():
             columns.setdefault(name, []).append(f"*{text}" if i in best.get(name, ()) else text)
     fixed = {"method": [record.method for record in records], "rate": [record.rate or "-" for record in records]}
     heads = {name: heading(name) if name in names else name for name in columns}
@@ -100,12 +101,12 @@ def print_table(records: Sequence[Record], out: Console) -> None:
         out.print(f"no room for {told}: metrics.json has them, and `sw report`", soft_wrap=True)
 
 
-def _cells(record: Record, names: Sequence[str]) -> dict[str, str]:
-    """Column -> text."""
+def _cells(record: Record, names: Sequence[str], digits: int) -> dict[str, str]:
+    """Column -> text; megabytes with so many digits."""
     means = {name: record.metrics[name].mean if name in record.metrics else None for name in names}
     return {
         **{name: _number(name, value) for name, value in means.items()},
-        "MB": f"{record.file.bytes / 1e6:.3f}",
+        "MB": f"{record.file.bytes / 1e6:.{digits}f}",
         "primitives": " / ".join(f"{n:,}" for n in record.counts.values()),
         "train s": _seconds(record.train.with_pretraining_s),
         "encode s": _seconds(record.codec.encode_s),

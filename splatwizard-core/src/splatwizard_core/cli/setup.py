@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,14 +63,19 @@ def resolve_all(
 ) -> list[ResolvedConfig]:
     """One configuration for every method and rate point that was asked for; wrong input fails before anything runs."""
     from splatwizard_core.experiments.config import rate_points, resolve
-    from splatwizard_core.experiments.start import settled
+    from splatwizard_core.experiments.start import of_no_use, settled
 
     found = []
     for name in methods:
         cls = load_method(plugins, name)
         for rate in rate_points(cls, rates) if rates is not None else [None]:
-            found.append(settled(plugins, resolve(cls, preset, rate, config_file, values, scene=scene)))
-    return found
+            found.append(resolve(cls, preset, rate, config_file, values, scene=scene))
+    useless = {each.method: error for each in found if (error := of_no_use(plugins, each)) is not None}
+    if len(useless) < len({each.method for each in found}):  # what one of several methods has no use for is not wrong
+        for name, error in useless.items():
+            say(f"{name} does not start from a trained scene: '{error.key}' is for the others")
+        found = [replace(each, init="", pretrained={}) if each.method in useless else each for each in found]
+    return [settled(plugins, each) for each in found]
 
 
 def resolve_one(

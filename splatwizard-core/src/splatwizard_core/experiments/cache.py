@@ -23,10 +23,13 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
     Two processes that want the same one train it once: the second waits for the first.
     """
     if outer.init and name == first_scene(make_method(session.plugins, outer)):
-        session.say(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
+        session.say_once(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
         return session.given(Path(outer.init))
     resolved = base_config(session.plugins, name, outer)
     key = training_key(session, resolved)
+    known = session.start(key)
+    if known is not None:
+        return known
 
     def nested(inner: str) -> TrainedModel:
         return trained_scene(session, inner, resolved, out)
@@ -37,13 +40,14 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
     with directory_lock(directory, wait=True, on_wait=session.say, say=session.say):
         sweep(directory)
         if StepLog(directory).done(STEP, key) is not None:
-            session.say(f"{outer.method} starts from the trained {name} scene in {directory}")
+            session.say_once(f"{outer.method} starts from the trained {name} scene in {directory}")
         elif CheckpointStore(directory / CHECKPOINTS).paths():
             session.say(f"the trained {name} scene for this configuration is not finished yet: going on with it first")
         else:
             session.say(f"no trained {name} scene for this configuration yet: training it first")
         found = train(session, resolved, directory, trained=nested)
     found.model.eval().requires_grad_(False)
+    session.remember_start(found)
     return found
 
 

@@ -48,6 +48,8 @@ class Session:
     _file_digests: dict[Path, str] = field(default_factory=dict)
     _last_trained: TrainedModel | None = None
     _given: TrainedModel | None = None
+    _start: TrainedModel | None = None
+    _said: set[str] = field(default_factory=set)
     _kernels_loaded: bool = False
 
     def scene(self, resolved: ResolvedConfig) -> Scene:
@@ -85,6 +87,20 @@ class Session:
             model = check_model(str(path)).to(self.device).eval().requires_grad_(False)
             self._given = TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
         return self._given
+
+    def say_once(self, line: str) -> None:
+        """Tell what rate points and stages would repeat."""
+        if line not in self._said:
+            self._said.add(line)
+            self.say(line)
+
+    def remember_start(self, trained: TrainedModel) -> None:
+        """Keep the trained scene that was last started from: often that of the next rate point too."""
+        self._start = trained
+
+    def start(self, key: str) -> TrainedModel | None:
+        """The trained scene that was last started from, if it is the one asked for."""
+        return self._start if self._start is not None and self._start.key == key else None
 
     def load_kernels(self) -> None:
         """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.

@@ -66,7 +66,7 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
         base = resolve(cls, str(preset), sets=wanted)
     except ConfigError as error:
         # What the other method's configuration says of its keys, with the names that they have here.
-        told = re.sub(r"\b(key|for|mean|preset) '([\w.]+)'", r"\1 'pretrained.\2'", str(error))
+        told = re.sub(r"\b(key|for|mean) '([\w.]+)'", r"\1 'pretrained.\2'", str(error))
         raise ConfigError(told, key=error.key) from None
     # What a preset says about the run (clamped renders, say) belongs to the base method; the rest is as outside.
     said = {key: value for key, value in cls.PRESETS[base.preset].items() if field_at(PipelineParams, key) is not None}
@@ -101,14 +101,32 @@ def training_key(session: Session, resolved: ResolvedConfig) -> str:
     return content_hash([*content, before] if before else content)
 
 
+def of_no_use(plugins: PluginManager, resolved: ResolvedConfig) -> ConfigError | None:
+    """What is said of `init` or `pretrained.KEY` for a method that starts from nothing that they could be about."""
+    if not resolved.init and not resolved.pretrained:
+        return None
+    method = make_method(plugins, resolved)
+    key = INIT if resolved.init else f"pretrained.{next(iter(resolved.pretrained))}"
+    if first_scene(method) is not None or (not resolved.init and named_scenes(method)):
+        return None
+    about = f"'init' ({resolved.init})" if resolved.init else f"'{key}'"
+    return ConfigError(
+        f"method '{resolved.method}' does not start from a trained scene, so {about} is of no use to it: leave it out",
+        key=key,
+    )
+
+
 def settled(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
     """The configuration with what it starts from checked, and the values of `pretrained.KEY` parsed.
 
     Before anything runs: raises UserInputError for a file that is no model, ConfigError for a wrong key or value, or
     if the method starts from nothing that these could be about.
     """
-    if resolved.init or resolved.pretrained:
-        resolved = _checked(plugins, resolved)
+    useless = of_no_use(plugins, resolved)
+    if useless is not None:
+        raise useless
+    if resolved.pretrained:
+        resolved = _with_parsed_values(plugins, resolved)
     own = str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
     for path in filter(None, (resolved.init, own)):
         stamp = os.stat(path).st_mtime_ns if os.path.exists(path) else 0
@@ -121,24 +139,10 @@ def _checked_once(path: str, stamp: int) -> None:
     check_model(path)
 
 
-def _checked(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
+def _with_parsed_values(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
     method = make_method(plugins, resolved)
     names, first = named_scenes(method), first_scene(method)
-    if resolved.init and first is None:
-        raise ConfigError(
-            f"method '{resolved.method}' does not start from a trained scene, so 'init' ({resolved.init}) is of no use "
-            "to it: leave it out",
-            key="init",
-        )
-    if not resolved.pretrained:
-        return resolved
     key = f"pretrained.{next(iter(resolved.pretrained))}"
-    if not names:
-        raise ConfigError(
-            f"method '{resolved.method}' does not start from a trained scene, so '{key}' is of no use to it: leave it "
-            "out",
-            key=key,
-        )
     if resolved.init and names == [first]:
         raise ConfigError(
             f"'{key}' is about training a {first} scene, and 'init' ({resolved.init}) is one: give one of them", key=key

@@ -63,7 +63,8 @@ def train(
     if done is None:
         resume = resume and not _is_of_an_older_release(session, home)
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
-        steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
+        if not CheckpointStore(home / CHECKPOINTS).paths():  # those of another training are refused, and stay as is
+            steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
     with session.plugins.recording() as loaded:
         outcome_model, facts = run_stages(
             session, resolved, scene, home, loaded,
