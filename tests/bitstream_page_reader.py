@@ -646,6 +646,32 @@ def packed_bits(data: bytes, n: int, w: int) -> list[int]:
     return [int(digits[i * w : (i + 1) * w], 2) for i in range(n)]
 
 
+def importance_vq(
+    header: bytes,
+    mask: bytes,
+    indices: bytes,
+    codebook: bytes,
+    own: bytes,
+    n: int,
+    d: int,
+    unzstd: Callable[[bytes], bytes],
+) -> np.ndarray:
+    """The vectors, f16 [n,d]."""
+    file = Bytes(header)
+    version, form, stated, size, k = file.unpack("BBIII")
+    file.done()
+    check(version == 1 and form in (0, 1) and stated == n, "version of the vectors")
+    bits = packed_bits(byte_planes(mask, "u1", (-(-n // 8),), unzstd).tobytes(), n, 1)
+    check(sum(bits) == k, "own vectors")
+    if form == 0:
+        entries = packed_bits(indices, n - k, max((size - 1).bit_length(), 1))
+    else:
+        entries = categorical(indices, size, 1, [0] * (n - k))
+    shared, kept = iter(entries), iter(byte_planes(own, "f2", (k, d), unzstd))
+    book = byte_planes(codebook, "f2", (size, d), unzstd)
+    return np.array([next(kept) if bit else book[next(shared)] for bit in bits], "<f2").reshape(n, d)
+
+
 # 6 The files of each method
 
 
@@ -659,13 +685,32 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
     if header["method"] == "3dgs":
         check(static["mode"] in ("exact", "quantized"), "mode")
         return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
-    check(header["method"] in ("trimming-the-fat", "pup-3dgs"), "method")
+    check(header["method"] in ("trimming-the-fat", "pup-3dgs", "lightgaussian"), "method")
+    if static["codec"] == "vectree":
+        return vectree(static, sections, unzstd)
     if static["codec"] == "gaussians-ply":
         return ply(static, sections["ply"])
     if static["codec"] == "gaussians-zstd":
         return packed(static, sections, unzstd)
     check(static["codec"] in ("gaussians-exact", "gaussians-quantized"), "codec")
     return exact_mode(static, sections) if static["codec"] == "gaussians-exact" else quantized(static, sections)
+
+
+def vectree(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    n, bands = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2
+    parts = [sections[name] for name in ("vq", "mask", "index", "codebook", "sh_keep")]
+    colors = importance_vq(*parts, n, 3 * bands, unzstd).astype("<f4")
+    attributes = byte_planes(sections["attr"], "f2", (n, 8), unzstd).astype("<f4")
+    return {
+        "means": float_delta(sections["xyz"], (n, 3), unzstd),
+        "sh_dc": colors[:, None, :3],
+        "sh_rest": colors[:, 3:].reshape(n, 3, bands - 1).transpose(0, 2, 1),
+        "opacity_logits": attributes[:, 0],
+        "log_scales": attributes[:, 1:4],
+        "quats": attributes[:, 4:],
+    }
 
 
 def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:

@@ -101,6 +101,8 @@ SMALL_HAC = {
     "grid.space": [6, 18], "grid.planes": [10, 40], "grid.log2_space": 7, "grid.log2_planes": 8,
 }  # fmt: skip
 
+SMALL_CODEBOOK = {"codec.vq_training": "kmeans", "codec.vq_iterations": 2}
+
 Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
 CASES: dict[str, Case] = {
     **{f"3dgs_{rate}_v1": ("3dgs", rate, {}, lambda: procedural(48)) for rate in ("r1", "r2", "r3", "r4", "r5")},
@@ -115,6 +117,15 @@ CASES: dict[str, Case] = {
     "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),
     "pup_3dgs_exact_v1": ("pup-3dgs", "r3", {}, lambda: procedural(5, 1)),
     "pup_3dgs_quantized_v1": ("pup-3dgs", "r6", {"codec": "gaussians-quantized"}, lambda: procedural(12, 1)),
+    "lightgaussian_v1": ("lightgaussian", "r3", SMALL_CODEBOOK, lambda: procedural(40, 2)),
+    "lightgaussian_one_v1": ("lightgaussian", "r1", SMALL_CODEBOOK, lambda: procedural(1, 1)),
+    "lightgaussian_empty_v1": ("lightgaussian", "r5", SMALL_CODEBOOK, lambda: procedural(0, 0)),
+    "lightgaussian_ranged_v1": (
+        "lightgaussian",
+        "r3",
+        {**SMALL_CODEBOOK, "codec.vq_ratio": 1.0, "codec.codebook_size": 2},
+        orderly,
+    ),
     "hac_exact_v1": ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC)),
     "hac_half_v1": ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
 }
