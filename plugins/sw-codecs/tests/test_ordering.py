@@ -6,6 +6,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from splatwizard_core.plugins import load_plugins
 from sw_codecs import morton
 from sw_codecs.ordering import CURVES, spatial_order
 
@@ -26,6 +27,14 @@ def test_the_hilbert_curve_visits_every_cell_by_steps_to_a_neighbour(bits):
 def test_morton_order_is_that_of_the_position_codecs(bits):
     cells = np.random.default_rng(0).integers(0, 1 << bits, (3000, 3))  # with 3 bits, most cells are there twice
     assert np.array_equal(spatial_order(cells, bits=bits), morton.sort(cells))
+
+
+@pytest.mark.parametrize("name", ["octree", "morton-delta", "raw", "draco", "byte-planes", "float-delta"])
+def test_a_method_asks_a_codec_for_the_order(name):
+    cells = np.random.default_rng(3).integers(0, 1 << 10, (500, 3))
+    sort = load_plugins().coders.load(name).sort
+    assert np.array_equal(sort(cells), morton.sort(cells))
+    assert np.array_equal(sort(torch.from_numpy(cells)).numpy(), morton.sort(cells))
 
 
 @settings(max_examples=60, deadline=None)

@@ -25,6 +25,7 @@ from splatwizard_core.errors import BitstreamError, CapabilityError
 from sw_codecs import morton
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.duplicates import decode_duplicates, encode_duplicates, without_duplicates
+from sw_codecs.ordering import spatial_order
 from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
 
 VERSION = 1
@@ -62,7 +63,7 @@ class Draco:
     `encode` and `decode` raise CapabilityError where DracoPy is not installed.
     """
 
-    sort = staticmethod(morton.sort)
+    sort = staticmethod(spatial_order)
 
     def __init__(self, *, max_points: int = MAX_POINTS) -> None:
         self.max_points = max_points

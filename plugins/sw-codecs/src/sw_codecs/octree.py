@@ -23,6 +23,7 @@ from sw_codecs.bits import ByteReader, pack_fixed, packed_size, unpack_fixed, wr
 from sw_codecs.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
 from sw_codecs.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.model_spec import Tables
+from sw_codecs.ordering import spatial_order
 from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
 
@@ -40,10 +41,10 @@ class Octree:
 
     max_points  `decode` refuses files that claim more
 
-    `Octree.sort(points)` gives the indices that bring points into the order that `encode` asks for.
+    `Octree.sort(points)` gives the indices that bring points (array or tensor) into the order that `encode` asks for.
     """
 
-    sort = staticmethod(morton.sort)
+    sort = staticmethod(spatial_order)
 
     def __init__(self, *, max_points: int = MAX_POINTS) -> None:
         self.max_points = max_points

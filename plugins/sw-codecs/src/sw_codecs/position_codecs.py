@@ -11,6 +11,7 @@ from splatwizard_core.errors import BitstreamError
 from sw_codecs import morton, zstd_frame
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.columns import Columns
+from sw_codecs.ordering import spatial_order
 from sw_codecs.point_limit import MAX_POINTS, check_written, point_limit
 
 VERSION = 1
@@ -41,7 +42,7 @@ def _checked(codes: np.ndarray, bits: int, crc: int) -> np.ndarray:
 class RawPositions:
     """Coordinates as u16 (u32 above 16 bits), one axis after the other, zstd level 19."""
 
-    sort = staticmethod(morton.sort)
+    sort = staticmethod(spatial_order)
 
     def __init__(self, *, max_points: int = MAX_POINTS) -> None:
         self.max_points = max_points
@@ -73,7 +74,7 @@ def _coordinate(bits: int) -> str:
 class MortonDelta:
     """Differences of successive Morton codes with the `columns` model: near the octree, twice as fast to write."""
 
-    sort = staticmethod(morton.sort)
+    sort = staticmethod(spatial_order)
 
     def __init__(self, *, max_points: int = MAX_POINTS) -> None:
         self.max_points = max_points
