@@ -1,0 +1,145 @@
+"""How it trains: 3DGS without densification from a trained scene, with removals in the first third."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+from splatwizard_core.errors import ConfigError, EmptyModel
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
+from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.pruning import PruneByScore, scores_of
+from splatwizard_core.training.stage import CameraIterator
+from sw_trimming_the_fat.score import doomed, mean_gradients
+
+if TYPE_CHECKING:
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.training.params import OptimizationParams, PipelineParams
+    from splatwizard_core.training.pruner import Pruner
+    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.training.stage import StageContext
+    from sw_trimming_the_fat.config import TrimmingTheFatConfig
+
+log = logging.getLogger(__name__)
+
+OWN = "trimming-the-fat"
+STATISTICS = ("grad_accum", "denom")
+CLEAR = -1  # before the same step's statistics are added
+
+
+class TrimmingStage(FineTuningStage):
+    """Ten removals; whoever survives one is still updated in that step.
+
+    Raises ConfigError for a pruner that is not installed.
+    """
+
+    name = "trimming-the-fat"
+
+    def __init__(self, config: TrimmingTheFatConfig, plugins: PluginManager) -> None:
+        super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
+        prune = config.prune
+        if prune.pruner not in plugins.pruners:
+            known = ", ".join(sorted(entry.name for entry in plugins.pruners))
+            raise ConfigError(f"no pruner is called '{prune.pruner}'; installed: {known}", key="prune.pruner")
+        self.prune = prune
+        self.pruner: Pruner = plugins.pruners.load(prune.pruner)()
+        self.statistics = self.pruner.uses_statistics and prune.statistics == "fresh"
+
+    def begin(self, context: StageContext) -> SplatModel:
+        left_over = {name: getattr(context.model, name).clone() for name in STATISTICS if hasattr(context.model, name)}
+        model = super().begin(context)
+        if self.prune.statistics == "checkpoint":
+            for name, values in left_over.items():
+                getattr(model, name).copy_(values)
+        return model
+
+    @property
+    def removals(self) -> range:
+        """Steps of this run."""
+        plan = self.when(range(self.prune.start, self.prune.stop, self.prune.interval))
+        assert isinstance(plan, range)
+        return plan
+
+    @property
+    def window(self) -> int:
+        """Steps of this run over which gradients are averaged."""
+        plan = self.when(range(self.prune.window + 1))
+        assert isinstance(plan, range)
+        return plan.stop - 1
+
+    def windows(self) -> list[range]:
+        """Steps at which gradients are added up, one range each time that the sums begin anew."""
+        if self.prune.refresh == "once":
+            return [range(self.window + 1)]
+        before = [0, *self.removals[:-1]]
+        return [range(max(last + 1, at - self.window), at) for last, at in zip(before, self.removals, strict=True)]
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        if self.statistics:
+            windows = self.windows()
+            if len(windows) > 1:
+                anew = [window.start for window in windows if window]
+                scheduler.register_task(anew, clear_statistics, priority=CLEAR, name="clear gradient statistics")
+            collecting = windows[0] if len(windows) == 1 else [step for window in windows for step in window]
+            scheduler.register_task(collecting, collect_statistics, name="collect gradient statistics")
+        if self.prune.pruner == OWN:
+            rule = PruneBelowBoth(self.pruner, self.prune.level, self.window)
+            scheduler.register_task(self.removals, rule, name="gradient aware prune")
+        else:
+            by_score = PruneByScore(self.pruner, self.prune.fraction_or_default, carry_grad=True)
+            scheduler.register_task(self.removals, by_score, name=f"prune by {self.prune.pruner}")
+
+
+def clear_statistics(model: GaussianModel) -> None:
+    """Schedule task: forgets the gradients that were added up so far."""
+    for name in STATISTICS:
+        getattr(model, name).zero_()
+
+
+class PruneBelowBoth:
+    """Schedule task: removes what lies below the level's quantile of opacity and of gradient.
+
+    window  steps over which gradients were added up
+
+    Gradients of too few views would make it remove nothing: where a share `level` of the Gaussians has none, the
+    quantile is 0 and nothing is below. That is an error as long as more views could be seen, and a warning otherwise.
+    """
+
+    def __init__(self, pruner: Pruner, level: float, window: int) -> None:
+        self.pruner, self.level, self.window = pruner, level, window
+
+    def __call__(
+        self,
+        model: GaussianModel,
+        optimizer: SplatOptimizer,
+        cameras: CameraIterator,
+        rasterizer: Rasterizer,
+        scene: Scene,
+        step: int,
+    ) -> None:
+        scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
+        goes = doomed(scores, self.level)
+        before, gone = model.num_rows, int(goes.sum())
+        if gone == 0 and self.level > 0:
+            self._explain(model, len(cameras))
+        if gone == before:
+            raise EmptyModel(step)
+        optimizer.keep_rows(model, ~goes, carry_grad=True)
+        log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
+
+    def _explain(self, model: GaussianModel, views: int) -> None:
+        """Whether there are too many Gaussians without a gradient for anything to be below the quantile."""
+        without = float((mean_gradients(model) == 0).double().mean())
+        if without < self.level:
+            return
+        share = f"{without:.0%} of the Gaussians have no gradient, so nothing lies below the {self.level:g}-quantile"
+        if self.window < views:
+            raise ValueError(
+                f"{share}: {self.window} steps of statistics saw at most {self.window} of {views} training views; "
+                f"set prune.window={views} and prune.start after it"
+            )
+        log.warning("%s, although every training view was seen: nothing is removed", share)
