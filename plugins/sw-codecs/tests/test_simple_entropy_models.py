@@ -31,6 +31,30 @@ def test_categorical_estimate_is_the_size():
         assert size == pytest.approx(float(Categorical().bits(torch.from_numpy(symbols), context).sum()), rel=0.01)
 
 
+def test_trained_logits_take_the_place_of_counts():
+    r = np.random.default_rng(3)
+    index = r.integers(0, 2, N)
+    symbols = np.minimum(r.geometric(np.array([0.6, 0.2])[index]) - 1, 31)
+    logits = torch.zeros(2, 32, requires_grad=True)
+    optimizer = torch.optim.Adam([logits], lr=0.3)
+    context = CategoricalContext(32, index=index, tables=2, logits=logits)
+    for _ in range(60):
+        optimizer.zero_grad()
+        estimate = Categorical().bits(torch.from_numpy(symbols), context).sum()
+        (estimate / N).backward()
+        optimizer.step()
+    data = Categorical().encode(symbols, context)
+    own = Categorical().encode(symbols, CategoricalContext(32, index=index, tables=2))
+    assert len(own) < len(data) < 1.02 * len(own)
+    assert 8 * len(data) == pytest.approx(float(estimate.detach()), rel=0.01)
+    assert np.array_equal(Categorical().decode(data, CategoricalContext(32, index=index, tables=2)), symbols)
+    logits.data[0, 3] = np.nan
+    with pytest.raises(ValueError, match="not finite"):
+        Categorical().encode(symbols, context)
+    with pytest.raises(ValueError, match="must be"):
+        CategoricalContext(32, tables=2, logits=torch.zeros(32))
+
+
 def test_a_context_that_tells_something_saves_bytes():
     index = np.arange(3000) % 2
     with_context = Categorical().encode(index * 5, CategoricalContext(8, index=index, tables=2))

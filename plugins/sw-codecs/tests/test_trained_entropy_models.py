@@ -101,6 +101,27 @@ def test_damage_to_float_coded_data_is_found(assert_survives_damage, name):
 
 
 @pytest.mark.parametrize("name", FLOATS)
+def test_hostile_float_coded_data_with_their_checksums_in_order(monkeypatch, name):
+    monkeypatch.setattr("zlib.crc32", lambda data, value=0: 0)
+    model, r, n = FLOATS[name][0](), rng(13), 60
+    context = FloatContext(t(r.normal(0, 3, n)), 1.5)
+    symbols = np.rint(r.normal(0, 3, n)).astype(int)
+    symbols[::9] += 10**6
+    data, decoded = model.encode(symbols, context), 0
+    for _ in range(400):
+        changed = bytearray(data)
+        for at in r.integers(0, len(data), r.integers(1, 4)):
+            changed[at] = r.integers(256)
+        try:
+            found = model.decode(bytes(changed[: r.integers(1, 2 * len(data))]), context)
+        except BitstreamError:
+            continue
+        assert (found.shape, found.dtype) == ((n,), np.int32)
+        decoded += 1
+    assert decoded  # some of it is well formed
+
+
+@pytest.mark.parametrize("name", FLOATS)
 def test_other_floats_than_the_encoders_are_named(name):
     model, mean = FLOATS[name][0](), rng(5).normal(0, 3, 100)
     data = model.encode(np.rint(mean).astype(int), FloatContext(t(mean), 1.0))
@@ -277,6 +298,16 @@ def test_a_step_other_than_one_changes_the_bins_alone(trained):
     assert np.array_equal(model.decode(data, indices.shape), indices)
     estimate = total(model.bits(t(indices) * context.step, context))
     assert 8 * len(data) == pytest.approx(estimate, rel=0.02)
+
+
+def test_forty_scales_out_everything_is_finite():
+    torch.manual_seed(4)
+    model = Factorised(init_scale=1)
+    x = t([-400.0, 400.0]).requires_grad_()
+    bits = model.bits(x)
+    assert bits.tolist() == pytest.approx([24, 24])
+    bits.sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in (x, *model.parameters()))
 
 
 def test_a_distant_value_is_pulled_back_or_left_alone():

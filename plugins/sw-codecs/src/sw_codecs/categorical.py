@@ -13,24 +13,31 @@ from sw_codecs.bits import ByteReader
 from sw_codecs.coders import RangeCoder
 from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables
 from sw_codecs.model_spec import Tables, as_symbols
+from sw_codecs.rates import categorical_bits
 
 VERSION = 1
 MAX_ENTRIES = 1 << 24
+TOTAL = 1 << 20
 
 
 @dataclass(frozen=True)
 class CategoricalContext:
     """size: how many symbols there are. index [n]: which table codes each symbol, in 0..tables-1; decoded before.
 
-    `decode` needs n: from the index, or given.
+    logits [tables, size], or [size]: trained weights whose softmax takes the place of the symbols' own statistics in
+    `bits`, then differentiable, and in `encode`. `decode` needs n, from the index or given, and no logits: the file has
+    the counts.
     """
 
     size: int
     n: int | None = None
     index: np.ndarray | None = None
     tables: int = 1
+    logits: Tensor | None = None
 
     def __post_init__(self) -> None:
+        if self.logits is not None and self.logits.numel() != self.size * self.tables:
+            raise ValueError(f"logits of shape {list(self.logits.shape)}, must be [{self.tables}, {self.size}]")
         if self.size < 1 or self.tables < 1 or self.size * self.tables > MAX_ENTRIES:
             raise ValueError(f"{self.tables} tables of {self.size} symbols are none or too many")
 
@@ -43,12 +50,18 @@ class CategoricalContext:
 
 
 class Categorical:
-    """Counts are gathered by the encoder and stored; nothing is trained. Its context is a `Categorical.Context`."""
+    """Counts are stored: of the symbols, or from logits that were trained. Its context is a `Categorical.Context`."""
 
     Context = CategoricalContext
 
     def bits(self, symbols: Tensor, context: CategoricalContext) -> Tensor:
-        """Bits per symbol under the counts of `symbols` itself, float64, shape of `symbols`; no gradient."""
+        """Bits per symbol, shape of `symbols`: under the logits, differentiable in them; or else under the counts of
+        `symbols` itself, float64, no gradient.
+        """
+        if context.logits is not None:
+            logits = context.logits.reshape(context.tables, context.size)
+            rows = torch.from_numpy(context.rows(symbols.numel()).astype(np.int64)).to(logits.device)
+            return categorical_bits(symbols.reshape(-1).long(), logits[rows]).reshape(symbols.shape)
         flat = as_symbols(symbols.detach().cpu().numpy().reshape(-1))
         index, tables = _histograms(flat, context)
         stored = np.stack([rounded_counts(t) for t in tables])
@@ -81,10 +94,15 @@ class Categorical:
 
 
 def _histograms(symbols: np.ndarray, context: CategoricalContext) -> tuple[np.ndarray, np.ndarray]:
-    """The table of each symbol, and the counts [tables, size]."""
+    """The table of each symbol, and the counts [tables, size]: how often each occurs, or shares of 2^20."""
     if symbols.size and not 0 <= symbols.min() <= symbols.max() < context.size:
         raise ValueError(f"symbols {symbols.min()}..{symbols.max()} leave 0..{context.size - 1}")
     index = context.rows(len(symbols))
+    if context.logits is not None:
+        logits = context.logits.detach().cpu().double().reshape(context.tables, context.size)
+        if bool(torch.isnan(logits.softmax(1)).any()):
+            raise ValueError("logits hold values that are not finite")
+        return index, np.maximum(np.rint(TOTAL * logits.softmax(1).numpy()), 1).astype(np.int64)
     counts = np.bincount(index.astype(np.int64) * context.size + symbols, minlength=context.tables * context.size)
     return index, counts.reshape(context.tables, context.size)
 

@@ -1,0 +1,68 @@
+"""The torch side of the codecs on a GPU: what it computes there is what it computes on the CPU."""
+
+import numpy as np
+import pytest
+import torch
+
+from sw_codecs import rates
+from sw_codecs.categorical import Categorical, CategoricalContext
+from sw_codecs.factorised import Factorised
+from sw_codecs.float_models import GaussianFloat
+from sw_codecs.gaussian_exact import FloatContext
+from sw_codecs.mixture import Mixture, MixtureContext
+from sw_codecs.ordering import CURVES, spatial_order
+
+pytestmark = [
+    pytest.mark.cuda,
+    pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU"),
+]
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_points_have_one_order(curve):
+    points = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0))
+    order = spatial_order(points.cuda(), curve=curve)
+    assert order.is_cuda
+    assert torch.equal(order.cpu(), spatial_order(points, curve=curve))
+
+
+def test_rates_and_their_gradients_agree():
+    draw = torch.Generator().manual_seed(1)
+    x, mean = (torch.randn(200, generator=draw, dtype=torch.float64) for _ in range(2))
+    scale = torch.rand(200, generator=draw, dtype=torch.float64) + 0.3
+    logits, means, scales = (torch.rand(3, generator=draw, dtype=torch.float64) + 0.1 for _ in range(3))
+
+    def everything(device):
+        moved = [v.to(device).requires_grad_() for v in (x, mean, scale, logits, means, scales)]
+        a, m, s, *mixed = moved
+        found = [
+            rates.gaussian_bits(a, m, s, 0.5),
+            rates.laplace_bits(a, m, s, 0.5),
+            rates.mixture_bits(a, *mixed, 0.5),
+        ]
+        sum(f.sum() for f in found).backward()
+        return [v.detach().cpu() for v in (*found, *(p.grad for p in moved))]
+
+    for here, there in zip(everything("cpu"), everything("cuda"), strict=True):
+        torch.testing.assert_close(there, here, rtol=1e-9, atol=1e-12)
+
+
+def test_a_file_from_parameters_on_a_gpu_decodes_without_one():
+    torch.manual_seed(2)
+    symbols = np.rint(np.random.default_rng(3).normal(0, 5, (3000, 2))).astype(np.int64)
+    model = Factorised(2).cuda()
+    torch.testing.assert_close(
+        model.bits(torch.from_numpy(symbols).double().cuda()).cpu(),
+        model.cpu().bits(torch.from_numpy(symbols).double()),
+        rtol=1e-9, atol=1e-9,
+    )  # fmt: skip
+    assert np.array_equal(Factorised(2).decode(model.cuda().encode(symbols), symbols.shape), symbols)
+    context = MixtureContext(*(torch.tensor(v, device="cuda") for v in ([0.0, 1.0], [-3.0, 3.0], [2.0, 4.0])))
+    assert np.array_equal(Mixture().decode(Mixture().encode(symbols, context), symbols.shape), symbols)
+    flat, mean = symbols[:, 0], torch.randn(3000, device="cuda")
+    data = GaussianFloat().encode(flat, FloatContext(mean, 5.0))
+    assert np.array_equal(GaussianFloat().decode(data, FloatContext(mean.cpu(), 5.0)), flat)
+    few = np.abs(flat) % 7
+    trained = CategoricalContext(7, n=3000, logits=torch.randn(7, device="cuda"))
+    assert Categorical().bits(torch.from_numpy(few).cuda(), trained).is_cuda
+    assert np.array_equal(Categorical().decode(Categorical().encode(few, trained), CategoricalContext(7, n=3000)), few)
