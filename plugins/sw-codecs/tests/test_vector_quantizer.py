@@ -107,6 +107,23 @@ def test_gradient_passes_straight_through_and_commitment_pulls():
     torch.testing.assert_close(x.grad, 2 * 0.5 * (x.detach() - nearest) / x.numel())
 
 
+def test_a_codebook_can_be_trained_by_gradient():
+    x, _, _ = blobs(300)
+    vq = VectorQuantizer(8)
+    vq.fit(x, generator=gen(), iterations=0)
+    vq.codebook = torch.nn.Parameter(vq.codebook)
+    optimizer = torch.optim.Adam([vq.codebook], lr=0.1)
+    losses = []
+    for _ in range(40):
+        optimizer.zero_grad()
+        loss = vq.codebook_loss(x.requires_grad_())
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert losses[-1] < losses[0]
+    assert x.grad is None
+
+
 @pytest.mark.parametrize("half", [False, True])
 def test_decoded_rows_are_the_nearest_stored_entries(half):
     x, _, _ = blobs(300)

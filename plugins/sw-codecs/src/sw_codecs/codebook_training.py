@@ -63,7 +63,7 @@ def train_codebook(
             scale = largest if rule == "batch-mean" else importance.mean()
             importance = torch.where(scale > 0, importance / scale.clamp_min(1e-30), 1.0).to(x.dtype)
             index, distance = nearest(rows, entries, block=block)
-            errors[i] = (distance * importance).sum() / importance.sum()
+            errors[i] = (distance * importance).sum() / importance.sum().clamp_min(1e-30)
             n, m = gather(rows, importance, index, size)
             if rule == "batch-mean":
                 entries = (decay * entries + (1 - decay) * (m / (n + EPSILON)[:, None])).to(x.dtype)

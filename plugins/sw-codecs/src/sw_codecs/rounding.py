@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.side_information import finite_values, fits
+from sw_codecs.side_information import finite_values, fits, within
 
 INDEX_CLAMP = 15_000  # index ranges then fit int16 (HAC)
 INDEX_LIMIT = 1 << 30
@@ -105,14 +105,14 @@ class SteRound:
 
     @staticmethod
     def decode(symbols: Tensor, side: dict[str, Any]) -> Tensor:
-        """x^ float32. Raises BitstreamError if the step does not fit, or a value not float32."""
+        """x^ float32. Raises BitstreamError if the step does not fit, or a value is not finite."""
         step = np.asarray(side.get("step"))
         if step.dtype.kind != "f" or not (np.isfinite(step).all() and (step > 0).all()):
             raise BitstreamError("a quantizer step is missing, not finite or not positive")
         if not fits(step.shape, tuple(symbols.shape)):
             raise BitstreamError(f"quantizer steps {list(step.shape)} do not fit {list(symbols.shape)}")
         step64 = torch.as_tensor(step.astype(np.float64), device=symbols.device)
-        return finite_values(symbols.to(torch.float64) * step64)
+        return finite_values(within(symbols, -INDEX_LIMIT, INDEX_LIMIT).to(torch.float64) * step64)
 
 
 class UniformNoise(SteRound):

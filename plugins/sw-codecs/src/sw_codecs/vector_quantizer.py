@@ -12,6 +12,7 @@ from splatwizard_core.errors import BitstreamError, ShapeError
 from sw_codecs.codebook_training import RULES, smoothed, train_codebook
 from sw_codecs.kmeans import kmeans
 from sw_codecs.nearest import nearest
+from sw_codecs.side_information import within
 from sw_codecs.stored_codebook import read_codebook, settled
 from sw_codecs.straight_through import straight_through
 from sw_codecs.weighted_rows import draw, gather, training_rows
@@ -187,9 +188,7 @@ class VectorQuantizer:
         codebook = read_codebook(side, "codebook", 2)
         if symbols.ndim != 1:
             raise BitstreamError(f"codebook indices have shape {list(symbols.shape)}, must be [N]")
-        if symbols.numel() and not 0 <= int(symbols.min()) <= int(symbols.max()) < len(codebook):
-            raise BitstreamError(f"a codebook index is outside 0..{len(codebook) - 1}")
-        return torch.from_numpy(codebook).to(symbols.device)[symbols.to(torch.int64)]
+        return torch.from_numpy(codebook).to(symbols.device)[within(symbols, 0, len(codebook) - 1)]
 
     def _fitted(self) -> Tensor:
         if self.codebook is None:
