@@ -37,6 +37,7 @@ format: $(VENV)/.ready-dev
 bench: $(VENV)/.ready-dev
 	$(BIN)/python benchmarks/rasterize_cpu.py
 	$(BIN)/python benchmarks/training_ops.py
+	$(BIN)/python benchmarks/coders.py --symbols 1000000
 
 kernels: $(VENV)/.ready
 	@tools/check-system compiler

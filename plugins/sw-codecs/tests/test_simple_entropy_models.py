@@ -36,9 +36,9 @@ def test_trained_logits_take_the_place_of_counts():
     index = r.integers(0, 2, N)
     symbols = np.minimum(r.geometric(np.array([0.6, 0.2])[index]) - 1, 31)
     logits = torch.zeros(2, 32, requires_grad=True)
-    optimizer = torch.optim.Adam([logits], lr=0.3)
+    optimizer = torch.optim.Adam([logits], lr=0.5)
     context = CategoricalContext(32, index=index, tables=2, logits=logits)
-    for _ in range(60):
+    for _ in range(40):
         optimizer.zero_grad()
         estimate = Categorical().bits(torch.from_numpy(symbols), context).sum()
         (estimate / N).backward()

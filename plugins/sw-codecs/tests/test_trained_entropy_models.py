@@ -37,7 +37,7 @@ def total(bits):
 # gaussian, laplace: float parameters
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     st.sampled_from(sorted(FLOATS)),
     st.lists(st.tuples(numbers, st.floats(-(2.0**29), 2.0**29), st.floats(1e-3, 1e6)), max_size=30),
@@ -335,7 +335,7 @@ def coders_of_columns():
     return {"mixture": (Mixture(), mixture), "factorised": (Factorised(2), None)}
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=50, deadline=None)
 @given(st.sampled_from(["mixture", "factorised"]), st.lists(st.tuples(numbers, numbers), max_size=30))
 def test_any_matrix_under_any_density(name, rows):
     """No rows, one, columns of one value, and most of them far outside of the density."""
