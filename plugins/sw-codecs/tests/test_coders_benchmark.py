@@ -1,4 +1,4 @@
-"""benchmarks/coders.py runs: every coder, model and position codec gives back what it was handed, or the script stops."""
+"""benchmarks/coders.py runs: every coder, model and position codec gives back what it got, or the script stops."""
 
 import subprocess
 import sys
