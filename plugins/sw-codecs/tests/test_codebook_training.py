@@ -28,7 +28,7 @@ def error(vq, x, weights=None):
     return float(distance.mean() if weights is None else (distance * weights).sum() / weights.sum())
 
 
-@pytest.mark.parametrize("size", [1, 2, 63, 512, 700])  # from 512 on entries are searched in groups
+@pytest.mark.parametrize("size", [1, 2, 63, 1024, 1100])  # from 1,024 on entries are searched in groups
 @pytest.mark.parametrize("block", [None, 7])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_the_search_is_brute_force(size, block, dtype):
