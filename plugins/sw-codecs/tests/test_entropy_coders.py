@@ -141,6 +141,17 @@ def test_mean_far_outside_the_domain_still_codes(coder):
         assert np.array_equal(coder().decode(coder().encode(symbols, spec), 4, spec), symbols)
 
 
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("coder", CODERS)
+@pytest.mark.parametrize("spec", [Gaussian, Laplace])
+def test_the_smallest_and_largest_parameters_still_code(coder, spec):
+    symbols = np.array([-5, 4, 0, 1, 0, 2, -1])
+    for location in (0.0, 1e300, -1e300, 0.5):
+        for scale in (5e-324, 1e-300, 1e20, 1e300):
+            for model in (spec(location, scale, -6, 6), spec(np.full(7, location), np.full(7, scale), -6, 6)):
+                assert np.array_equal(coder().decode(coder().encode(symbols, model), 7, model), symbols)
+
+
 @pytest.mark.parametrize("coder", STREAMS)
 @pytest.mark.parametrize("name", ["table", "gaussian", "bernoulli"])
 def test_many_chunks(coder, name, monkeypatch):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +14,6 @@ from sw_codecs.bits import ByteReader
 from sw_codecs.coders import RangeCoder
 from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables
 from sw_codecs.model_spec import Tables, as_symbols
-from sw_codecs.rates import categorical_bits
 
 VERSION = 1
 MAX_ENTRIES = 1 << 24
@@ -61,7 +61,8 @@ class Categorical:
         if context.logits is not None:
             logits = context.logits.reshape(context.tables, context.size)
             rows = torch.from_numpy(context.rows(symbols.numel()).astype(np.int64)).to(logits.device)
-            return categorical_bits(symbols.reshape(-1).long(), logits[rows]).reshape(symbols.shape)
+            shares = torch.log_softmax(logits, 1)  # of each table once, not of each symbol's
+            return -(shares[rows, symbols.reshape(-1).long()] / math.log(2)).reshape(symbols.shape)
         flat = as_symbols(symbols.detach().cpu().numpy().reshape(-1))
         index, tables = _histograms(flat, context)
         stored = np.stack([rounded_counts(t) for t in tables])

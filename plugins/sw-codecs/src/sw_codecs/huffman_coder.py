@@ -86,7 +86,8 @@ def _as_tables(spec: ModelSpec, n: int) -> tuple[np.ndarray, np.ndarray, int]:
     width = spec.kmax - spec.kmin + 1
     if len(distinct) > MAX_TABLES or len(distinct) * width > MAX_ENTRIES:
         raise ValueError(f"{len(distinct):,} distinct models of {width:,} symbols are too many for Huffman tables")
-    edges = (np.arange(spec.kmin, spec.kmax + 2) - 0.5 - distinct[:, :1]) / distinct[:, 1:]  # [T, K + 1]
+    with np.errstate(over="ignore"):  # infinitely many scales away is far enough
+        edges = (np.arange(spec.kmin, spec.kmax + 2) - 0.5 - distinct[:, :1]) / distinct[:, 1:]  # [T, K + 1]
     edges[:, 0], edges[:, -1] = -np.inf, np.inf  # the tails are folded in
     if isinstance(spec, Gaussian):
         cdf = torch.special.ndtr(torch.from_numpy(edges)).numpy()
