@@ -73,7 +73,8 @@ class Codec(Params):
 
     name: str = Field("vectree", description="which codec for Gaussians; the keys below are those of vectree")
     vq_ratio: float = Field(0.6, ge=0, le=1, description="share of the Gaussians whose colours are vector-quantised")
-    codebook_size: int = Field(8192, ge=2, le=1 << 16, description="codebook entries, at most one for 4 such Gaussians")
+    codebook_size: int = Field(8192, ge=2, le=1 << 16, description="codebook entries at most")
+    rows_per_code: float = Field(4, ge=1, description="and no more than one for so many such Gaussians, a power of two")
     vq_iterations: int = Field(1000, ge=0, description="updates of the codebook")
     vq_batch: int = Field(80_000, ge=1, description="Gaussians of each update")
     vq_decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook's averages each update keeps")

@@ -49,9 +49,9 @@ class LightGaussian(Method):
             raise TypeError(f"lightgaussian encodes a GaussianModel, not a {type(model).__name__}")
         codec = self.config.codec
         settings = {
-            "ratio": codec.vq_ratio, "size": codec.codebook_size, "iterations": codec.vq_iterations,
-            "batch": codec.vq_batch, "decay": codec.vq_decay, "reseed": codec.vq_reseed,
-            "training": codec.vq_training,
+            "ratio": codec.vq_ratio, "size": codec.codebook_size, "rows_per_code": codec.rows_per_code,
+            "iterations": codec.vq_iterations, "batch": codec.vq_batch, "decay": codec.vq_decay,
+            "reseed": codec.vq_reseed, "training": codec.vq_training,
         }  # fmt: skip
         encode_gaussians(self.plugins, codec.name, model, writer, **(settings if codec.name == "vectree" else {}))
 

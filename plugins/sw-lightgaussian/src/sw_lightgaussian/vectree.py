@@ -65,6 +65,7 @@ class VecTree:
         arrays = _arrays(model)
         order = self._order(arrays["means"])
         colors = _colors(arrays["sh_dc"], arrays["sh_rest"])[order]
+        self.vq.device = model.device  # where a codebook of millions of colours is trained in minutes, if that is a GPU
         coded = self.vq.quantize(colors, importance_of(model)[order], self.seed)
         self._write(model, arrays, order, coded, writer)
 
@@ -181,7 +182,8 @@ def _cells(means: NDArray[np.float32]) -> NDArray[np.int64]:
     points = means.astype(np.float64)
     low = points.min(0)
     width = np.maximum(points.max(0) - low, 1e-300)
-    return ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
+    cells: NDArray[np.int64] = ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
+    return cells
 
 
 def _finite(array: NDArray[Any]) -> NDArray[Any]:
