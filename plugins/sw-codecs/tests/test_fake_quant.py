@@ -56,7 +56,11 @@ def test_a_frozen_range_stays_and_encoding_never_observes():
     q = frozen(FakeQuantAffine(), torch.tensor([-1.0, 1.0]))
     q.forward(torch.tensor([100.0]))
     q.encode(torch.tensor([100.0]))
+    q.observing = True
+    q.eval().forward(torch.tensor([100.0]))
     assert (float(q.minimum), float(q.maximum)) == (-1, 1)
+    q.train().forward(torch.tensor([100.0]))
+    assert float(q.maximum) == 100
     q.reset()
     assert not torch.isfinite(q.minimum).any()
     symbols, side = q.encode(torch.tensor([0.0, 2.0]))  # nothing observed: the range of what is encoded

@@ -27,10 +27,10 @@ class FakeQuantAffine(nn.Module):
     blocks     B: a range for each of B contiguous blocks of rows, the first N mod B of which have a row more
     zero       the range always includes 0. Without it (and with 0 far outside) steps are at least 2^-20 of the values
 
-    `forward` observes x if `observing` is True, then quantizes; its gradient is 1 where round(x / s) + z is within the
-    range, 0 outside. Set `observing` to False before evaluation and encoding: the file must hold the range that was
-    trained with. `encode` never observes; without an observed range it takes that of x. State (in state_dict): minimum
-    and maximum [B, C], inf and -inf where nothing was seen.
+    `forward` first observes x, in training mode while `observing` is True, then quantizes; its gradient is 1 where
+    round(x / s) + z is within the range, 0 outside. Evaluate after `eval()` or with `observing` False: the file must hold
+    the range that was trained with. `encode` never observes; without an observed range it takes that of x. State (in
+    state_dict): minimum and maximum [B, C], inf and -inf where nothing was seen.
 
     Signed integers are these minus 2^(bits-1). Source: Jacob et al. (arXiv 1712.05877); with 8 bits and ema 0.99 in
     C3DGS (arXiv 2401.02436), running and in blocks in MesonGS (arXiv 2409.09756).
@@ -76,7 +76,7 @@ class FakeQuantAffine(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """x^ of the shape of x; differentiable."""
-        if self.observing:
+        if self.training and self.observing:
             self.observe(x)
         rows = _rows(x)
         scale, zero = (_of_rows(each, len(rows)) for each in self._lattice(x))
