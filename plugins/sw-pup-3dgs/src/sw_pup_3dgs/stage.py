@@ -10,6 +10,7 @@ from torch import Tensor
 
 from splatwizard_core.errors import ConfigError, EmptyModel
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
@@ -107,7 +108,7 @@ class PruneUpToScore(PruneByScore):
 
     def __call__(
         self,
-        model: GaussianModel,
+        model: SplatModel,
         optimizer: SplatOptimizer,
         cameras: CameraIterator,
         rasterizer: Rasterizer,

@@ -1,0 +1,23 @@
+"""From the command to the record: a trained scene, removals, a file that a fresh process decodes."""
+
+import json
+
+import pytest
+from safetensors.torch import load_file
+
+from splatwizard_core.cli.main import main
+
+SETS = ["iterations=30", "prune.window=8", "prune.start=9", "prune.stop=30", "prune.interval=5"]
+
+
+@pytest.mark.pipeline
+def test_a_run_ends_with_a_record_of_fewer_gaussians(tmp_path):
+    # Six views of 64 x 48 pixels; the 3DGS scene that it starts from is trained first.
+    sets = [f"--set={pair}" for pair in (*SETS, "pretrained.iterations=30", "codec=gaussians-zstd")]
+    status = main(["run", "--method", "trimming-the-fat", "--scene", "demo:tiny", "--out", str(tmp_path), *sets])
+    assert status == 0
+    (path,) = tmp_path.glob("demo-tiny/trimming-the-fat/r3/metrics.json")
+    record = json.loads(path.read_text())
+    (trained,) = tmp_path.glob(".trained/*/checkpoints/*.safetensors")
+    before = len(load_file(trained)["model/means"])
+    assert 0 < record["counts"]["num_gaussians"] < 0.95 * before
