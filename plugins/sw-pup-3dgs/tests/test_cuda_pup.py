@@ -25,6 +25,7 @@ def test_scores_agree():
     g = torch.Generator().manual_seed(1)
     n = 400
     raw = [
+        0.4 * torch.randn(n, 3, generator=g), torch.randn(n, 1, 3, generator=g),
         0.1 * torch.randn(n, 8, 3, generator=g), torch.randn(n, generator=g),
         0.3 * torch.randn(n, 3, generator=g) - 2.5, torch.randn(n, 4, generator=g),
     ]  # fmt: skip
