@@ -119,6 +119,19 @@ def test_prediction_may_start_from_statistics():
         torch.testing.assert_close(scale.mean(0), value.std(0).clamp(min=base), atol=0.05, rtol=0.2)
 
 
+def test_predictions_in_steps_are_the_same_once_folded():
+    model, rows = make(in_steps=True), torch.arange(40)
+    before = model.predict(rows)
+    out = model.mlp_grid(model.grid(model.codes()[rows] / 65535))
+    torch.testing.assert_close(before.means[1], out[:, 16:22] * 0.001)
+    torch.testing.assert_close(before.scales[2], out[:, 40:52] * 0.2)
+    model.fold_units()
+    after = model.predict(rows)
+    for name in ("means", "scales", "steps"):
+        for one, other in zip(getattr(before, name), getattr(after, name), strict=True):
+            torch.testing.assert_close(one, other)
+
+
 def test_the_state_of_grid_and_network_is_part_of_the_digest():
     model, other = make(seed=1), make(seed=2)
     assert model.digest() != other.digest()

@@ -115,6 +115,7 @@ class Lattice:
 def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> Lattice:
     """Write all sections; the bits of the result are what the tables say of the last three (mode `exact`)."""
     model = copy.deepcopy(model).to("cpu").eval()
+    model.fold_units()
     round_networks(model.networks(), codec.weights)
     rows = torch.nonzero(model.kept()).squeeze(1)
     rows = rows[morton_order(model.codes()[rows], plugins)]

@@ -58,6 +58,9 @@ class Rate(Params):
         "network",
         description="first prediction: the network's, as published, or mean and deviation of the values at that step",
     )
+    units: Literal["values", "steps"] = Field(
+        "values", description="the network predicts values, as published, or multiples of the base steps"
+    )
 
 
 class Steps(Params):

@@ -50,7 +50,7 @@ class HAC(Method):
             scene.points, voxel_size=c.voxel_size, num_offsets=c.num_offsets, feature_dim=c.feature_dim,
             hidden=c.hidden, margin=c.bound_margin, sample=c.rate.sample, base_steps=c.steps.triple,
             generator=generator, entropy=self.plugins.entropy_models.load("gaussian-exact")(), grid=grid,
-            grid_hidden=c.grid.hidden,
+            grid_hidden=c.grid.hidden, in_steps=c.rate.units == "steps",
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:

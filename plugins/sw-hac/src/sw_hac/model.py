@@ -40,18 +40,30 @@ class HACAnchors(CodedAnchors):
 
     mlp_grid: nn.Sequential
 
+    units: Tensor
+
     def __init__(
-        self, *tensors: Tensor, grid: Any, grid_hidden: int, generator: torch.Generator, **kwargs: Any
+        self,
+        *tensors: Tensor,
+        grid: Any,
+        grid_hidden: int,
+        in_steps: bool = False,
+        generator: torch.Generator,
+        **kwargs: Any,
     ) -> None:
         """As CodedAnchors.
 
         grid        a MixedHashGrid of the registry's context model `hash-grid`
         grid_hidden width of the network behind it
+        in_steps    the network gives means and deviations in base steps: scales are some hundredths, which one update
+                    of a network that gives them as they are can overturn
         """
         super().__init__(*tensors, generator=generator, **kwargs)
         widths = output_widths(self.features.shape[1], self.num_offsets)
         self.grid = grid.to(self.features)
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
+        units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0] * 3
+        self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
 
     def networks(self) -> dict[str, nn.Module]:
         """What the file holds besides the grid, in its order."""
@@ -59,8 +71,16 @@ class HACAnchors(CodedAnchors):
 
     def predict(self, rows: Tensor) -> AnchorContext:
         features, bits = self.grid.with_bits(self.codes()[rows].to(self.features) / TOP)
-        outputs = self.mlp_grid(features)
+        outputs = self.mlp_grid(features) * self.units
         return context_of(outputs, self.features.shape[1], self.num_offsets, self.base_steps, own_bits=bits)
+
+    @torch.no_grad()
+    def fold_units(self) -> None:
+        """Let the network itself give values, as it does in the file."""
+        last = self.mlp_grid[2]
+        last.weight.mul_(self.units[:, None])
+        last.bias.mul_(self.units)
+        self.units.fill_(1)
 
     @torch.no_grad()
     def start_from_statistics(self) -> None:
@@ -76,7 +96,7 @@ class HACAnchors(CodedAnchors):
         found = []
         for values, step in zip(self.raw(rows), self.base_steps, strict=True):
             found += [values.mean(dim=0), values.std(dim=0).clamp(min=step)]
-        last.bias.copy_(torch.cat([*found, last.bias.new_zeros(3)]))
+        last.bias.copy_(torch.cat([*found, last.bias.new_zeros(3)]) / self.units)
 
 
 def context_of(

@@ -1,0 +1,139 @@
+"""HAC on the small procedural scene: it learns, trades bytes for quality, resumes; its file holds what it learned."""
+
+import pytest
+import torch
+from hac_models import PLUGINS, decoded, method
+
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.gaussians.coded_anchors import ENTROPY
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.streams import stream
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from sw_hac import codec
+
+pytestmark = pytest.mark.pipeline
+
+STEPS = 240
+SMALL = {
+    "iterations": STEPS, "voxel_size": 0.02, "feature_dim": 8, "num_offsets": 5, "hidden": 16, "grid.hidden": 16,
+    "grid.space": [10, 18], "grid.planes": [18, 34], "grid.features": 2, "grid.log2_space": 9, "grid.log2_planes": 9,
+    "phases.quantized": 40, "phases.rebound": 79, "phases.entropy": 80, "growth.start": 30, "growth.stop": 120,
+    "growth.pause_start": 1000, "growth.pause_end": 1001, "growth.interval": 20, "growth.start_stat": 10,
+    "growth.grad_threshold": 2e-3, "growth.init_factor": 4, "lr.max_steps": STEPS, "lr.features": 0.03,
+    "lr.masks_final": 4e-3, "lr.grid_final": 1e-3, "lr.mlp_grid_final": 1e-3, "rate.start": "statistics",
+    "rate.units": "steps", "steps.scales": 0.004,
+}  # fmt: skip
+WEIGHTS = (0.0005, 0.004, 0.03)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return load_scene("demo:tiny", SceneOptions(init_points=600), PLUGINS)
+
+
+@pytest.fixture(scope="module")
+def rasterizer():
+    return NegotiatedRasterizer(PLUGINS, device="cpu")
+
+
+def train(scene, rasterizer, directory=None, stop_after=None, **values):
+    made = method(**{key.replace(".", "__"): value for key, value in {**SMALL, **values}.items()})
+    losses = []
+    outcome = train_stages(
+        made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
+        directory=directory, identity={}, trained=None, stop_after=stop_after,
+        on_step=lambda record: losses.append({name: float(part) for name, part in record.parts.items()}),
+    )  # fmt: skip
+    return outcome.model.eval(), losses, made
+
+
+@torch.no_grad()
+def psnr(model, scene, rasterizer) -> float:
+    """Mean over the training views, dB: enough to see that something was learned."""
+    values = []
+    for view in scene.train:
+        options = RasterOptions(background=scene.background)
+        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
+        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
+    return float(torch.stack(values).mean())
+
+
+def file_of(model, made) -> tuple[bytes, codec.Lattice]:
+    writer = ContainerWriter("hac", 1)
+    with torch.no_grad():
+        lattice = codec.encode(model, writer, made.config.codec, PLUGINS)
+    return writer.to_bytes(), lattice
+
+
+@pytest.fixture(scope="module")
+def trained(scene, rasterizer):
+    """Weight of the rate -> model, losses, method."""
+    return {weight: train(scene, rasterizer, **{"rate.weight": weight}) for weight in WEIGHTS}
+
+
+def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):
+    model, losses, _ = trained[WEIGHTS[1]]
+    assert len(losses) == STEPS
+    assert model.phase == ENTROPY
+    assert psnr(model, scene, rasterizer) > 25
+
+    def mean(name, steps):
+        found = [losses[s][name] for s in steps if name in losses[s]]
+        return sum(found) / len(found)
+
+    assert mean("l1", range(220, 240)) < 0.6 * mean("l1", range(20))
+    assert "rate" not in losses[79]
+    losses = trained[WEIGHTS[2]][1]
+    assert mean("rate", range(220, 240)) < 0.8 * mean("rate", range(80, 90))
+
+
+def test_a_larger_weight_gives_a_smaller_and_worse_file(scene, rasterizer, trained):
+    sizes, quality = [], []
+    for model, _, made in trained.values():
+        data, _ = file_of(model, made)
+        sizes.append(len(data))
+        quality.append(psnr(decoded(data), scene, rasterizer))
+    assert sizes == sorted(sizes, reverse=True)
+    assert quality == sorted(quality, reverse=True)
+
+
+def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
+    model, _, made = trained[WEIGHTS[0]]
+    data, _ = file_of(model, made)
+    found = decoded(data)
+    assert found.counts() == model.counts()
+    assert psnr(found, scene, rasterizer) > psnr(model, scene, rasterizer) - 0.2
+
+
+def test_estimates_of_a_trained_model_are_its_size(trained):
+    model, _, made = trained[WEIGHTS[1]]
+    data, lattice = file_of(model, made)
+    sections = ContainerReader(data).sections
+    size = 8 * sum(sections[name] for name in codec.SECTIONS)
+    assert size == pytest.approx(lattice.bits, rel=0.01)
+    rows = torch.nonzero(model.kept()).squeeze(1)
+    numbers = len(rows) * (8 + 6 + 15)
+    model.train()
+    try:
+        with torch.no_grad():
+            sampled = [float(model.attributes(rows).extras["rate"].bits) for _ in range(40)]
+            grids = float(model.predict(rows[:1]).own_bits)
+    finally:
+        model.eval()
+    assert sum(sampled) / 40 * numbers == pytest.approx(size, rel=0.03)
+    # 22 bytes of framing; the estimate counts 32 bits for the share of ones.
+    assert 8 * (sections["grids"] - 22) == pytest.approx(grids - 32, rel=0.05)
+
+
+def test_an_interrupted_training_ends_as_a_whole_one(scene, rasterizer, tmp_path):
+    short = {"iterations": 60, "phases.quantized": 20, "phases.rebound": 29, "phases.entropy": 30, "growth.stop": 55}
+    whole = train(scene, rasterizer, **short)[0]
+    for stop in (25, 45):  # in the second phase; in the third, between two adjustments
+        with pytest.raises(TrainingStopped):
+            train(scene, rasterizer, tmp_path / str(stop), stop, **short)
+        resumed = train(scene, rasterizer, tmp_path / str(stop), **short)[0]
+        assert resumed.digest() == whole.digest()
