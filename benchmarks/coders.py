@@ -23,6 +23,7 @@ from splatwizard_core.plugins import load_plugins
 models = constriction.stream.model
 queue, stack = constriction.stream.queue, constriction.stream.stack
 huffman = constriction.symbol.huffman
+ROWS = 1_000_000  # per-symbol tables that the library is handed at once: 128 MB
 ZSTD_SAMPLE = 1_000_000  # symbols: level 19 takes a second for each
 
 
@@ -50,7 +51,9 @@ def zstd_bits(symbols):
 
 
 def families(n, specs):
-    """Name -> (symbols int32 [n], our model, a plain model, its per-symbol parameters, entropy in bits a symbol)."""
+    """Name, symbols int32 [n], our model, a plain model, its per-symbol parameters (or what makes those of a part),
+    and the entropy in bits a symbol, if it is known.
+    """
     r = np.random.default_rng(0)
     mean, scale = r.normal(0, 10, n), np.exp(r.uniform(np.log(0.2), np.log(20), n))
     for name, draw, ours, plain in (
@@ -77,48 +80,46 @@ def families(n, specs):
     yield f"table of {len(counts)}, one", k - np.int32(low), specs.Table(counts), table, (), entropy
     tables, index = r.integers(1, 50, (64, 16)), r.integers(0, 64, n)
     shares = (tables / tables.sum(1, keepdims=True)).cumsum(1)
-    k = (r.random(n)[:, None] > shares[index]).sum(1).clip(0, 15).astype(np.int32) if n <= 2_000_000 else (
-        np.concatenate([(r.random(len(part))[:, None] > shares[part]).sum(1) for part in np.array_split(index, 10)])
-        .clip(0, 15).astype(np.int32))  # fmt: skip
-    rows = tables[index].astype(float) if n <= 2_000_000 else None  # 1.3 GB at 10^7
-    yield (
-        "tables of 16, one of 64 each",
-        k,
-        specs.Tables(tables, index),
-        models.Categorical(perfect=False),
-        (rows,),
-        None,
-    )
+    pieces = np.array_split(index, max(n // ROWS, 1))
+    k = np.concatenate([(r.random(len(i))[:, None] > shares[i]).sum(1) for i in pieces]).clip(0, 15).astype(np.int32)
+
+    def rows(start, stop):
+        return (tables[index[start:stop]].astype(float),)
+
+    yield "tables of 16, one of 64 each", k, specs.Tables(tables, index), models.Categorical(perfect=False), rows, None
     p = r.uniform(0.01, 0.99, n)
     yield "Bernoulli, a share each", (r.random(n) < p).astype(np.int32), specs.Bernoulli(p), models.Bernoulli(
         perfect=False), (p,), -(p * np.log2(p) + (1 - p) * np.log2(1 - p)).mean()  # fmt: skip
     yield "Bernoulli, one", (r.random(n) < 0.1).astype(np.int32), specs.Bernoulli(0.1), models.Bernoulli(
         0.1, perfect=False), (), 0.468996  # fmt: skip
+    yield "1,000 alike", r.integers(0, 1000, n).astype(np.int32), specs.Uniform(1000), models.Uniform(1000), (), (
+        np.log2(1000))  # fmt: skip
 
 
 def plain_coder(name, symbols, model, parameters):
     """Encoder and decoder that do nothing but call the library."""
-    if name == "range":
-
-        def encode():
-            coder = queue.RangeEncoder()
-            coder.encode(symbols, model, *parameters)
-            return coder.get_compressed()
-
-        def decode(words):
-            coder = queue.RangeDecoder(words)
-            return coder.decode(model, *parameters) if parameters else coder.decode(model, len(symbols))
-
+    n = len(symbols)
+    if callable(parameters):
+        parts = [(i, min(i + ROWS, n)) for i in range(0, n, ROWS)]
+        make = parameters
     else:
+        parts = [(0, n)]
+        make = lambda start, stop: parameters  # noqa: E731
 
-        def encode():
-            coder = stack.AnsCoder()
-            coder.encode_reverse(symbols, model, *parameters)
-            return coder.get_compressed()
+    def encode():
+        coder = queue.RangeEncoder() if name == "range" else stack.AnsCoder()
+        for start, stop in parts if name == "range" else reversed(parts):
+            put = coder.encode if name == "range" else coder.encode_reverse
+            put(symbols[start:stop], model, *make(start, stop))
+        return coder.get_compressed()
 
-        def decode(words):
-            coder = stack.AnsCoder(words)
-            return coder.decode(model, *parameters) if parameters else coder.decode(model, len(symbols))
+    def decode(words):
+        coder = queue.RangeDecoder(words) if name == "range" else stack.AnsCoder(words)
+        found = []
+        for start, stop in parts:
+            given = make(start, stop)
+            found.append(coder.decode(model, *given) if given else coder.decode(model, stop - start))
+        return found
 
     return encode, decode
 
@@ -140,9 +141,9 @@ def plain_huffman(symbols, counts):
 
 
 def bench_coder(name, coder, family, symbols, ours, plain, repeats):
-    """One line. plain: (encode, decode) of the library alone, or None."""
+    """One line. plain: (encode, decode) of the library alone."""
     n, fast = len(symbols), coder(verify=False)
-    encode, decode = plain or ((lambda: None), (lambda words: None))
+    encode, decode = plain
     (ours_s, plain_s), (data, words) = fastest(lambda: fast.encode(symbols, ours), encode, repeats=repeats)
     (ours_d, plain_d), (found, _) = fastest(lambda: fast.decode(data, n, ours), lambda: decode(words), repeats=repeats)
     assert np.array_equal(found, symbols)
@@ -150,9 +151,9 @@ def bench_coder(name, coder, family, symbols, ours, plain, repeats):
     if family.startswith(("Gaussian", "Laplace")):
         (whole,), _ = fastest(lambda: coder().encode(symbols, ours), repeats=2)
         proof = f"{max(whole - ours_s, 0) / ours_s:8.1f} x"
-    ratios = [f"{p / o:5.2f}" if plain else "    -" for p, o in ((plain_s, ours_s), (plain_d, ours_d))]
     print(
-        f"{name:<8}{family:<33}{n / ours_s / 1e6:10.1f} {ratios[0]}{n / ours_d / 1e6:16.1f} {ratios[1]}{proof:>10}"
+        f"{name:<8}{family:<33}{n / ours_s / 1e6:10.1f}{plain_s / ours_s:6.2f}"
+        f"{n / ours_d / 1e6:16.1f}{plain_d / ours_d:6.2f}{proof:>10}"
         f"{8 * len(data) / n:11.4f}",
         end="",
     )
@@ -170,8 +171,7 @@ def bench_coders(plugins, n, repeats):
                     continue
                 plain = plain_huffman(symbols, ours.counts)
             else:
-                has_plain = all(p is not None for p in parameters)
-                plain = plain_coder(name, symbols, model, parameters) if has_plain else None
+                plain = plain_coder(name, symbols, model, parameters)
             bench_coder(name, coder, family, symbols, ours, plain, repeats)
             print(f"{'' if entropy is None else f'{entropy:.4f}':>9}{zstd:9.3f}")
     (crc,), _ = fastest(lambda: zlib.crc32(symbols), repeats=repeats)
