@@ -60,6 +60,9 @@ class VQ(Params):
     preset: Literal["own", "toolkit"] = Field(
         "own", description="toolkit: the codebook is trained by the rule of the authors' code"
     )
+    training: Literal["ema", "kmeans"] = Field(
+        "ema", description="else: by moving averages over batches, or by passes over all vectors"
+    )
     ratio2: float = Field(0.8, ge=0, le=1, description="share of the degree-2 group that shares the codebook")
     ratio3: float = Field(0.6, ge=0, le=1, description="the same of the degree-3 group")
     size: int = Field(8192, ge=2, le=1 << 16, description="entries of each codebook, at most one for 4 such vectors")

@@ -81,7 +81,7 @@ class ChimeraGS(Method):
         vq = self.config.vq
         settings: dict[str, dict[str, Any]] = {}
         if vq.codec == "importance-vq":
-            training = "official" if vq.preset == "toolkit" else "ema"
+            training = "official" if vq.preset == "toolkit" else vq.training
             shared = {"size": vq.size, "iterations": vq.iterations, "batch": vq.batch, "training": training}
             settings = {"sh2": {"ratio": vq.ratio2, **shared}, "sh3": {"ratio": vq.ratio3, **shared}}
         file.encode(model, writer, self.plugins, coder=vq.codec, settings=settings, xyz=self.config.xyz)

@@ -9,12 +9,13 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "inria": {"student.preset": "inria"},
     # For a CPU and the demo scene.
     "quick": {
-        "iterations": 2000,
+        "iterations": 2500,
         "student.preset": "quick",
         "distill.iterations": 1000,
         "vq.size": 1024,
-        "vq.iterations": 200,
-        "vq.batch": 8192,
+        "vq.training": "kmeans",
+        "vq.iterations": 20,
+        "xyz": "uniform16",
     },
 }
 
