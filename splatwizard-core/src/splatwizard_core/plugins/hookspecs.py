@@ -49,7 +49,7 @@ def register_context_models(registry: Registry) -> None:
 
 @hookspec
 def register_coders(registry: Registry) -> None:
-    """Add entropy coders (symbols <-> bytes under a ModelSpec) and position codecs (integer points <-> bytes)."""
+    """Add entropy coders (symbols <-> bytes under a ModelSpec), position codecs, and coders of plain arrays."""
 
 
 @hookspec
