@@ -73,6 +73,28 @@ def test_gradient_reaches_what_was_quantized(name):
     assert (x.grad != 0).any()
 
 
+@pytest.mark.parametrize("name", [name for name in OURS if name != "lsq"])  # it reads where to start from its data
+def test_a_training_step_leaves_no_tensor_behind_and_waits_for_none(name):
+    """The device "meta" has shapes but no data: another device's tensor, or a look at a value, would fail."""
+    x = rows(20, 0, 0.5)
+    quantizer = made(name, x)
+    if isinstance(quantizer, torch.nn.Module):
+        quantizer = quantizer.to("meta")
+    elif name == "vq":
+        quantizer.codebook = quantizer.codebook.to("meta")
+    leaf = x.to("meta").requires_grad_()
+    out = quantizer.forward(leaf)
+    assert out.device.type == "meta"
+    assert out.shape == x.shape
+    out.sum().backward()
+    assert leaf.grad.device.type == "meta"
+    if name in {"ste-round", "uniform-noise"}:
+        step = torch.ones(3, device="meta", requires_grad=True)
+        quantizer.step_gradient = True
+        quantizer.forward(leaf, step).sum().backward()
+        assert step.grad.shape == (3,)
+
+
 @pytest.mark.parametrize("name", OURS)
 def test_damaged_side_information_is_refused_or_decodes_to_numbers(name):
     x = rows(12, 3, 1.0)

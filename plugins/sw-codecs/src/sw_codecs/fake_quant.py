@@ -28,9 +28,9 @@ class FakeQuantAffine(nn.Module):
     zero       the range always includes 0. Without it (and with 0 far outside) steps are at least 2^-20 of the values
 
     `forward` first observes x, in training mode while `observing` is True, then quantizes; its gradient is 1 where
-    round(x / s) + z is within the range, 0 outside. Evaluate after `eval()` or with `observing` False: the file must hold
-    the range that was trained with. `encode` never observes; without an observed range it takes that of x. State (in
-    state_dict): minimum and maximum [B, C], inf and -inf where nothing was seen.
+    round(x / s) + z is within the range, 0 outside. Evaluate after `eval()` or with `observing` False: the file must
+    hold the range that was trained with. `encode` never observes; without an observed range it takes that of x.
+    State (in state_dict): minimum and maximum [B, C], inf and -inf where nothing was seen; it follows x to its device.
 
     Signed integers are these minus 2^(bits-1). Source: Jacob et al. (arXiv 1712.05877); with 8 bits and ema 0.99 in
     C3DGS (arXiv 2401.02436), running and in blocks in MesonGS (arXiv 2409.09756).
@@ -115,7 +115,9 @@ class FakeQuantAffine(nn.Module):
         """Minimum and maximum of each block and channel, [B, C] float32; inf and -inf where there is no row."""
         if self.channels is not None and (x.ndim != 2 or x.shape[1] != self.channels):
             raise ShapeError(f"values have shape {list(x.shape)}", actual=x.shape, expected=("N", self.channels))
-        rows = _rows(x.detach()).to(self.minimum)
+        if self.minimum.device != x.device:
+            self.to(x.device)
+        rows = _rows(x.detach()).to(self.minimum.dtype)
         if rows.numel() == 0:
             return torch.full_like(self.minimum, torch.inf), torch.full_like(self.maximum, -torch.inf)
         lows, highs = (rows, rows) if self.channels is not None else torch.aminmax(rows, dim=1, keepdim=True)

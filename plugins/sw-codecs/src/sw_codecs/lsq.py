@@ -44,7 +44,8 @@ class Lsq(nn.Module):
     g (round(x / s) - x / s) there, g n or g p beyond. (The paper compares x / s before rounding, which differs only
     within half a step of the ends; this one is the derivative of the formula above with rounding passed through.)
     The absolute value of the parameter `step` is used, so an optimizer that steps through 0 does no harm.
-    State (in state_dict): step [C] or [], and whether it is set. Source: LSQ (Esser et al., arXiv 1902.08153).
+    State (in state_dict): step [C] or [], and whether it is set; it follows x to its device.
+    Source: LSQ (Esser et al., arXiv 1902.08153).
     """
 
     is_set: Tensor
@@ -102,6 +103,8 @@ class Lsq(nn.Module):
 
     @torch.no_grad()
     def _start(self, x: Tensor) -> None:
+        if self.step.device != x.device:
+            self.to(x.device)
         if self._started or x.numel() == 0:
             return
         self._started = True

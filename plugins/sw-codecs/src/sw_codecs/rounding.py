@@ -5,6 +5,7 @@ Noise and rounding never mix: training renders and rates the noisy value, everyt
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -63,10 +64,13 @@ class SteRound:
     def _step(self, x: Tensor, step: float | Tensor | None, *, check: bool = False) -> Tensor:
         given = self.step if step is None else step
         found = torch.as_tensor(given, dtype=x.dtype, device=x.device)
-        # A look at a tensor on a GPU waits for it, which a training step should not.
-        if (check or not isinstance(given, Tensor) or found.device.type == "cpu") and not bool(
-            (found.detach() > 0).all() and torch.isfinite(found.detach()).all()
-        ):
+        if not isinstance(given, Tensor):
+            good = 0 < given < math.inf
+        elif check or given.device.type == "cpu":  # a look at a GPU waits for it, which a training step should not
+            good = bool((given.detach() > 0).all() and torch.isfinite(given.detach()).all())
+        else:
+            good = True
+        if not good:
             raise ValueError("a quantizer step must be positive and finite")
         return found
 
