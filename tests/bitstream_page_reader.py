@@ -10,6 +10,7 @@ import bisect
 import heapq
 import itertools
 import json
+import math
 import struct
 import zlib
 from collections.abc import Callable, Iterator, Sequence
@@ -534,6 +535,101 @@ def hash_grid(bits: Iterator[int], levels: Sequence[int], limit: int, signs: int
     return np.array([[x for _, out in found[row::n] for x in out] for row in range(n)], np.int64).reshape(n, -1)
 
 
+def places(frame: np.ndarray, bounds: np.ndarray, codes: np.ndarray) -> np.ndarray:
+    """Where 16-bit codes [n,3] on the lattice `bounds` [2,3] lie in a triplane."""
+    mu, v, s, low, high = frame[0], frame[1:4], frame[4], frame[5], frame[6]
+    o, d = bounds[0], np.where(bounds[1] > bounds[0], (bounds[1] - bounds[0]) / 65535, 1e-6)
+    axes = []
+    for i in range(3):
+        a = [float(v[j, i] * d[j] / s[i]) for j in range(3)]
+        z = float((v[0, i] * (o[0] - mu[0]) + v[1, i] * (o[1] - mu[1]) + v[2, i] * (o[2] - mu[2])) / s[i])
+        size = ((abs(a[0]) + abs(a[1]) + abs(a[2])) * 2.0**16 + abs(z)) * 2.0**16
+        check(size < 2.0**61, "frame")
+        e = next(e for e in (20, 16, 12, 8, 4, 0) if size * 2.0**e < 2.0**61)
+        axes.append([*(round(x * 2.0 ** (16 + e)) for x in (*a, z)), e])
+    sides = [(round(float(a) * 2**18), round(float(b) * 2**18)) for a, b in zip(low, high, strict=True)]
+    found = []
+    for code in codes.tolist():
+        y = [(a * code[0] + b * code[1] + c * code[2] + z) >> e for a, b, c, z, e in axes]
+        y = [min(max(each, -(1 << 26)), 1 << 26) for each in y]
+        n = math.isqrt(sum(each * each for each in y))
+        if n > 1 << 16:
+            y = [(((2 * n - (1 << 16)) << 16) // n) * each // n for each in y]
+        u = [((p + (1 << 17) - low_) << 20) // max(high_ - low_, 1) for p, (low_, high_) in zip(y, sides, strict=True)]
+        found.append([min(max(each, 0), 1 << 20) for each in u])
+    return np.array(found, np.int64).reshape(-1, 3)
+
+
+PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
+def triplane(scales: Sequence[np.ndarray], u: np.ndarray) -> np.ndarray:
+    """Outputs at places [n,3] of planes [3,C,R,R] a scale."""
+    sums, found = 0, []
+    for planes in scales:
+        r = planes.shape[-1]
+        t = u * (r - 1) >> 8
+        c = np.minimum(t >> 12, max(r - 2, 0))
+        f = t - 4096 * c
+        ends, weights = np.stack([c, np.minimum(c + 1, r - 1)]), np.stack([4096 - f, f])
+        samples = [
+            sum(
+                weights[i, :, a] * weights[j, :, b] * plane[:, ends[j, :, b], ends[i, :, a]]
+                for i in (0, 1)
+                for j in (0, 1)
+            )
+            for (a, b), plane in zip(PAIRS, planes, strict=True)
+        ]
+        sums = sums + np.concatenate(samples)
+        found.append(sums >> 16)
+    return np.concatenate(found).T
+
+
+NEIGHBORS = [(-2, x) for x in range(-2, 3)] + [(-1, x) for x in range(-2, 3)] + [(0, -2), (0, -1)]
+
+
+def planes_under_models(
+    section: bytes, tables: ExactTables, shapes: Sequence[tuple[int, ...]], models: Sequence[Any]
+) -> list[np.ndarray]:
+    file = Bytes(section)
+    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    crc, escapes, length = file.one("I"), file.varint(), file.varint()
+    words, bits, coded = RangeWords(file.take(length)), file.bits(), []
+    found = [np.zeros(shape, np.int64) for shape in shapes]
+    for w in range(max(shape[3] + 3 * (shape[2] - 1) for shape in shapes)):
+        due = [
+            (scale, k, c, row, w - 3 * row)
+            for scale, shape in enumerate(shapes)
+            for k, c, row in itertools.product(*(range(length_) for length_ in shape[:3]))
+            if 0 <= w - 3 * row < shape[3]
+        ]
+        centres, numbers = [], []
+        for scale, k, c, row, column in due:
+            plane = found[scale][k, c]
+            around = [(row + y, column + x) for y, x in NEIGHBORS]
+            inside = [0 <= y < plane.shape[0] and 0 <= x < plane.shape[1] for y, x in around]
+            seen = [int(plane[at]) if ok else 0 for at, ok in zip(around, inside, strict=True)]
+            mu, t = network(models[k], np.ones(2), np.array([seen], np.int64) * 4096)[0].tolist()
+            level = min(max((7_215_259_165 - 288_539 * t) >> 28, 0), 63)
+            eighths = (8 * mu + 2048) // 4096
+            centres.append((eighths + 4) // 8)
+            numbers.append(8 * level + eighths + 4 - 8 * centres[-1])
+        entries = symbols_by_table(words, tables.tables["laplace"], numbers)
+        values = [0] * len(due)
+        for i in sorted(range(len(due)), key=lambda i: numbers[i]):
+            radius = tables.radius["laplace"][numbers[i] // 8]
+            values[i] = entries[i] - radius
+            if entries[i] == 2 * radius + 1:
+                escapes -= 1
+                negative, v = escape(bits)
+                values[i] = -(v + radius + 1) if negative else v + radius + 1
+        for (scale, *at), value, centre in zip(due, values, centres, strict=True):
+            found[scale][tuple(at)] = value + centre
+            coded.append(value + centre)
+    check(escapes == 0 and crc_i32(coded) == crc, "CRC of planes")
+    return found
+
+
 # 5 Positions
 
 
@@ -682,6 +778,8 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
     static = header["static"]
     if header["method"] == "hac":
         return hac(static, sections, tables)
+    if header["method"] == "cat-3dgs":
+        return cat(static, sections, tables)
     if header["method"] == "3dgs":
         check(static["mode"] in ("exact", "quantized"), "mode")
         return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
@@ -852,6 +950,93 @@ def hac(static: dict[str, Any], sections: dict[str, bytes], tables: ExactTables)
         i = conditional(sections[name], tables, max(groups), mean, scale, m, there)
         values.append((i * (m * (steps[g] / 4096))).astype(np.float32))
         at += 2 * width
+    step = (bounds[1] - bounds[0]) / 65535
+    return {
+        "anchors": (codes * np.where(step > 0, step, 1e-6) + bounds[0]).astype(np.float32),
+        "features": values[0],
+        "scales": values[1],
+        "offsets": values[2].reshape(n, k, 3),
+        **{
+            f"{name}.{2 * i}.{part}": array_
+            for name, found in drawing.items()
+            for i, layer in enumerate(found)
+            for part, array_ in zip(("weight", "bias"), layer, strict=True)
+        },
+    }
+
+
+def cat(static: dict[str, Any], sections: dict[str, bytes], tables: ExactTables) -> dict[str, np.ndarray]:
+    check(static["mode"] == "exact", "mode")
+    n, k, d, h = (static[name] for name in ("num_anchors", "num_offsets", "feature_dim", "hidden"))
+    bounds = np.frombuffer(sections["anchors"][:24], "<f4").astype(np.float64).reshape(2, 3)
+    codes = octree(sections["anchors"][24:])
+    masks = np.array(bernoulli(sections["masks"], n * k)).reshape(n, k) > 0
+    check(len(codes) == n and masks.sum() == static["num_gaussians"], "number of anchors")
+    weights = Bytes(sections["networks"])
+    form = {"float32": "<f4", "float16": "<f2"}[static["weights"]]
+
+    def layers(*widths: int) -> list[tuple[np.ndarray, np.ndarray]]:
+        found = []
+        for a, b in itertools.pairwise(widths):
+            numbers = np.frombuffer(weights.take((a * b + b) * int(form[2])), form).astype(np.float32)
+            found.append((numbers[: a * b].reshape(b, a), numbers[a * b :]))
+        return found
+
+    groups, slices, s = (d, 6, 3 * k), static["slices"], static["slice_hidden"]
+    drawing = {name: layers(d + 4, h, w * k) for name, w in (("mlp_opacity", 1), ("mlp_cov", 7), ("mlp_color", 3))}
+    outputs = 3 * static["channels"] * len(static["multiples"])
+    predicting = layers(outputs, static["context_hidden"], 2 * sum(groups) + 3)
+    starts = [sum(slices[:i]) for i in range(len(slices))]
+    refining = [layers(start, s, 2 * size) for start, size in zip(starts[1:], slices[1:], strict=True)]
+    more = [layers(d, s, 2 * width) for width in groups[1:]] if static["refine"] else []
+    spatial = [layers(12, 16, 16, 16, 16, 2) for _ in PAIRS]
+    for model in spatial:
+        model[1:4] = [(w + np.eye(16, dtype=np.float32), b) for w, b in model[1:4]]
+    weights.done()
+
+    steps = (1.0, 0.001, 0.2)
+    values = [np.zeros((n, width), np.float32) for width in groups]
+    if n:
+        sizes = [m * static["resolution"] for m in static["multiples"]]
+        shapes = [(3, static["channels"], size, size) for size in sizes]
+        planes = planes_under_models(sections["triplane"], tables, shapes, spatial)
+        frame = array(sections["frame"]).astype(np.float64)
+        units = np.array([1 / q for q, width in zip(steps, groups, strict=True) for _ in range(2 * width)] + [1.0] * 3)
+        seen = triplane(planes, places(frame, bounds, codes))
+        out, at = network(predicting, units, seen), 0
+        numbers = np.clip((out[:, -3:] + (1 << 15)) >> 9, 0, 127)
+        m = np.array(tables.multipliers, np.int64)[numbers] + 410
+        known = np.zeros((n, 0), np.int64)
+        for g, width in enumerate(groups):
+            mean, scale = out[:, at : at + width].copy(), out[:, at + width : at + 2 * width].copy()
+            at += 2 * width
+            if g == 0:
+                for i, (start, size) in enumerate(zip(starts, slices, strict=True)):
+                    part = slice(start, start + size)
+                    if i > 0:
+                        shift = network(refining[i - 1], np.ones(2 * size), known * m[:, [0]])
+                        mean[:, part] += shift[:, :size]
+                        scale[:, part] += shift[:, size:]
+                    there = np.ones((n, size), bool)
+                    coded = conditional(
+                        sections[f"features.{i + 1}"],
+                        tables,
+                        max(groups),
+                        mean[:, part],
+                        scale[:, part],
+                        m[:, [0]],
+                        there,
+                    )
+                    known = np.concatenate([known, coded], axis=1)
+                integers = known
+            else:
+                if more:
+                    shift = network(more[g - 1], np.full(2 * width, 1 / steps[g]), known * m[:, [0]])
+                    mean, scale = mean + shift[:, :width], scale + shift[:, width:]
+                there = np.repeat(masks, 3, axis=1) if g == 2 else np.ones((n, width), bool)
+                name = ("scalings", "offsets")[g - 1]
+                integers = conditional(sections[name], tables, max(groups), mean, scale, m[:, [g]], there)
+            values[g] = (integers * (m[:, [g]] * (steps[g] / 4096))).astype(np.float32)
     step = (bounds[1] - bounds[0]) / 65535
     return {
         "anchors": (codes * np.where(step > 0, step, 1e-6) + bounds[0]).astype(np.float32),

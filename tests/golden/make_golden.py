@@ -101,6 +101,36 @@ SMALL_HAC = {
     "grid.space": [6, 18], "grid.planes": [10, 40], "grid.log2_space": 7, "grid.log2_planes": 8,
 }  # fmt: skip
 
+
+def cat_anchors(settings: Mapping[str, Any]) -> SplatModel:
+    """Nine anchors of CAT-3DGS with scattered values, planes and networks, a fifth of the offsets masked."""
+    values = Scattered()
+    points = PointCloud(4 * values(40, 3), 0.5 + values(40, 3) / 2)
+    scene = Scene("scattered", [], [], points, Protocol("test"))
+    model = create_method(load_plugins(), "cat-3dgs", settings).create_model(scene, torch.Generator())
+    with torch.no_grad():
+        for i, plane in enumerate(model.context.triplane.initial(3, torch.Generator())):
+            setattr(model.context.triplane.planes, str(i), torch.nn.Parameter(torch.zeros_like(plane)))
+        for name, parameter in sorted(model.named_parameters()):
+            parameter.copy_(values(*parameter.shape) / (4 if name.startswith("context.arms") else 1))
+        model.anchors.mul_(4)
+        model.features.mul_(6)
+        model.log_scales.sub_(4)
+        model.mask_logits.copy_(torch.where(model.mask_logits > -0.4, 1.0, -9.0))
+        model.mask_logits[9:] = -9.0
+        model.update_bounds()
+        turned = torch.tensor([[0.6, -0.8, 0], [0.8, 0.6, 0], [0, 0, 1.0]])
+        sides = [torch.full((1, 3), side) for side in (0.0, 2.5, 0.125, 0.875)]
+        model.context.frame = torch.cat([sides[0], turned, *sides[1:]])
+    return model
+
+
+SMALL_CAT = {
+    "voxel_size": 0.01, "num_offsets": 3, "feature_dim": 5, "hidden": 4, "context.channels": 2, "context.hidden": 6,
+    "context.slices": [2, 3], "context.slice_hidden": 3, "codec.weights": "float16",
+    "context.refine": True,
+}  # fmt: skip
+
 SMALL_CODEBOOK = {"codec.vq_training": "kmeans", "codec.vq_iterations": 2}
 
 Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
@@ -128,6 +158,7 @@ CASES: dict[str, Case] = {
     ),
     "hac_exact_v1": ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC)),
     "hac_half_v1": ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
+    "cat_3dgs_refined_v1": ("cat-3dgs", "r1", SMALL_CAT, lambda: cat_anchors(SMALL_CAT)),
 }
 """File -> method, rate point, other values of its configuration, model."""
 

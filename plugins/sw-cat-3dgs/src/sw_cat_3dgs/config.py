@@ -34,7 +34,9 @@ class Context(Params):
     """The models that predict attributes."""
 
     channels: int = Field(72, ge=1, le=512, description="channels of each plane")
-    multiples: list[int] = Field([1, 2], min_length=1, max_length=4, description="resolutions of the scales")
+    multiples: list[int] = Field(
+        [1, 2], min_length=1, max_length=4, description="resolutions of the scales over the base resolution; up to 16"
+    )
     anchors_per_cell: float = Field(
         36.0, gt=0, description="the base resolution is sqrt(anchors / this) when the triplane is set up"
     )

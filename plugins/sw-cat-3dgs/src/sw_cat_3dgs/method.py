@@ -61,8 +61,8 @@ class Cat3DGS(Method):
                 f"context.slices {c.slices} must be positive and sum to feature_dim {config.feature_dim}",
                 key="context.slices",
             )
-        if min(c.multiples) < 1:
-            raise ConfigError(f"context.multiples {c.multiples} must be positive", key="context.multiples")
+        if not all(1 <= m <= 16 for m in c.multiples):
+            raise ConfigError(f"context.multiples {c.multiples} must be in 1..16", key="context.multiples")
         return ContextShape(
             config.feature_dim, config.num_offsets, c.channels, tuple(c.multiples), c.hidden, tuple(c.slices),
             c.slice_hidden, c.refine,

@@ -62,7 +62,7 @@ class ExactPredictor:
     @staticmethod
     def quantum(group: str, step: Tensor) -> Tensor:
         """Steps in units of the values, float64."""
-        return step.to(torch.float64) / (1 << FRACTION) * BASE_STEPS[GROUPS.index(group)]
+        return step.to(torch.float64) * (BASE_STEPS[GROUPS.index(group)] / (1 << FRACTION))
 
 
 class FloatPredictor:

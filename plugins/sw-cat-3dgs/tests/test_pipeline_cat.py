@@ -1,0 +1,220 @@
+"""CAT-3DGS on the small procedural scene: it learns, resumes, and its file has the size that it estimates."""
+
+import contextlib
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.gaussians.coded_anchors import ENTROPY
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.streams import stream
+from splatwizard_core.training.pipeline import TrainingStopped
+from sw_cat_3dgs.estimate import estimated_bits
+from sw_cat_3dgs.method import Cat3DGS
+
+pytestmark = pytest.mark.pipeline
+
+
+@torch.no_grad()
+def psnr(model, scene, rasterizer) -> float:
+    values = []
+    for view in scene.train:
+        options = RasterOptions(background=scene.background)
+        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
+        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
+    return float(torch.stack(values).mean())
+
+
+def encoded(model, method, **values) -> bytes:
+    writer = ContainerWriter("cat-3dgs", Cat3DGS.version)
+    before = model.digest()
+    with torch.no_grad():
+        method(**values).encode(model, writer)
+    assert model.digest() == before
+    return writer.to_bytes()
+
+
+def decoded(data: bytes):
+    with torch.no_grad():
+        return Cat3DGS(load_plugins(), None).decode(ContainerReader(data, "test.swz"))
+
+
+def test_it_learns_and_the_file_renders_what_was_trained(scene, rasterizer, method, trained):
+    start = method().create_model(scene, stream(0, "init"))
+    best = psnr(trained.eval(), scene, rasterizer)
+    assert best > psnr(start, scene, rasterizer) + 5
+    assert trained.phase == ENTROPY
+    model = decoded(encoded(trained, method))
+    assert model.counts() == trained.counts()
+    # Steps come from a table of 128 in the file: not quite those of training.
+    assert psnr(model, scene, rasterizer) > best - 0.3
+
+
+def test_stopping_changes_nothing(train, tmp_path):
+    plan = {"iterations": 100, "lr__max_steps": 100}
+    whole = train(**plan).model.digest()
+    for stop in (65, 83):  # amid entropy training; while the spatial models train alone
+        with pytest.raises(TrainingStopped):
+            train(directory=tmp_path / str(stop), stop_after=stop, **plan)
+        assert train(directory=tmp_path / str(stop), **plan).model.digest() == whole
+
+
+@pytest.mark.parametrize("mode", ["exact", "float"])
+def test_the_estimate_is_the_size_of_the_file(method, trained, mode):
+    reader = ContainerReader(encoded(trained, method, codec__mode=mode), "test.swz")
+    bits = estimated_bits(trained, method(codec__mode=mode).plugins)
+    framing = 30  # bytes of a section's first block
+    for name, estimate in bits.items():
+        size = 8 * sum(v for k, v in reader.sections.items() if k.split(".")[0] == name)
+        sections = sum(k.split(".")[0] == name for k in reader.sections)
+        assert abs(size - estimate) < 0.02 * estimate + 8 * framing * sections, name
+    total = 8 * sum(v for k, v in reader.sections.items() if k.split(".")[0] in bits)
+    assert abs(total - sum(bits.values())) < 0.02 * total + 8 * framing * len(reader.sections)
+
+
+def test_a_fresh_process_decodes_the_same_model(method, trained, tmp_path):
+    path = tmp_path / "model.swz"
+    path.write_bytes(encoded(trained, method))
+    code = (
+        "import torch, sys; torch.set_num_threads(2)\n"
+        "from splatwizard_core.experiments.decoding import open_model\n"
+        "from splatwizard_core.plugins import load_plugins\n"
+        "print(open_model(sys.argv[1], load_plugins(), torch.device('cpu'))[0].digest())"
+    )
+    found = subprocess.run([sys.executable, "-c", code, str(path)], capture_output=True, text=True, check=True)
+    assert found.stdout.split()[-1] == decoded(path.read_bytes()).digest()
+
+
+@pytest.mark.parametrize("rows", [7, 64, 1 << 20])
+def test_exact_symbols_do_not_depend_on_the_block(method, trained, monkeypatch, rows):
+    """Blocks are part of the file; what is predicted for a row is not."""
+    usual = decoded(encoded(trained, method)).digest()
+    coding = sys.modules[load_plugins().entropy_models.load("conditional-gaussian").__module__]
+    monkeypatch.setattr(coding, "BLOCK_SYMBOLS", 12 * rows)
+    assert decoded(encoded(trained, method)).digest() == usual
+
+
+def test_float_files_hold_the_same_up_to_their_steps(scene, rasterizer, method, trained):
+    exact, floats = (decoded(encoded(trained, method, codec__mode=mode)) for mode in ("exact", "float"))
+    assert torch.equal(exact.anchors, floats.anchors)
+    assert torch.equal(exact.masks, floats.masks)
+    assert abs(psnr(exact, scene, rasterizer) - psnr(floats, scene, rasterizer)) < 0.3
+    assert (
+        ContainerReader(encoded(trained, method, codec__mode="float"), "x").static["made_on"]["torch"]
+        == torch.__version__
+    )
+
+
+def test_half_precision_weights_halve_their_section(scene, rasterizer, method, trained):
+    full, half = (ContainerReader(encoded(trained, method, codec__weights=w), "x") for w in ("float32", "float16"))
+    assert half.sections["networks"] * 2 == full.sections["networks"]
+    model = Cat3DGS(load_plugins(), None).decode(half)
+    assert psnr(model, scene, rasterizer) > psnr(trained.eval(), scene, rasterizer) - 0.5
+
+
+def test_refined_scales_and_offsets_come_back(method, train):
+    model = train(iterations=70, lr__max_steps=70, context__refine=True).model
+    with torch.no_grad():
+        for p in model.context.slices.parameters():
+            p.add_(0.003)
+    found = decoded(encoded(model, method, context__refine=True))
+    assert found.counts() == model.counts()
+
+
+def test_a_model_without_a_triplane_or_without_anchors_has_a_file(method, train, scene):
+    early = train(iterations=30, lr__max_steps=30).model
+    assert early.context.resolution == 0
+    assert decoded(encoded(early, method)).num_rows == early.counts()["num_anchors"] > 0
+    empty = method().create_model(scene, stream(0, "init"))
+    with torch.no_grad():
+        empty.mask_logits.fill_(-20.0)
+    found = decoded(encoded(empty, method))
+    assert found.counts() == {"num_anchors": 0, "num_gaussians": 0}
+
+
+def test_a_heavier_rate_makes_a_smaller_file(method, train, trained, scene, rasterizer):
+    sizes, quality = [], []
+    for weight in (0.004, 0.03, 0.2):
+        model = (trained if weight == 0.004 else train(rate__lambda_=weight).model).eval()
+        data = encoded(model, method, rate__lambda_=weight)
+        sizes.append(len(data))
+        quality.append(psnr(decoded(data), scene, rasterizer))
+    assert sizes == sorted(sizes, reverse=True)
+    assert quality[0] > quality[2]
+
+
+def test_a_heavy_weight_on_the_planes_shrinks_their_section(method, train):
+    sizes = []
+    for weight in (0.0, 3000.0):
+        model = train(rate__triplane=weight, context__anchors_per_cell=4.0, iterations=150).model
+        sizes.append(ContainerReader(encoded(model, method), "x").sections["triplane"])
+    assert sizes[1] < 0.7 * sizes[0]
+
+
+SMALL_FILE = {"iterations": 70, "lr__max_steps": 70, "growth__stop": 0}
+
+
+def test_damage_is_refused(method, train):
+    """Sections changed at any place, with a container that agrees: an error with the section's name, or the same."""
+    data = encoded(train(**SMALL_FILE).model, method)
+    reader = ContainerReader(data, "x")
+    good = decoded(data).digest()
+    random = np.random.default_rng(0)
+
+    def rebuilt(**changes):
+        writer = ContainerWriter("cat-3dgs", Cat3DGS.version)
+        writer.static.update(changes.pop("static", reader.static))
+        for name in reader.sections:
+            if changes.get(name, b"") is not None:
+                writer.add(name, changes.get(name, reader.section(name)))
+        return writer.to_bytes()
+
+    assert decoded(rebuilt()).digest() == good
+    for name in reader.sections:
+        payload = reader.section(name)
+        with pytest.raises(BitstreamError):
+            decoded(rebuilt(**{name: None}))
+        with pytest.raises(BitstreamError):
+            decoded(rebuilt(**{name: payload + b"\x00"}))
+        for cut in random.integers(0, len(payload), 3):
+            with pytest.raises(BitstreamError):
+                decoded(rebuilt(**{name: payload[:cut]}))
+        if name in ("networks", "frame", "anchors"):  # other numbers there are another model, where they are usable
+            continue
+        for at in random.integers(0, len(payload), 6):
+            changed = bytearray(payload)
+            changed[at] ^= 1 << random.integers(8)
+            with contextlib.suppress(BitstreamError):
+                assert decoded(rebuilt(**{name: bytes(changed)})).digest() == good
+    hostile = {
+        "feature_dim": 0, "slices": [1], "multiples": [], "channels": 513, "resolution": 1 << 13,
+        "num_anchors": 1 << 30, "num_offsets": 65, "mode": "magic", "refine": 2, "hidden": "12",
+        "context_hidden": 11, "weights": "float8",
+    }  # fmt: skip
+    for key, value in hostile.items():
+        with pytest.raises(BitstreamError):
+            decoded(rebuilt(static={**reader.static, key: value}))
+    for value in (np.nan, 1e38, 0.0):
+        from splatwizard_core.coding.array_section import pack_array
+
+        with pytest.raises(BitstreamError):
+            decoded(rebuilt(frame=pack_array(np.full((7, 3), value, "<f4"))))
+    weights = np.frombuffer(reader.section("networks"), "<f4").copy()
+    weights[:] = 3e38
+    with pytest.raises(BitstreamError):
+        decoded(rebuilt(networks=weights.tobytes()))
+
+
+@pytest.mark.cuda
+def test_a_model_on_cuda_writes_a_file_that_the_cpu_decodes(method, trained):
+    data = encoded(trained, method)
+    on_gpu = encoded(trained.cuda(), method)
+    trained.cpu()
+    assert ContainerReader(on_gpu, "x").sections.keys() == ContainerReader(data, "x").sections.keys()
+    assert decoded(on_gpu).counts() == decoded(data).counts()
