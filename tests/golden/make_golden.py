@@ -133,6 +133,21 @@ SMALL_CAT = {
 
 SMALL_CODEBOOK = {"codec.vq_training": "kmeans", "codec.vq_iterations": 2}
 
+
+def masked(n: int, on: int) -> GaussianModel:
+    """Students of ChimeraGS, `on` of whose n masks are on, with an importance that falls along the rows."""
+    from sw_chimerags.model import MaskedGaussians
+
+    quantizer = load_plugins().quantizers.load("ste-mask")(0.01)
+    model = MaskedGaussians.of(procedural(n), quantizer=quantizer, init=-6.0)
+    with torch.no_grad():
+        model.mask_logits[torch.arange(n) * 7 % max(n, 1) < on] = 1.0
+    model.set_importance(torch.arange(n, 0, -1).float())
+    return model
+
+
+SMALL_VQ = {"vq.size": 4, "vq.iterations": 0}
+
 Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
 CASES: dict[str, Case] = {
     **{f"3dgs_{rate}_v1": ("3dgs", rate, {}, lambda: procedural(48)) for rate in ("r1", "r2", "r3", "r4", "r5")},
@@ -159,6 +174,11 @@ CASES: dict[str, Case] = {
     "hac_exact_v1": ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC)),
     "hac_half_v1": ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
     "cat_3dgs_refined_v1": ("cat-3dgs", "r1", SMALL_CAT, lambda: cat_anchors(SMALL_CAT)),
+    "speedy_splat_v1": ("speedy-splat", "r3", {}, lambda: procedural(16, 2, 1)),
+    "chimerags_v1": ("chimerags", "r2", SMALL_VQ, lambda: masked(32, 12)),
+    "chimerags_uniform16_v1": ("chimerags", "r1", {**SMALL_VQ, "xyz": "uniform16"}, lambda: masked(20, 0)),
+    "chimerags_float16_v1": ("chimerags", "r4", {**SMALL_VQ, "xyz": "float16", "prefer": []}, lambda: masked(5, 5)),
+    "chimerags_empty_v1": ("chimerags", "r3", SMALL_VQ, lambda: masked(0, 0)),
 }
 """File -> method, rate point, other values of its configuration, model."""
 
