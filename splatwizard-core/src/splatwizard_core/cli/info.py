@@ -93,11 +93,10 @@ def _print_record(facts: dict[str, Any]) -> None:
     from rich.table import Table
 
     from splatwizard_core.experiments.report.facts import PhaseFacts, TrainFacts
-    from splatwizard_core.experiments.report.results_tables import started_from
 
     train = TrainFacts.model_validate(facts["train"])
     gist = {k: v for k, v in facts.items() if k not in ("phases", "train")} | {"steps": train.steps}
-    gist["starts from"] = started_from(train)
+    gist["starts from"] = train.started_from()
     _print_plain({k: v for k, v in gist.items() if v != ""})
     if facts["phases"] is None:
         console().print("who served which phase is not known of this record")

@@ -161,8 +161,9 @@ def notes(records: Sequence[Record]) -> list[str]:
     found = []
     before: dict[str, dict[str, None]] = {}
     for record in records:
-        for name in record.train.pretraining or {}:
-            before.setdefault(name, {})[record.method] = None
+        for name, scene in (record.train.pretraining or {}).items():
+            if scene.train_s is not None:
+                before.setdefault(name, {})[record.method] = None
     for name, methods in before.items():
         found.append(f"train s of {', '.join(methods)}: with that of the {name} scene that it starts from")
     missing: dict[str, dict[str, None]] = {}

@@ -56,6 +56,7 @@ def train(
 ) -> None:
     """Train one method on one scene; checkpoints and log go into its run directory."""
     from splatwizard_core.experiments.run import RunRequest, train_only
+    from splatwizard_core.experiments.training_run import pretraining
     from splatwizard_core.plugins import load_plugins
 
     plugins = load_plugins()
@@ -71,6 +72,7 @@ def train(
         "directory": str(directory),
         "counts": trained.model.counts(),
         **{k: trained.facts[k] for k in ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdown_s")},
+        "pretraining": pretraining(trained.facts),
     }
     if as_json:
         print_json(facts)

@@ -90,7 +90,9 @@ def test_the_seconds_of_what_a_method_starts_from_count_and_are_said(make_run, m
         content["train"] = {**content["train"], "pretraining": {"3dgs": scene}, "with_pretraining_s": 1860.0}
 
     def given(content):
-        content["train"] = {**content["train"], "with_pretraining_s": None}
+        unknown = dict.fromkeys(("preset", "config", "steps", "train_s"))
+        given_scene = {**scene, **unknown, "file": {"name": "a.ply", "sha256": "00"}}
+        content["train"] = {**content["train"], "pretraining": {"3dgs": given_scene}, "with_pretraining_s": None}
         content["unknown"] = {**content["unknown"], "train.with_pretraining_s": "the 3dgs scene came from a file"}
 
     done = []
@@ -101,3 +103,4 @@ def test_the_seconds_of_what_a_method_starts_from_count_and_are_said(make_run, m
     assert "1860.0" in text
     assert "train s of pruned: with that of the 3dgs scene that it starts from" in text
     assert "train s of given is not known: the 3dgs scene came from a file" in text
+    assert "train s of given: with" not in text

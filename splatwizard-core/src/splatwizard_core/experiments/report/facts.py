@@ -15,6 +15,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 
 from splatwizard_core.errors import UserInputError
 from splatwizard_core.experiments.record import SCHEMA
+from splatwizard_core.experiments.report import numbers
 
 LONGEST_TEXT = 300
 LARGEST_RECORD = 64_000_000  # bytes; ten thousand views with ten metrics take a tenth of it
@@ -108,6 +109,17 @@ class TrainFacts(Facts):
     memory_kind: Text | None = None
     breakdown_s: dict[Text, dict[Text, float]] | None = None
     trained_in: Text | None = None
+
+    def started_from(self) -> str:
+        """What the training started from, in words; empty: nothing that was trained."""
+        found = []
+        for name, scene in (self.pretraining or {}).items():
+            steps = "" if scene.steps is None else f", {numbers.count(scene.steps)} steps"
+            seconds = "" if scene.train_s is None else f", {numbers.seconds(scene.train_s)} s"
+            preset = "" if scene.preset is None else f" ({scene.preset} preset{steps}{seconds})"
+            origin = f" from the file {scene.file['name']}" if "name" in scene.file else preset
+            found.append(f"a trained {name} scene{origin}")
+        return "; ".join(found)
 
 
 class PartFacts(Facts):

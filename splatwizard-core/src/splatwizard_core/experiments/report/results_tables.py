@@ -9,7 +9,7 @@ from splatwizard_core.experiments.report import numbers
 from splatwizard_core.experiments.report.aggregate import DatasetTable
 from splatwizard_core.experiments.report.blocks import Cell, Row, Table, columns, row
 from splatwizard_core.experiments.report.distortion import BdCell, BdTable
-from splatwizard_core.experiments.report.facts import RunFacts, TrainFacts, clean
+from splatwizard_core.experiments.report.facts import RunFacts, clean
 from splatwizard_core.experiments.report.runs import Run, machine
 
 
@@ -232,18 +232,6 @@ def phases_table(runs: Sequence[Run]) -> Table | None:
     return Table("Phases", columns(heads, text=heads, long=(heads[1], heads[3])), rows)
 
 
-def started_from(train: TrainFacts) -> str:
-    """What the training of a run started from, in words; empty: nothing that was trained."""
-    found = []
-    for name, scene in (train.pretraining or {}).items():
-        steps = "" if scene.steps is None else f", {numbers.count(scene.steps)} steps"
-        seconds = "" if scene.train_s is None else f", {numbers.seconds(scene.train_s)} s"
-        preset = "" if scene.preset is None else f" ({scene.preset} preset{steps}{seconds})"
-        origin = f" from the file {scene.file['name']}" if "name" in scene.file else preset
-        found.append(f"a trained {name} scene{origin}")
-    return "; ".join(found)
-
-
 def cost_table(facts: RunFacts) -> Table:
     """Times and memory of one run."""
     kind = {"rss": "growth of the resident set", "cuda": "CUDA allocator"}
@@ -259,7 +247,7 @@ def cost_table(facts: RunFacts) -> Table:
     drawn = "" if speed.image_size is None else f"at {speed.image_size[0]} × {speed.image_size[1]} px"
     entries = [
         ("training", time(facts.train.train_s), f"{numbers.count(facts.train.steps)} steps"),
-        ("training, with what it starts from", time(facts.train.with_pretraining_s), started_from(facts.train)),
+        ("training, with what it starts from", time(facts.train.with_pretraining_s), facts.train.started_from()),
         ("training memory", *size(facts.train.peak_bytes, facts.train.memory_kind)),
         ("encoding", time(facts.codec.encode_s), ""),
         ("decoding", time(facts.codec.decode_s), "median, fresh process"),
