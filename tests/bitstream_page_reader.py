@@ -994,7 +994,8 @@ def cat(static: dict[str, Any], sections: dict[str, bytes], tables: ExactTables)
         model[1:4] = [(w + np.eye(16, dtype=np.float32), b) for w, b in model[1:4]]
     weights.done()
 
-    steps = (1.0, 0.001, 0.2)
+    steps = static["base_steps"]
+    check(steps[0] == 1, "step of features")
     values = [np.zeros((n, width), np.float32) for width in groups]
     if n:
         sizes = [m * static["resolution"] for m in static["multiples"]]

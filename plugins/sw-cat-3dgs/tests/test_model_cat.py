@@ -86,8 +86,9 @@ def test_views_are_counted_again_when_as_many_anchors_came_as_went(begun, little
     assert (model.view_weights[:-1] > 0).sum() == (first[1:] > 0).sum()
 
 
-def test_setting_up_makes_planes_of_the_anchors_resolution_and_predicts_their_statistics(begun):
-    stage, model, optimizer = begun(context__anchors_per_cell=4.0)
+@pytest.mark.parametrize("units", ["values", "steps"])
+def test_setting_up_makes_planes_of_the_anchors_resolution_and_predicts_their_statistics(begun, units):
+    stage, model, optimizer = begun(context__anchors_per_cell=4.0, context__units=units)
     with torch.no_grad():
         model.features.normal_(3.0, 2.0, generator=torch.Generator().manual_seed(0))
     assert model.context.resolution == 0
@@ -98,6 +99,10 @@ def test_setting_up_makes_planes_of_the_anchors_resolution_and_predicts_their_st
     assert (context.scales[0] - model.features.std(0)).abs().max() < 0.1
     for step, base in zip(context.steps, (1.0, 0.001, 0.2), strict=True):
         assert step.detach() == pytest.approx(1.1 * base, rel=0.1)
+    model.context.fold_units()
+    folded = model.predict(torch.arange(model.num_rows))
+    for before, after in zip((*context.means, *context.scales), (*folded.means, *folded.scales), strict=True):
+        assert torch.allclose(before, after, rtol=1e-4, atol=1e-7)
     places = model.places()
     assert places.min() >= 0
     assert places is model.places()  # kept while anchors and frame stay

@@ -195,7 +195,7 @@ def test_damage_is_refused(method, train):
     hostile = {
         "feature_dim": 0, "slices": [1], "multiples": [], "channels": 513, "resolution": 1 << 13,
         "num_anchors": 1 << 30, "num_offsets": 65, "mode": "magic", "refine": 2, "hidden": "12",
-        "context_hidden": 11, "weights": "float8",
+        "context_hidden": 11, "weights": "float8", "base_steps": [1.0, 0.0, 0.2],
     }  # fmt: skip
     for key, value in hostile.items():
         with pytest.raises(BitstreamError):

@@ -199,6 +199,7 @@ def _settled_context(model: CatAnchors, places: AnchorPlaces, config: CatConfig)
         resolution = base_resolution(len(places.codes), settings.anchors_per_cell)
         shapes = [plane.shape for plane in context.triplane.initial(resolution, torch.Generator())]
         _use_integers(context, [np.zeros(each, np.int64) for each in shapes])
+    context.fold_units()
     return context
 
 
@@ -215,6 +216,7 @@ def _write_shape(writer: ContainerWriter, shape: ContextShape, config: CatConfig
         mode=config.codec.mode, feature_dim=shape.features, hidden=config.hidden, channels=shape.channels,
         multiples=list(shape.multiples), resolution=resolution, context_hidden=shape.hidden, slices=list(shape.slices),
         slice_hidden=shape.slice_hidden, refine=int(shape.refine),
+        base_steps=list(shape.base_steps),
     )  # fmt: skip
     if config.codec.mode == "float":
         writer.static["made_on"] = this_machine()
@@ -232,9 +234,19 @@ def _read_shape(reader: ContainerReader) -> tuple[ContextShape, int, int]:
         features=sizes["feature_dim"], offsets=reader.integer("num_offsets", low=1, high=64),
         channels=sizes["channels"], multiples=_sizes(reader, "multiples", longest=4, high=16),
         hidden=sizes["context_hidden"], slices=slices, slice_hidden=sizes["slice_hidden"],
-        refine=bool(reader.integer("refine", low=0, high=1)),
+        refine=bool(reader.integer("refine", low=0, high=1)), base_steps=_read_steps(reader),
     )  # fmt: skip
     return shape, sizes["hidden"], sizes["resolution"]
+
+
+def _read_steps(reader: ContainerReader) -> tuple[float, float, float]:
+    steps = reader.static.get("base_steps")
+    usable = isinstance(steps, list) and len(steps) == 3 and all(type(q) in (int, float) for q in steps)
+    if not usable or steps[0] != 1 or not all(1e-9 <= q <= 1e9 for q in steps):
+        raise BitstreamError(
+            f"{reader.name}: header value 'base_steps' must be 1 and two numbers in 1e-9..1e9", section="header"
+        )
+    return 1.0, float(steps[1]), float(steps[2])
 
 
 def _sizes(reader: ContainerReader, name: str, *, longest: int, high: int) -> tuple[int, ...]:

@@ -30,6 +30,13 @@ class Phases(Params):
     rebound: bool = Field(True, description="fit the lattice of positions again at the warm-up, when growth is over")
 
 
+class Steps(Params):
+    """Quantiser steps that the predicted ones multiply by 0.1 to 2.1; that of the features is 1."""
+
+    scales: float = Field(0.001, gt=0, description="base step of the scales, world units")
+    offsets: float = Field(0.2, gt=0, description="base step of the offsets, in units of the scales")
+
+
 class Context(Params):
     """The models that predict attributes."""
 
@@ -45,6 +52,9 @@ class Context(Params):
         [5, 10, 15, 20], min_length=1, max_length=64, description="slices of the features; sums to feature_dim"
     )
     slice_hidden: int = Field(100, ge=1, le=512, description="width of the networks of the slices")
+    units: Literal["values", "steps"] = Field(
+        "values", description="what the network predicts scales and offsets in; steps learns faster, same file"
+    )
     refine: bool = Field(False, description="also predict scales and offsets better from all features")
     neighbors: int = Field(50, ge=1, description="neighbours that decide whether an anchor is an outlier")
     contamination: float = Field(0.05, ge=0, lt=1, description="share of anchors that the triplane's axes ignore")
@@ -54,7 +64,10 @@ class Rate(Params):
     """The rate term and the masks."""
 
     lambda_: float = Field(0.002, ge=0, description="weight of the bits per number of an anchor")
-    triplane: float = Field(10.0, ge=0, description="weight of the bits of the planes, times lambda_")
+    scale: float = Field(
+        1.0, ge=0, description="multiplies lambda_, whose values are meant for scenes of some 100,000 anchors"
+    )
+    triplane: float = Field(10.0, ge=0, description="weight of the bits of the planes, times that of an anchor's bits")
     sample: float = Field(
         0.05, gt=0, le=1, description="share of the visible anchors whose bits are computed each step"
     )
@@ -62,8 +75,13 @@ class Rate(Params):
         1.0, gt=0, le=1, description="share of the channels whose bits are computed each step"
     )
     mask_floor: float = Field(1e-3, ge=0, description="least weight of the mean sigmoid of the mask logits")
-    mask_factor: float = Field(0.3, ge=0, description="that weight over lambda_, where it is more")
+    mask_factor: float = Field(0.3, ge=0, description="that weight over lambda_ * scale, where it is more")
     view_factor: float = Field(1.0, gt=0, description="weight of a mask of an anchor seen as often as the average one")
+
+    @property
+    def weight(self) -> float:
+        """Of the bits per number."""
+        return self.lambda_ * self.scale
 
 
 class ContextLearningRates(Params):
@@ -94,6 +112,7 @@ class CatConfig(AnchorParams):
     lr: AnchorLearningRates = Field(AnchorLearningRates(max_steps=FULL_RUN), description="step sizes")
     context_lr: ContextLearningRates = Field(ContextLearningRates(), description="step sizes of the context")
     phases: Phases = Field(Phases(), description="what is trained when")
+    steps: Steps = Field(Steps(), description="base steps of the quantisers")
     context: Context = Field(Context(), description="the models that predict attributes")
     rate: Rate = Field(Rate(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what the file holds")

@@ -19,8 +19,6 @@ from splatwizard_core.gaussians.coded_anchors import AnchorContext
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
 
-BASE_STEPS = (1.0, 0.001, 0.2)
-"""Quantiser steps of features, scales and offsets that predicted ones multiply."""
 STEP_OFFSET = 1.1
 """A step is its base times (1.1 + tanh t): never zero."""
 PLANES = 3
@@ -29,7 +27,10 @@ FRAME_ROWS = {"mean": slice(0, 1), "axes": slice(1, 4), "std": slice(4, 5), "low
 
 @dataclass(frozen=True)
 class ContextShape:
-    """What sizes the networks: features F and offsets k of an anchor, and the fields of `config.Context`."""
+    """What sizes the networks: features F and offsets k of an anchor, and the fields of `config.Context`.
+
+    base_steps  quantiser steps of features (1), scales and offsets that predicted ones multiply
+    """
 
     features: int
     offsets: int
@@ -39,6 +40,7 @@ class ContextShape:
     slices: tuple[int, ...]
     slice_hidden: int
     refine: bool
+    base_steps: tuple[float, float, float]
 
     @property
     def widths(self) -> tuple[int, int, int]:
@@ -60,6 +62,7 @@ class CatContext(nn.Module):
     slices      the registry's `channel-ar`
     arms        one of the registry's `spatial-ar` for each plane orientation
     rounded     planes are used (and trained) as the file will have them
+    in_steps    the network gives means and scales as multiples of base steps, not in the units of the values
     """
 
     frame: Tensor
@@ -75,6 +78,7 @@ class CatContext(nn.Module):
         self.arms = nn.ModuleList(models.load("spatial-ar")(generator) for _ in range(PLANES))
         self.register_buffer("frame", torch.zeros(7, 3))
         self.rounded = False
+        self.in_steps = False
 
     @property
     def resolution(self) -> int:
@@ -105,19 +109,36 @@ class CatContext(nn.Module):
             return
         bias = self.network[-1].bias
         start = 0
-        for value, base in zip(values, BASE_STEPS, strict=True):
+        for value, base, unit in zip(values, self.shape.base_steps, self.units, strict=True):
             for column in (value.mean(dim=0), value.std(dim=0, unbiased=False).clamp(min=base)):
-                bias[start : start + len(column)] = column
+                bias[start : start + len(column)] = column / unit
                 start += len(column)
         bias[start:] = 0
+
+    @property
+    def units(self) -> tuple[float, float, float]:
+        """Of the network's means and scales by group."""
+        return self.shape.base_steps if self.in_steps else (1.0, 1.0, 1.0)
+
+    @torch.no_grad()
+    def fold_units(self) -> None:
+        """Let the network predict in the units of the values, which is what the file has."""
+        last, start = self.network[-1], 0
+        for width, unit in zip(self.shape.widths, self.units, strict=True):
+            rows = slice(start, start + 2 * width)
+            last.weight[rows] *= unit
+            last.bias[rows] *= unit
+            start += 2 * width
+        self.in_steps = False
 
     # Prediction in training
 
     def forward(self, places: Tensor) -> AnchorContext:
         """Of anchors at places [V,3]; differentiable."""
         out = self.network(self.triplane(places, rounded=self.rounded)).split(self.shape.splits, dim=1)
-        steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(BASE_STEPS)  # [V,3]
-        return AnchorContext((out[0], out[2], out[4]), (out[1], out[3], out[5]), tuple(steps.split(1, dim=1)))  # type: ignore[arg-type]
+        steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
+        means, scales = (tuple(out[2 * i + second] * unit for i, unit in enumerate(self.units)) for second in (0, 1))
+        return AnchorContext(means, scales, tuple(steps.split(1, dim=1)))  # type: ignore[arg-type]
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
         """The context once features [V,F] are known: each slice sees those before it."""

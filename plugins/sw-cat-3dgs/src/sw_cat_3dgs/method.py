@@ -45,11 +45,13 @@ class Cat3DGS(Method):
             raise SceneError(
                 f"scene '{scene.name}' has no start points: anchors need SfM points, or random ones", path=scene.path
             )
+        context = CatContext(self.plugins, self.shape(), generator)
+        context.in_steps = config.context.units == "steps"
         return CatAnchors.from_points(
             scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets, feature_dim=config.feature_dim,
             hidden=config.hidden, generator=generator, margin=config.bound_margin, sample=config.rate.sample,
             entropy=self.plugins.entropy_models.load("gaussian-exact")(), view_factor=config.rate.view_factor,
-            context=CatContext(self.plugins, self.shape(), generator),
+            context=context,
         )  # fmt: skip
 
     def shape(self) -> ContextShape:
@@ -65,7 +67,7 @@ class Cat3DGS(Method):
             raise ConfigError(f"context.multiples {c.multiples} must be in 1..16", key="context.multiples")
         return ContextShape(
             config.feature_dim, config.num_offsets, c.channels, tuple(c.multiples), c.hidden, tuple(c.slices),
-            c.slice_hidden, c.refine,
+            c.slice_hidden, c.refine, (1.0, config.steps.scales, config.steps.offsets),
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:

@@ -11,7 +11,7 @@ from torch import Tensor
 from splatwizard_core.gaussians.coded_anchors import AnchorContext, CodedAnchors
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
-from sw_cat_3dgs.context import BASE_STEPS, STEP_OFFSET, CatContext
+from sw_cat_3dgs.context import STEP_OFFSET, CatContext
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
 
@@ -31,7 +31,7 @@ class CatAnchors(CodedAnchors):
 
     def __init__(self, *tensors: Tensor, context: CatContext, view_factor: float = 1.0, **kwargs: Any) -> None:
         """Tensors and other arguments as of CodedAnchors."""
-        super().__init__(*tensors, base_steps=BASE_STEPS, noise_factor=STEP_OFFSET, **kwargs)
+        super().__init__(*tensors, base_steps=context.shape.base_steps, noise_factor=STEP_OFFSET, **kwargs)
         self.context = context.to(self.anchors.device)
         self.view_factor = view_factor
         self.views_stale = True

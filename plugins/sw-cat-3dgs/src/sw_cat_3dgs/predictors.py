@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.gaussians.coded_anchors import GROUPS
-from sw_cat_3dgs.context import BASE_STEPS
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
@@ -36,12 +35,11 @@ class ExactPredictor:
         self.context = context
         self._planes = context.triplane.integers()
         shape = context.shape
-        units = [1 / base for base, width in zip(BASE_STEPS, shape.widths, strict=True) for _ in range(2 * width)]
+        units = [1 / base for base, width in zip(shape.base_steps, shape.widths, strict=True) for _ in range(2 * width)]
         network = plugins.context_models.load("integer-mlp")
         self._network = network.from_module(context.network, output_scale=np.array([*units, 1.0, 1.0, 1.0]))
-        self._slices: Mapping[str, Any] = context.slices.exact(
-            {"scales": 1 / BASE_STEPS[1], "offsets": 1 / BASE_STEPS[2]}
-        )
+        inverse = {"scales": 1 / shape.base_steps[1], "offsets": 1 / shape.base_steps[2]}
+        self._slices: Mapping[str, Any] = context.slices.exact(inverse)
         self._multipliers = plugins.entropy_models.load("conditional-gaussian").step_multipliers
 
     def first(self, places: Tensor) -> Prediction:
@@ -59,10 +57,9 @@ class ExactPredictor:
         """Decoded features as the networks take them: their base step is 1."""
         return symbols * step
 
-    @staticmethod
-    def quantum(group: str, step: Tensor) -> Tensor:
+    def quantum(self, group: str, step: Tensor) -> Tensor:
         """Steps in units of the values, float64."""
-        return step.to(torch.float64) * (BASE_STEPS[GROUPS.index(group)] / (1 << FRACTION))
+        return step.to(torch.float64) * (self.context.shape.base_steps[GROUPS.index(group)] / (1 << FRACTION))
 
 
 class FloatPredictor:
@@ -82,8 +79,7 @@ class FloatPredictor:
     def known(self, symbols: Tensor, step: Tensor) -> Tensor:
         return (symbols.to(torch.float64) * step).to(torch.float32)
 
-    @staticmethod
-    def quantum(group: str, step: Tensor) -> Tensor:
+    def quantum(self, group: str, step: Tensor) -> Tensor:
         return step.to(torch.float64)
 
 

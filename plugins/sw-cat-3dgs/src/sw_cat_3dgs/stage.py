@@ -116,12 +116,12 @@ class CatStage(AnchorStage):
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Tensor]:
         rate, terms = self.config.rate, {}
         if step >= self.at(self.config.phases.quantize):
-            weight = max(rate.mask_floor, rate.mask_factor * rate.lambda_)
+            weight = max(rate.mask_floor, rate.mask_factor * rate.weight)
             terms["masks"] = weight * torch.sigmoid(model.mask_logits).mean()
         if "rate" in result.extras:
-            terms["rate"] = rate.lambda_ * result.extras["rate"].bits
+            terms["rate"] = rate.weight * result.extras["rate"].bits
         if model.context.rounded:
-            terms["triplane"] = rate.lambda_ * rate.triplane * self._plane_bits(model)
+            terms["triplane"] = rate.weight * rate.triplane * self._plane_bits(model)
         return terms
 
     def _plane_bits(self, model: CatAnchors) -> Tensor:
