@@ -87,7 +87,7 @@ class TrimmingStage(FineTuningStage):
             collecting = windows[0] if len(windows) == 1 else [step for window in windows for step in window]
             scheduler.register_task(collecting, collect_statistics, name="collect gradient statistics")
         if self.prune.pruner == OWN:
-            rule = PruneBelowBoth(self.pruner, self.prune.level, self.window)
+            rule = PruneBelowBoth(self.pruner, self.prune.level, self.window if self.statistics else None)
             scheduler.register_task(self.removals, rule, name="gradient aware prune")
         else:
             by_score = PruneByScore(self.pruner, self.prune.fraction_or_default, carry_grad=True)
@@ -103,13 +103,13 @@ def clear_statistics(model: GaussianModel) -> None:
 class PruneBelowBoth:
     """Schedule task: removes what lies below the level's quantile of opacity and of gradient.
 
-    window  steps over which gradients were added up
+    window  steps over which gradients were added up; None: not by this training
 
     Gradients of too few views would make it remove nothing: where a share `level` of the Gaussians has none, the
     quantile is 0 and nothing is below. That is an error as long as more views could be seen, and a warning otherwise.
     """
 
-    def __init__(self, pruner: Pruner, level: float, window: int) -> None:
+    def __init__(self, pruner: Pruner, level: float, window: int | None) -> None:
         self.pruner, self.level, self.window = pruner, level, window
 
     def __call__(
@@ -137,9 +137,10 @@ class PruneBelowBoth:
         if without < self.level:
             return
         share = f"{without:.0%} of the Gaussians have no gradient, so nothing lies below the {self.level:g}-quantile"
-        if self.window < views:
+        if self.window is not None and self.window < views:
             raise ValueError(
                 f"{share}: {self.window} steps of statistics saw at most {self.window} of {views} training views; "
                 f"set prune.window={views} and prune.start after it"
             )
-        log.warning("%s, although every training view was seen: nothing is removed", share)
+        seen = "" if self.window is None else ", although every training view was seen"
+        log.warning("%s%s: nothing is removed", share, seen)
