@@ -76,6 +76,14 @@ def test_another_pruner_decides_if_asked(train, toy):
     assert float(model.opacity_logits.detach().min()) >= float(toy.truth.opacity_logits.sort().values[264])
 
 
+def test_every_installed_pruner_may_decide(train, plugins):
+    names = [entry.name for entry in plugins.pruners]
+    assert {"lightgaussian", "opacity"} <= set(names)
+    for name in names:
+        _, model = train(only=0, prune__iterations=4, prune__steps=[3], prune__pruner=name, prune__percent=0.25)
+        assert model.num_rows == 300, name
+
+
 def test_distilling_trains_all_but_the_opacities(train, toy):
     _, pruned = train(only=0)
     _, student = train(only=1, start=pruned)
