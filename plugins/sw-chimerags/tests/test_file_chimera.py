@@ -25,7 +25,7 @@ EXACT = {"vq.ratio2": 0.0, "vq.ratio3": 0.0}
 def writer_of(model, **sets) -> ContainerWriter:
     writer = ContainerWriter("chimerags", ChimeraGS.version)
     values = {"vq.iterations": 3, **{key.replace("__", "."): value for key, value in sets.items()}}
-    ChimeraGS(load_plugins(), resolve(ChimeraGS, sets=values).config).encode(model, writer)
+    ChimeraGS(load_plugins(), resolve(ChimeraGS, "paper", sets=values).config).encode(model, writer)
     return writer
 
 
@@ -162,7 +162,9 @@ def test_no_gaussians_at_all(student):
 
 
 HOSTILE = [
-    ("num_sh2", 10**9), ("num_sh2", -1), ("num_sh2", 79), ("num_sh2", 0.5), ("num_sh3", 2**31), ("num_sh3", None),
+    ("num_gaussians", 10**9), ("num_gaussians", -1), ("num_gaussians", 119), ("num_gaussians", 0.5),
+    ("num_gaussians", None), ("num_sh3", 2**31), ("num_sh3", 121), ("num_sh3", 39), ("num_sh3", None),
+    ("max_sh_degree", 2),
     ("xyz", "float64"), ("xyz", "uniform16"), ("xyz", 3), ("vq", "range"), ("vq", "no-such-coder"), ("vq", None),
 ]  # fmt: skip
 
@@ -218,12 +220,25 @@ def test_a_decoded_gaussian_takes_what_the_cap_counts(student):
 
 def test_header_values_are_plain_and_the_version_is_checked(student):
     writer = writer_of(student())
-    assert json.loads(json.dumps(writer.static)) == {
-        "vq": "importance-vq",
-        "xyz": "float32",
-        "num_sh2": 80,
-        "num_sh3": 40,
-    }
+    expected = {"num_gaussians": 120, "num_sh3": 40, "max_sh_degree": 3, "vq": "importance-vq", "xyz": "float32"}
+    assert json.loads(json.dumps(writer.static)) == expected
     writer.version = 0
     with pytest.raises(BitstreamError, match="layout version"):
         decoded(writer)
+
+
+def test_steps_make_the_file_smaller_and_values_multiples_of_them(student):
+    model = student(400, 100)
+    steps = {"steps__colors": 1 / 32, "steps__opacity": 1 / 8, "steps__scales": 1 / 16, "steps__quats": 1 / 64}
+    plain, writer = writer_of(model, **EXACT), writer_of(model, **EXACT, **steps)
+    for name in ("sh2/attributes", "sh2/vq/own", "sh3/vq/own"):
+        assert writer.sections[name] < 0.8 * plain.sections[name]
+    found = decoded(writer)
+    ours, theirs = by_place(model), by_place(found)
+    for name, step in (("sh_dc", 1 / 32), ("opacity_logits", 1 / 8), ("log_scales", 1 / 16)):
+        a, b = getattr(model, name).detach()[ours], getattr(found, name).detach()[theirs]
+        assert torch.equal(b, (b / step).round() * step)
+        assert float((a - b).abs().max()) <= step / 2 + 1e-3
+    unit = torch.nn.functional.normalize(model.quats.detach()[ours], dim=1)
+    unit = unit * torch.where(unit[:, :1] < 0, -1.0, 1.0)
+    assert float((unit - found.quats.detach()[theirs]).abs().max()) <= 1 / 128 + 1e-6

@@ -117,7 +117,7 @@ def distilled(plugins, rasterizer, student, teacher, **sets):
         "distill.pseudo_view_std": 0.05,
         **{k.replace("__", "."): v for k, v in sets.items()},
     }
-    method = ChimeraGS(plugins, resolve(ChimeraGS, sets=values).config)
+    method = ChimeraGS(plugins, resolve(ChimeraGS, "paper", sets=values).config)
     return train_stages(
         method.stages()[-1:], lambda: copy.deepcopy(student), scene_of(), PipelineParams(), rasterizer,
         directory=None, identity={}, trained=lambda name: teacher,

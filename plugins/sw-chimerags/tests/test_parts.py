@@ -68,6 +68,10 @@ def test_a_scaled_schedule_scales_both_stages(everybody):
     assert [r.when for r in post.registrations] == [500]
 
 
+def test_a_run_that_is_cut_short_has_no_longer_stage(everybody):
+    assert [stage.iterations for stage in method_of(everybody, "quick", iterations=20).stages()] == [20, 20]
+
+
 def test_rates_that_change_are_a_task_of_the_plan(everybody):
     stage = method_of(everybody, distill__lr__decay=0.9).stages()[-1]
     pre, _ = build_schedulers(stage, PipelineParams())

@@ -70,10 +70,19 @@ class VQ(Params):
     batch: int = Field(80_000, ge=1, description="vectors of each update")
 
 
+class Steps(Params):
+    """Roundings before float16, so that its bytes repeat; 0: to float16 alone, as published. The decoder needs none."""
+
+    colors: float = Field(0, ge=0, le=1, description="SH coefficients become multiples of this, best a power of two")
+    opacity: float = Field(0, ge=0, le=4, description="the same of the opacity logits")
+    scales: float = Field(0, ge=0, le=1, description="the same of the log scales")
+    quats: float = Field(0, ge=0, le=0.25, description="the same of the quaternions, which get length 1 and w >= 0")
+
+
 class ChimeraConfig(OptimizationParams):
     """Everything that can be set for ChimeraGS."""
 
-    ENCODING: ClassVar[tuple[str, ...]] = ("vq", "xyz", "prefer")
+    ENCODING: ClassVar[tuple[str, ...]] = ("vq", "steps", "xyz", "prefer")
 
     train: Train = Field(Train(), description="stage 1")
     student: dict[str, Any] = Field(
@@ -83,6 +92,7 @@ class ChimeraConfig(OptimizationParams):
     mask: Mask = Field(Mask(), description="which Gaussians keep SH degree 3")
     score: Score = Field(Score(), description="whose colours are kept")
     vq: VQ = Field(VQ(), description="the colours in the file")
+    steps: Steps = Field(Steps(), description="roundings of what the file holds in float16")
     xyz: Literal["float32", "float16", "uniform16"] = Field(
         "float32", description="positions in the file: without loss, rounded, or on 2^16 steps of the bounding box"
     )

@@ -25,6 +25,7 @@ from sw_chimerags.model import DEGREE, LOWER, TENSORS, MaskedGaussians
 if TYPE_CHECKING:
     from splatwizard_core.coding.container import ContainerReader, ContainerWriter
     from splatwizard_core.plugins import PluginManager
+    from sw_chimerags.config import Steps
 
 GROUPS = {"sh2": LOWER, "sh3": (DEGREE + 1) ** 2 - 1}
 """Group -> coefficients behind band 0 that its Gaussians have, in the order of the decoded model."""
@@ -50,12 +51,14 @@ def encode(
     *,
     coder: str,
     settings: Mapping[str, Mapping[str, Any]],
+    steps: Steps,
     xyz: str,
 ) -> None:
     """Write both groups; the model stays as it is.
 
     coder       name of the vector coder
     settings    group -> what its coder is made with
+    steps       roundings before float16
     xyz         one of POSITIONS
 
     Raises ConfigError for a coder that there is not, SplatwizardError for values that are not finite and for a model
@@ -69,12 +72,11 @@ def encode(
         raise SplatwizardError(
             "the model was changed since the importance of its Gaussians was computed: `distill` computes it at its end"
         )
-    arrays = _arrays(model)
+    arrays = _rounded(_arrays(model), steps)
     on = model.mask_on().cpu().numpy()
     writer.raster["sh_degree"] = DEGREE
-    writer.static.update(vq=coder, xyz=xyz)
+    writer.static.update(num_gaussians=len(on), num_sh3=int(on.sum()), max_sh_degree=DEGREE, vq=coder, xyz=xyz)
     for group, rows in (("sh2", ~on), ("sh3", on)):
-        writer.static[f"num_{group}"] = int(rows.sum())
         if rows.any():
             ordered = _in_order({name: array[rows] for name, array in arrays.items()}, plugins)
             vectors = plugins.coders.load(coder)(plugins, **settings.get(group, {}))
@@ -92,6 +94,22 @@ def _arrays(model: MaskedGaussians) -> Arrays:
             raise SplatwizardError(f"'{name}' of {rows:,} Gaussians is not finite: they cannot be encoded")
         found[name] = array if name == "means" else array.clip(-HALF_MAX, HALF_MAX)
     found["importance"] = model.importance.double().cpu().numpy()
+    return found
+
+
+def _rounded(arrays: Arrays, steps: Steps) -> Arrays:
+    """What the file holds in float16 on coarser lattices, where a step is given."""
+    found = dict(arrays)
+    if steps.quats > 0:
+        quats = arrays["quats"]
+        quats = quats / np.maximum(np.linalg.norm(quats, axis=1, keepdims=True), 1e-12)
+        found["quats"] = quats * np.where(quats[:, :1] < 0, -1, 1)
+    for name, step in (
+        ("sh_dc", steps.colors), ("sh_rest", steps.colors), ("opacity_logits", steps.opacity),
+        ("log_scales", steps.scales), ("quats", steps.quats),
+    ):  # fmt: skip
+        if step > 0:
+            found[name] = (np.rint(found[name].astype(np.float64) / step) * step).astype(np.float32)
     return found
 
 
@@ -129,12 +147,13 @@ def _write_group(
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     """The model of a file. Raises BitstreamError."""
-    counts = {group: reader.integer(f"num_{group}", low=0, high=2**32 - 1) for group in GROUPS}
-    total = sum(counts.values())
+    total = reader.integer("num_gaussians", low=0, high=2**32 - 1)
+    on = reader.integer("num_sh3", low=0, high=total)
+    reader.integer("max_sh_degree", low=DEGREE, high=DEGREE)
     reader.allow(ROW_BYTES * total, f"a model of {total:,} Gaussians")
     xyz = reader.text("xyz", choices=POSITIONS)
     coder = plugins.coders.load(reader.text("vq", choices=vector_coders(plugins)))(plugins)
-    groups = [_read_group(group, n, reader, plugins, coder, xyz) for group, n in counts.items()]
+    groups = [_read_group(group, n, reader, plugins, coder, xyz) for group, n in (("sh2", total - on), ("sh3", on))]
     tensors = [torch.cat([group[i] for group in groups]) for i in range(len(TENSORS))]
     return GaussianModel(*tensors, active_sh_degree=DEGREE)
 

@@ -47,7 +47,7 @@ class ChimeraGS(Method):
         if name == self.name:
             raise ConfigError("train.method is chimerags itself: name the method that makes the student", key="train")
         full = self.plugins.methods.load(name).Config.FULL_ITERATIONS
-        values: dict[str, Any] = {"scale_schedule": config.scale_schedule}
+        values: dict[str, Any] = {"scale_schedule": True} if config.scale_schedule else {}
         if full == config.FULL_ITERATIONS:
             values["iterations"] = config.iterations
         elif config.scale_schedule:
@@ -84,7 +84,10 @@ class ChimeraGS(Method):
             training = "official" if vq.preset == "toolkit" else vq.training
             shared = {"size": vq.size, "iterations": vq.iterations, "batch": vq.batch, "training": training}
             settings = {"sh2": {"ratio": vq.ratio2, **shared}, "sh3": {"ratio": vq.ratio3, **shared}}
-        file.encode(model, writer, self.plugins, coder=vq.codec, settings=settings, xyz=self.config.xyz)
+        file.encode(
+            model, writer, self.plugins,
+            coder=vq.codec, settings=settings, steps=self.config.steps, xyz=self.config.xyz,
+        )  # fmt: skip
         if self.config.prefer:
             writer.raster["prefer"] = list(self.config.prefer)
 

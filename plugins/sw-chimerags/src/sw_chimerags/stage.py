@@ -57,7 +57,8 @@ class MaskedDistillation(DistillationStage):
 
     @property
     def iterations(self) -> int:
-        return max(1, round(self.config.distill.iterations * self.config.schedule_scale))
+        """Never more than `iterations`, the length of the longest stage: a run that is cut short is short."""
+        return min(max(1, round(self.config.distill.iterations * self.config.schedule_scale)), self.config.iterations)
 
     @property
     def taught_by(self) -> tuple[str, ...]:
