@@ -4,10 +4,10 @@
     python benchmarks/vector_quantization.py --rows 50000 --codes 512        # seconds instead of minutes
 
 Each contestant runs in a process of its own, so that its peak memory is its own; all use the threads that
-OMP_NUM_THREADS allows. A pass is one look at as many rows as there are: N * K distances. What each does before its first
-pass (k-means++ on 3 K rows there, spread seeds and four iterations on 16 K rows here) is in the seconds, not in the
-passes. The error is that of an exact search in the codebook, the same search for all. Without scikit-learn its row is
-left out (`pip install scikit-learn`).
+OMP_NUM_THREADS allows. A pass is one look at as many rows as there are: N * K distances. What each does before its
+first pass (k-means++ on 3 K rows there, spread seeds and four iterations on 16 K rows here) is in the seconds, not in
+the passes. The error is that of an exact search in the codebook, the same search for all. Without scikit-learn its row
+is left out (`pip install scikit-learn`).
 
 data     sh        rows like SH coefficients: 64 loose clusters, heavy tails, less spread in higher degrees
          clusters  as many tight clusters as codes: who finds them all?
@@ -119,8 +119,8 @@ def main():
             found[name] = json.loads(child.stdout.splitlines()[-1])
             vq.codebook = torch.from_numpy(np.load(save)).to(x)
             decoded = vq.forward(x)
-            error = sum(float((a - b).double().square().sum()) for a, b in zip(x.split(4096), decoded.split(4096)))
-            found[name]["mse"] = error / x.numel()
+            blocks = zip(x.split(4096), decoded.split(4096), strict=True)
+            found[name]["mse"] = sum(float((a - b).double().square().sum()) for a, b in blocks) / x.numel()
     reference = found.get("sklearn")
     ratios = f" {'seconds':>9} {'MSE':>8}   ratio to scikit-learn" if reference else ""
     print(f"{'':<18} {'seconds':>9} {'peak GB':>8} {'GPU GB':>7} {'MSE':>11}{ratios}")
