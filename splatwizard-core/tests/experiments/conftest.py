@@ -116,6 +116,15 @@ class Taught(Toy):
         return [StudentStage(self.config), TaughtStage(self.config)]
 
 
+class Pupil(Toy):
+    """Begins by itself, and is taught later."""
+
+    name = "toy-pupil"
+
+    def stages(self):
+        return [ToyStage(self.config), TaughtStage(self.config)]
+
+
 class SecretStage(TaughtStage):
     taught_by = ()
 
@@ -245,6 +254,7 @@ def register_methods(registry):
     registry.add("toy", "toy_method:Toy", summary="for tests")
     registry.add("toy-student", "toy_method:Student", summary="for tests")
     registry.add("toy-taught", "toy_method:Taught", summary="for tests")
+    registry.add("toy-pupil", "toy_method:Pupil", summary="for tests")
     registry.add("toy-secret", "toy_method:Secret", summary="for tests")
 
 

@@ -190,16 +190,26 @@ def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
 def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
     from splatwizard_core.cli.setup import resolve_all
 
-    def resolved(*methods: str) -> list[ResolvedConfig]:
+    def resolved(*methods: str, **values: str) -> list[ResolvedConfig]:
         return resolve_all(
-            toy_plugins, methods, None, preset=None, config_file=None, values={"init": str(ply)}, scene="demo:tiny"
-        )
+            toy_plugins, methods, None, preset=None, config_file=None, values=values, scene="demo:tiny"
+        )  # fmt: skip
 
-    plain, student = resolved("toy", "toy-student")
+    plain, student = resolved("toy", "toy-student", init=str(ply))
     assert (plain.init, student.init) == ("", str(ply))
     assert "toy does not start from a trained scene: 'init' is for the others" in capsys.readouterr().err
-    with pytest.raises(ConfigError, match="does not start from a trained scene"):
-        resolved("toy")
+    # One that is taught by a trained scene has no use for a start, and one for the values of its teacher.
+    for method in ("toy", "toy-pupil"):
+        with pytest.raises(ConfigError, match="does not start from a trained scene"):
+            resolved(method, init=str(ply))
+    pupil, taught = resolved("toy-pupil", "toy", **{"pretrained.iterations": "3"})
+    assert (pupil.pretrained, taught.pretrained) == ({"iterations": 3}, {})
+
+
+def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
+    found, _ = Run(toy_plugins, tmp_path).train("pretrained.iterations=2", method="toy-pupil")
+    assert found.facts["pretraining"]["toy"]["steps"] == 2
+    assert [phase["phase"] for phase in found.facts["phases"]] == ["train: toy", "train: taught"]
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):

@@ -63,19 +63,33 @@ def resolve_all(
 ) -> list[ResolvedConfig]:
     """One configuration for every method and rate point that was asked for; wrong input fails before anything runs."""
     from splatwizard_core.experiments.config import rate_points, resolve
-    from splatwizard_core.experiments.start import of_no_use, settled
+    from splatwizard_core.experiments.start import settled
 
     found = []
     for name in methods:
         cls = load_method(plugins, name)
         for rate in rate_points(cls, rates) if rates is not None else [None]:
             found.append(resolve(cls, preset, rate, config_file, values, scene=scene))
-    useless = {each.method: error for each in found if (error := of_no_use(plugins, each)) is not None}
-    if len(useless) < len({each.method for each in found}):  # what one of several methods has no use for is not wrong
-        for name, error in useless.items():
-            say(f"{name} does not start from a trained scene: '{error.key}' is for the others")
-        found = [replace(each, init="", pretrained={}) if each.method in useless else each for each in found]
-    return [settled(plugins, each) for each in found]
+    return [settled(plugins, each) for each in _left_to_those_with_a_use(plugins, found)]
+
+
+def _left_to_those_with_a_use(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
+    """Of several methods, those that start from nothing trained leave --init and `pretrained.KEY` to the others."""
+    from splatwizard_core.experiments.start import of_no_use
+
+    alone: dict[str, dict[str, Any]] = {"init": {"pretrained": {}}, "pretrained": {"init": ""}}
+    without: dict[str, dict[str, Any]] = {"init": {"init": ""}, "pretrained": {"pretrained": {}}}
+    for what in alone:
+        useless = {
+            each.method: error
+            for each in found
+            if (error := of_no_use(plugins, replace(each, **alone[what]))) is not None
+        }
+        if len(useless) < len({each.method for each in found}):  # else it is wrong, and told so
+            for name, error in useless.items():
+                say(f"{name} does not start from a trained scene: '{error.key}' is for the others")
+            found = [replace(each, **without[what]) if each.method in useless else each for each in found]
+    return found
 
 
 def resolve_one(
