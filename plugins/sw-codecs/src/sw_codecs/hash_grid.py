@@ -63,11 +63,12 @@ class HashGrid(nn.Module):
         features: int,
         log2_size: int,
         binary: bool,
-        generator: torch.Generator,
+        generator: torch.Generator | None,
     ) -> None:
         """levels: (scale, resolution) of each. Raises ValueError if a level is out of range.
 
         binary      signs, without border vertices; else the numbers with all vertices
+        generator   draws the first values; None: zeros, for a grid that is read from a file
         """
         super().__init__()
         if dimensions not in (2, 3) or not levels or features < 1 or not 3 <= log2_size <= 30:
@@ -82,7 +83,10 @@ class HashGrid(nn.Module):
             size = table_size(resolution, dimensions, log2_size)
             self.levels.append(Level(scale, resolution, size, start, vertices <= size))
             start += size
-        self.table = nn.Parameter((torch.rand(start, features, generator=generator) * 2 - 1) * INITIAL)
+        self.table = nn.Parameter(torch.zeros(start, features))
+        if generator is not None:
+            with torch.no_grad():
+                self.table.uniform_(-INITIAL, INITIAL, generator=generator)
         # Dense levels come first in the buffers below; `order` brings features back into the order of the levels.
         dense_first = sorted(range(len(self.levels)), key=lambda i: not self.levels[i].dense)
         chosen = [self.levels[i] for i in dense_first]
@@ -99,7 +103,13 @@ class HashGrid(nn.Module):
 
     @classmethod
     def binary_grid(
-        cls, dimensions: int, resolutions: Sequence[int], *, features: int, log2_size: int, generator: torch.Generator
+        cls,
+        dimensions: int,
+        resolutions: Sequence[int],
+        *,
+        features: int,
+        log2_size: int,
+        generator: torch.Generator | None,
     ) -> HashGrid:
         """As in HAC: resolutions R >= 3 count the border, R - 2 vertices an axis are used."""
         if min(resolutions, default=0) < 3:
@@ -248,7 +258,6 @@ class MixedHashGrid(nn.Module):
         generator: torch.Generator | None = None,
     ) -> None:
         super().__init__()
-        generator = torch.Generator() if generator is None else generator
         self.grids = nn.ModuleList(
             HashGrid.binary_grid(
                 len(axes),

@@ -17,7 +17,7 @@ from splatwizard_core.errors import BitstreamError
 
 FRACTION = 12
 ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1
-WEIGHT_LIMIT = 1 << 24  # 4096 in units of 1
+WEIGHT_LIMIT = 4096
 
 
 class IntegerMlp:
@@ -52,8 +52,8 @@ class IntegerMlp:
             scale = np.broadcast_to(scale, (width,))
             wq = np.rint(w.astype(np.float64) * scale[:, None] * 2.0**FRACTION)
             bq = np.rint(b.astype(np.float64) * scale * 2.0 ** (2 * FRACTION))
-            if not (np.isfinite(wq).all() and np.isfinite(bq).all()) or np.abs(wq).max(initial=0) > WEIGHT_LIMIT:
-                raise ValueError(f"layer {i}: a weight is not finite or exceeds {WEIGHT_LIMIT >> FRACTION}")
+            if not (np.isfinite(wq).all() and np.isfinite(bq).all()) or np.abs(w).max(initial=0) > WEIGHT_LIMIT:
+                raise ValueError(f"layer {i}: a weight is not finite or exceeds {WEIGHT_LIMIT}")
             if (np.abs(wq).sum(1) * ACTIVATION_LIMIT + np.abs(bq)).max(initial=0) >= 2.0**53:
                 raise ValueError(f"layer {i}: sums could reach 2^53 and would not be exact")
             self._layers.append((torch.from_numpy(wq).to(device), torch.from_numpy(bq).to(device)))
