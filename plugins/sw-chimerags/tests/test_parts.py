@@ -91,9 +91,20 @@ def test_keys_reach_the_student_and_what_it_borrows(everybody):
 @pytest.mark.parametrize("rate", [*ChimeraGS.RATES])
 def test_every_preset_makes_its_stages_at_every_rate_point(everybody, preset, rate):
     first, second = method_of(everybody, preset, rate).stages()
+    assert first.config.prune.stop <= first.iterations
     values = ChimeraGS.RATES[rate]
     assert (first.config.prune.soft, first.config.prune.hard) == (values["train.soft"], values["train.hard"])
     assert second.config.mask.weight == values["mask.weight"]
+
+
+@pytest.mark.parametrize("preset", ["paper", "quick"])
+@pytest.mark.parametrize("name", ["3dgs", "lightgaussian", "trimming-the-fat"])
+def test_other_methods_of_explicit_gaussians_may_make_the_student(everybody, preset, name):
+    if name not in everybody.methods:
+        pytest.skip(f"{name} is not installed")
+    stages = method_of(everybody, preset, train__method=name).stages()
+    assert len(stages) >= 2
+    assert stages[-1].name == "distill"
 
 
 def test_rate_points_remove_less_and_less():
@@ -119,7 +130,7 @@ def test_student_teacher_score_and_coder_of_others_need_names_alone(everybody, s
     method = method_of(
         everybody, "quick", train__method="theirs", student__nudge="-0.5", student__preset="paper",
         distill__teacher="theirs", distill__iterations="4", score__pruner="their-order", vq__codec="their-vectors",
-        mask__weight="100", distill__pseudo_views="false",
+        mask__weight="100", distill__pseudo_views="false", steps__colors="0", xyz="float32",
     )  # fmt: skip
     first, second = method.stages()
     assert (first.name, first.iterations, first.opt.nudge, second.taught_by) == ("theirs", 5, -0.5, ("theirs",))

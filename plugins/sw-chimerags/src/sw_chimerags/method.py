@@ -53,7 +53,7 @@ class ChimeraGS(Method):
         elif config.scale_schedule:
             values["iterations"] = max(1, round(full * config.schedule_scale))
         if name == "speedy-splat":
-            values |= {"prune.soft": config.train.soft, "prune.hard": config.train.hard}
+            values |= {f"prune.{key}": getattr(config.train, key) for key in ("soft", "hard", "stop")}
         values |= dotted(config.student, "")
         preset = str(values.pop("preset", "paper"))
         return create_method(self.plugins, name, values, preset=preset)

@@ -13,7 +13,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "quick": {
         "iterations": 2500,
         "student.preset": "quick",
-        "student.prune.stop": 1900,
+        "train.stop": 1900,
         "distill.iterations": 700,
         "distill.lr.position_init": 2e-4,
         "distill.lr.position_final": 4e-6,
