@@ -46,7 +46,9 @@ class Score(Params):
 class Prune(Params):
     """Stage 1: remove the least significant, then recover."""
 
-    iterations: int = Field(5_000, ge=1, description="steps of the stage, of the full run")
+    iterations: int = Field(
+        5_000, ge=1, description="steps of the stage, of the full run; never more than `iterations`"
+    )
     pruner: str = Field("lightgaussian", description="whose scores decide: any registered pruner")
     percent: float = Field(0.66, ge=0, lt=1, description="share of the Gaussians that goes, 0..1")
     steps: list[int] = Field([1], description="steps that prune, of the full run")

@@ -41,7 +41,8 @@ class PruneStage(FineTuningStage):
 
     @property
     def iterations(self) -> int:
-        return max(1, round(self.config.prune.iterations * self.opt.schedule_scale))
+        """Never more than `iterations`, the length of the longer stage: a run that is cut short is short."""
+        return min(max(1, round(self.config.prune.iterations * self.opt.schedule_scale)), self.opt.iterations)
 
     def fractions(self) -> dict[int, float]:
         """Step of this run -> share that goes."""
