@@ -61,11 +61,12 @@ class BackwardSampler(CameraSampler):
 
 class MaskStage(Stage):
     name = "mask"
+    taught_by = ("other",)
 
     def begin(self, context):
-        self.taught_by = context.trained("other")
+        teacher = context.trained("other")
         noise = torch.rand(1, generator=context.generator("method")).item()
-        model = Masked(context.model, copy.deepcopy(self.taught_by))
+        model = Masked(context.model, copy.deepcopy(teacher))
         with torch.no_grad():
             model.mask_logits.fill_(noise)
         self.noise = context.generator("method")
