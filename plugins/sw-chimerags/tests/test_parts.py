@@ -114,7 +114,12 @@ def test_rate_points_remove_less_and_less():
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("score__pruner", "no-such"), ("train__method", "chimerags"), ("score__pruner", "trimming-the-fat")],
+    [
+        ("score__pruner", "no-such"),
+        ("vq__codec", "range"),
+        ("train__method", "chimerags"),
+        ("score__pruner", "trimming-the-fat"),
+    ],
 )
 def test_parts_that_cannot_serve_are_told_in_a_line(everybody, key, value):
     if value not in everybody.pruners and value == "trimming-the-fat":

@@ -119,9 +119,11 @@ def test_rate_points_remove_less_and_less():
     assert points[2] == (0.80, 0.30) == tuple(SpeedySplat.RATES[SpeedySplat.DEFAULT_RATE].values())
 
 
-def test_an_unknown_pruner_is_told_with_those_there_are():
+def test_an_unknown_pruner_or_codec_is_told_with_those_there_are():
     with pytest.raises(ConfigError, match="speedy-splat"):
         stage_of(prune__pruner="speedy")
+    with pytest.raises(ConfigError, match="gaussians-exact"):
+        stage_of(codec="range")
 
 
 class FakeStatistics:

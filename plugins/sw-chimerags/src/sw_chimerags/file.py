@@ -44,6 +44,14 @@ def vector_coders(plugins: PluginManager) -> list[str]:
     return [entry.name for entry in plugins.coders if entry.declared.get("codes") == "vectors"]
 
 
+def check_coder(plugins: PluginManager, name: str) -> None:
+    """Raise ConfigError if no coder of vectors is called so."""
+    if name not in vector_coders(plugins):
+        raise ConfigError(
+            f"no coder of vectors is called '{name}'; installed: {', '.join(vector_coders(plugins))}", key="vq.codec"
+        )
+
+
 def encode(
     model: MaskedGaussians,
     writer: ContainerWriter,
@@ -64,10 +72,7 @@ def encode(
     Raises ConfigError for a coder that there is not, SplatwizardError for values that are not finite and for a model
     whose importance is not that of its Gaussians.
     """
-    if coder not in vector_coders(plugins):
-        raise ConfigError(
-            f"no coder of vectors is called '{coder}'; installed: {', '.join(vector_coders(plugins))}", key="vq.codec"
-        )
+    check_coder(plugins, coder)
     if not model.has_importance():
         raise SplatwizardError(
             "the model was changed since the importance of its Gaussians was computed: `distill` computes it at its end"

@@ -72,6 +72,7 @@ class ChimeraGS(Method):
         return self._student().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
+        file.check_coder(self.plugins, self.config.vq.codec)  # now, and not when all is trained
         quantizer = self.plugins.quantizers.load("ste-mask")(self.config.mask.threshold)
         return [*self._student().stages(), MaskedDistillation(self.config, quantizer, self._pruner())]
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians, gaussian_codecs
+from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.experiments.keys import dotted
 from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.gaussians.model import GaussianModel
@@ -44,6 +44,9 @@ class SpeedySplat(Method):
         return self._base().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
+        codec, known = self.config.codec, gaussian_codecs(self.plugins)
+        if codec not in known:  # now, and not when all is trained
+            raise ConfigError(f"no codec for Gaussians is called '{codec}'; installed: {', '.join(known)}", key="codec")
         return [SpeedySplatStage(self.config, self._base(), self.plugins)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
