@@ -84,7 +84,7 @@ class Significance:
             camera = camera.to(model.device)
             # One view at a time: a rasterizer returns its sums as int32 and float32.
             view = rasterizer.accumulate(model.gaussians(camera, rasterizer), [camera], options).scores
-            hits += view["hits"]
+            hits += view["hits"].long()
             caught += view["caught"]
         return hits, caught
 
