@@ -70,7 +70,7 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig, plugin
 
     conditional = plugins.entropy_models.load("conditional-gaussian")
     coder = conditional(config.codec.mode)
-    predictor = PREDICTORS[config.codec.mode](context, plugins)
+    predictor: Any = PREDICTORS[config.codec.mode](context, plugins)
     blocks: dict[str, list[bytes]] = {name: [] for name in sections(context.shape)}
 
     def code(section: str, group: str, part: slice, columns: slice, distribution: Any, there: Any) -> Tensor:
@@ -112,7 +112,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
         shapes = [(shape.channels, m * resolution, m * resolution) for m in shape.multiples]
         _use_integers(context, plugins.context_models.load("spatial-ar").decode(data, shapes, arms))
     with reader.decoding("networks"):
-        predictor = PREDICTORS[mode](context, plugins)
+        predictor: Any = PREDICTORS[mode](context, plugins)
 
     conditional = plugins.entropy_models.load("conditional-gaussian")
     coder = conditional(mode)
@@ -195,7 +195,8 @@ def _settled_context(model: CatAnchors, places: AnchorPlaces, config: CatConfig)
     elif context.resolution == 0:
         settings = config.context
         context.fit_frame(places.positions, neighbors=settings.neighbors, contamination=settings.contamination)
-        context.start_at(tuple(v.cpu() for v in model.raw(torch.nonzero(model.kept()).squeeze(1))))
+        features, scales, offsets = (v.cpu() for v in model.raw(torch.nonzero(model.kept()).squeeze(1)))
+        context.start_at((features, scales, offsets))
         resolution = base_resolution(len(places.codes), settings.anchors_per_cell)
         shapes = [plane.shape for plane in context.triplane.initial(resolution, torch.Generator())]
         _use_integers(context, [np.zeros(each, np.int64) for each in shapes])
@@ -240,7 +241,7 @@ def _read_shape(reader: ContainerReader) -> tuple[ContextShape, int, int]:
 
 
 def _read_steps(reader: ContainerReader) -> tuple[float, float, float]:
-    steps = reader.static.get("base_steps")
+    steps: Any = reader.static.get("base_steps")
     usable = isinstance(steps, list) and len(steps) == 3 and all(type(q) in (int, float) for q in steps)
     if not usable or steps[0] != 1 or not all(1e-9 <= q <= 1e9 for q in steps):
         raise BitstreamError(
@@ -251,7 +252,7 @@ def _read_steps(reader: ContainerReader) -> tuple[float, float, float]:
 
 def _sizes(reader: ContainerReader, name: str, *, longest: int, high: int) -> tuple[int, ...]:
     """A list of the header."""
-    value = reader.static.get(name)
+    value: Any = reader.static.get(name)
     fits = isinstance(value, list) and 1 <= len(value) <= longest
     if not fits or any(type(v) is not int or not 1 <= v <= high for v in value):
         raise BitstreamError(

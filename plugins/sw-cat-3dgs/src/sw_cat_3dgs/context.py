@@ -66,6 +66,10 @@ class CatContext(nn.Module):
     """
 
     frame: Tensor
+    triplane: Any
+    network: nn.Sequential
+    slices: Any
+    arms: Any
 
     def __init__(self, plugins: PluginManager, shape: ContextShape, generator: torch.Generator) -> None:
         super().__init__()
@@ -107,7 +111,7 @@ class CatContext(nn.Module):
         """Let the network predict mean and deviation of each column of the groups, wherever an anchor is."""
         if not len(values[0]):
             return
-        bias = self.network[-1].bias
+        bias: Any = self.network[-1].bias
         start = 0
         for value, base, unit in zip(values, self.shape.base_steps, self.units, strict=True):
             for column in (value.mean(dim=0), value.std(dim=0, unbiased=False).clamp(min=base)):
@@ -124,6 +128,7 @@ class CatContext(nn.Module):
     def fold_units(self) -> None:
         """Let the network predict in the units of the values, which is what the file has."""
         last, start = self.network[-1], 0
+        assert isinstance(last, nn.Linear)
         for width, unit in zip(self.shape.widths, self.units, strict=True):
             rows = slice(start, start + 2 * width)
             last.weight[rows] *= unit
@@ -138,7 +143,7 @@ class CatContext(nn.Module):
         out = self.network(self.triplane(places, rounded=self.rounded)).split(self.shape.splits, dim=1)
         steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
         means, scales = (tuple(out[2 * i + second] * unit for i, unit in enumerate(self.units)) for second in (0, 1))
-        return AnchorContext(means, scales, tuple(steps.split(1, dim=1)))  # type: ignore[arg-type]
+        return AnchorContext(means, scales, tuple(steps.split(1, dim=1)))
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
         """The context once features [V,F] are known: each slice sees those before it."""
