@@ -37,7 +37,7 @@ class CatAnchors(CodedAnchors):
         self.views_stale = True
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
-        self._places: tuple[Tensor, Tensor, Tensor] | None = None
+        self._places: tuple[Tensor, Tensor, int, Tensor] | None = None
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -55,9 +55,9 @@ class CatAnchors(CodedAnchors):
         """[N,3] integer places of the anchors in the triplane, kept until anchors or frame are others."""
         codes, frame = self.codes(), self.context.frame
         kept = self._places
-        if kept is None or kept[0] is not codes or kept[1] is not frame:
-            kept = self._places = (codes, frame, self.context.places(codes, self.bounds))
-        return kept[2]
+        if kept is None or kept[0] is not codes or kept[1] is not frame or kept[2] != frame._version:
+            kept = self._places = (codes, frame, frame._version, self.context.places(codes, self.bounds))
+        return kept[3]
 
     def predict(self, rows: Tensor) -> AnchorContext:
         found: AnchorContext = self.context(self.places()[rows])
