@@ -7,7 +7,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-PACKAGES := splatwizard-core plugins/sw-rasterizers plugins/sw-codecs plugins/sw-3dgs plugins/sw-trimming-the-fat plugins/sw-pup-3dgs plugins/sw-gsplat plugins/sw-cat-3dgs plugins/sw-hac plugins/sw-lightgaussian plugins/sw-speedy-splat plugins/sw-chimerags
+PACKAGES := splatwizard-core $(sort $(wildcard plugins/*))
 PROJECTS := $(addsuffix /pyproject.toml,$(PACKAGES))
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out
