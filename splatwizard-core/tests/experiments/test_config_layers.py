@@ -244,3 +244,29 @@ def test_a_borrowed_preset_leaves_the_keys_of_the_run_to_the_run():
     assert create_method(Manager(), "toy", preset="old").config.iterations == 77  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="clamp_render"):
         create_method(Manager(), "toy", {"clamp_render": True})  # type: ignore[arg-type]
+
+
+class Borrowing(OptimizationParams):
+    ENCODING = ("file", "order")
+    base: dict[str, Any] = {}
+    file: Codec = Codec()
+    order: str = "morton"
+
+
+class Borrower(Method):
+    name = "borrower"
+    Config = Borrowing
+
+
+def test_keys_of_a_borrowed_method_go_as_deep_as_it_has_blocks():
+    sets = {"base.densify.start": "600", "base.preset": "inria", "base.lr.means.init": "1.5e-4"}
+    assert resolve(Borrower, sets=sets).config.base == {
+        "densify": {"start": 600}, "preset": "inria", "lr": {"means": {"init": 1.5e-4}},
+    }  # fmt: skip
+
+
+def test_a_method_says_which_fields_only_its_encoder_reads():
+    plain = resolve(Borrower)
+    for sets in ({"file.mode": "quantized"}, {"order": "hilbert"}):
+        assert resolve(Borrower, sets=sets).training_hash() == plain.training_hash()
+    assert resolve(Borrower, sets={"base.densify.start": "600"}).training_hash() != plain.training_hash()
