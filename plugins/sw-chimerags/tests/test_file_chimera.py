@@ -242,3 +242,8 @@ def test_steps_make_the_file_smaller_and_values_multiples_of_them(student):
     unit = torch.nn.functional.normalize(model.quats.detach()[ours], dim=1)
     unit = unit * torch.where(unit[:, :1] < 0, -1.0, 1.0)
     assert float((unit - found.quats.detach()[theirs]).abs().max()) <= 1 / 128 + 1e-6
+
+
+@pytest.mark.cuda
+def test_a_model_on_a_gpu_makes_the_file_that_it_makes_on_the_cpu(student):
+    assert writer_of(student().cuda()).to_bytes() == writer_of(student()).to_bytes()
