@@ -87,6 +87,26 @@ def test_steps_that_fall_together_are_an_error(stages, steps):
         build_schedulers(stage, PipelineParams())
 
 
+@pytest.mark.parametrize("steps", [[3, 3], [-1], [0, 5]])
+def test_steps_that_make_no_plan_are_an_error_in_a_full_run_too(stages, steps):
+    with pytest.raises(ConfigError, match=r"prune\.steps"):
+        stages(prune__steps=steps)[0].fractions()
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 3])
+def test_a_run_of_hardly_any_steps_still_prunes_and_scores(stages, iterations):
+    prune, distill = stages(iterations=iterations, scale_schedule=True)
+    assert (prune.iterations, distill.iterations) == (iterations, iterations)
+    assert plan(prune)["prune"] == "1"
+    assert plan(distill)["calculate importance score"] == str(iterations)
+
+
+def test_an_unknown_codec_is_told_before_anything_is_trained(stages):
+    with pytest.raises(ConfigError, match=r"no codec for Gaussians is called 'zip'; installed: .*vectree") as told:
+        stages(codec__name="zip")
+    assert told.value.key == "codec.name"
+
+
 class Statistical:
     uses_statistics = True
 

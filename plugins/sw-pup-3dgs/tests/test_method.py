@@ -82,6 +82,12 @@ def test_an_unknown_codec_and_another_layout_are_refused():
         written(torch.nn.Linear(1, 1))
 
 
+def test_an_unknown_codec_is_told_before_anything_is_trained():
+    config = apply_overrides(Pup3DGSConfig(), {"codec": "zip"}, source="test")
+    with pytest.raises(ConfigError, match="gaussians-exact"):
+        Pup3DGS(load_plugins(), config).stages()
+
+
 def fields(block: type[Params], prefix: str = ""):
     for name, field in block.model_fields.items():
         if isinstance(field.default, Params):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
+from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.gaussians.model import GaussianModel
@@ -42,6 +42,7 @@ class LightGaussian(Method):
         return create_method(self.plugins, "3dgs").create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
+        check_gaussian_codec(self.plugins, self.config.codec.name, "codec.name")
         return [PruneStage(self.config, self._pruner()), DistillStage(self.config, self._significance())]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:

@@ -49,9 +49,10 @@ class PruneStage(FineTuningStage):
         prune = self.config.prune
         steps = self.when(list(prune.steps))
         assert isinstance(steps, list)
-        if len(steps) < len(set(prune.steps)) or 0 in steps:
+        if len(set(steps)) < len(prune.steps) or min(steps, default=1) < 1:
             raise ConfigError(
-                f"prune.steps {prune.steps} must be steps from 1 on that do not fall together in this run"
+                f"prune.steps {prune.steps} must be steps from 1 on that do not fall together in this run",
+                key="prune.steps",
             )
         return {step: prune.percent * prune.decay**i for i, step in enumerate(sorted(steps))}
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
+from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
 from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.gaussians.model import GaussianModel
@@ -37,6 +37,7 @@ class TrimmingTheFat(Method):
         raise SceneError(f"{self.name} starts from a trained 3dgs scene, not from points", path=scene.path)
 
     def stages(self) -> Sequence[Stage]:
+        check_gaussian_codec(self.plugins, self.config.codec)
         return [TrimmingStage(self.config, self.plugins)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:

@@ -44,6 +44,16 @@ def gaussian_codecs(plugins: PluginManager) -> list[str]:
     return [entry.name for entry in plugins.coders if entry.declared.get("codes") == "gaussians"]
 
 
+def check_gaussian_codec(plugins: PluginManager, name: str, key: str = KEY) -> None:
+    """Raise ConfigError if none of that name is installed: a method asks in `stages`, before anything is trained.
+
+    key     of the method's config that names it
+    """
+    known = gaussian_codecs(plugins)
+    if name not in known:
+        raise ConfigError(f"no codec for Gaussians is called '{name}'; installed: {', '.join(known)}", key=key)
+
+
 def encode_gaussians(
     plugins: PluginManager, name: str, model: GaussianModel, writer: ContainerWriter, **settings: Any
 ) -> None:
@@ -51,9 +61,7 @@ def encode_gaussians(
 
     Raises ConfigError if there is none of that name, PluginError if it cannot be loaded.
     """
-    known = gaussian_codecs(plugins)
-    if name not in known:
-        raise ConfigError(f"no codec for Gaussians is called '{name}'; installed: {', '.join(known)}", key=KEY)
+    check_gaussian_codec(plugins, name)
     writer.static[KEY] = name
     plugins.coders.load(name)(plugins, **settings).encode(model, writer)
 
