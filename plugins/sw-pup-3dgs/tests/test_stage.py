@@ -247,3 +247,31 @@ def test_a_pruner_that_reads_statistics_waits_until_it_has_some():
     assert calendar["collect gradient statistics"] == [*range(1, 100), *range(4902, 5001)]
     assert calendar["clear gradient statistics"] == [1, 4902]
     assert calendar["start round"] == [1, 5001]
+
+
+def test_statistics_of_two_close_removals_do_not_mix():
+    if "trimming-the-fat" not in load_plugins().pruners:
+        pytest.skip("no pruner that reads statistics is installed")
+    calendar = fires(stage_of(prune__pruner="trimming-the-fat", prune__steps=[1, 150]))
+    assert calendar["prune by trimming-the-fat"] == [100, 150]
+    assert calendar["clear gradient statistics"] == [1, 101]  # not at 51, within the window of the first
+    assert calendar["collect gradient statistics"] == [*range(1, 100), *range(101, 150)]
+    next_step = fires(stage_of(prune__pruner="trimming-the-fat", prune__steps=[1, 101]))
+    assert next_step["clear gradient statistics"] == [1, 101]
+    assert next_step["collect gradient statistics"] == [*range(1, 100), 101]
+
+
+def test_the_window_of_statistics_is_scaled_with_the_plan():
+    if "trimming-the-fat" not in load_plugins().pruners:
+        pytest.skip("no pruner that reads statistics is installed")
+    calendar = fires(stage_of(prune__pruner="trimming-the-fat", iterations=1000, scale_schedule=True))
+    assert calendar["prune by trimming-the-fat"] == [11, 500]
+    assert calendar["collect gradient statistics"] == [*range(1, 11), *range(490, 500)]
+
+
+def test_a_removal_that_would_wait_beyond_the_end_is_told():
+    if "trimming-the-fat" not in load_plugins().pruners:
+        pytest.skip("no pruner that reads statistics is installed")
+    with pytest.raises(ConfigError, match=r"at step 100, after 99 steps .* ends at step 50: lower prune\.window"):
+        stage_of(prune__pruner="trimming-the-fat", iterations=50)
+    assert fires(stage_of(iterations=50))["PUP prune"] == [1]  # one round, as published beside the two

@@ -112,6 +112,34 @@ def test_a_scaled_plan():
     assert calendar["collect gradient statistics"] == list(range(1, 10))
 
 
+@pytest.mark.parametrize("iterations", [1, 3, 200])
+@pytest.mark.parametrize("refresh", ["once", "every_interval"])
+def test_a_run_of_hardly_any_steps_has_statistics_at_its_first_removal(iterations, refresh):
+    stage = stage_of(iterations=iterations, scale_schedule=True, prune__refresh=refresh)
+    calendar = fires(stage)
+    assert calendar["gradient aware prune"][0] == 1
+    assert calendar["collect gradient statistics"][0] == 1
+    _, post = build_schedulers(stage, PipelineParams())
+    order = [r.name for r in post.registrations if r.due(1)]
+    assert order[-2:] == ["collect gradient statistics", "gradient aware prune"]
+
+
+def test_a_shortest_run_removes_what_its_one_view_says(rasterizer):
+    model, _ = toy_model()
+    scene = pictured(model, rasterizer, count=1)
+    found = trained(stage_of(iterations=1, scale_schedule=True), model, scene, rasterizer)
+    assert 0 < found.num_rows < 300
+
+
+def test_removals_in_successive_steps_have_statistics_of_their_own_and_none_at_all_is_a_plan():
+    values = {"prune__refresh": "every_interval", "prune__start": 3, "prune__interval": 1}
+    calendar = fires(stage_of(**values, prune__stop=6))
+    assert calendar["gradient aware prune"] == [3, 4, 5]
+    assert calendar["clear gradient statistics"] == [1, 4, 5]
+    assert calendar["collect gradient statistics"] == [1, 2, 4, 5]
+    assert fires(stage_of(**values, prune__stop=0))["gradient aware prune"] == []
+
+
 def test_gradients_may_be_averaged_anew_before_each_removal():
     calendar = fires(stage_of(prune__refresh="every_interval"))
     removals = calendar["gradient aware prune"]
@@ -287,6 +315,18 @@ def test_a_window_that_sees_too_few_views_is_an_error_that_says_what_to_set(rast
     values = {**SMALL, "prune__window": 2, "prune__start": 3}
     with pytest.raises(TaskError, match=r"67% of the Gaussians have no gradient.*set prune\.window=6 and prune\.start"):
         trained(stage_of(**values), model, scene, rasterizer)
+
+
+def test_in_a_scaled_run_it_names_steps_of_the_full_one(rasterizer):
+    model, _ = toy_model()
+    with torch.no_grad():
+        model.means[:200] += torch.tensor([0.0, 0.0, 50.0])
+    scene = pictured(model, rasterizer)
+    values = {"iterations": 150, "scale_schedule": True, "prune__window": 250, "prune__start": 300}
+    with pytest.raises(TaskError, match=r"2 steps of statistics .* set prune\.window=649 and"):
+        trained(stage_of(**values), model, scene, rasterizer)
+    enough = stage_of(**{**values, "prune__window": 649, "prune__start": 650})
+    assert (enough.window, enough.removals.start) == (6, 7)
 
 
 def test_if_every_view_was_seen_the_rule_takes_nothing_and_says_so(rasterizer, caplog):

@@ -54,18 +54,30 @@ class PupStage(FineTuningStage):
         self.statistics = self.pruner.uses_statistics
         if len(self.round_starts()) != len(prune.steps) or len(self.removals()) != len(prune.steps):
             raise ConfigError(f"rounds at {prune.steps} are too close together for this run", key="prune.steps")
+        late = [at for start, at in zip(self.round_starts(), self.removals(), strict=True) if start < at]
+        if late and late[0] > self.iterations:
+            raise ConfigError(
+                f"the first removal by '{prune.pruner}' would be at step {late[0]}, after {self.window} steps of "
+                f"gradient statistics, and the run ends at step {self.iterations}: lower prune.window",
+                key="prune.window",
+            )
 
     def round_starts(self) -> Sequence[int]:
         steps = self.when(self.prune.steps)
         assert isinstance(steps, list)
         return steps
 
+    @property
+    def window(self) -> int:
+        """Steps of this run over which gradients are averaged, for a pruner that reads them."""
+        return max(1, round(self.prune.window * self.opt.schedule_scale))
+
     def removals(self) -> Mapping[int, float]:
         """Step of this run -> share that goes then: where a round begins.
 
         A pruner that reads gradient statistics must wait until it has some.
         """
-        wait = self.prune.window if self.statistics else 0
+        wait = self.window if self.statistics else 0
         return {
             max(step, wait + 1): share for step, share in zip(self.round_starts(), self.prune.fractions, strict=True)
         }
@@ -77,7 +89,11 @@ class PupStage(FineTuningStage):
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         removals = self.removals()
         if self.statistics:
-            windows = [range(max(1, at - self.prune.window), at) for at in removals]
+            before = [0, *removals]  # no window reaches behind a removal, whose own sums it would clear
+            windows = [
+                range(max(last + 1, at - self.window), max(at, last + 2))
+                for last, at in zip(before, removals, strict=False)
+            ]
             scheduler.register_task(
                 [window.start for window in windows], clear_statistics, priority=CLEAR, name="clear gradient statistics"
             )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from typing import TYPE_CHECKING
 
 from splatwizard_core.errors import ConfigError, EmptyModel
@@ -66,28 +67,35 @@ class TrimmingStage(FineTuningStage):
 
     @property
     def window(self) -> int:
-        """Steps of this run over which gradients are averaged."""
+        """Steps of this run over which gradients are averaged; in a run of hardly any steps at least the first."""
         plan = self.when(range(self.prune.window + 1))
         assert isinstance(plan, range)
-        return plan.stop - 1
+        return max(1, plan.stop - 1)
 
     def windows(self) -> list[range]:
-        """Steps at which gradients are added up, one range each time that the sums begin anew."""
+        """Steps at which gradients are added up, one range each time that the sums begin anew.
+
+        Of removals in successive steps each has the gradients of its own step, which are collected first.
+        """
         if self.prune.refresh == "once":
             return [range(self.window + 1)]
-        before = [0, *self.removals[:-1]]
-        return [range(max(last + 1, at - self.window), at) for last, at in zip(before, self.removals, strict=True)]
+        before = [0, *self.removals]
+        return [
+            range(max(last + 1, at - self.window), max(at, last + 2))
+            for last, at in zip(before, self.removals, strict=False)
+        ]
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         if self.statistics:
             windows = self.windows()
             if len(windows) > 1:
-                anew = [window.start for window in windows if window]
+                anew = [window.start for window in windows]
                 scheduler.register_task(anew, clear_statistics, priority=CLEAR, name="clear gradient statistics")
             collecting = windows[0] if len(windows) == 1 else [step for window in windows for step in window]
             scheduler.register_task(collecting, collect_statistics, name="collect gradient statistics")
         if self.prune.pruner == OWN:
-            rule = PruneBelowBoth(self.pruner, self.prune.level, self.window if self.statistics else None)
+            window = self.window if self.statistics else None
+            rule = PruneBelowBoth(self.pruner, self.prune.level, window, scale=self.opt.schedule_scale)
             scheduler.register_task(self.removals, rule, name="gradient aware prune")
         else:
             by_score = PruneByScore(self.pruner, self.prune.fraction_or_default, carry_grad=True)
@@ -104,13 +112,14 @@ class PruneBelowBoth:
     """Schedule task: removes what lies below the level's quantile of opacity and of gradient.
 
     window  steps over which gradients were added up; None: not by this training
+    scale   of the plan: `prune.window`, which a message names, is in steps of the full run, 1 / scale of this run's
 
     Gradients of too few views would make it remove nothing: where a share `level` of the Gaussians has none, the
     quantile is 0 and nothing is below. That is an error as long as more views could be seen, and a warning otherwise.
     """
 
-    def __init__(self, pruner: Pruner, level: float, window: int | None) -> None:
-        self.pruner, self.level, self.window = pruner, level, window
+    def __init__(self, pruner: Pruner, level: float, window: int | None, *, scale: float = 1.0) -> None:
+        self.pruner, self.level, self.window, self.scale = pruner, level, window, scale
 
     def __call__(
         self,
@@ -138,9 +147,10 @@ class PruneBelowBoth:
             return
         share = f"{without:.0%} of the Gaussians have no gradient, so nothing lies below the {self.level:g}-quantile"
         if self.window is not None and self.window < views:
+            enough = math.ceil((views + 0.5) / self.scale - 1e-9) - 1  # what scales to as many steps as there are views
             raise ValueError(
                 f"{share}: {self.window} steps of statistics saw at most {self.window} of {views} training views; "
-                f"set prune.window={views} and prune.start after it"
+                f"set prune.window={enough} and prune.start after it"
             )
         seen = "" if self.window is None else ", although every training view was seen"
         log.warning("%s%s: nothing is removed", share, seen)
