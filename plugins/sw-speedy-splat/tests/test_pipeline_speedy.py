@@ -21,6 +21,7 @@ pytestmark = pytest.mark.pipeline
 SHORT = {
     "iterations": 120, "prune.start": 30, "prune.interval": 30, "prune.stop": 110, "prune.soft": 0.3,
     "base.densify.start": 10, "base.densify.interval": 10, "base.densify.stop": 70, "base.densify.reset_interval": 1000,
+    "base.densify.grad_threshold": 4e-4, "base.lr.max_steps": 2000,
 }  # fmt: skip
 
 
