@@ -133,6 +133,13 @@ def test_stopped_and_resumed_equals_one_go(train, whole, tmp_path, stop):
     assert train(directory=tmp_path)[1].digest() == whole[1].digest()
 
 
+@pytest.mark.parametrize("iterations", [1, 3])
+def test_a_run_of_hardly_any_steps(train, iterations):
+    _, model = train(iterations=iterations, scale_schedule=True, prune__iterations=5000)
+    assert model.num_rows == 136
+    assert float(model.importance.max()) > 0
+
+
 def encoded(method, model):
     writer = ContainerWriter(method.name, method.version)
     method.encode(model, writer)

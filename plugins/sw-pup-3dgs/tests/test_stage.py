@@ -14,7 +14,7 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingStopped, train_stages
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.method import Pup3DGS
@@ -72,10 +72,11 @@ def scene(rasterizer):
     return Scene("toy", made, made[:1], None, Protocol("test"))
 
 
-def trained(stage, model, scene, rasterizer, on_step=None):
+def trained(stage, model, scene, rasterizer, on_step=None, directory=None, stop_after=None):
     return train_stages(
         [stage], lambda: pytest.fail("it starts from a trained scene"), scene, PipelineParams(), rasterizer,
-        directory=None, identity={}, trained=lambda name: {"3dgs": model}[name], on_step=on_step,
+        directory=directory, identity={}, trained=lambda name: {"3dgs": model}[name], on_step=on_step,
+        stop_after=stop_after,
     ).model  # fmt: skip
 
 
@@ -198,6 +199,23 @@ def test_counts_and_nothing_is_updated_in_the_step_of_a_removal(scene, rasterize
     # Step 1 removes, step 2 is the last, which updates nothing: the survivors are rows of the model as it was.
     rows = {tuple(row) for row in model.means.detach().tolist()}
     assert {tuple(row) for row in only_pruned.means.detach().tolist()} <= rows
+
+
+@pytest.mark.parametrize("stop", [1, 5, 8, 9])  # at a removal, within a round, before and at the next removal
+def test_stopped_and_resumed_equals_one_go(scene, rasterizer, tmp_path, stop):
+    values = {"iterations": 12, "prune__steps": [1, 9]}
+    whole = trained(stage_of(**values), toy_model(), scene, rasterizer)
+    with pytest.raises(TrainingStopped):
+        trained(stage_of(**values), toy_model(), scene, rasterizer, directory=tmp_path, stop_after=stop)
+    found = trained(stage_of(**values), toy_model(), scene, rasterizer, directory=tmp_path)
+    assert found.digest() == whole.digest()
+    assert found.num_rows == 20
+
+
+@pytest.mark.parametrize("iterations", [2, 3])
+def test_a_run_of_hardly_any_steps(scene, rasterizer, iterations):
+    stage = stage_of(iterations=iterations, scale_schedule=True, prune__steps=[1, 10_000])
+    assert trained(stage, toy_model(), scene, rasterizer).num_rows == 20
 
 
 def test_the_lowest_scores_go(scene, rasterizer):

@@ -15,7 +15,7 @@ from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingStopped, train_stages
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator
 from splatwizard_core.training.statistics import accumulate_statistics
@@ -81,10 +81,10 @@ def pictured(model, rasterizer, count=6):
     return Scene("toy", made, made[:1], None, Protocol("test"))
 
 
-def trained(stage, model, scene, rasterizer, steps=None):
+def trained(stage, model, scene, rasterizer, directory=None, stop_after=None):
     return train_stages(
         [stage], lambda: pytest.fail("it starts from a trained scene"), scene, PipelineParams(), rasterizer,
-        directory=None, identity={}, trained=lambda name: {"3dgs": model}[name],
+        directory=directory, identity={}, trained=lambda name: {"3dgs": model}[name], stop_after=stop_after,
     ).model  # fmt: skip
 
 
@@ -305,6 +305,19 @@ def test_training_begins_with_fresh_statistics_and_repeats_itself(rasterizer):
     again = trained(stage_of(**SMALL), model, scene, rasterizer)
     assert first.digest() == again.digest()
     assert float(first.denom.max()) == 6  # the window, though it trained 26 steps
+
+
+@pytest.mark.parametrize("stop", [4, 7, 15])  # within the window, at a removal, between two
+@pytest.mark.parametrize("refresh", ["once", "every_interval"])
+def test_stopped_and_resumed_equals_one_go(rasterizer, tmp_path, stop, refresh):
+    model, _ = toy_model()
+    scene = pictured(model, rasterizer)
+    values = {**SMALL, "prune__refresh": refresh}
+    whole = trained(stage_of(**values), model, scene, rasterizer)
+    with pytest.raises(TrainingStopped):
+        trained(stage_of(**values), model, scene, rasterizer, directory=tmp_path, stop_after=stop)
+    assert trained(stage_of(**values), model, scene, rasterizer, directory=tmp_path).digest() == whole.digest()
+    assert whole.num_rows < 300
 
 
 def test_a_window_that_sees_too_few_views_is_an_error_that_says_what_to_set(rasterizer):
