@@ -71,6 +71,11 @@ def test_the_least_significant_go_at_the_first_step_and_nothing_is_updated_in_it
     assert toy.truth.num_rows == 400  # the teacher is as it was
 
 
+def test_the_count_of_the_authors_code_takes_one_more(train):
+    _, model = train(only=0, prune__iterations=1, prune__count_rule="official")
+    assert model.num_rows == 400 - (int(0.66 * 399) + 1)
+
+
 def test_another_pruner_decides_if_asked(train, toy):
     _, model = train(only=0, prune__iterations=1, prune__pruner="opacity")
     assert float(model.opacity_logits.detach().min()) >= float(toy.truth.opacity_logits.sort().values[264])

@@ -18,7 +18,7 @@ from splatwizard_core.training.pipeline import TrainingStopped, train_stages
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.method import Pup3DGS
-from sw_pup_3dgs.stage import PupStage, start_round, up_to
+from sw_pup_3dgs.stage import PupStage, start_round
 
 PAPER_PLAN = """\
 Stage | Task        | Plan
@@ -230,10 +230,6 @@ def test_the_lowest_scores_go(scene, rasterizer):
 
 
 def test_the_official_count_takes_one_more_or_all_equal_ones(scene, rasterizer):
-    scores = torch.tensor([5.0, 1.0, 3.0, 2.0, 4.0, 0.0])
-    assert up_to(scores, 0.5).tolist() == [False, True, False, True, False, True]  # index int(0.5 * 5) = 2
-    unseen = torch.tensor([-torch.inf, 7.0, -torch.inf, -torch.inf, 8.0])
-    assert up_to(unseen, 0.1).tolist() == [True, False, True, True, False]
     values = {"iterations": 1, "prune__steps": [1], "prune__fractions": [0.5], "prune__count_rule": "official"}
     assert trained(stage_of(**values), toy_model(), scene, rasterizer).num_rows == 100
     assert trained(stage_of(**values), toy_model(201), scene, rasterizer).num_rows == 100

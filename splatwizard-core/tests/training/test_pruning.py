@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from splatwizard_core.errors import EmptyModel, ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.pruning import PruneByScore, lowest, removal_count, scores_of
+from splatwizard_core.training.pruning import PruneByScore, lowest, removal_count, scores_of, up_to
 from splatwizard_core.training.stage import CameraIterator
 
 
@@ -85,6 +85,23 @@ def test_survivors_may_keep_their_gradient(scene):
     task = PruneByScore(Fixed(torch.arange(10.0)), 0.3, carry_grad=True)
     task(gaussians, optimizer, CameraIterator(scene.train), None, scene, 1)
     assert gaussians.means.grad[:, 0].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
+
+
+def test_the_count_of_the_authors_codes_takes_one_more_or_all_equal_ones(scene):
+    scores = torch.tensor([5.0, 1.0, 3.0, 2.0, 4.0, 0.0])
+    assert up_to(scores, 0.5).tolist() == [False, True, False, True, False, True]  # index int(0.5 * 5) = 2
+    unseen = torch.tensor([-torch.inf, 7.0, -torch.inf, -torch.inf, 8.0])
+    assert up_to(unseen, 0.1).tolist() == [True, False, True, True, False]
+    assert up_to(scores[:0], 0.5).shape == (0,)
+    gaussians = model()
+    optimizer = SplatOptimizer(gaussians, [ParamGroup("means", 1e-3)])
+    task = PruneByScore(Fixed(torch.arange(10.0)), {3: 0.3}, count_rule="official")
+    task(gaussians, optimizer, CameraIterator(scene.train), None, scene, 3)
+    assert gaussians.num_rows == 10 - (int(0.3 * 9) + 1)
+    with pytest.raises(EmptyModel, match="step 3"):
+        PruneByScore(Fixed(torch.zeros(7)), 0.1, count_rule="official")(
+            gaussians, optimizer, CameraIterator(scene.train), None, scene, 3
+        )
 
 
 def test_an_empty_model_is_an_error_and_nothing_is_removed(scene):

@@ -7,6 +7,7 @@ from pydantic import Field
 from splatwizard_core.training.distillation import DistillLoss
 from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.training.pruning import CountRule
 from sw_lightgaussian.importance_vq import Training
 from sw_lightgaussian.significance import Kind, VolumeNorm
 
@@ -53,6 +54,9 @@ class Prune(Params):
     percent: float = Field(0.66, ge=0, lt=1, description="share of the Gaussians that goes, 0..1")
     steps: list[int] = Field([1], description="steps that prune, of the full run")
     decay: float = Field(1.0, gt=0, le=1, description="the i-th of these steps removes percent x decay^i")
+    count_rule: CountRule = Field(
+        "exact", description="official: all up to the score at index int(share (N - 1)), as in the authors' code"
+    )
     lr: PruneRates = Field(PruneRates(), description="step sizes")
 
 

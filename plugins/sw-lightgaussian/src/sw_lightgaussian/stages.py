@@ -62,7 +62,8 @@ class PruneStage(FineTuningStage):
             scheduler.register_task(range(max(fractions) + 1), collect_statistics, name="collect gradient statistics")
         steps = list(fractions)
         when = steps[0] if len(steps) == 1 else steps
-        scheduler.register_task(when, PruneByScore(self.pruner, fractions), name="prune")
+        task = PruneByScore(self.pruner, fractions, count_rule=self.config.prune.count_rule)
+        scheduler.register_task(when, task, name="prune")
 
 
 class ScoredGaussians(GaussianModel):

@@ -8,6 +8,7 @@ from pydantic import Field, model_validator
 
 from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.training.pruning import CountRule
 
 
 class Prune(Params):
@@ -19,7 +20,7 @@ class Prune(Params):
     resolution: Literal[1, 2, 4, 8] = Field(
         4, description="the score draws views at 1/resolution of their width and height"
     )
-    count_rule: Literal["exact", "official"] = Field(
+    count_rule: CountRule = Field(
         "exact", description="official: all up to the score at index int(share (N - 1)), as in the authors' code"
     )
     window: int = Field(

@@ -2,21 +2,13 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
-import torch
-from torch import Tensor
-
-from splatwizard_core.errors import ConfigError, EmptyModel
+from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
 from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.pruning import PruneByScore, scores_of
-from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.training.pruning import PruneByScore
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -26,8 +18,6 @@ if TYPE_CHECKING:
     from splatwizard_core.training.pruner import Pruner
     from splatwizard_core.training.scheduler import Scheduler
     from sw_pup_3dgs.config import Pup3DGSConfig
-
-log = logging.getLogger(__name__)
 
 OWN = "pup-3dgs"
 STATISTICS = ("grad_accum", "denom")
@@ -99,8 +89,7 @@ class PupStage(FineTuningStage):
             )
             collecting = [step for window in windows for step in window]
             scheduler.register_task(collecting, collect_statistics, name="collect gradient statistics")
-        official = self.prune.count_rule == "official"
-        task = (PruneUpToScore if official else PruneByScore)(self.pruner, removals)
+        task = PruneByScore(self.pruner, removals, count_rule=self.prune.count_rule)
         name = "PUP prune" if self.prune.pruner == OWN else f"prune by {self.prune.pruner}"
         scheduler.register_task(list(removals), task, name=name)
 
@@ -114,32 +103,3 @@ def clear_statistics(model: GaussianModel) -> None:
     """Schedule task: forgets the gradients that were added up so far."""
     for name in STATISTICS:
         getattr(model, name).zero_()
-
-
-class PruneUpToScore(PruneByScore):
-    """Schedule task: removes what scores no higher than the Gaussian at index int(share (N - 1)) of the sorted scores.
-
-    The count rule of the authors' code: one more than asked for, or all of many equal ones (those that nobody sees).
-    """
-
-    def __call__(
-        self,
-        model: SplatModel,
-        optimizer: SplatOptimizer,
-        cameras: CameraIterator,
-        rasterizer: Rasterizer,
-        scene: Scene,
-        step: int,
-    ) -> None:
-        assert not isinstance(self.fractions, float)
-        goes = up_to(scores_of(self.pruner, model, cameras, rasterizer, scene), self.fractions[step])
-        before, gone = model.num_rows, int(goes.sum())
-        if gone == before:
-            raise EmptyModel(step)
-        optimizer.keep_rows(model, ~goes)
-        log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
-
-
-def up_to(scores: Tensor, share: float) -> Tensor:
-    """[N] bool: at most the score at index int(share (N - 1)) of the sorted `scores` [N]."""
-    return scores <= torch.sort(scores).values[int(share * (len(scores) - 1))]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -18,6 +19,8 @@ from splatwizard_core.training.pruner import Pruner
 from splatwizard_core.training.stage import CameraIterator
 
 log = logging.getLogger(__name__)
+
+CountRule = Literal["exact", "official"]
 
 
 def removal_count(n: int, fraction: float) -> int:
@@ -41,6 +44,17 @@ def lowest(scores: Tensor, count: int) -> Tensor:
     return doomed
 
 
+def up_to(scores: Tensor, fraction: float) -> Tensor:
+    """[N] bool, True for at most the score at index int(fraction (N - 1)) of the sorted `scores` [N].
+
+    How the authors of PUP 3D-GS and of LightGaussian count: one more than the fraction, and all of many equal ones
+    (those that nobody sees).
+    """
+    if len(scores) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=scores.device)
+    return scores <= torch.sort(scores).values[int(fraction * (len(scores) - 1))]
+
+
 class PruneByScore:
     """Schedule task: scores every primitive over the training views and removes the lowest.
 
@@ -48,12 +62,20 @@ class PruneByScore:
     fractions   share that goes, 0..1: of the count at that step. A number, or step -> number
     carry_grad  the survivors are still updated in this step; otherwise their gradient is gone with the old tensors,
                 as in most published code
+    count_rule  "exact": `removal_count` of the `lowest`; "official": `up_to`
 
     Gradients of the step stay what they are: scoring leaves them alone. Raises EmptyModel if nothing would be left.
     """
 
-    def __init__(self, pruner: Pruner, fractions: float | Mapping[int, float], *, carry_grad: bool = False) -> None:
-        self.pruner, self.fractions, self.carry_grad = pruner, fractions, carry_grad
+    def __init__(
+        self,
+        pruner: Pruner,
+        fractions: float | Mapping[int, float],
+        *,
+        carry_grad: bool = False,
+        count_rule: CountRule = "exact",
+    ) -> None:
+        self.pruner, self.fractions, self.carry_grad, self.count_rule = pruner, fractions, carry_grad, count_rule
 
     def __call__(
         self,
@@ -67,7 +89,8 @@ class PruneByScore:
         scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
         fraction = self.fractions[step] if isinstance(self.fractions, Mapping) else self.fractions
         before = model.num_rows
-        doomed = lowest(scores, removal_count(before, fraction))
+        official = self.count_rule == "official"
+        doomed = up_to(scores, fraction) if official else lowest(scores, removal_count(before, fraction))
         left = before - int(doomed.sum())
         if left == 0:
             raise EmptyModel(step)
