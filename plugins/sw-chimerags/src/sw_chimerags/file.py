@@ -2,7 +2,7 @@
 
 Sections of a group `sh2`, `sh3`, rows in Morton order (docs/methods/chimerags.md); an empty group has none:
 
-    xyz         `float-delta` of float32 [n,3]; float16: `byte-planes`; uniform16: `byte-planes` of uint16, and `box`
+    xyz         `float-delta` of float32 [n,3]; float16: `byte-planes`; uniform16: `octree` with 16 bits, and `box`
     box         float64 [2,3]: lowest and highest coordinate, of `uniform16`
     attributes  float16 [n,8], `byte-planes`: opacity logit, three log scales, four quaternion components, raw
     vq/...      the parts of the vector coder: n vectors of 27 or 48 numbers, SH band 0, then channel by channel
@@ -33,7 +33,7 @@ GROUPS = {"sh2": LOWER, "sh3": (DEGREE + 1) ** 2 - 1}
 POSITIONS = ("float32", "float16", "uniform16")
 HALF_MAX = 65504.0
 CELLS = 21  # bits an axis of the Morton codes
-STEPS = (1 << 16) - 1
+BITS = 16  # bits an axis of the positions `uniform16`
 ROW_BYTES = 4 * (3 + 8 + 3 * (DEGREE + 1) ** 2)  # of a decoded Gaussian
 
 Arrays = dict[str, NDArray[Any]]
@@ -83,7 +83,8 @@ def encode(
     writer.static.update(num_gaussians=len(on), num_sh3=int(on.sum()), max_sh_degree=DEGREE, vq=coder, xyz=xyz)
     for group, rows in (("sh2", ~on), ("sh3", on)):
         if rows.any():
-            ordered = _in_order({name: array[rows] for name, array in arrays.items()}, plugins)
+            own = {name: array[rows] for name, array in arrays.items()}
+            ordered = _in_order(own, plugins, BITS if xyz == "uniform16" else CELLS)
             vectors = plugins.coders.load(coder)(plugins, **settings.get(group, {}))
             _write_group(group, ordered, writer, plugins, vectors, xyz)
     writer.allow(ROW_BYTES * len(on), f"a model of {len(on):,} Gaussians")
@@ -118,14 +119,14 @@ def _rounded(arrays: Arrays, steps: Steps) -> Arrays:
     return found
 
 
-def _in_order(arrays: Arrays, plugins: PluginManager) -> Arrays:
-    """Rows along a Morton curve through their own bounding box, x in the lowest bit."""
+def _in_order(arrays: Arrays, plugins: PluginManager, bits: int) -> Arrays:
+    """Rows along a Morton curve through their own bounding box, x in the lowest bit; `cells` [n,3] are their places."""
     points = arrays["means"].astype(np.float64)
     low = points.min(0)
     width = np.maximum(points.max(0) - low, 1e-300)
-    cells = ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
-    order = plugins.coders.load("float-delta").sort(cells)
-    return {name: array[order] for name, array in arrays.items()}
+    cells = np.rint((points - low) / width * ((1 << bits) - 1)).astype(np.int64)
+    order = plugins.coders.load("octree").sort(cells)
+    return {name: array[order] for name, array in {**arrays, "cells": cells}.items()}
 
 
 def _write_group(
@@ -138,10 +139,8 @@ def _write_group(
     elif xyz == "float16":
         writer.add(f"{group}/xyz", planes.encode(means.clip(-HALF_MAX, HALF_MAX).astype(np.float16)))
     else:
-        box = np.stack([means.min(0), means.max(0)]).astype(np.float64)
-        width = np.maximum(box[1] - box[0], 1e-300)
-        writer.add_array(f"{group}/box", box)
-        writer.add(f"{group}/xyz", planes.encode(np.rint((means - box[0]) / width * STEPS).astype(np.uint16)))
+        writer.add_array(f"{group}/box", np.stack([means.min(0), means.max(0)]).astype(np.float64))
+        writer.add(f"{group}/xyz", plugins.coders.load("octree")().encode(arrays["cells"], BITS))
     columns = [arrays["opacity_logits"][:, None], arrays["log_scales"], arrays["quats"]]
     writer.add(f"{group}/attributes", planes.encode(np.concatenate(columns, 1).astype(np.float16)))
     n = len(means)
@@ -184,15 +183,16 @@ def _positions(group: str, n: int, reader: ContainerReader, plugins: PluginManag
     if xyz == "float32":
         with reader.decoding(f"{group}/xyz") as data:
             return _finite(plugins.coders.load("float-delta")().decode(data, (n, 3)))
-    planes = plugins.coders.load("byte-planes")()
     if xyz == "float16":
         with reader.decoding(f"{group}/xyz") as data:
-            return _finite(planes.decode(data, np.float16, (n, 3)))
-    box = reader.array(f"{group}/box", dtype="float64", shape=(2, 3), finite=True)
+            return _finite(plugins.coders.load("byte-planes")().decode(data, np.float16, (n, 3)))
+    low, high = reader.array(f"{group}/box", dtype="float64", shape=(2, 3), finite=True)
     with reader.decoding(f"{group}/xyz") as data:
-        steps = planes.decode(data, np.uint16, (n, 3)).astype(np.float64)
+        cells = plugins.coders.load("octree")(max_points=n).decode(data)
+        if len(cells) != n or cells.max() >= 1 << BITS:
+            raise BitstreamError(f"{len(cells):,} points of up to {int(cells.max(initial=0)):,}, expected {n:,}")
         with np.errstate(over="ignore", invalid="ignore"):
-            return _finite((box[0] + steps / STEPS * (box[1] - box[0])).astype(np.float32))
+            return _finite((low + cells / ((1 << BITS) - 1) * (high - low)).astype(np.float32))
 
 
 def _vectors(group: str, n: int, d: int, reader: ContainerReader, coder: Any) -> NDArray[Any]:
