@@ -331,3 +331,10 @@ def test_the_header_is_plain_data():
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
 def test_a_model_on_a_gpu_makes_the_same_file():
     assert encoded(make().cuda()) == encoded(make())
+
+
+def test_a_model_that_never_met_its_rate_is_encoded_with_a_warning(caplog):
+    model = make(n=30)
+    model.phase = "quantized training"
+    assert decoded(encoded(model)).num_rows == 25
+    assert "never trained for its rate" in caplog.text

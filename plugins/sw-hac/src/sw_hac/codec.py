@@ -8,6 +8,7 @@ sign, `bernoulli`), and the integers of `features`, `scalings` and `offsets`, bl
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from splatwizard_core.coding.anchor_sections import (
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.anchor_lattice import TOP
 from splatwizard_core.gaussians.anchors import two_layers
-from splatwizard_core.gaussians.coded_anchors import rounded_indices
+from splatwizard_core.gaussians.coded_anchors import ENTROPY, rounded_indices
 from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from sw_hac.model import HACAnchors, context_of, group_widths, output_widths
 
@@ -37,6 +38,8 @@ if TYPE_CHECKING:
     from splatwizard_core.coding.container import ContainerReader, ContainerWriter
     from splatwizard_core.plugins import PluginManager
     from sw_hac.config import Codec
+
+log = logging.getLogger(__name__)
 
 SECTIONS = ("features", "scalings", "offsets")
 LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features": 16}
@@ -114,6 +117,10 @@ class Lattice:
 
 def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> Lattice:
     """Write all sections; the bits of the result are what the tables say of the last three (mode `exact`)."""
+    if model.phase != ENTROPY:
+        log.warning(
+            "the model was never trained for its rate (phase '%s'): its file will be large and inexact", model.phase
+        )
     model = copy.deepcopy(model).to("cpu").eval()
     model.fold_units()
     round_networks(model.networks(), codec.weights)

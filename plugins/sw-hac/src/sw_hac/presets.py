@@ -5,9 +5,9 @@ from typing import Any
 
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
-    # The plan scaled down for a CPU and the demo scene. A tenth of the steps takes larger ones, a prediction that starts
-    # where the values are, and base steps for scales of a twentieth; networks and grids of the published size would be
-    # most of so small a file.
+    # The plan scaled down for a CPU and the demo scene. A tenth of the steps takes larger updates, a prediction that
+    # starts where the values are, and base steps for scales of a twentieth; networks and grids of the published size
+    # would be most of so small a file.
     "quick": {
         "iterations": 3000,
         "voxel_size": 0.08,
