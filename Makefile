@@ -1,4 +1,4 @@
-# make demo   set up .venv and run the procedural demo scene: train, encode, decode, evaluate, report
+# make demo   set up .venv and run ChimeraGS beside 3DGS on the demo scene: train, encode, decode, evaluate, report
 # make test   set up .venv and run the default tests (no network, no GPU)
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
@@ -17,7 +17,7 @@ PYTEST_ARGS ?=
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
-	$(BIN)/sw run --method 3dgs --scene demo --rate all --out $(DEMO_OUT)
+	$(BIN)/sw run --method 3dgs --method chimerags --scene demo --out $(DEMO_OUT)
 
 test: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest $(PYTEST_ARGS)
