@@ -783,7 +783,9 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
     if header["method"] == "3dgs":
         check(static["mode"] in ("exact", "quantized"), "mode")
         return exact_mode(static, sections) if static["mode"] == "exact" else quantized(static, sections)
-    check(header["method"] in ("trimming-the-fat", "pup-3dgs", "lightgaussian"), "method")
+    if header["method"] == "chimerags":
+        return chimera(static, sections, unzstd)
+    check(header["method"] in ("trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian"), "method")
     if static["codec"] == "vectree":
         return vectree(static, sections, unzstd)
     if static["codec"] == "gaussians-ply":
@@ -809,6 +811,39 @@ def vectree(
         "log_scales": attributes[:, 1:4],
         "quats": attributes[:, 4:],
     }
+
+
+def chimera(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    check(static["max_sh_degree"] == 3 and static["vq"] == "importance-vq", "coder of the vectors")
+    groups = []
+    for group, n, rest in (("sh2", static["num_gaussians"] - static["num_sh3"], 8), ("sh3", static["num_sh3"], 15)):
+        d = 3 + 3 * rest
+        means, attributes, colors = np.zeros((0, 3), "<f4"), np.zeros((0, 8), "<f4"), np.zeros((0, d), "<f4")
+        if n:
+            means = chimera_means(static["xyz"], group, n, sections, unzstd)
+            attributes = byte_planes(sections[f"{group}/attributes"], "f2", (n, 8), unzstd).astype("<f4")
+            parts = [sections[f"{group}/vq/{name}"] for name in ("header", "mask", "indices", "codebook", "own")]
+            colors = importance_vq(*parts, n, d, unzstd).astype("<f4")
+        higher = np.zeros((n, 15, 3), "<f4")
+        higher[:, :rest] = colors[:, 3:].reshape(n, 3, rest).transpose(0, 2, 1)
+        groups.append((means, colors[:, None, :3], higher, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:]))
+    names = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
+    return {name: np.concatenate(both) for name, *both in zip(names, *groups, strict=True)}
+
+
+def chimera_means(
+    xyz: str, group: str, n: int, sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> np.ndarray:
+    section = sections[f"{group}/xyz"]
+    if xyz == "float32":
+        return float_delta(section, (n, 3), unzstd)
+    if xyz == "float16":
+        return byte_planes(section, "f2", (n, 3), unzstd).astype("<f4")
+    check(xyz == "uniform16", "positions")
+    low, high = array(sections[f"{group}/box"])
+    return (low + octree(section) / 65535 * (high - low)).astype("<f4")
 
 
 def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
