@@ -1,5 +1,5 @@
 # make demo   set up .venv and run ChimeraGS beside 3DGS on the demo scene: train, encode, decode, evaluate, report
-# make test   set up .venv and run the default tests (no network, no GPU)
+# make test   set up .venv and run the default tests (no network, no GPU), TEST_JOBS=2 at a time
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
 # make kernels  compile every native module ahead of time
@@ -12,6 +12,7 @@ PROJECTS := $(addsuffix /pyproject.toml,$(PACKAGES))
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out
 PYTEST_ARGS ?=
+TEST_JOBS ?= 2
 
 .PHONY: demo test coverage lint format bench kernels docs clean
 
@@ -20,10 +21,10 @@ demo: $(VENV)/.ready
 	$(BIN)/sw run --method 3dgs --method chimerags --scene demo --out $(DEMO_OUT)
 
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal $(PYTEST_ARGS)
 
 coverage: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .
