@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.coding.float_mode import this_machine
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from splatwizard_core.rendering.rasterizer import RasterOptions
@@ -245,7 +246,7 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
     data = encoded(model, codec__mode="float")
     assert torch.equal(decoded(data).positions(), decoded(encoded(model)).positions())
     reader = ContainerReader(data)
-    assert reader.static["made_on"] == codec.this_machine()
+    assert reader.static["made_on"] == this_machine()
     for changed in ({"device": "cpu other", "torch": torch.__version__}, {"device": "x", "torch": "1.0"}, None):
         with pytest.raises(BitstreamError, match=r"mode 'float' decodes only where it was encoded.*codec.mode=exact"):
             decoded(rewritten(data, made_on=changed))

@@ -5,8 +5,6 @@ from typing import get_args
 
 import pytest
 
-from splatwizard_core.training.params import Params
-from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.presets import PRESETS, RATES
 from sw_lightgaussian.significance import Kind
 from sw_lightgaussian.vectree import SECTIONS
@@ -14,21 +12,6 @@ from sw_lightgaussian.vectree import SECTIONS
 PAGE = Path(__file__).parents[3] / "docs" / "methods" / "lightgaussian.md"
 README = Path(__file__).parents[1] / "README.md"
 alone = pytest.mark.skipif(not PAGE.is_file(), reason="the package stands alone, without the repository's docs")
-
-
-def fields(block: type[Params], prefix: str = ""):
-    for name, field in block.model_fields.items():
-        if isinstance(field.default, Params):
-            yield from fields(type(field.default), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", field.default, field.description
-
-
-@alone
-def test_the_page_lists_every_setting_with_its_default():
-    lines = PAGE.read_text().splitlines()
-    for key, default, description in fields(LightGaussianConfig):
-        assert f"| `{key}` | {default} | {description} |" in lines
 
 
 @alone

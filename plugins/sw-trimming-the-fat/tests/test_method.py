@@ -11,7 +11,6 @@ from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.training.params import Params
 from sw_trimming_the_fat.config import TrimmingTheFatConfig
 from sw_trimming_the_fat.method import TrimmingTheFat
 from sw_trimming_the_fat.presets import PRESETS, RATES
@@ -86,21 +85,6 @@ def test_an_unknown_codec_is_told_before_anything_is_trained():
     config = apply_overrides(TrimmingTheFatConfig(), {"codec": "zip"}, source="test")
     with pytest.raises(ConfigError, match="gaussians-exact"):
         TrimmingTheFat(load_plugins(), config).stages()
-
-
-def fields(block: type[Params], prefix: str = ""):
-    for name, field in block.model_fields.items():
-        if isinstance(field.default, Params):
-            yield from fields(type(field.default), f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", field.default, field.description
-
-
-@pytest.mark.skipif(not PAGE.is_file(), reason="the package stands alone, without the repository's docs")
-def test_the_page_lists_every_setting_with_its_default():
-    lines = PAGE.read_text().splitlines()
-    for key, default, description in fields(TrimmingTheFatConfig):
-        assert f"| `{key}` | {default} | {description} |" in lines
 
 
 def test_the_registry_and_the_readme_name_every_preset_and_rate_point():

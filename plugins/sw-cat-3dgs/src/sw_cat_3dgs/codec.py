@@ -24,11 +24,11 @@ from splatwizard_core.coding.anchor_sections import (
     read_places,
     round_networks,
 )
+from splatwizard_core.coding.float_mode import check_machine, one_thread, this_machine
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.coded_anchors import GROUPS, MASK_THRESHOLD, rounded_indices
 from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
-from sw_cat_3dgs.machine import check_machine, one_thread, this_machine
 from sw_cat_3dgs.model import CatAnchors
 from sw_cat_3dgs.predictors import PREDICTORS
 from sw_cat_3dgs.stage import base_resolution

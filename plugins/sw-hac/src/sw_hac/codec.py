@@ -10,7 +10,6 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +26,7 @@ from splatwizard_core.coding.anchor_sections import (
     read_places,
     round_networks,
 )
+from splatwizard_core.coding.float_mode import check_machine, one_thread, this_machine
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.anchor_lattice import TOP
 from splatwizard_core.gaussians.anchors import two_layers
@@ -67,7 +67,7 @@ class Predictor:
         """For anchors at `codes` [n,3]: for each section a context of the entropy model, and steps [n,1] float64."""
         if self.mode == "exact":
             return self._exact(codes)
-        with _one_thread():
+        with one_thread():
             outputs = self.mlp_grid(self.grid(codes.to(torch.float32) / TOP))
         found = context_of(outputs, self.feature_dim, self.num_offsets, self.base_steps)
         steps = [step.numpy().astype(np.float64) for step in found.steps]
@@ -183,7 +183,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
     )
     mode = reader.text("mode", choices=("exact", "float"))
     if mode == "float":
-        _check_machine(reader)
+        check_machine(reader)
     base_steps = _read_steps(reader)
     k = reader.integer("num_offsets", low=1, high=64)
     places = read_places(reader, plugins, bytes_per_anchor=bytes_per_anchor(feature_dim, k))
@@ -276,31 +276,3 @@ def _present(masks: Tensor) -> tuple[None, None, np.ndarray]:
 def bytes_per_anchor(feature_dim: int, num_offsets: int) -> int:
     """Of the decoded model."""
     return 4 * (3 + sum(group_widths(feature_dim, num_offsets))) + num_offsets
-
-
-def this_machine() -> dict[str, str]:
-    """What the floats of a network depend on. Files are always encoded and decoded on the CPU."""
-    return {"device": f"cpu {torch.backends.cpu.get_cpu_capability()}", "torch": torch.__version__}
-
-
-def _check_machine(reader: ContainerReader) -> None:
-    theirs, ours = reader.static.get("made_on"), this_machine()
-    if theirs != ours:
-        shown = " with torch ".join(str(v)[:40] for v in theirs.values()) if isinstance(theirs, dict) else "unknown"
-        raise BitstreamError(
-            f"{reader.name}: mode 'float' decodes only where it was encoded ({shown}), this is {ours['device']} with "
-            f"torch {ours['torch']}: encode with codec.mode=exact",
-            section="header",
-        )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Matrix products may depend on the number of threads."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        with torch.no_grad():
-            yield
-    finally:
-        torch.set_num_threads(threads)

@@ -1,4 +1,7 @@
-"""What a file of mode `float` is tied to: its decoder must get the very floats of its encoder."""
+"""What a file is tied to whose decoder must get the very floats of its encoder: networks evaluated as trained.
+
+The other way, exact integers (docs/bitstream.md), decodes anywhere; methods offer this one for comparison.
+"""
 
 from __future__ import annotations
 

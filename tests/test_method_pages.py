@@ -1,0 +1,33 @@
+"""docs/methods has a page for each method, and its table holds every setting with default and description."""
+
+from pathlib import Path
+
+import pytest
+
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.training.params import Params
+
+PAGES = Path(__file__).parent.parent / "docs" / "methods"
+OWN = [e.name for e in load_plugins().methods if e.distribution.startswith("sw-") and "test" not in e.distribution]
+
+
+def settings(block: Params, prefix: str = ""):
+    """Key, value and description of every field; a block's defaults are those of the object that it defaults to."""
+    for name, field in type(block).model_fields.items():
+        value = getattr(block, name)
+        if isinstance(value, Params):
+            yield from settings(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value, field.description
+
+
+@pytest.mark.parametrize("method", [name for name in OWN if name != "third-party"])
+def test_the_page_lists_every_setting_with_its_default(method):
+    lines = (PAGES / f"{method}.md").read_text().splitlines()
+    for key, default, description in settings(load_plugins().methods.load(method).Config()):
+        shown = '""' if default == "" else default
+        assert f"| `{key}` | {shown} | {description} |" in lines
+
+
+def test_all_methods_of_this_repository_are_looked_at():
+    assert {path.stem for path in PAGES.glob("*.md")} <= set(OWN)
