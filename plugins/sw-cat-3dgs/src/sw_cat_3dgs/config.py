@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -105,10 +105,9 @@ class Codec(Params):
 class CatConfig(AnchorParams):
     """Everything that can be set for CAT-3DGS."""
 
+    FULL_ITERATIONS: ClassVar[int] = FULL_RUN
+
     iterations: int = Field(FULL_RUN, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
-    scale_schedule: bool = Field(
-        False, description="multiply every plan bound and interval, and lr max_steps, by iterations / 40000"
-    )
     lr: AnchorLearningRates = Field(AnchorLearningRates(max_steps=FULL_RUN), description="step sizes")
     context_lr: ContextLearningRates = Field(ContextLearningRates(), description="step sizes of the context")
     phases: Phases = Field(Phases(), description="what is trained when")
@@ -116,8 +115,3 @@ class CatConfig(AnchorParams):
     context: Context = Field(Context(), description="the models that predict attributes")
     rate: Rate = Field(Rate(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what the file holds")
-
-    @property
-    def schedule_scale(self) -> float:
-        """Of the published 40,000 steps, unlike most methods."""
-        return self.iterations / FULL_RUN if self.scale_schedule else 1.0
