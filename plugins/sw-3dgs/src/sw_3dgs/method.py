@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.errors import SceneError
 from splatwizard_core.experiments.method import Method
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import load_ply
@@ -69,11 +69,7 @@ class ThreeDGS(Method):
             quantized.encode(model, writer, codec, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: 3dgs layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-3dgs"
-            )
+        self.check_version(reader)
         if reader.text("mode", choices=("exact", "quantized")) == "exact":
             return exact.decode(reader)
         return quantized.decode(reader, self.plugins)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
+from splatwizard_core.errors import ConfigError, SceneError
 from splatwizard_core.experiments.method import Method
 from sw_cat_3dgs import codec
 from sw_cat_3dgs.config import CatConfig
@@ -79,9 +79,5 @@ class Cat3DGS(Method):
         codec.encode(model, writer, self.config, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: cat-3dgs layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-cat-3dgs"
-            )
+        self.check_version(reader)
         return codec.decode(reader, self.plugins)

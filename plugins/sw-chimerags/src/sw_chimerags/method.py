@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.errors import ConfigError
 from splatwizard_core.experiments.keys import dotted
 from splatwizard_core.experiments.method import Method, create_method
 from sw_chimerags import file
@@ -93,9 +93,5 @@ class ChimeraGS(Method):
             writer.raster["prefer"] = list(self.config.prefer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: chimerags layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-chimerags"
-            )
+        self.check_version(reader)
         return file.decode(reader, self.plugins)

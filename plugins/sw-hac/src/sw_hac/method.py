@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.errors import SceneError
 from splatwizard_core.experiments.method import Method
 from sw_hac import codec
 from sw_hac.config import HACConfig
@@ -62,9 +62,5 @@ class HAC(Method):
         codec.encode(model, writer, self.config.codec, self.plugins)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: hac layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-hac"
-            )
+        self.check_version(reader)
         return codec.decode(reader, self.plugins)

@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
-from splatwizard_core.errors import BitstreamError
 from splatwizard_core.experiments.method import Method, create_method
-from splatwizard_core.gaussians.model import GaussianModel
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.presets import PRESETS, RATES
 from sw_lightgaussian.significance import Significance
@@ -46,8 +44,6 @@ class LightGaussian(Method):
         return [PruneStage(self.config, self._pruner()), DistillStage(self.config, self._significance())]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        if not isinstance(model, GaussianModel):
-            raise TypeError(f"lightgaussian encodes a GaussianModel, not a {type(model).__name__}")
         codec = self.config.codec
         settings = {
             "ratio": codec.vq_ratio, "size": codec.codebook_size, "rows_per_code": codec.rows_per_code,
@@ -57,11 +53,7 @@ class LightGaussian(Method):
         encode_gaussians(self.plugins, codec.name, model, writer, **(settings if codec.name == "vectree" else {}))
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: lightgaussian layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-lightgaussian"
-            )
+        self.check_version(reader)
         return decode_gaussians(self.plugins, reader)
 
     def _significance(self) -> Significance:

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
-from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.errors import SceneError
 from splatwizard_core.experiments.method import Method
-from splatwizard_core.gaussians.model import GaussianModel
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.presets import PRESETS, RATES
 from sw_pup_3dgs.stage import PupStage
@@ -41,14 +40,8 @@ class Pup3DGS(Method):
         return [PupStage(self.config, self.plugins)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        if not isinstance(model, GaussianModel):
-            raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
         encode_gaussians(self.plugins, self.config.codec, model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-{self.name}"
-            )
+        self.check_version(reader)
         return decode_gaussians(self.plugins, reader)

@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians, gaussian_codecs
-from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
 from splatwizard_core.experiments.keys import dotted
 from splatwizard_core.experiments.method import Method, create_method
-from splatwizard_core.gaussians.model import GaussianModel
 from sw_speedy_splat.config import SpeedySplatConfig
 from sw_speedy_splat.presets import PRESETS, RATES
 from sw_speedy_splat.stage import SpeedySplatStage
@@ -44,20 +42,12 @@ class SpeedySplat(Method):
         return self._base().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
-        codec, known = self.config.codec, gaussian_codecs(self.plugins)
-        if codec not in known:  # now, and not when all is trained
-            raise ConfigError(f"no codec for Gaussians is called '{codec}'; installed: {', '.join(known)}", key="codec")
+        check_gaussian_codec(self.plugins, self.config.codec)
         return [SpeedySplatStage(self.config, self._base(), self.plugins)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        if not isinstance(model, GaussianModel):
-            raise TypeError(f"speedy-splat encodes a GaussianModel, not a {type(model).__name__}")
         encode_gaussians(self.plugins, self.config.codec, model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        if reader.version != self.version:
-            raise BitstreamError(
-                f"{reader.name}: speedy-splat layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-speedy-splat"
-            )
+        self.check_version(reader)
         return decode_gaussians(self.plugins, reader)

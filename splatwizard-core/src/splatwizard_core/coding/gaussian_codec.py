@@ -14,10 +14,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Protocol
 
 from splatwizard_core.errors import ConfigError
+from splatwizard_core.gaussians.model import GaussianModel
 
 if TYPE_CHECKING:
     from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.model import GaussianModel
+    from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.plugins import PluginManager
 
 KEY = "codec"
@@ -55,12 +56,15 @@ def check_gaussian_codec(plugins: PluginManager, name: str, key: str = KEY) -> N
 
 
 def encode_gaussians(
-    plugins: PluginManager, name: str, model: GaussianModel, writer: ContainerWriter, **settings: Any
+    plugins: PluginManager, name: str, model: SplatModel, writer: ContainerWriter, **settings: Any
 ) -> None:
     """Write `model` with the codec `name`, whose name goes into the header.
 
-    Raises ConfigError if there is none of that name, PluginError if it cannot be loaded.
+    Raises TypeError if the model is no GaussianModel, ConfigError if there is no codec of that name, PluginError if it
+    cannot be loaded.
     """
+    if not isinstance(model, GaussianModel):
+        raise TypeError(f"{writer.method} encodes a GaussianModel, not a {type(model).__name__}")
     check_gaussian_codec(plugins, name)
     writer.static[KEY] = name
     plugins.coders.load(name)(plugins, **settings).encode(model, writer)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.params import OptimizationParams
 
@@ -62,6 +63,14 @@ class Method:
     def decode(self, reader: ContainerReader) -> SplatModel:
         """Rebuild the model from the file alone."""
         raise NotImplementedError
+
+    def check_version(self, reader: ContainerReader) -> None:
+        """For `decode` of a method that reads its own layout version alone: raise BitstreamError for any other."""
+        if reader.version != self.version:
+            raise BitstreamError(
+                f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
+                f"{self.version}: upgrade sw-{self.name}"
+            )
 
 
 def create_method(
