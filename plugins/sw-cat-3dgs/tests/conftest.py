@@ -44,8 +44,8 @@ PLAN = {
     "phases.warmup": 80,
     "phases.scene": 86,
     "phases.planes": 94,
-    "rate.sample": 0.2,
-    "rate.lambda_": 0.004,
+    "rate_term.sample": 0.2,
+    "rate_term.lambda_": 0.004,
 }
 
 

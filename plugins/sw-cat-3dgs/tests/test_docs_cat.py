@@ -35,4 +35,4 @@ def test_the_readme_has_the_plan_the_presets_and_the_rate_points():
     assert all(f"`{name}`" in text for name in PRESETS)
     for name, values in RATES.items():
         row = next(line for line in text.splitlines() if line.startswith(f"| `{name}`"))
-        assert f"| {values['rate.lambda_']} |" in row
+        assert f"| {values['rate_term.lambda_']} |" in row

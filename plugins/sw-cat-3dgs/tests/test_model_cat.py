@@ -52,7 +52,7 @@ class Eye:
 
 
 def test_masks_are_weighted_by_views_over_their_mean(begun):
-    _, model, _ = begun(rate__view_factor=3.0)
+    _, model, _ = begun(rate_term__view_factor=3.0)
     cameras = [Eye(), Eye()]
     model.count_views(cameras, Seeing({id(cameras[0]): [0, 1], id(cameras[1]): [1]}))
     mean = 3 / model.num_rows
@@ -109,7 +109,7 @@ def test_setting_up_makes_planes_of_the_anchors_resolution_and_predicts_their_st
 
 
 def test_the_rate_reaches_planes_networks_and_attributes(begun, little_scene, rasterizer):
-    stage, model, optimizer = begun(rate__sample=1.0)
+    stage, model, optimizer = begun(rate_term__sample=1.0)
     stage.setup_triplane(model, optimizer)
     model.count_views([v.camera for v in little_scene.train], rasterizer)
     model.phase = ENTROPY
@@ -125,7 +125,7 @@ def test_the_rate_reaches_planes_networks_and_attributes(begun, little_scene, ra
 
 
 def test_untrained_slices_refine_nothing_and_the_parts_sum_to_the_whole(begun, little_scene, rasterizer):
-    stage, model, optimizer = begun(rate__sample=1.0)
+    stage, model, optimizer = begun(rate_term__sample=1.0)
     stage.setup_triplane(model, optimizer)
     model.phase = ENTROPY
     rows = torch.arange(model.num_rows)

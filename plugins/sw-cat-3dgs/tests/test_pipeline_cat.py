@@ -141,8 +141,8 @@ def test_a_model_without_a_triplane_or_without_anchors_has_a_file(method, train,
 def test_a_heavier_rate_makes_a_smaller_file(method, train, trained, scene, rasterizer):
     sizes, quality = [], []
     for weight in (0.004, 0.03, 0.2):
-        model = (trained if weight == 0.004 else train(rate__lambda_=weight).model).eval()
-        data = encoded(model, method, rate__lambda_=weight)
+        model = (trained if weight == 0.004 else train(rate_term__lambda_=weight).model).eval()
+        data = encoded(model, method, rate_term__lambda_=weight)
         sizes.append(len(data))
         quality.append(psnr(decoded(data), scene, rasterizer))
     assert sizes == sorted(sizes, reverse=True)
@@ -152,7 +152,7 @@ def test_a_heavier_rate_makes_a_smaller_file(method, train, trained, scene, rast
 def test_a_heavy_weight_on_the_planes_shrinks_their_section(method, train):
     sizes = []
     for weight in (0.0, 3000.0):
-        model = train(rate__triplane=weight, context__anchors_per_cell=4.0, iterations=150).model
+        model = train(rate_term__triplane=weight, context__anchors_per_cell=4.0, iterations=150).model
         sizes.append(ContainerReader(encoded(model, method), "x").sections["triplane"])
     assert sizes[1] < 0.7 * sizes[0]
 

@@ -110,7 +110,7 @@ def test_each_phase_trains_what_the_table_says(scene, rasterizer, method, offici
     made = method(
         iterations=400, lr__max_steps=400, growth__stop=0, growth__pause_start=0, growth__pause_end=0, growth__start=0,
         phases__quantize=30, phases__triplane=100, phases__warmup=150, phases__scene=160, phases__planes=190,
-        phases__official_warmup=official, rate__sample=1.0,
+        phases__official_warmup=official, rate_term__sample=1.0,
     )  # fmt: skip
     (stage,) = made.stages()
     model = made.create_model(scene, stream(0, "init"))
@@ -151,12 +151,12 @@ def test_slices_must_make_up_the_features(method):
 @pytest.mark.parametrize("rate", [*Cat3DGS.RATES])
 def test_every_preset_resolves_at_every_rate_point(name, rate):
     config = resolve(Cat3DGS, name, rate).config
-    assert config.rate.lambda_ == Cat3DGS.RATES[rate]["rate.lambda_"]
+    assert config.rate_term.lambda_ == Cat3DGS.RATES[rate]["rate_term.lambda_"]
     Cat3DGS(load_plugins(), config).shape()
 
 
 def test_rate_points_are_the_papers_and_the_first_makes_the_smallest_file():
-    weights = [values["rate.lambda_"] for values in Cat3DGS.RATES.values()]
+    weights = [values["rate_term.lambda_"] for values in Cat3DGS.RATES.values()]
     assert weights == sorted(weights, reverse=True)
     assert sorted(weights) == [0.002, 0.004, 0.01, 0.015, 0.03, 0.04]
 

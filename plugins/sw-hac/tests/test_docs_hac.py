@@ -26,4 +26,4 @@ def test_the_readme_names_every_preset_and_rate_point():
     assert all(f"`{name}`" in text for name in PRESETS)
     for name, values in RATES.items():
         row = next(line for line in text.splitlines() if line.startswith(f"| `{name}`"))
-        assert f" {values['rate.weight']} " in row
+        assert f" {values['rate_term.weight']} " in row

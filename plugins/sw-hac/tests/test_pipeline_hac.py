@@ -24,8 +24,8 @@ SMALL = {
     "phases.quantized": 40, "phases.rebound": 79, "phases.entropy": 80, "growth.start": 30, "growth.stop": 120,
     "growth.pause_start": 1000, "growth.pause_end": 1001, "growth.interval": 20, "growth.start_stat": 10,
     "growth.grad_threshold": 2e-3, "growth.init_factor": 4, "lr.max_steps": STEPS, "lr.features": 0.03,
-    "lr.masks_final": 4e-3, "lr.grid_final": 1e-3, "lr.mlp_grid_final": 1e-3, "rate.start": "statistics",
-    "rate.units": "steps", "steps.scales": 0.004,
+    "lr.masks_final": 4e-3, "lr.grid_final": 1e-3, "lr.mlp_grid_final": 1e-3, "rate_term.start": "statistics",
+    "rate_term.units": "steps", "steps.scales": 0.004,
 }  # fmt: skip
 WEIGHTS = (0.0005, 0.004, 0.03)
 
@@ -72,7 +72,7 @@ def file_of(model, made) -> tuple[bytes, codec.Lattice]:
 @pytest.fixture(scope="module")
 def trained(scene, rasterizer):
     """Weight of the rate -> model, losses, method."""
-    return {weight: train(scene, rasterizer, **{"rate.weight": weight}) for weight in WEIGHTS}
+    return {weight: train(scene, rasterizer, **{"rate_term.weight": weight}) for weight in WEIGHTS}
 
 
 def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):

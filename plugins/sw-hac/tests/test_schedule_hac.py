@@ -73,9 +73,9 @@ def test_the_phases_follow_one_another():
 
 
 def test_rate_points_are_the_published_weights():
-    weights = {name: values["rate.weight"] for name, values in HAC.RATES.items()}
+    weights = {name: values["rate_term.weight"] for name, values in HAC.RATES.items()}
     assert weights == {"r1": 0.004, "r2": 0.003, "r3": 0.002, "r4": 0.001, "r5": 0.0005}
-    assert HAC.RATES[HAC.DEFAULT_RATE]["rate.weight"] == HACConfig().rate.weight
+    assert HAC.RATES[HAC.DEFAULT_RATE]["rate_term.weight"] == HACConfig().rate_term.weight
     entry = load_plugins().methods.entry("hac")
     assert list(entry.declared["presets"]) == list(HAC.PRESETS)
     assert list(entry.declared["rates"]) == list(HAC.RATES)

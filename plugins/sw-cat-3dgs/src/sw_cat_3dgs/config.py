@@ -60,7 +60,7 @@ class Context(Params):
     contamination: float = Field(0.05, ge=0, lt=1, description="share of anchors that the triplane's axes ignore")
 
 
-class Rate(Params):
+class RateTerm(Params):
     """The rate term and the masks."""
 
     lambda_: float = Field(0.002, ge=0, description="weight of the bits per number of an anchor")
@@ -113,5 +113,5 @@ class CatConfig(AnchorParams):
     phases: Phases = Field(Phases(), description="what is trained when")
     steps: Steps = Field(Steps(), description="base steps of the quantisers")
     context: Context = Field(Context(), description="the models that predict attributes")
-    rate: Rate = Field(Rate(), description="rate term and masks")
+    rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what the file holds")

@@ -49,8 +49,8 @@ class Cat3DGS(Method):
         context.in_steps = config.context.units == "steps"
         return CatAnchors.from_points(
             scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets, feature_dim=config.feature_dim,
-            hidden=config.hidden, generator=generator, margin=config.bound_margin, sample=config.rate.sample,
-            entropy=self.plugins.entropy_models.load("gaussian-exact")(), view_factor=config.rate.view_factor,
+            hidden=config.hidden, generator=generator, margin=config.bound_margin, sample=config.rate_term.sample,
+            entropy=self.plugins.entropy_models.load("gaussian-exact")(), view_factor=config.rate_term.view_factor,
             context=context,
         )  # fmt: skip
 

@@ -8,7 +8,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     "tandt": {"voxel_size": 0.01},
     "db": {"voxel_size": 0.005, "context.refine": True, "context.slices": [12, 12, 13, 13]},
-    "bungee": {"voxel_size": 0.0, "growth.init_factor": 128, "rate.view_factor": 25.0, "lr.max_steps": 30_000},
+    "bungee": {"voxel_size": 0.0, "growth.init_factor": 128, "rate_term.view_factor": 25.0, "lr.max_steps": 30_000},
     # The plan and the networks scaled down for a CPU and the demo scene: some 8,000 anchors, of whose file the
     # published networks would be most. Step sizes are larger, since there are few steps; base steps fit larger voxels.
     "quick": {
@@ -44,12 +44,12 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "context.slices": [4, 6, 10, 12],
         "context.slice_hidden": 32,
         "context.units": "steps",
-        "rate.scale": 0.25,
-        "rate.triplane_sample": 0.125,
+        "rate_term.scale": 0.25,
+        "rate_term.triplane_sample": 0.125,
         "codec.weights": "float16",
     },
 }
 
 RATES: Mapping[str, Mapping[str, Any]] = {
-    f"r{i}": {"rate.lambda_": value} for i, value in enumerate((0.04, 0.03, 0.015, 0.01, 0.004, 0.002), 1)
+    f"r{i}": {"rate_term.lambda_": value} for i, value in enumerate((0.04, 0.03, 0.015, 0.01, 0.004, 0.002), 1)
 }

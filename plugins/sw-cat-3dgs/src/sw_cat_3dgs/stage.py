@@ -114,7 +114,7 @@ class CatStage(AnchorStage):
     # Loss
 
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Tensor]:
-        rate, terms = self.config.rate, {}
+        rate, terms = self.config.rate_term, {}
         if step >= self.at(self.config.phases.quantize):
             weight = max(rate.mask_floor, rate.mask_factor * rate.weight)
             terms["masks"] = weight * torch.sigmoid(model.mask_logits).mean()
@@ -127,7 +127,7 @@ class CatStage(AnchorStage):
     def _plane_bits(self, model: CatAnchors) -> Tensor:
         """Of the planes, per number of all anchors."""
         numbers = model.num_rows * sum(model.context.shape.widths)
-        bits: Tensor = model.context.triplane_bits(model.uniform, self.config.rate.triplane_sample) / numbers
+        bits: Tensor = model.context.triplane_bits(model.uniform, self.config.rate_term.triplane_sample) / numbers
         return bits
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:

@@ -48,7 +48,7 @@ class Phases(Params):
     entropy: int = Field(10_001, ge=1, description="after this step noise has predicted steps, and the rate counts")
 
 
-class Rate(Params):
+class RateTerm(Params):
     """The rate term of the loss."""
 
     weight: float = Field(0.001, ge=0, description="lambda: weight of the bits per number")
@@ -94,6 +94,6 @@ class HACConfig(AnchorParams):
     grid: Grid = Field(Grid(), description="hash grid and its network")
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
-    rate: Rate = Field(Rate(), description="rate term of the loss")
+    rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
     codec: Codec = Field(Codec(), description="what the file holds")

@@ -48,9 +48,9 @@ class HAC(Method):
         )  # fmt: skip
         return HACAnchors.from_points(
             scene.points, voxel_size=c.voxel_size, num_offsets=c.num_offsets, feature_dim=c.feature_dim,
-            hidden=c.hidden, margin=c.bound_margin, sample=c.rate.sample, base_steps=c.steps.triple,
+            hidden=c.hidden, margin=c.bound_margin, sample=c.rate_term.sample, base_steps=c.steps.triple,
             generator=generator, entropy=self.plugins.entropy_models.load("gaussian-exact")(), grid=grid,
-            grid_hidden=c.grid.hidden, in_steps=c.rate.units == "steps",
+            grid_hidden=c.grid.hidden, in_steps=c.rate_term.units == "steps",
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:

@@ -30,9 +30,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "phases.quantized": 600,
         "phases.rebound": 899,
         "phases.entropy": 900,
-        "rate.start": "statistics",
-        "rate.units": "steps",
-        "rate.masks": 2e-3,
+        "rate_term.start": "statistics",
+        "rate_term.units": "steps",
+        "rate_term.masks": 2e-3,
         "steps.features": 0.5,
         "steps.scales": 0.004,
         "lr.max_steps": 3000,
@@ -52,9 +52,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 }
 
 RATES: Mapping[str, Mapping[str, Any]] = {
-    "r1": {"rate.weight": 0.004},
-    "r2": {"rate.weight": 0.003},
-    "r3": {"rate.weight": 0.002},
-    "r4": {"rate.weight": 0.001},
-    "r5": {"rate.weight": 0.0005},
+    "r1": {"rate_term.weight": 0.004},
+    "r2": {"rate_term.weight": 0.003},
+    "r3": {"rate_term.weight": 0.002},
+    "r4": {"rate_term.weight": 0.001},
+    "r5": {"rate_term.weight": 0.0005},
 }

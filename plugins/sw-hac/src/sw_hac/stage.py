@@ -43,7 +43,7 @@ class HACStage(AnchorStage):
         PhaseSwitch(self._at(phases.quantized), QUANTIZED).register(scheduler)
         scheduler.register_task(self._at(phases.rebound), self.update_anchor_bound)
         PhaseSwitch(self._at(phases.entropy), ENTROPY).register(scheduler)
-        if self.hac.rate.start == "statistics":
+        if self.hac.rate_term.start == "statistics":
             scheduler.register_task(self._at(phases.entropy), self.start_from_statistics)
 
     def _at(self, step: int) -> int:
@@ -59,7 +59,7 @@ class HACStage(AnchorStage):
         if rate is None:
             return {}
         assert rate.own_bits is not None
-        weights, width = self.hac.rate, model.features.shape[1] + 6 + 3 * model.num_offsets
+        weights, width = self.hac.rate_term, model.features.shape[1] + 6 + 3 * model.num_offsets
         return {
             "rate": weights.weight * rate.bits,
             "grid": weights.weight * rate.own_bits / (model.num_rows * width),
