@@ -1,0 +1,411 @@
+"""How fast HAC and CAT-3DGS train, phase by phase, where a step's time goes, and 3DGS drawing as many Gaussians beside.
+
+    python benchmarks/train_anchors.py demo --preset quick --device cuda
+    python benchmarks/train_anchors.py ../shared/data/fox:images_2 --iterations 7000 --device cuda --syncs
+    python benchmarks/train_anchors.py demo --preset quick --iterations 300 --device cpu --methods hac
+
+A scene is FOLDER[:PICTURES] or demo. The plan of the preset is scaled to --iterations (default: as the preset has it).
+Iterations a second count all steps of a phase but those that are profiled, growth and pruning included. In the middle
+of each phase a window of steps is watched by torch.profiler: what share of a step's time on the host, and on the GPU,
+goes into which part, forward and backward together (a backward operator counts where its forward one ran); operators
+and kernels launched; and how often the host waits for the GPU (on a CPU: operators that would make it wait). The
+profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that wait (CUDA only).
+
+3DGS beside: the Gaussians that all anchors spawn for one view, thinned at random until views draw as many on average
+as the anchors' last steps did, trained as 3DGS without densification and with all its spherical harmonics.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import math
+import sys
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch.profiler import ProfilerActivity, profile, record_function
+
+from splatwizard_core.experiments.config import resolve
+from splatwizard_core.experiments.session import Session
+from splatwizard_core.experiments.start import make_method
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
+from splatwizard_core.plugins.manager import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.scene.images import decode_all, keep_pictures
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.streams import stream
+from splatwizard_core.training import rng
+from splatwizard_core.training.rng import Streams
+from splatwizard_core.training.stage import StageContext
+from splatwizard_core.training.trainer import StepRecord, Trainer
+
+SECTION = "section: "
+WAITS_ON_CUDA = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
+WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::_unique2", "aten::unique_dim")
+"""Operators that make the host wait for a GPU; what they stand in (item, indexing by a mask) ends in one of them."""
+
+# Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.
+# Of nested ones the innermost counts.
+PARTS = {
+    "rasterizer.render": "rasterizer",
+    "rasterizer.visible_filter": "visibility",
+    "model.gaussians": "decoding",
+    "model._noisy": "noise",
+    "model.heads": "anchor MLPs",
+    "model.mlp_opacity.forward": "anchor MLPs",
+    "model.mlp_cov.forward": "anchor MLPs",
+    "model.mlp_color.forward": "anchor MLPs",
+    "model.mlp_grid.forward": "context MLPs",
+    "model.context.network.forward": "context MLPs",
+    "model.context.slices.forward": "context MLPs",
+    "model.grid.with_bits": "grid or planes",
+    "model.context.triplane.forward": "grid or planes",
+    "model.context.triplane_bits": "planes' rate",
+    "model.rate": "rate",
+    "stage.loss": "loss",
+    "pre.exec": "plan before",
+    "post.exec": "plan after",
+    "optimizer.step": "optimizer",
+    "optimizer.zero_grad": "optimizer",
+}
+
+
+@dataclass
+class Phase:
+    """Steps after `start` up to `end` of one run."""
+
+    name: str
+    start: int
+    end: int
+    seconds: float = 0.0
+    steps: int = 0
+    lines: list[str] = field(default_factory=list)
+
+
+@dataclass
+class Watch:
+    """Called after each step: clocks every phase, and profiles `window` steps from its middle on."""
+
+    device: torch.device
+    phases: list[Phase]
+    window: int
+    syncs: bool
+    drawn: collections.deque[int] = field(default_factory=lambda: collections.deque(maxlen=100))
+    _since: float = 0.0
+    _profile: Any = None
+    _caught: Any = None
+
+    def begin(self) -> None:
+        self._since = self._now()
+
+    def __call__(self, record: StepRecord) -> None:
+        step = record.step
+        phase = next((p for p in self.phases if p.start < step <= p.end), None)
+        if phase is None:
+            return
+        middle = (phase.start + phase.end) // 2
+        length = min(self.window, phase.end - middle - 1)
+        if self._profile is None:
+            phase.steps += 1
+        if step == middle and length > 0:
+            phase.seconds += self._now() - self._since
+            self._profile = profile(activities=_activities(self.device))
+            self._profile.__enter__()
+        elif step == middle + length and self._profile is not None:
+            self._now()
+            self._profile.__exit__(None, None, None)
+            phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.num_rows)
+            self._profile = None
+            self._listen(on=self.syncs and self.device.type == "cuda")
+            self._since = self._now()
+        elif step == middle + length + 5 and self._caught is not None:
+            phase.lines += self._listen(on=False)
+        if step == phase.end:
+            phase.seconds += self._now() - self._since
+            self._since = self._now()
+
+    def _listen(self, *, on: bool) -> list[str]:
+        """Let torch warn of what waits, for five steps; then the lines it named."""
+        if on:
+            torch.cuda.synchronize()
+            self._caught = warnings.catch_warnings(record=True)
+            self._found = self._caught.__enter__()
+            warnings.simplefilter("always")
+            torch.cuda.set_sync_debug_mode("warn")
+            return []
+        if self._caught is None:
+            return []
+        torch.cuda.set_sync_debug_mode("default")
+        self._caught.__exit__(None, None, None)
+        self._caught = None
+        places = collections.Counter("/".join(w.filename.split("/")[-2:]) + f":{w.lineno}" for w in self._found)
+        return [f"      waits {count / 5:.1f} x a step at {place}" for place, count in places.most_common()]
+
+    def _now(self) -> float:
+        if self.device.type == "cuda":
+            torch.cuda.synchronize()
+        return time.perf_counter()
+
+
+def _activities(device: torch.device) -> list[ProfilerActivity]:
+    return [ProfilerActivity.CPU] + [ProfilerActivity.CUDA] * (device.type == "cuda")
+
+
+@dataclass
+class Part:
+    """What one part of a step took, summed over the window; times in microseconds."""
+
+    host: float = 0.0
+    device: float = 0.0
+    operators: int = 0
+    kernels: int = 0
+    waits: int = 0
+
+
+def report(watched: Any, steps: int, *, cuda: bool, rows: int) -> list[str]:
+    """The table of parts."""
+    events = sorted(watched.events(), key=lambda e: e.time_range.start)
+    part_of, forward = _sections(events)
+    parts: dict[str, Part] = collections.defaultdict(Part)
+    for event in events:
+        if str(event.device_type).endswith("CUDA"):
+            continue
+        part = parts[part_of(event, forward)]
+        part.host += event.self_cpu_time_total
+        part.operators += event.name.startswith("aten::") and not _inside_operator(event)
+        part.waits += event.name in (WAITS_ON_CUDA if cuda else WAITS)
+        kernels = [k for k in event.kernels if not k.name.startswith(SECTION)]
+        part.kernels += len(kernels)
+        part.device += sum(k.duration for k in kernels)
+    total = Part(*(sum(getattr(p, name) for p in parts.values()) for name in Part.__dataclass_fields__))
+    head = f"{rows:,} anchors, a step:"
+    lines = [f"      {head:34} {'host':>6} {'GPU':>6} {'ops':>6} {'kernels':>8} {'waits':>6}"]
+    ordered = sorted(parts.items(), key=lambda item: -item[1].host)
+    for name, p in [*ordered, ("all", total)]:
+        host, device = (_share(getattr(p, which), getattr(total, which)) for which in ("host", "device"))
+        counts = f"{p.operators / steps:6.1f} {p.kernels / steps:8.1f} {p.waits / steps:6.1f}"
+        lines.append(f"        {name:32} {host:>6} {device:>6} {counts}")
+    lines.append(
+        f"        all, ms                          {total.host / steps / 1e3:6.2f} {total.device / steps / 1e3:6.2f}"
+    )
+    return lines
+
+
+def _share(value: float, total: float) -> str:
+    return f"{value / total:.1%}" if total else "-"
+
+
+def _sections(events: list[Any]) -> tuple[Callable[[Any, dict[int, str]], str], dict[int, str]]:
+    """How to find an event's part, and the part of each autograd node by its sequence number."""
+
+    def part_of(event: Any, forward: dict[int, str]) -> str:
+        while event is not None:
+            if event.name.startswith(SECTION):
+                return str(event.name[len(SECTION) :])
+            if event.name.startswith("autograd::engine::evaluate_function"):
+                return forward.get(event.sequence_nr, "rest")
+            event = event.cpu_parent
+        return "rest"
+
+    forward: dict[int, str] = {}
+    for event in events:
+        inside: Any = event
+        while inside is not None and not inside.name.startswith("autograd::engine"):
+            inside = inside.cpu_parent
+        if event.sequence_nr >= 0 and inside is None:
+            # Operators that make no node carry the number of the next one that does: the last to have it made it.
+            forward[event.sequence_nr] = part_of(event, {})
+    return part_of, forward
+
+
+def _inside_operator(event: Any) -> bool:
+    parent = event.cpu_parent
+    while parent is not None:
+        if parent.name.startswith("aten::"):
+            return True
+        parent = parent.cpu_parent
+    return False
+
+
+def mark_parts(trainer: Trainer) -> None:
+    """Name the parts of a step for the profiler."""
+    for path, name in PARTS.items():
+        *owners, leaf = path.split(".")
+        owner: Any = trainer
+        for each in owners:
+            owner = getattr(owner, each, None)
+        if owner is not None and hasattr(owner, leaf):
+            # Past nn.Module's own __setattr__ and pydantic's: a plain attribute of this object.
+            object.__setattr__(owner, leaf, _named(getattr(owner, leaf), SECTION + name))
+
+
+def _named(call: Callable[..., Any], name: str) -> Callable[..., Any]:
+    def named(*args: Any, **kwargs: Any) -> Any:
+        with record_function(name):
+            return call(*args, **kwargs)
+
+    return named
+
+
+def phases_of(method: str, stage: Any) -> list[Phase]:
+    """The phases of a plan, in steps of this run."""
+    at, end = stage.config.phases, stage.iterations
+    if method == "hac":
+        names = ("full precision", "noise", "entropy")
+        starts: tuple[int, ...] = (0, stage.when(at.quantized), stage.when(at.entropy))
+    else:
+        names = ("full precision", "noise", "entropy", "planes' rate alone", "planes fixed", "everything")
+        steps = (at.quantize, at.triplane, at.warmup, at.scene, at.planes)
+        starts = (0, *(stage.when(step) for step in steps))
+    return [Phase(*each) for each in zip(names, starts, (*starts[1:], end), strict=True) if each[1] < each[2]]
+
+
+def anchors(method: str, args: argparse.Namespace, session: Session, folder: str, pictures: str) -> None:
+    """Train and print one method, and 3DGS beside it."""
+    cls = session.plugins.methods.load(method)
+    planned = resolve(cls, args.preset, sets={}, scene=folder).config
+    last = args.iterations or planned.iterations
+    # The plan of a preset is for its own number of steps: scaled, it is that of a longer run, which ends at `last`.
+    nominal = round(last / planned.iterations * cls.Config.FULL_ITERATIONS)
+    sets: dict[str, Any] = {"iterations": nominal, "scale_schedule": True, "seed": args.seed}
+    sets |= {"images": pictures} if pictures else {}
+    resolved = resolve(cls, args.preset, sets=sets, scene=folder)
+    scene = session.scene(resolved)
+    made = make_method(session.plugins, resolved)
+    rasterizer = NegotiatedRasterizer(session.plugins, device=session.device)
+    with rng.seeded(args.seed):
+        model = made.create_model(scene, stream(args.seed, "init")).to(session.device)
+        trainer = trainer_of(made.stages()[0], model, scene, resolved.ppl, rasterizer)
+        phases = phases_of(method, trainer.stage)
+        phases[-1].end = last
+        watch = Watch(session.device, phases, args.window, args.syncs)
+        drawn: list[Any] = []
+        render = trainer.rasterizer.render
+
+        def counted(*call: Any) -> Any:
+            result = render(*call)
+            if trainer.step >= last - 20:
+                drawn.append((result.radii > 0).sum())
+            return result
+
+        object.__setattr__(trainer.rasterizer, "render", counted)
+        mark_parts(trainer)
+
+        def run() -> None:
+            watch.begin()
+            trainer.run(last, watch)
+
+        with_pictures(scene, session.device, run)
+    count = round(sum(int(d) for d in drawn) / max(len(drawn), 1))
+    print(f"  {method}, {last:,} steps of preset {args.preset}, {trainer.model.num_rows:,} anchors, {count:,} drawn")
+    for phase in phases:
+        rate = phase.steps / phase.seconds if phase.seconds else math.nan
+        print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {rate:7.1f} it/s")
+        print("\n".join(phase.lines), flush=True)
+    rate, drawn_there = explicit(trainer.model, count, args, session, scene, folder)
+    print(f"    3DGS drawing {drawn_there:,} Gaussians a view: {rate:.1f} it/s", flush=True)
+
+
+def trainer_of(stage: Any, model: Any, scene: Scene, ppl: Any, rasterizer: Any) -> Trainer:
+    """As `train_stages` makes it."""
+    streams = Streams(ppl.seed)
+
+    def none(name: str) -> Any:
+        raise AssertionError(f"starts from no {name}")
+
+    model = stage.begin(StageContext(model, scene, ppl, rasterizer, streams, none))
+    return Trainer(stage, model, scene, ppl, rasterizer, streams)
+
+
+def with_pictures(scene: Scene, device: torch.device, run: Callable[[], None]) -> None:
+    decode_all(scene.train)
+    keep_pictures(scene.train, device)
+    try:
+        run()
+    finally:
+        keep_pictures(scene.train, "cpu")
+
+
+def explicit(
+    model: Any, count: int, args: argparse.Namespace, session: Session, scene: Scene, folder: str
+) -> tuple[float, int]:
+    """(iterations a second, Gaussians drawn a view) of 3DGS on some of the model's Gaussians."""
+    rasterizer = NegotiatedRasterizer(session.plugins, device=session.device)
+    with torch.no_grad():
+        camera = scene.train[0].camera.to(session.device)
+        found = model.eval().decode(camera, torch.arange(model.num_rows, device=session.device))
+        n = len(found)
+        options = RasterOptions(background=scene.background.to(session.device))
+
+        def drawn(g: GaussianModel) -> int:
+            views = scene.train[:: max(1, len(scene.train) // 8)]
+            cameras = [view.camera.to(session.device) for view in views]
+            radii = [rasterizer.render(g.gaussians(c, rasterizer), c, options).radii for c in cameras]
+            return round(sum(int((r > 0).sum()) for r in radii) / len(radii))
+
+        def some(share: float) -> GaussianModel:
+            rows = torch.randperm(n, generator=stream(args.seed, "thin"))[: max(1, round(share * n))]
+            rows = rows.to(session.device)
+            return GaussianModel(
+                found.means[rows], rgb_to_dc(found.colors[rows])[:, None], found.means.new_zeros(len(rows), 15, 3),
+                torch.logit(found.opacities[rows].clamp(1e-3, 0.999)), found.scales[rows].clamp(min=1e-6).log(),
+                found.quats[rows],
+            )  # fmt: skip
+
+        everything = drawn(some(1.0))
+        splats = some(min(1.0, count / max(everything, 1)))
+        drawn_there = drawn(splats)
+    steps = args.baseline_steps
+    cls = session.plugins.methods.load("3dgs")
+    sets = {"iterations": steps, "densify.stop": 0, "densify.white_reset": 0, "seed": args.seed}
+    resolved = resolve(cls, "paper", sets=sets, scene=folder)
+    trainer = trainer_of(make_method(session.plugins, resolved).stages()[0], splats, scene, resolved.ppl, rasterizer)
+    clock: dict[int, float] = {}
+
+    def after(record: StepRecord) -> None:
+        if record.step in (steps // 5, steps):
+            if session.device.type == "cuda":
+                torch.cuda.synchronize()
+            clock[record.step] = time.perf_counter()
+
+    def run() -> None:
+        trainer.run(steps, after)
+
+    with_pictures(scene, session.device, run)
+    return (steps - steps // 5) / (clock[steps] - clock[steps // 5]), drawn_there
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]|demo")
+    parser.add_argument("--methods", default="hac,cat-3dgs")
+    parser.add_argument("--preset", default="paper")
+    parser.add_argument("--iterations", type=int, default=0, help="default: those of the preset")
+    parser.add_argument("--window", type=int, default=20, help="steps that are profiled in each phase")
+    parser.add_argument("--baseline-steps", type=int, default=500, help="of 3DGS")
+    parser.add_argument("--syncs", action="store_true", help="also which lines wait for the GPU")
+    parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    if args.device == "cuda" and not torch.cuda.is_available():
+        sys.exit("torch sees no CUDA device here")
+    session = Session(load_plugins(), torch.device(args.device), lambda line: print(line, file=sys.stderr))
+    session.load_kernels()
+    where = torch.cuda.get_device_name(0) if args.device == "cuda" else f"CPU, {torch.get_num_threads()} thread(s)"
+    print(f"{where}, torch {torch.__version__}")
+    for asked in args.scenes:
+        folder, _, pictures = asked.partition(":")
+        print(asked)
+        for method in args.methods.split(","):
+            anchors(method, args, session, folder, pictures)
+
+
+if __name__ == "__main__":
+    main()
