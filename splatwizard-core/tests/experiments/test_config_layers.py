@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field
 
-from splatwizard_core.errors import ConfigError
+from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.experiments.config import apply_overrides, parse_set, rate_points, resolve
 from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.experiments.values import parse_text
@@ -99,6 +99,37 @@ def test_the_written_file_makes_the_same_configuration(tmp_path: Path):
     assert again.scene_spec == first.scene_spec
     assert again.config_hash() == first.config_hash()
     assert again.training_hash() == first.training_hash()
+
+
+class Rate(Params):
+    weight: float = 0.001
+
+
+class HidesTheRate(OptimizationParams):
+    rate: Rate = Rate()
+
+
+class HidesMore(OptimizationParams):
+    seed: int = 0
+    images: str = ""
+    pretrained: Rate = Rate()
+    init: str = ""  # this one a method may have: it means its own
+
+
+@pytest.mark.parametrize(
+    ("config", "names"), [(HidesTheRate, "'rate'"), (HidesMore, "'seed' and 'images' and 'pretrained'")]
+)
+def test_a_method_whose_keys_hide_those_of_a_run_is_refused_by_name(config: type[OptimizationParams], names: str):
+    class TheirMethod(Method):
+        name = "theirs"
+        Config = config
+
+    with pytest.raises(PluginError) as caught:
+        resolve(TheirMethod)
+    assert str(caught.value) == (
+        f"method 'theirs' cannot be used: its {config.__name__} ({__name__}) has a key {names}, as every run has; "
+        "its author must choose another name"
+    )
 
 
 def test_a_written_file_refuses_another_rate_point_instead_of_ignoring_it(tmp_path: Path):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from splatwizard_core.errors import ConfigError
+from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.experiments.keys import (
     block_keys,
     dotted,
@@ -48,6 +48,8 @@ SCENE_KEYS = tuple(f.name for f in dataclasses.fields(SceneOptions) if f.name !=
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
 INIT = "init"  # a .ply in place of that scene; a method that has a key of this name means its own
 RATE_ALIASES = ("low", "default", "high", "all")
+# What else stands at the top of a configuration: a method's own key of such a name would hide it. INIT may be both.
+TAKEN = {*RESERVED, *SCENE_KEYS, *PipelineParams.model_fields, PRETRAINED.rstrip(".")}
 
 
 def apply_overrides(config: ParamsT, values: Mapping[str, Any], *, source: str) -> ParamsT:
@@ -166,7 +168,7 @@ class ResolvedConfig:
 
         content: dict[str, Any] = {"method": self.method, "preset": self.preset, "rate": self.rate}
         content["scene"] = absolute_spec(self.scene_spec)
-        # The blocks are merged upwards: first come keys of the method, where both have one.
+        # The blocks are merged upwards: no two have a key in common (`check_own_keys`), or INIT is the method's own.
         content |= {key: getattr(self.scene, key) for key in SCENE_KEYS}
         content |= self.ppl.model_dump(mode="json")
         config = self.config.model_dump(mode="json")
@@ -248,6 +250,17 @@ def _spell_none(value: Any) -> Any:
     return value
 
 
+def check_own_keys(method: type[Method]) -> None:
+    """Raise PluginError for a method whose Config has a key that a run needs itself, such as its rate point's name."""
+    clashing = [key for key in method.Config.model_fields if key in TAKEN]
+    if clashing:
+        names = " and ".join(f"'{key}'" for key in clashing)
+        raise PluginError(
+            f"method '{method.name}' cannot be used: its {method.Config.__name__} ({method.Config.__module__}) has a "
+            f"key {names}, as every run has; its author must choose another name"
+        )
+
+
 def rate_points(method: type[Method], asked: str) -> list[str]:
     """The rate points that "r1,r3", "low", "default", "high" or "all" mean, in the method's order."""
     names = list(method.RATES)
@@ -308,8 +321,9 @@ def resolve(
                     `init` or `pretrained.KEY`, which `experiments.start.settled` checks
     scene           "demo", a folder, or dataset/scene; None: what the file says, else "demo"
 
-    Raises ConfigError.
+    Raises ConfigError, and PluginError for a method whose Config has keys that belong to the run.
     """
+    check_own_keys(method)
     tables = read_config_file(config_file) if config_file is not None else {}
     said = {name: tables.pop(name) for name in RESERVED if name in tables}
     for name, value in said.items():
