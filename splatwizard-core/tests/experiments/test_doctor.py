@@ -459,6 +459,37 @@ def test_a_rasterizer_that_draws_black_is_broken_and_the_reference_is_not(site):
     assert "wrong picture" in checks["black"].detail
 
 
+@pytest.mark.parametrize(
+    ("answer", "state", "detail", "mend"),
+    [
+        ("return 'their is not installed (pip install \"sw-their[x]\")'", "missing", "their is not installed",
+         'pip install "sw-their[x]"'),
+        ("return 'it needs a GPU (a new one)'", "missing", "it needs a GPU (a new one)", None),
+        ("raise OSError('libtheir.so')", "broken", "OSError: libtheir.so",
+         "pip install --force-reinstall --no-deps doctored_absent"),
+        ("return None", "ok", "drew a test picture on cpu (runs on cpu)", None),
+    ],
+)  # fmt: skip
+def test_a_rasterizer_whose_probe_says_why_it_cannot_run_is_missing_not_broken(
+    site, monkeypatch, answer, state, detail, mend
+):
+    monkeypatch.delitem(sys.modules, "doctored_absent", raising=False)
+    plugins = manager(
+        site, "doctored_absent",
+        f"""
+        @hookimpl
+        def register_rasterizers(registry):
+            registry.add("their", "splatwizard_core.rendering.reference:ReferenceRasterizer", summary="none",
+                         devices=["cpu"], features=["COLORS_ND"], available="doctored_absent:unavailable", speed=3)
+
+        def unavailable():
+            {answer}
+        """,
+    )  # fmt: skip
+    found = next(c for c in probe.check_rasterizers(plugins) if c.name == "their")
+    assert (found.state, found.detail, found.mend) == (state, detail, mend)
+
+
 def test_a_rasterizer_of_surfels_draws_surfels(site):
     plugins = manager(
         site, "doctored_flat",

@@ -72,6 +72,22 @@ def info_from_entry(entry: Entry) -> RasterizerInfo:
         raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} is declared wrongly: {error}") from error
 
 
+def obstacle(info: RasterizerInfo, device: torch.device) -> str | None:
+    """Why a rasterizer cannot run on `device`, as its own probe says, or None; compiles nothing.
+
+    Raises what the probe raises.
+    """
+    if info.min_cc is not None and device.type == "cuda":
+        capability = torch.cuda.get_device_capability(device)
+        if capability < info.min_cc:
+            return f"it needs compute capability {info.min_cc}, this GPU has {capability}"
+    if info.available is None:
+        return None
+    module, _, function = info.available.partition(":")
+    probe: Callable[[], str | None] = getattr(importlib.import_module(module), function)
+    return probe()
+
+
 @dataclass(frozen=True)
 class _Candidate:
     """A rasterizer that can serve a request if `adapted` features are composed for it."""
@@ -250,19 +266,10 @@ class NegotiatedRasterizer:
         """Why it cannot run here, or None; compiles nothing."""
         if candidate.entry.name in self._failed:
             return self._failed[candidate.entry.name]
-        info = candidate.info
-        if info.min_cc is not None and self.device.type == "cuda":
-            capability = torch.cuda.get_device_capability(self.device)
-            if capability < info.min_cc:
-                return f"it needs compute capability {info.min_cc}, this GPU has {capability}"
-        if info.available is None:
-            return None
-        module, _, function = info.available.partition(":")
         try:
-            probe: Callable[[], str | None] = getattr(importlib.import_module(module), function)
-            return probe()
+            return obstacle(candidate.info, self.device)
         except Exception as error:
-            return f"its probe {info.available} failed: {type(error).__name__}: {error}"
+            return f"its probe {candidate.info.available} failed: {type(error).__name__}: {error}"
 
     def _nothing(self, wanted: frozenset[str], unavailable: list[tuple[str, str]]) -> CapabilityError:
         asked = " + ".join(sorted(wanted)) or "plain rendering"

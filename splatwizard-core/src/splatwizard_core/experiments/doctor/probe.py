@@ -10,6 +10,7 @@ import contextlib
 import importlib
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -171,7 +172,7 @@ def check_rasterizers(plugins: PluginManager) -> list[Check]:
 def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
     import torch
 
-    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry, obstacle
 
     device = "cpu" if "cpu" in entry.declared.get("devices", ("cpu",)) else "cuda"
     where = ", ".join(entry.declared.get("devices", ("cpu",)))
@@ -182,6 +183,10 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         detail = f"its kernels '{lacking.name}' are not loaded"
         return Check("rasterizers", entry.name, lacking.state, detail, lacking.mend)
     try:
+        why = obstacle(info_from_entry(entry).on(device), torch.device(device))
+        if why is not None:
+            what, mend = _with_command_apart(why)
+            return Check("rasterizers", entry.name, "missing", one_line(what), mend)
         exactness = entry.declared.get("exactness", "exact")
         alone = [name for name in plugins.rasterizers.names if name != entry.name]
         rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=alone, exactness=[exactness])
@@ -191,6 +196,12 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
         return Check("rasterizers", entry.name, "broken", one_line(f"{type(error).__name__}: {error}"), mend)
     return Check("rasterizers", entry.name, "ok", f"drew a test picture on {device} (runs on {where})")
+
+
+def _with_command_apart(why: str) -> tuple[str, str | None]:
+    """`gsplat is not installed (pip install X)` as `gsplat is not installed` and `pip install X`."""
+    found = re.fullmatch(r"(.*\S) \((pip install [^()]+)\)", why)
+    return (why, None) if found is None else (found[1], found[2])
 
 
 def _lacking_kernels(entry: Entry) -> Check | None:
