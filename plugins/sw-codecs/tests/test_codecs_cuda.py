@@ -33,7 +33,7 @@ def test_rates_and_their_gradients_agree():
     logits, means, scales = (torch.rand(3, generator=draw, dtype=torch.float64) + 0.1 for _ in range(3))
 
     def everything(device):
-        moved = [v.to(device).requires_grad_() for v in (x, mean, scale, logits, means, scales)]
+        moved = [v.detach().clone().to(device).requires_grad_() for v in (x, mean, scale, logits, means, scales)]
         a, m, s, *mixed = moved
         found = [
             rates.gaussian_bits(a, m, s, 0.5),

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from sw_trimming_the_fat.score import worth
+from sw_trimming_the_fat.score import doomed, worth
 
 pytestmark = pytest.mark.cuda
 
@@ -11,4 +11,8 @@ pytestmark = pytest.mark.cuda
 def test_ranks_agree_with_ties():
     g = torch.Generator().manual_seed(0)
     opacities, gradients = torch.rand(10_000, generator=g), torch.randint(0, 300, (10_000,), generator=g).float()
-    assert torch.equal(worth(opacities.cuda(), gradients.cuda()).cpu(), worth(opacities, gradients))
+    here = worth(opacities, gradients)
+    there = worth(opacities.cuda(), gradients.cuda())
+    assert torch.equal(there.cpu(), here)
+    for rank in range(0, 10_000, 7):  # levels that are the quotients themselves: where the last bit decides
+        assert torch.equal(doomed(there, rank / 9_999).cpu(), doomed(here, rank / 9_999))

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import statistics
 from pathlib import Path
 
 import pytest
@@ -21,19 +22,25 @@ pytestmark = [
 def test_throughput_is_that_of_cudas_own_events():
     device = torch.device("cuda")
     a = torch.randn(4096, 4096, device=device)
+    events: list[tuple[torch.cuda.Event, torch.cuda.Event]] = []
 
     def render(view: int) -> torch.Tensor:
-        return a @ a
+        begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
+        begin.record()
+        product = a @ a
+        end.record()
+        events.append((begin, end))
+        return product
 
     report = measure_speed(render, list(range(10)), device)
-    begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
-    begin.record()
-    for _ in range(report.frames):
-        render(0).sum()
-    end.record()
-    torch.cuda.synchronize()
-    assert report.fps == pytest.approx(1e3 * report.frames / begin.elapsed_time(end), rel=0.05)
-    assert report.latency_ms_median >= 0.95 * 1e3 / report.fps
+    # Both clocks look at the same frames, so what else the GPU has to do counts for both.
+    together = events[report.warmup_frames : report.warmup_frames + report.frames]
+    one_by_one = events[report.warmup_frames + report.frames :]
+    assert len(one_by_one) == len(together) == report.frames
+    milliseconds = together[0][0].elapsed_time(together[-1][1])
+    assert report.fps == pytest.approx(1e3 * report.frames / milliseconds, rel=0.05)
+    drawing = statistics.median(begin.elapsed_time(end) for begin, end in one_by_one)
+    assert 0.99 * drawing <= report.latency_ms_median <= 3 * drawing
     assert report.memory_kind == "cuda"
     assert report.peak_bytes >= 2 * 4096 * 4096 * 4  # the factor and the product
     assert report.peak_reserved_bytes >= report.peak_bytes

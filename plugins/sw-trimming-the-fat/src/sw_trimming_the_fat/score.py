@@ -60,7 +60,10 @@ def worth(opacities: Tensor, gradients: Tensor) -> Tensor:
     n = len(opacities)
     if n == 1:
         return torch.ones(1, dtype=torch.float64, device=opacities.device)
-    return torch.maximum(ranks(opacities), ranks(gradients)).double() / max(n - 1, 1)
+    better = torch.maximum(ranks(opacities), ranks(gradients)).double()
+    # By a tensor: a GPU multiplies by the reciprocal of a Python number, which may differ from a CPU in the last bit and
+    # so put a Gaussian on the other side of a level.
+    return better / torch.full_like(better, n - 1)
 
 
 def ranks(values: Tensor) -> Tensor:
