@@ -61,8 +61,8 @@ def worth(opacities: Tensor, gradients: Tensor) -> Tensor:
     if n == 1:
         return torch.ones(1, dtype=torch.float64, device=opacities.device)
     better = torch.maximum(ranks(opacities), ranks(gradients)).double()
-    # By a tensor: a GPU multiplies by the reciprocal of a Python number, whose last bit may differ from a CPU's quotient
-    # and put a Gaussian on the other side of a level.
+    # By a tensor: a GPU multiplies by the reciprocal of a Python number, whose last bit may differ from the quotient of
+    # a CPU and put a Gaussian on the other side of a level.
     return better / torch.full_like(better, n - 1)
 
 
