@@ -5,11 +5,12 @@
 Coders: millions of symbols a second beside the library `constriction` used plainly on the same arrays, and the ratio
 ours / plain (1.00: our chunks, checks and checksums cost nothing). Float models are decoded again by the encoder, as a
 proof: that time stands apart. Rates: bits a symbol beside the model's entropy and zstd level 19 on the same integers.
-Processor seconds of one thread; the runs of both take turns, and the fastest of each counts.
+Processor seconds of one thread; the runs of both take turns, and the median of each counts.
 """
 
 import argparse
 import resource
+import statistics
 import time
 import zlib
 
@@ -19,6 +20,7 @@ import torch
 import zstandard
 
 from splatwizard_core.plugins import load_plugins
+from sw_codecs import checksum
 
 models = constriction.stream.model
 queue, stack = constriction.stream.queue, constriction.stream.stack
@@ -33,15 +35,16 @@ def cpu_seconds():
     return time.process_time() + children.ru_utime + children.ru_stime
 
 
-def fastest(*functions, repeats):
-    """Seconds of the fastest run of each, and what each returned last."""
-    best, results = [float("inf")] * len(functions), [None] * len(functions)
+def in_turns(*functions, repeats):
+    """Median of the seconds that each takes, one after another and again, and what each returned last."""
+    seconds, results = [[] for _ in functions], [None] * len(functions)
     for _ in range(repeats):
         for i, function in enumerate(functions):
+            results[i] = None  # freed here, not in the time of the next
             start = cpu_seconds()
             results[i] = function()
-            best[i] = min(best[i], cpu_seconds() - start)
-    return best, results
+            seconds[i].append(cpu_seconds() - start)
+    return [statistics.median(each) for each in seconds], results
 
 
 def zstd_bits(symbols):
@@ -141,15 +144,15 @@ def plain_huffman(symbols, counts):
 
 
 def bench_coder(name, coder, family, symbols, ours, plain, repeats):
-    """One line. plain: (encode, decode) of the library alone."""
+    """One line, and ours / plain of encoding and decoding. plain: (encode, decode) of the library alone."""
     n, fast = len(symbols), coder(verify=False)
     encode, decode = plain
-    (ours_s, plain_s), (data, words) = fastest(lambda: fast.encode(symbols, ours), encode, repeats=repeats)
-    (ours_d, plain_d), (found, _) = fastest(lambda: fast.decode(data, n, ours), lambda: decode(words), repeats=repeats)
+    (ours_s, plain_s), (data, words) = in_turns(lambda: fast.encode(symbols, ours), encode, repeats=repeats)
+    (ours_d, plain_d), (found, _) = in_turns(lambda: fast.decode(data, n, ours), lambda: decode(words), repeats=repeats)
     assert np.array_equal(found, symbols)
     proof = ""
     if family.startswith(("Gaussian", "Laplace")):
-        (whole,), _ = fastest(lambda: coder().encode(symbols, ours), repeats=2)
+        (whole,), _ = in_turns(lambda: coder().encode(symbols, ours), repeats=2)
         proof = f"{max(whole - ours_s, 0) / ours_s:8.1f} x"
     print(
         f"{name:<8}{family:<33}{n / ours_s / 1e6:10.1f}{plain_s / ours_s:6.2f}"
@@ -157,12 +160,14 @@ def bench_coder(name, coder, family, symbols, ours, plain, repeats):
         f"{8 * len(data) / n:11.4f}",
         end="",
     )
+    return plain_s / ours_s, plain_d / ours_d
 
 
 def bench_coders(plugins, n, repeats):
     print(f"\n{n:,} symbols: Msymbols/s, and ours / plain")
     print(f"{'':<41}{'encode':>16}{'decode':>22}{'proof':>10}{'bits/sym':>11}{'entropy':>9}{'zstd-19':>9}")
     coders = {name: plugins.coders.load(name) for name in ("range", "rans", "huffman")}
+    ratios = {}
     for family, symbols, ours, model, parameters, entropy in families(n, coders["range"].specs):
         zstd = zstd_bits(symbols)
         for name, coder in coders.items():
@@ -172,15 +177,18 @@ def bench_coders(plugins, n, repeats):
                 plain = plain_huffman(symbols, ours.counts)
             else:
                 plain = plain_coder(name, symbols, model, parameters)
-            bench_coder(name, coder, family, symbols, ours, plain, repeats)
+            ratios[f"{name}, {family}"] = bench_coder(name, coder, family, symbols, ours, plain, repeats)
             print(f"{'' if entropy is None else f'{entropy:.4f}':>9}{zstd:9.3f}")
-    (crc,), _ = fastest(lambda: zlib.crc32(symbols), repeats=repeats)
-    print(f"a CRC-32 of the symbols alone: {n / crc / 1e6:.0f} Msymbols/s")
+    for i, doing in enumerate(("encode", "decode")):
+        worst = min(ratios, key=lambda case: ratios[case][i])
+        print(f"lowest ours / plain, {doing}: {ratios[worst][i]:.2f} ({worst})")
+    (ours_s, zlib_s), _ = in_turns(lambda: checksum.crc32(symbols), lambda: zlib.crc32(symbols), repeats=repeats)
+    print(f"a CRC-32 of the symbols alone: {1e9 * ours_s / n:.2f} ns a symbol, by zlib {1e9 * zlib_s / n:.2f}")
 
 
 def report(name, symbols, encode, decode, expected, yardstick_bytes, yardstick, repeats):
-    (encode_s,), (data,) = fastest(encode, repeats=repeats)
-    (decode_s,), (found,) = fastest(lambda: decode(data), repeats=repeats)
+    (encode_s,), (data,) = in_turns(encode, repeats=repeats)
+    (decode_s,), (found,) = in_turns(lambda: decode(data), repeats=repeats)
     assert np.array_equal(found, expected)
     print(
         f"{name:<34}{symbols / encode_s / 1e6:10.2f}{symbols / decode_s / 1e6:10.2f}{8 * len(data) / symbols:10.4f}"

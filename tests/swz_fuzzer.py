@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from splatwizard_core.errors import BitstreamError, PluginError
 from splatwizard_core.memory import peak_rss_bytes, reset_peak_rss, rss_bytes
@@ -38,12 +39,10 @@ VALUES = (
 @contextlib.contextmanager
 def blind() -> Iterator[None]:
     """Every CRC-32 is 0 inside."""
-    real = zlib.crc32
-    zlib.crc32 = lambda data, value=0: 0
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("zlib.crc32", "sw_codecs.checksum.crc32"):  # of the core and of sw-codecs
+            patch.setattr(name, lambda data, value=0: 0)
         yield
-    finally:
-        zlib.crc32 = real
 
 
 @dataclass

@@ -164,6 +164,13 @@ def test_many_chunks(coder, name, monkeypatch):
 
 
 @pytest.mark.parametrize("coder", CODERS)
+def test_more_symbols_than_the_bytes_can_hold_take_no_memory(coder):
+    data = coder().encode(np.zeros(5, int), Table(np.ones(3, int)))
+    with pytest.raises(BitstreamError, match="cannot hold"):
+        coder().decode(data, 1 << 50, Table(np.ones(3, int)))
+
+
+@pytest.mark.parametrize("coder", CODERS)
 def test_a_chunk_under_a_float_model_that_does_not_decode_is_not_written(coder, monkeypatch):
     monkeypatch.setattr(coder, "_decode_chunk", lambda self, payload, count, spec: np.zeros(count, np.int32))
     with pytest.raises(RuntimeError, match="does not decode"):

@@ -102,7 +102,7 @@ def test_damage_to_float_coded_data_is_found(assert_survives_damage, name):
 
 @pytest.mark.parametrize("name", FLOATS)
 def test_hostile_float_coded_data_with_their_checksums_in_order(monkeypatch, name):
-    monkeypatch.setattr("zlib.crc32", lambda data, value=0: 0)
+    monkeypatch.setattr("sw_codecs.checksum.crc32", lambda data, value=0: 0)
     model, r, n = FLOATS[name][0](), rng(13), 60
     context = FloatContext(t(r.normal(0, 3, n)), 1.5)
     symbols = np.rint(r.normal(0, 3, n)).astype(int)

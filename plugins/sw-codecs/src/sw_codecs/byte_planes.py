@@ -11,14 +11,13 @@ CRC-32 of the values as they are, then values or frame, whichever is shorter.
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import zstd_frame
+from sw_codecs import checksum, zstd_frame
 from sw_codecs.bits import ByteReader
 from sw_codecs.ordering import spatial_order
 
@@ -49,7 +48,7 @@ class BytePlanes:
         plain = values.astype(values.dtype.newbyteorder("<"), copy=False).tobytes()
         frame = zstd_frame.compress(*_planes(plain, len(values), values.dtype.itemsize))
         form, body = (PLANES, frame) if len(frame) < len(plain) else (PLAIN, plain)
-        return bytes([VERSION, form]) + zlib.crc32(plain).to_bytes(4, "little") + body
+        return bytes([VERSION, form]) + checksum.crc32(plain).to_bytes(4, "little") + body
 
     def decode(self, data: bytes, dtype: npt.DTypeLike, shape: Sequence[int]) -> np.ndarray:
         """The array, writable. Raises BitstreamError unless `data` is what `encode` wrote for this dtype and shape.
@@ -74,7 +73,7 @@ class BytePlanes:
             plain = bytes(body)
         else:
             raise BitstreamError(f"{len(body):,} bytes of values, {list(shape)} of {wanted} are {size:,}")
-        if zlib.crc32(plain) != crc:
+        if checksum.crc32(plain) != crc:
             raise BitstreamError("the decoded values do not match their CRC-32")
         return np.frombuffer(plain, wanted).reshape(shape).astype(wanted.newbyteorder("="), copy=True)
 

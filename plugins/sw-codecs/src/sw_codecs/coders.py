@@ -8,14 +8,13 @@ bytes. A chunk with kmin = kmax has no payload. Source: specification of the cod
 from __future__ import annotations
 
 import struct
-import zlib
 from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import model_spec
+from sw_codecs import checksum, model_spec
 from sw_codecs.bits import ByteReader
 from sw_codecs.model_spec import Gaussian, Laplace, ModelSpec, as_symbols, changed, check_length, domain
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter
@@ -63,7 +62,7 @@ class ChunkedCoder:
                 and not np.array_equal(self._decode_chunk(memoryview(payload), len(chunk), spec), chunk)
             ):
                 raise RuntimeError("a chunk does not decode to what was encoded; please report this")
-            parts += [HEADER.pack(len(chunk), kmin, kmax, len(payload), zlib.crc32(chunk)), payload]
+            parts += [HEADER.pack(len(chunk), kmin, kmax, len(payload), checksum.crc32(chunk)), payload]
         return b"".join(parts)
 
     def decode(self, data: bytes, n: int, model: ModelSpec) -> np.ndarray:
@@ -71,9 +70,11 @@ class ChunkedCoder:
         check_length(model, n)
         low, high = domain(model)
         reader = ByteReader(data)
-        found: list[np.ndarray] = []
-        start = 0
-        while start < n:
+        if reader.left < HEADER.size * -(-n // CHUNK):
+            raise BitstreamError(f"{reader.left:,} bytes cannot hold {n:,} symbols: truncated data or a wrong number")
+        # One array from the start: each chunk is freed as soon as it is copied, and the next takes its memory.
+        found = np.empty(n, np.int32)
+        for start in range(0, n, CHUNK):
             count, kmin, kmax, length, crc = HEADER.unpack(reader.take(HEADER.size))
             if count != min(CHUNK, n - start):
                 raise BitstreamError(f"a chunk has {count:,} symbols, expected {min(CHUNK, n - start):,}")
@@ -86,12 +87,11 @@ class ChunkedCoder:
                 chunk = np.full(count, kmin, np.int32)
             else:
                 chunk = self._decode_chunk(payload, count, _for_chunk(model, start, count, kmin, kmax))
-            if zlib.crc32(np.ascontiguousarray(chunk, "<i4")) != crc or chunk.min() != kmin or chunk.max() != kmax:
+            if checksum.crc32(np.ascontiguousarray(chunk, "<i4")) != crc or chunk.min() != kmin or chunk.max() != kmax:
                 raise BitstreamError("the decoded symbols do not match their CRC-32: damaged data or a wrong model")
-            found.append(chunk)
-            start += count
+            found[start : start + count] = chunk
         reader.finish()
-        return found[0] if len(found) == 1 else np.concatenate([np.empty(0, np.int32), *found])
+        return found
 
     def _encode_chunk(self, symbols: np.ndarray, spec: ModelSpec) -> bytes:
         raise NotImplementedError

@@ -9,7 +9,6 @@ integer counts reach the coder. Layout (docs/bitstream.md has it byte by byte):
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +17,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError
+from sw_codecs import checksum
 from sw_codecs.bits import ByteReader, class_bits, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.column_plan import CONSTANT, MAGNITUDES, MAX_VALUE, ColumnPlan, choose_plan
 from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables
@@ -59,7 +59,7 @@ class Columns:
         plans, tables, classes_of, raw, crc = [], [], [], [], 0
         for values in matrix.T:
             column = np.ascontiguousarray(values)
-            crc = zlib.crc32(column.astype("<i8", copy=False), crc)
+            crc = checksum.crc32(column.astype("<i8", copy=False), crc)
             plan = choose_plan(column)
             plans.append(plan)
             if plan.kind == CONSTANT:
@@ -103,7 +103,7 @@ class Columns:
                 column[:] = plan.values(plan.join(classes, _unpack_raw(reader, classes, plan)))
             if rows and not -MAX_VALUE <= column.min() <= column.max() <= MAX_VALUE:
                 raise BitstreamError("a value is beyond 2^60")
-            found_crc = zlib.crc32(column.astype("<i8", copy=False), found_crc)
+            found_crc = checksum.crc32(column.astype("<i8", copy=False), found_crc)
         chunks.finish()
         reader.finish()
         if found_crc != crc:

@@ -12,14 +12,13 @@ Exp-Golomb bits.
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import exp_golomb
+from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, write_signed, write_varint
 from sw_codecs.column_plan import MAX_TABLE
 from sw_codecs.columns import MAX_ELEMENTS, decode_classes, encode_classes
@@ -74,7 +73,7 @@ def encode(matrix: np.ndarray, spans: list[Window], mass: Callable[[int, np.ndar
     tables, entries, signs, magnitudes = [], [], [np.empty(0, bool)], [np.empty(0, np.int64)]
     for column, span in enumerate(spans if rows else []):
         values = np.ascontiguousarray(matrix[:, column])
-        crc = zlib.crc32(values.astype("<i8", copy=False), crc)
+        crc = checksum.crc32(values.astype("<i8", copy=False), crc)
         outside = (values < span.low) | (values > span.high)
         counts = _counts(mass(column, np.arange(span.low, span.high + 1)), has_escapes=bool(outside.any()))
         entries.append(np.where(outside, span.size, values - span.low))
@@ -124,7 +123,7 @@ def decode(data: bytes, shape: tuple[int, ...]) -> np.ndarray:
         chunks.finish()
         _fill_escapes(matrix, spans, reader.take(reader.left))
         for values in matrix:
-            found_crc = zlib.crc32(values.astype("<i8", copy=False), found_crc)
+            found_crc = checksum.crc32(values.astype("<i8", copy=False), found_crc)
     reader.finish()
     if found_crc != crc:
         raise BitstreamError("the decoded matrix does not match its CRC-32")

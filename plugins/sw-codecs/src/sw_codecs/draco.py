@@ -14,7 +14,6 @@ import importlib.util
 import os
 import subprocess
 import sys
-import zlib
 from pathlib import Path
 from types import ModuleType
 
@@ -22,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.errors import BitstreamError, CapabilityError
-from sw_codecs import morton
+from sw_codecs import checksum, morton
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.ordering import spatial_order
@@ -73,7 +72,7 @@ class Draco:
         draco = _draco()
         codes = morton.sorted_codes(points, bits)
         distinct, extra = without_duplicates(codes)
-        head = bytes([VERSION, bits]) + zlib.crc32(codes.astype("<i8")).to_bytes(4, "little")
+        head = bytes([VERSION, bits]) + checksum.crc32(codes.astype("<i8")).to_bytes(4, "little")
         out = head + write_varint(len(codes)) + write_varint(len(distinct))
         if len(distinct):
             file = draco.encode(
@@ -83,7 +82,8 @@ class Draco:
                 quantization_range=(1 << bits) - 1,
                 quantization_origin=[0, 0, 0],
             )
-            out += write_varint(len(file)) + zlib.crc32(file).to_bytes(4, "little") + file + encode_duplicates(extra)
+            file_crc = checksum.crc32(file).to_bytes(4, "little")
+            out += write_varint(len(file)) + file_crc + file + encode_duplicates(extra)
         return check_written(len(codes), out, self.max_points)
 
     def decode(self, data: bytes) -> np.ndarray:
@@ -101,12 +101,12 @@ class Draco:
         if distinct:
             length = reader.varint(reader.left)
             file_crc, file = reader.integer(4), bytes(reader.take(length))
-            if zlib.crc32(file) != file_crc:
+            if checksum.crc32(file) != file_crc:
                 raise BitstreamError("the Draco data do not match their CRC-32")
             times = decode_duplicates(reader, count, distinct)
             codes = np.repeat(np.sort(morton.encode(_decoded(file, distinct, bits))), times)
         reader.finish()
-        if zlib.crc32(codes.astype("<i8")) != crc:
+        if checksum.crc32(codes.astype("<i8")) != crc:
             raise BitstreamError("the decoded points do not match their CRC-32")
         return morton.decode(codes)
 

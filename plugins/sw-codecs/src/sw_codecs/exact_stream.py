@@ -13,14 +13,13 @@ codec library, exact mode, rules 4 to 6.
 from __future__ import annotations
 
 import functools
-import zlib
 from typing import Any
 
 import constriction
 import numpy as np
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import exp_golomb
+from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.exact_tables import FRACTIONS, Family, exact_tables
 from sw_codecs.gaussian_exact import SYMBOL_LIMIT, _entries, _groups
@@ -66,7 +65,7 @@ class ExactWriter:
         """
         if len(symbols) and np.abs(symbols).max() >= SYMBOL_LIMIT:
             raise ValueError("a symbol is beyond 2^30")
-        self._crc = zlib.crc32(np.ascontiguousarray(symbols, "<i4"), self._crc)
+        self._crc = checksum.crc32(np.ascontiguousarray(symbols, "<i4"), self._crc)
         offsets = symbols - centre
         for table, rows in _groups(number):
             radius = int(self._family.radius[table // FRACTIONS])
@@ -124,7 +123,7 @@ class ExactReader:
         symbols += centre
         if len(symbols) and np.abs(symbols).max() >= SYMBOL_LIMIT:
             raise BitstreamError("a symbol is beyond 2^30: damaged data or a wrong context")
-        self._crc = zlib.crc32(symbols.astype("<i4"), self._crc)
+        self._crc = checksum.crc32(symbols.astype("<i4"), self._crc)
         return symbols
 
     def _resolve(self, offsets: np.ndarray, radius: int) -> None:

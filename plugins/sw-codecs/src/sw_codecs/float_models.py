@@ -12,14 +12,13 @@ Source: specification of the codec library, coder mode float.
 
 from __future__ import annotations
 
-import zlib
 from typing import Any, ClassVar
 
 import numpy as np
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import exp_golomb
+from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, bit_length, write_varint
 from sw_codecs.coders import RangeCoder
 from sw_codecs.gaussian_exact import SYMBOL_LIMIT, FloatContext
@@ -128,7 +127,7 @@ def _parameters(context: FloatContext, n: int) -> tuple[np.ndarray, np.ndarray, 
     mean, scale = (np.ascontiguousarray(np.broadcast_to(each / step, n)) for each in (mean, scale))
     if not (np.abs(mean) < SYMBOL_LIMIT).all():
         raise ValueError("a mean is not finite, or beyond 2^30 steps")
-    crc = zlib.crc32(scale.astype("<f8", copy=False), zlib.crc32(mean.astype("<f8", copy=False)))
+    crc = checksum.crc32(scale.astype("<f8", copy=False), checksum.crc32(mean.astype("<f8", copy=False)))
     centre = np.rint(mean)
     return centre.astype(np.int64), mean - centre, scale, crc
 

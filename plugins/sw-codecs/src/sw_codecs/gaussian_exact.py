@@ -8,7 +8,6 @@ rules 3 to 6.
 
 from __future__ import annotations
 
-import zlib
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -16,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import exp_golomb
+from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.coders import CHUNK, HEADER
 from sw_codecs.exact_tables import FRACTIONS, Family, exact_tables
@@ -119,7 +118,7 @@ class ExactModel:
             payload = _encode_chunk(symbols[part] - centre[part], number[part], family)
             if not np.array_equal(_decode_chunk(payload, number[part], family) + centre[part], symbols[part]):
                 raise RuntimeError("a chunk does not decode to what was encoded; please report this")
-            parts.append(HEADER.pack(len(chunk), chunk.min(), chunk.max(), len(payload), zlib.crc32(chunk)))
+            parts.append(HEADER.pack(len(chunk), chunk.min(), chunk.max(), len(payload), checksum.crc32(chunk)))
             parts.append(payload)
         return b"".join(parts)
 
@@ -139,7 +138,7 @@ class ExactModel:
             if count != len(found[part]):
                 raise BitstreamError(f"a chunk has {count:,} symbols, expected {len(found[part]):,}")
             chunk = _decode_chunk(reader.take(length), number[part], family) + centre[part]
-            if chunk.min() != kmin or chunk.max() != kmax or zlib.crc32(chunk.astype("<i4")) != crc:
+            if chunk.min() != kmin or chunk.max() != kmax or checksum.crc32(chunk.astype("<i4")) != crc:
                 raise BitstreamError("the decoded symbols do not match their CRC-32: damaged data or a wrong context")
             found[part] = chunk
         reader.finish()
@@ -215,7 +214,7 @@ def _encode_chunk(offsets: np.ndarray, number: np.ndarray, family: Family) -> by
     for table, rows in _groups(number):
         radius = int(family.radius[table // FRACTIONS])
         entry, _, escaped = _entries(offsets[rows], radius)
-        writer.put(entry, family.tables[table])
+        writer.put_checked(entry.astype(np.int32), family.tables[table])
         signs.append(escaped < 0)
         magnitudes.append(np.abs(escaped) - radius - 1)
     words = writer.finish()
@@ -229,7 +228,7 @@ def _decode_chunk(payload: bytes | memoryview, number: np.ndarray, family: Famil
     offsets, escapes, floors = np.empty(len(number), np.int64), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for table, rows in _groups(number):
         radius = int(family.radius[table // FRACTIONS])
-        entry = coded.get(len(rows), family.tables[table]).astype(np.int64)
+        entry = coded.get_unchecked(len(rows), family.tables[table]).astype(np.int64)
         offsets[rows] = entry - radius
         escaped = rows[entry == 2 * radius + 1]
         escapes.append(escaped)

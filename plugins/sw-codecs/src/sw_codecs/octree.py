@@ -12,13 +12,11 @@ duplicates (`columns`), u32 CRC-32 of the points.
 
 from __future__ import annotations
 
-import zlib
-
 import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import morton
+from sw_codecs import checksum, morton
 from sw_codecs.bits import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
 from sw_codecs.duplicates import decode_duplicates, encode_duplicates, without_duplicates
@@ -59,7 +57,7 @@ class Octree:
         out = bytes([VERSION, bits]) + write_varint(len(codes)) + write_varint(len(leaves))
         if len(leaves):
             out += _encode_tree(leaves, bits) + encode_duplicates(extra)
-        out += zlib.crc32(codes.astype("<i8", copy=False)).to_bytes(4, "little")
+        out += checksum.crc32(codes.astype("<i8", copy=False)).to_bytes(4, "little")
         return check_written(len(codes), out, self.max_points)
 
     def decode(self, data: bytes) -> np.ndarray:
@@ -80,7 +78,7 @@ class Octree:
             codes = np.repeat(leaves, decode_duplicates(reader, count, distinct))
         crc = reader.integer(4)
         reader.finish()
-        if zlib.crc32(codes.astype("<i8", copy=False)) != crc:
+        if checksum.crc32(codes.astype("<i8", copy=False)) != crc:
             raise BitstreamError("the decoded points do not match their CRC-32")
         return morton.decode(codes)
 

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import zlib
-
 import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs import morton, zstd_frame
+from sw_codecs import checksum, morton, zstd_frame
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.columns import Columns
 from sw_codecs.ordering import spatial_order
@@ -20,7 +18,7 @@ LOW_BITS = 48  # a step is coded as two columns, so that each stays within what 
 
 def _head(codes: np.ndarray, bits: int) -> bytes:
     """u8 version, u8 bits, u32 CRC-32 of the Morton codes as int64, varint points."""
-    return bytes([VERSION, bits]) + zlib.crc32(codes.astype("<i8")).to_bytes(4, "little") + write_varint(len(codes))
+    return bytes([VERSION, bits]) + checksum.crc32(codes.astype("<i8")).to_bytes(4, "little") + write_varint(len(codes))
 
 
 def _parse_head(reader: ByteReader, max_points: int) -> tuple[int, int, int]:
@@ -31,7 +29,7 @@ def _parse_head(reader: ByteReader, max_points: int) -> tuple[int, int, int]:
 
 
 def _checked(codes: np.ndarray, bits: int, crc: int) -> np.ndarray:
-    if zlib.crc32(codes.astype("<i8")) != crc:
+    if checksum.crc32(codes.astype("<i8")) != crc:
         raise BitstreamError("the decoded points do not match their CRC-32")
     # Compared, not subtracted: a stranger's codes may be so far apart that their difference wraps around.
     if len(codes) and (codes[0] < 0 or int(codes[-1]) >> (3 * bits) or (codes[1:] < codes[:-1]).any()):

@@ -7,7 +7,6 @@ choice without calling it, groups per-symbol tables, and turns whatever goes wro
 from __future__ import annotations
 
 import contextlib
-import zlib
 from collections.abc import Iterator
 from typing import Any
 
@@ -15,6 +14,7 @@ import constriction
 import numpy as np
 
 from splatwizard_core.errors import BitstreamError
+from sw_codecs import checksum
 from sw_codecs.model_spec import (
     Bernoulli,
     Gaussian,
@@ -109,7 +109,7 @@ class SymbolWriter:
         if symbols.min() < low or symbols.max() > high:
             raise ValueError(f"symbols {symbols.min()}..{symbols.max()} leave the model's domain {low}..{high}")
         symbols = np.ascontiguousarray(symbols, "<i4")
-        self.crc = zlib.crc32(symbols, self.crc)
+        self.crc = checksum.crc32(symbols, self.crc)
         self.count += len(symbols)
         self.put_checked(symbols, spec)
 
@@ -171,7 +171,7 @@ class SymbolReader:
         if count == 0:
             return np.empty(0, np.int32)
         symbols = self.get_unchecked(count, spec)
-        self.crc = zlib.crc32(np.ascontiguousarray(symbols, "<i4"), self.crc)
+        self.crc = checksum.crc32(np.ascontiguousarray(symbols, "<i4"), self.crc)
         self.count += count
         return symbols
 
