@@ -103,3 +103,28 @@ def test_no_state_is_kept_without_gradient():
         before = torch.cuda.memory_allocated()
         result = StandardRasterizer().render(moved, cam, RasterOptions())
     assert torch.cuda.memory_allocated() - before <= 2 * (result.image.nbytes + result.radii.nbytes) + 4096
+
+
+DEEP = RasterCase(
+    "deep", n=6000, width=70, height=50, spread=1.0, scale=(0.02, 0.3), opacity=(0.005, 0.05), degree=1, active_degree=1
+)
+"""20 tiles with lists of a thousand and more, of which all pixels see many: cut into pieces for the backward pass."""
+
+
+@pytest.mark.parametrize("absgrad", [False, True])
+@pytest.mark.parametrize("opacity", [(0.005, 0.05), (0.2, 0.9)], ids=["deep", "opaque"])
+def test_lists_that_are_cut_for_the_backward_pass_give_the_gradients_of_whole_ones(absgrad, opacity):
+    g, cam = draw_scene(replace(DEEP, opacity=opacity), 5, torch.float32)
+    g = cast_inputs(g, torch.float32, "cuda")
+    options = RasterOptions(alpha=True, grad2d=True, absgrad=absgrad, background=torch.rand(3, device="cuda"))
+    whole, wanted = run(StandardRasterizer(count=True), g, cam, options)  # counting walks whole lists
+    cut, found = run(StandardRasterizer(), g, cam, options)
+    assert whole.stats.n_pairs > 20 * 3 * 256
+    torch.testing.assert_close(cut.image, whole.image, rtol=0, atol=2e-6)
+    torch.testing.assert_close(cut.alpha, whole.alpha, rtol=0, atol=1e-6)
+    pairs = {name: (x, wanted[name]) for name, x in found.items()}
+    for name in ("grad2d", "absgrad2d") if absgrad else ("grad2d",):
+        pairs[name] = (getattr(cut, name).value, getattr(whole, name).value)
+    for name, (a, b) in pairs.items():
+        error = float((a.double() - b.double()).norm() / b.double().norm().clamp(min=1e-30))
+        assert error <= 2e-5, f"gradient of {name}: relative error {error:.3g}"

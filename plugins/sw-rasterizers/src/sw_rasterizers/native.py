@@ -33,6 +33,7 @@ MODULE = NativeModule(
         "csrc/cuda/sort.cu",
         "csrc/cuda/blend_backward.cu",
         "csrc/cuda/blend.cu",
+        "csrc/cuda/blend_few.cu",
         "csrc/cuda/flash.cu",
         "csrc/cuda/tcgs.cu",
         "csrc/cuda/fisher.cu",

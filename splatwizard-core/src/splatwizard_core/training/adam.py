@@ -32,36 +32,23 @@ class AdamUpdate:
 @torch.no_grad()
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     """`adam_step` for each of them: the same numbers, on CUDA in one launch."""
-    together = [u for u in updates if u.param.is_cuda and _fits_cuda_kernel(u)]
+    together = [u for u in updates if u.param.is_cuda]
     if together and TRAINING.has_cuda():
-        torch.ops.splatwizard_training.adam_many(
+        left = torch.ops.splatwizard_training.adam_many(
             [u.param for u in together], [u.grad for u in together],
             [u.exp_avg for u in together], [u.exp_avg_sq for u in together],
             [u.lr for u in together], [u.beta1 for u in together], [u.beta2 for u in together],
             [u.eps for u in together], [u.step for u in together],
         )  # fmt: skip
-        _mark_written(*[t for u in together for t in (u.param, u.exp_avg, u.exp_avg_sq)])
-        if len(together) == len(updates):
+        _mark_written(*(u.param for u in together))
+        if not left and len(together) == len(updates):
             return
-        done = {id(u) for u in together}
-        updates = [u for u in updates if id(u) not in done]
+        updates = [u for u in updates if not u.param.is_cuda] + [together[i] for i in left]
     for u in updates:
         adam_step(
             u.param, u.grad, u.exp_avg, u.exp_avg_sq,
             lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps, step=u.step,
         )  # fmt: skip
-
-
-def _fits_cuda_kernel(u: AdamUpdate) -> bool:
-    shape, device = u.param.shape, u.param.device
-    if u.step < 1 or device.type != "cuda":
-        return False
-    for t in (u.param, u.grad, u.exp_avg, u.exp_avg_sq):
-        if t.shape != shape or t.dtype != torch.float32 or not t.is_contiguous() or t.data_ptr() % 16:
-            return False
-        if t.device != device:
-            return False
-    return True
 
 
 def _mark_written(*tensors: Tensor) -> None:
@@ -116,4 +103,4 @@ def adam_step(
             [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=True, amsgrad=False, maximize=False,
             weight_decay=0.0, lr=lr, beta1=beta1, beta2=beta2, eps=eps,
         )  # fmt: skip
-    _mark_written(param, exp_avg, exp_avg_sq)
+    _mark_written(param)

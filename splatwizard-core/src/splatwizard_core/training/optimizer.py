@@ -97,7 +97,7 @@ class SplatOptimizer:
         for group_name, group in self.groups.items():
             beta1, beta2 = group.betas
             for name in self._members[group_name]:
-                param = self.model.get_parameter(name)
+                param = _parameter(self.model, name)
                 if param.grad is None:
                     continue
                 moments = self._moments.get(name)
@@ -141,8 +141,10 @@ class SplatOptimizer:
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters of the model, those in no group included."""
-        for param in self.model.parameters():
-            param.grad = None
+        for module in self.model.modules():
+            for param in module._parameters.values():
+                if param is not None:
+                    param.grad = None
 
     @torch.no_grad()
     def append_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> None:
@@ -323,6 +325,11 @@ class SplatOptimizer:
         if isinstance(old, nn.Parameter):
             tensor = nn.Parameter(tensor, requires_grad=old.requires_grad)
         setattr(owner, leaf, tensor)
+
+
+def _parameter(model: SplatModel, name: str) -> nn.Parameter:
+    found = model._parameters.get(name)  # nearly always: asked for at every step
+    return model.get_parameter(name) if found is None else found
 
 
 def _attribute(model: SplatModel, name: str) -> Tensor:

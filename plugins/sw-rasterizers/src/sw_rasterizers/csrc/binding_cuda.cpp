@@ -9,14 +9,12 @@
 #include <vector>
 
 #include "binding_cuda.h"
+#include "binding_state.h"
 
 namespace {
 
 using namespace sw;        // NOLINT: one file
 using namespace sw::cuda;  // NOLINT
-
-// The state that blend_backward needs; the flags of the Gaussians, for project_backward, come behind it.
-enum Saved { kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kSavedCount };
 
 Image image_of(const Inputs& in) {
   Image image{};
@@ -66,14 +64,12 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   std::vector<Tensor> saved(kSavedCount);
   const bool median = settings.median_depth;
   const Binned binned(view, settings, projected, tally, row, save || median, clock);
-  saved[kShape] = binned.compact.shape, saved[kTail] = binned.compact.tail;
-  saved[kChannelRows] = binned.compact.channels;
+  saved[kShape] = binned.compact.shape, saved[kChannelRows] = binned.compact.channels;
   saved[kTileStart] = binned.tile_start, saved[kSplat] = binned.splat;
   clock.mark();
 
-  saved[kTransmittance] = make({save ? height : 0, width});
-  saved[kLast] = make_as({save ? height : 0, width}, at::kInt);
-  saved[kMedianSplat] = make_as({save && median ? height : 0, width}, at::kInt);
+  if (save) saved[kTransmittance] = make({height, width}), saved[kLast] = make_as({height, width}, at::kInt);
+  if (save && median) saved[kMedianSplat] = make_as({height, width}, at::kInt);
   const bool fast = in.flags & (kFlash | kTensorCores), as_bytes = in.flags & kBytes;
   TORCH_CHECK(fast || !as_bytes, "sw_rasterizers: 8-bit images are drawn by the inference kernels only");
   TORCH_CHECK(!fast || (!general && !save), "sw_rasterizers: the inference kernels draw three colours, no gradients");
@@ -85,9 +81,18 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   image.alpha = data<float>(alpha), image.median = data<float>(median_depth);
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
+  const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
+  const bool few = !fast && !general && !count_work && tiles < kFewTiles;
+  if (few && save && tally.pairs() > 0) {
+    const int64_t pieces = piece_count(tiles, tally.pairs());
+    saved[kBehind] = make({pieces, kTile * kTile, 4}), saved[kWhere] = make_as({pieces, 2}, at::kInt);
+    image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere])};
+  }
   if (fast)
     (in.flags & kFlash ? blend_flash : blend_tcgs)(view, binned.drawn, binned.lists(), image,
                                                    as_bytes ? data<uint8_t>(picture) : nullptr, stream);
+  else if (few)
+    blend_few(view, binned.drawn, binned.lists(), image, stream);
   else
     blend(view, binned.drawn, binned.lists(), image, general, count_work ? tally.counters : nullptr,
           binned.sorted_depth, stream);
@@ -96,8 +101,9 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
 
   std::vector<int64_t> counts = tally.counts(count_work);
   if (save) {
+    const Tensor nothing = make({0});
     for (Tensor& t : saved)
-      if (!t.defined()) t = make({0});
+      if (!t.defined()) t = nothing;
     saved.push_back(flags);
   } else {
     saved.clear();
@@ -153,12 +159,13 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   image.background_is_image = background.has_value() && background->dim() == 3;
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
+  image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere])};
   const ImageGradient gradient{data<float>(image_gradient), data<float>(alpha_gradient), data<float>(median_gradient)};
-  const Splats splats = splats_of(saved[kShape], saved[kTail], saved[kChannelRows]);
+  const Splats splats = splats_of(saved[kShape], saved[kChannelRows]);
   const bool general = channels.total() != 3 || channels.colors != 3 || median;
   if (saved[kSplat].numel() > 0)
     blend_backward(view, flags & kPassClamp, splats, {data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])},
-                   image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, stream);
+                   saved[kSplat].numel(), image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
   return {row_memory, clock.seconds()};
@@ -189,9 +196,9 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   StageClock clock{(flags & kCount) != 0, stream, {}};
   clock.mark();
 
-  std::vector<Tensor> grads(kWantedCount);
+  std::vector<Tensor> grads(kWantedCount, at::empty({0}, real));
   const auto want = [&](int which, const OptionalTensor& like) {
-    grads[which] = at::empty(wanted[which] && like.has_value() ? like->sizes() : at::IntArrayRef{0}, real);
+    if (wanted[which] && like.has_value()) grads[which] = at::empty(like->sizes(), real);
     return data<float>(grads[which]);
   };
   Gradients<float> out{};
@@ -213,7 +220,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   out.colors = want(kWantColors, in.colors);
   out.features = want(kWantFeatures, in.features);
   const auto screen = [&](int which) {
-    grads[which] = at::empty({wanted[which] ? n : 0, 2}, real);
+    if (wanted[which]) grads[which] = at::empty({n, 2}, real);
     return data<float>(grads[which]);
   };
   out.grad2d = screen(kWantGrad2d);

@@ -68,48 +68,78 @@ inline void check_placement(const Inputs& in) {
               "sw_rasterizers: on CUDA quats must start at a multiple of 16 bytes; clone() it");
 }
 
-inline Splats splats_of(const Tensor& shape, const Tensor& tail, const Tensor& channels) {
-  return {data<float4>(shape), data<float2>(tail), data<float>(channels)};
+// `shape`: [splats, 10], all their shapes and then all their tails.
+inline Splats splats_of(const Tensor& shape, const Tensor& channels) {
+  auto* first = data<float4>(shape);
+  auto* tail = first == nullptr ? nullptr : reinterpret_cast<float2*>(first + 2 * shape.size(0));
+  return {first, tail, data<float>(channels)};
 }
 
 inline Tensor cuda_bytes(size_t count, const at::TensorOptions& options) {
   return at::empty({int64_t(std::max<size_t>(count, 1))}, options.dtype(at::kByte));
 }
 
+// Places in one allocation: each of its own would cost the host about as much as a launch.
+struct Layout {
+  size_t bytes = 0;
+  size_t add(size_t count, size_t size) {
+    const size_t at = bytes;
+    bytes += (count * size + 127) / 128 * 128;
+    return at;
+  }
+};
+template <class T>
+T* place(const Tensor& memory, size_t at) {
+  return reinterpret_cast<T*>(static_cast<char*>(memory.data_ptr()) + at);
+}
+
+// Where the device leaves its counts for the host, and the events that say so. A thread draws one view at a time and
+// reads before it returns, so it needs one of them for each GPU; never freed, since a thread may outlive the driver.
+struct Mailbox {
+  Tensor pinned = at::empty({16}, at::TensorOptions().dtype(at::kLong).pinned_memory(true));
+  Event counted{false}, colored{false};
+
+  static Mailbox& of(int device) {
+    static thread_local std::vector<Mailbox*> boxes;
+    if (boxes.size() <= size_t(device)) boxes.resize(size_t(device) + 1);
+    if (boxes[size_t(device)] == nullptr) boxes[size_t(device)] = new Mailbox;
+    return *boxes[size_t(device)];
+  }
+};
+
 // The counters on the device, and what the host learns of them.
 struct Tally {
   cudaStream_t stream;
   int64_t blocks;  // of the projection
-  Tensor memory, pinned;
+  Tensor memory;
+  Mailbox& mailbox;
   Counters* counters;
   uint64_t* states;  // of the projection's prefix sums, then of the emission's
   Published* published;
   Counters* after;  // the colours
-  Event counted{false}, colored{false};
   bool used = false;
 
   Tally(int64_t gaussians, const at::TensorOptions& options, cudaStream_t stream)
-      : stream(stream), blocks(ceil_blocks(gaussians)) {
+      : stream(stream), blocks(ceil_blocks(gaussians)), mailbox(Mailbox::of(options.device().index())) {
     const size_t bytes = sizeof(Counters) + 2 * size_t(blocks + 1) * sizeof(uint64_t);
     memory = cuda_bytes(bytes, options);
     counters = reinterpret_cast<Counters*>(memory.data_ptr());
     states = reinterpret_cast<uint64_t*>(counters + 1);
     C10_CUDA_CHECK(cudaMemsetAsync(counters, 0, bytes, stream));
     static_assert(sizeof(Published) + sizeof(Counters) <= 16 * sizeof(int64_t));
-    pinned = at::empty({16}, at::TensorOptions().dtype(at::kLong).pinned_memory(true));
-    published = reinterpret_cast<Published*>(pinned.data_ptr());
+    published = reinterpret_cast<Published*>(mailbox.pinned.data_ptr());
     after = reinterpret_cast<Counters*>(published + 1);
     *published = {};
     *after = {};
   }
 
-  void projected() { counted.record(stream); }
+  void projected() { mailbox.counted.record(stream); }
   // The colours are launched: waits for the counts of the projection, while they are still being computed.
   void shaded() {
     C10_CUDA_CHECK(cudaMemcpyAsync(after, counters, sizeof(Counters), cudaMemcpyDeviceToHost, stream));
-    colored.record(stream);
+    mailbox.colored.record(stream);
     C10_CUDA_KERNEL_LAUNCH_CHECK();
-    counted.wait();
+    mailbox.counted.wait();
     used = true;
     TORCH_CHECK(pairs() <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", pairs(),
                 " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
@@ -119,7 +149,7 @@ struct Tally {
 
   // Visible, pairs, evaluated, blended, not finite; at the end. `work`: whether work was counted.
   std::vector<int64_t> counts(bool work) const {
-    if (used) colored.wait();  // long past by now
+    if (used) mailbox.colored.wait();  // long past by now
     int64_t evaluated = -1, blended = -1;
     if (work) {
       Counters now{};
@@ -137,29 +167,33 @@ struct Tally {
 
 // What the projection writes: compact, but for up to N splats, since how many there are is not known yet.
 struct Projected {
-  Tensor shape, tail, channels, depth, order, extent, tiles, radius;
+  Tensor memory;
   Splats splats;
   SplatWork work;
   // `row`: channels of a splat.
   Projected(int64_t gaussians, int row, bool tight, const at::TensorOptions& real) {
-    const auto make_int = [&](int64_t count) { return at::empty({count}, real.dtype(at::kInt)); };
-    shape = at::empty({gaussians, 8}, real), tail = at::empty({gaussians, 2}, real);
-    channels = at::empty({row > 0 ? gaussians : 0, row}, real);
-    depth = make_int(gaussians), order = make_int(gaussians), extent = at::empty({gaussians, 2}, real);
-    tiles = make_int(gaussians), radius = make_int(tight ? 0 : gaussians);
-    splats = splats_of(shape, tail, channels);
-    work = {data<uint32_t>(depth), data<float2>(extent), data<int32_t>(radius), data<int32_t>(tiles),
-            data<int32_t>(order)};
+    const auto n = size_t(gaussians);
+    Layout layout;
+    const size_t shape = layout.add(n, 2 * sizeof(float4)), tail = layout.add(n, sizeof(float2));
+    const size_t channels = layout.add(n, size_t(row) * sizeof(float)), extent = layout.add(n, sizeof(float2));
+    const size_t depth = layout.add(n, 4), order = layout.add(n, 4), tiles = layout.add(n, 4);
+    const size_t radius = layout.add(tight ? 0 : n, 4);
+    memory = cuda_bytes(layout.bytes, real);
+    splats = {place<float4>(memory, shape), place<float2>(memory, tail),
+              row > 0 ? place<float>(memory, channels) : nullptr};
+    work = {place<uint32_t>(memory, depth), place<float2>(memory, extent),
+            tight ? nullptr : place<int32_t>(memory, radius), place<int32_t>(memory, tiles),
+            place<int32_t>(memory, order)};
   }
 };
 
 // The pairs by tile, nearest first; with `keep` also the splats in depth order, which the values then count.
 struct Binned {
   struct {
-    Tensor shape, tail, channels;
+    Tensor shape, channels;
   } compact;
   Tensor tile_start, splat;
-  Tensor depth_other;
+  Tensor depth_memory;
   Splats drawn;
   const uint32_t* sorted_depth = nullptr;  // of the splats in depth order; lives as long as this and Projected
 
@@ -173,46 +207,48 @@ struct Binned {
     const int64_t used = tally.splats(), count = tally.pairs();
     const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
     const bool wide = tiles >= 0xffff;  // one key more than tiles: for places that no tile claims
-    const auto real = projected.shape.options();
+    const auto real = projected.memory.options().dtype(at::kFloat);
     const auto make = [&](at::IntArrayRef shape) { return at::empty(shape, real); };
     const auto make_as = [&](at::IntArrayRef shape, at::ScalarType type) { return at::empty(shape, real.dtype(type)); };
 
     int32_t* sorted = nullptr;
-    Tensor order_other;
     if (used > 0) {
-      depth_other = make_as({used}, at::kInt), order_other = make_as({used}, at::kInt);
+      const size_t scratch = depth_order_scratch(int(used));
+      Layout layout;
+      const size_t depth_at = layout.add(size_t(used), 4), order_at = layout.add(size_t(used), 4);
+      const size_t scratch_at = layout.add(scratch, 1);
+      depth_memory = cuda_bytes(layout.bytes, real);
       uint32_t* depth = nullptr;
-      const auto run = [&](void* scratch, size_t size) {
-        return depth_order(scratch, size, int(used), projected.work.depth, data<uint32_t>(depth_other),
-                           projected.work.order, data<int32_t>(order_other), &sorted, &depth, stream);
-      };
-      const size_t size = run(nullptr, 0);
-      run(cuda_bytes(size, real).data_ptr(), size);
+      depth_order(place<char>(depth_memory, scratch_at), scratch, int(used), projected.work.depth,
+                  place<uint32_t>(depth_memory, depth_at), projected.work.order,
+                  place<int32_t>(depth_memory, order_at), &sorted, &depth, stream);
       sorted_depth = depth;
     }
     clock.mark();
 
     tile_start = make_as({tiles + 1}, at::kInt);
-    Tensor keys[2], values[2];
+    Tensor pair_memory, values[2];
     void* sorted_keys = nullptr;
     int32_t* sorted_values = nullptr;
     if (count > 0) {
-      for (Tensor& t : keys) t = make_as({count}, wide ? at::kInt : at::kShort);
+      const size_t scratch = sort_pairs_scratch(int(count), wide), key = wide ? 4 : 2;
+      Layout layout;
+      const size_t keys[2] = {layout.add(size_t(count), key), layout.add(size_t(count), key)};
+      const size_t scratch_at = layout.add(scratch, 1);
+      pair_memory = cuda_bytes(layout.bytes, real);
       for (Tensor& t : values) t = make_as({count}, at::kInt);
       if (keep) {
-        compact.shape = make({used, 8}), compact.tail = make({used, 2});
-        compact.channels = make({row > 0 ? used : 0, row});
-        drawn = splats_of(compact.shape, compact.tail, compact.channels);
+        compact.shape = make({used, 10});
+        if (row > 0) compact.channels = make({used, row});
+        drawn = splats_of(compact.shape, compact.channels);
       }
       emit(view, settings, int(used), sorted, projected.splats, projected.work, keep ? &drawn : nullptr, row,
-           keys[0].data_ptr(), wide, data<int32_t>(values[0]), tally.counters, tally.states + tally.blocks + 1, stream);
+           place<char>(pair_memory, keys[0]), wide, data<int32_t>(values[0]), tally.counters,
+           tally.states + tally.blocks + 1, stream);
       const int key_bits = std::bit_width(uint64_t(tiles));
-      const auto run = [&](void* scratch, size_t size) {
-        return sort_pairs(scratch, size, int(count), key_bits, wide, keys[0].data_ptr(), keys[1].data_ptr(),
-                          data<int32_t>(values[0]), data<int32_t>(values[1]), &sorted_keys, &sorted_values, stream);
-      };
-      const size_t size = run(nullptr, 0);
-      run(cuda_bytes(size, real).data_ptr(), size);
+      sort_pairs(place<char>(pair_memory, scratch_at), scratch, int(count), key_bits, wide,
+                 place<char>(pair_memory, keys[0]), place<char>(pair_memory, keys[1]), data<int32_t>(values[0]),
+                 data<int32_t>(values[1]), &sorted_keys, &sorted_values, stream);
     }
     find_tiles(int(count), int(tiles), sorted_keys, wide, data<int32_t>(tile_start), stream);
     if (count > 0) splat = sorted_values == data<int32_t>(values[0]) ? values[0] : values[1];

@@ -13,20 +13,15 @@
 #include <tuple>
 #include <vector>
 
+#include "binding_cuda.h"
 #include "binding_scores.h"
+#include "binding_state.h"
 #include "cuda/score_kernels.h"
 
 namespace {
 
 using namespace sw;        // NOLINT: one file
 using namespace sw::cuda;  // NOLINT
-
-// The state that `render` keeps for the backward pass, in the order of `Saved` in binding_cuda.cpp.
-// clang-format off
-enum Saved {
-  kShape, kTail, kChannelRows, kTileStart, kSplat, kTransmittance, kLast, kMedianSplat, kFlags, kSavedCount
-};
-// clang-format on
 
 using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
                             std::vector<double>>;
@@ -57,11 +52,11 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
       render.call(means, opacities, scales, quats, cov3d, sh, sh_dc, sh_rest, colors, none, visible, background, camera,
                   width, height, sh_degree, scale_modifier, eps2d, (flags | kSave) & ~int64_t(kCount));
   const std::vector<Tensor>& saved = std::get<4>(rendered);
-  TORCH_CHECK(saved.size() == kSavedCount, "sw_rasterizers: the forward pass kept another state than expected");
+  TORCH_CHECK(saved.size() == kFlags + 1, "sw_rasterizers: the forward pass kept another state than expected");
   if (saved[kSplat].numel() == 0) return;
 
   const auto view = View<float>::from(camera.data(), int(width), int(height));
-  const Splats splats{data<float4>(saved[kShape]), data<float2>(saved[kTail]), data<float>(saved[kChannelRows])};
+  const Splats splats = splats_of(saved[kShape], saved[kChannelRows]);
   const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
   Totals to{};
   const Scores<float> contributions = asked.select<float>(false, to.of);
@@ -75,7 +70,7 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
   const Scores<float> squares = asked.select<float>(true, to.of);
   if (squares.count > 0) square_derivatives(view, pass_clamp, splats, lists, image, squares, to, stream);
   if (blocks.has_value()) {
-    const int64_t used = saved[kTail].size(0);
+    const int64_t used = saved[kShape].size(0);
     const Tensor rows = at::zeros({used, kFisherSums}, means.options().requires_grad(false));
     fisher_sums(view, pass_clamp, splats, lists, image, data<float>(rows), stream);
     fisher_blocks(view, in.gaussians<float>(), in.settings(), int(used), splats, data<uint8_t>(saved[kFlags]),

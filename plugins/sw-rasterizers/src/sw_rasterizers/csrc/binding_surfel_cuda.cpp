@@ -19,7 +19,7 @@ using namespace sw::cuda;  // NOLINT
 
 // clang-format off
 enum Saved {  // the state that the backward pass needs
-  kShape, kTail, kPlanes, kTileStart, kSplat, kFlags, kTransmittance, kLast, kFirst, kSum, kSquare, kMedian, kSavedCount
+  kShape, kPlanes, kTileStart, kSplat, kFlags, kTransmittance, kLast, kFirst, kSum, kSquare, kMedian, kSavedCount
 };
 // clang-format on
 
@@ -71,7 +71,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int6
 
   std::vector<Tensor> saved(kSavedCount);
   const Binned binned(view, settings, projected, tally, kPlane, save, clock);
-  saved[kShape] = binned.compact.shape, saved[kTail] = binned.compact.tail, saved[kPlanes] = binned.compact.channels;
+  saved[kShape] = binned.compact.shape, saved[kPlanes] = binned.compact.channels;
   saved[kTileStart] = binned.tile_start, saved[kSplat] = binned.splat, saved[kFlags] = drawn;
   clock.mark();
 
@@ -126,7 +126,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> render_backward(
   clock.mark();
 
   const Tensor sums = at::zeros({g.count, surfel_columns(maps)}, real);
-  const Splats splats = splats_of(saved[kShape], saved[kTail], saved[kPlanes]);
+  const Splats splats = splats_of(saved[kShape], saved[kPlanes]);
   const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
   const ImageGradient gradient{data<float>(image_gradient), data<float>(alpha_gradient), nullptr};
   if (saved[kSplat].numel() > 0)

@@ -114,7 +114,7 @@ TORCH_LIBRARY(splatwizard_training, m) {
   m.def("photometric_backward(Tensor x, Tensor y, Tensor slopes, Tensor scale, bool valid, float l1_weight,"
         " float ssim_weight) -> Tensor");
   m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
-        " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> ()");
+        " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> int[]");
   m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
         " Tensor(c!) max_radii) -> ()");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));

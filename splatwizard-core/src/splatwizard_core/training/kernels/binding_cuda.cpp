@@ -77,30 +77,38 @@ at::Tensor photometric_backward(const at::Tensor& x, const at::Tensor& y, const 
   return grad;
 }
 
-// One step of many tensors; lr and step per tensor, the rest common.
-void adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
-               const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
-               at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s, at::ArrayRef<double> beta2s,
-               at::ArrayRef<double> epss, at::IntArrayRef steps) {
+// Whether the kernel can update this parameter: float32, contiguous and aligned, all on the first one's GPU.
+bool fits_adam(const at::Tensor& first, int64_t step, std::initializer_list<const at::Tensor*> tensors) {
+  const at::Tensor& param = **tensors.begin();
+  for (const at::Tensor* tensor : tensors)
+    if (!tensor->is_cuda() || tensor->device() != first.device() || tensor->scalar_type() != at::kFloat ||
+        !tensor->is_contiguous() || tensor->sizes() != param.sizes() ||
+        reinterpret_cast<uintptr_t>(tensor->const_data_ptr()) % 16 != 0)
+      return false;
+  return step >= 1;
+}
+
+// One step of many tensors, in one launch. Returns the places of those that the kernel cannot take: they are left as
+// they were.
+std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
+                               const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
+                               at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s, at::ArrayRef<double> beta2s,
+                               at::ArrayRef<double> epss, at::IntArrayRef steps) {
   const size_t count = params.size();
   TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
                   lrs.size() == count && beta1s.size() == count && beta2s.size() == count && epss.size() == count &&
                   steps.size() == count,
               "adam: lists of different lengths");
-  if (count == 0) return;
+  std::vector<int64_t> left;
+  if (count == 0) return left;
   const c10::cuda::CUDAGuard guard(params[0].device());
   std::vector<kernels::AdamTensor> tensors;
+  tensors.reserve(count);
   for (size_t i = 0; i < count; ++i) {
-    const std::pair<const char*, const at::Tensor*> named[] = {
-        {"param", &params[i]}, {"grad", &grads[i]}, {"exp_avg", &exp_avgs[i]}, {"exp_avg_sq", &exp_avg_sqs[i]}};
-    for (const auto& [name, tensor] : named) {
-      check(*tensor, "adam", name);
-      TORCH_CHECK(tensor->numel() == params[i].numel() && tensor->device() == params[0].device(), "adam: ", name,
-                  " does not fit its parameter");
-      TORCH_CHECK(reinterpret_cast<uintptr_t>(tensor->const_data_ptr()) % 16 == 0, "adam: ", name,
-                  " must start at a multiple of 16 bytes");
+    if (!fits_adam(params[0], steps[i], {&params[i], &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
+      left.push_back(int64_t(i));
+      continue;
     }
-    TORCH_CHECK(steps[i] >= 1, "adam: step counts from 1, got ", steps[i]);
     const double t = static_cast<double>(steps[i]);
     tensors.push_back({params[i].mutable_data_ptr<float>(), grads[i].const_data_ptr<float>(),
                        exp_avgs[i].mutable_data_ptr<float>(), exp_avg_sqs[i].mutable_data_ptr<float>(),
@@ -110,10 +118,11 @@ void adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tens
                        static_cast<float>(1. / std::sqrt(1. - std::pow(beta2s[i], t))),
                        static_cast<float>(epss[i]), 0});
   }
-  for (size_t first = 0; first < count; first += kernels::kAdamTensors)
-    kernels::adam(tensors.data() + first, int(std::min<size_t>(kernels::kAdamTensors, count - first)),
+  for (size_t first = 0; first < tensors.size(); first += kernels::kAdamTensors)
+    kernels::adam(tensors.data() + first, int(std::min<size_t>(kernels::kAdamTensors, tensors.size() - first)),
                   c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return left;
 }
 
 void view_statistics(const at::Tensor& gradients, const at::Tensor& radii, const at::Tensor& grad_accum,

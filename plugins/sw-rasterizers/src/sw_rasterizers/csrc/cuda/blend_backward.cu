@@ -3,6 +3,10 @@
 // Pixels are walked back to front. For each splat that reaches the quarter a warp forms the sums over its 64 pixels
 // with shuffles and adds them to the Gaussian's row, one atomic instruction for all sums. Because the conic is
 // constant, moments of v = dL/dsigma are enough; the derivatives are put together in project_backward.
+//
+// A block walks a tile's whole list, or on small images a piece of it, from the state that `blend_few` kept there.
+#include <climits>
+
 #include "../blend.h"
 #include "kernels.h"
 #include "splat.h"
@@ -61,7 +65,13 @@ __global__ void __launch_bounds__(kThreads)
   __shared__ unsigned words[kBoxes][kWords];
   __shared__ unsigned block_last;
 
-  const int tile = int(blockIdx.x), tiles_x = view.tiles_x();
+  int tile = int(blockIdx.x), from = 0, to = INT_MAX;  // list positions of the block's pairs: [from, to)
+  if (image.pieces.where != nullptr) {
+    const int2 piece = image.pieces.where[blockIdx.x];
+    if (piece.x < 0) return;
+    tile = piece.x, from = piece.y, to = piece.y + kPiece;
+  }
+  const int tiles_x = view.tiles_x();
   const int begin = lists.start[tile];
   if (begin == lists.start[tile + 1]) return;
   const int x0 = tile % tiles_x * kTile, y0 = tile / tiles_x * kTile;
@@ -91,6 +101,13 @@ __global__ void __launch_bounds__(kThreads)
                   image.background[image.background_is_image ? channel * size + at : int64_t(channel)];
     }
     state.behind = state.transmittance * behind;
+    if (state.last > to) {  // more is drawn behind this piece
+      const int thread = (first_box + p * kBoxColumns) * kWarp + lane_index();
+      const float4 kept = image.pieces.behind[int64_t(blockIdx.x) * (kTile * kTile) + thread];
+      state.transmittance = kept.x;
+      state.behind += kept.y * state.gradient[0] + kept.z * state.gradient[1] + kept.w * state.gradient[2];
+      state.last = to;
+    }
   }
   // How many pairs from the front matter to the warp, and to the block.
   const int warp_last = int(warp_max(unsigned(max(pixel[0].last, pixel[1].last))));
@@ -107,10 +124,10 @@ __global__ void __launch_bounds__(kThreads)
                      : index < kAt ? (index - kMomentSums < chunk.count ? chunk.first + index : -1)
                                    : kMomentSums + rows.channels + index - kAt;
 
-  for (int stop = int(block_last); stop > 0; stop -= kThreads) {  // list positions [stop - kThreads, stop)
+  for (int stop = int(block_last); stop > from; stop -= kThreads) {  // list positions [stop - kThreads, stop)
     unsigned mask = 0;
     const int position = stop - 1 - int(threadIdx.x);
-    if (position >= 0) {
+    if (position >= from) {
       const int slot = lists.splat[begin + position];
       const float4 s0 = splats.shape[2 * int64_t(slot)], s1 = splats.shape[2 * int64_t(slot) + 1];
       const float2 tail = splats.tail[slot];
@@ -201,9 +218,10 @@ __global__ void median_kernel(int64_t pixels, const int32_t* median_splat, const
 }  // namespace
 
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
-                    const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
-                    cudaStream_t stream) {
-  const unsigned tiles = unsigned(view.tiles_x()) * unsigned(view.tiles_y());
+                    int64_t pairs, const Image& image, bool general, const ImageGradient& gradient, int detached,
+                    const Rows& rows, cudaStream_t stream) {
+  const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
+  const unsigned blocks = unsigned(image.pieces.where != nullptr ? piece_count(tiles, pairs) : tiles);
   const float clamp_limit = pass_clamp ? 3e38f : float(kAlphaMax);
   const auto kernel = general ? (rows.absgrad ? backward_kernel<true, true> : backward_kernel<true, false>)
                               : (rows.absgrad ? backward_kernel<false, true> : backward_kernel<false, false>);
@@ -212,7 +230,7 @@ void blend_backward(const View<float>& view, bool pass_clamp, const Splats& spla
     const int count = general && image.channels - first < kMaxChunk ? image.channels - first : step;
     const int influence = geometry - first < 0 ? 0 : (geometry - first < count ? geometry - first : count);
     const Chunk chunk{first, count, influence, first == 0 && gradient.alpha != nullptr};
-    kernel<<<tiles, kThreads, 0, stream>>>(view, splats, lists, image, gradient, chunk, clamp_limit, rows);
+    kernel<<<blocks, kThreads, 0, stream>>>(view, splats, lists, image, gradient, chunk, clamp_limit, rows);
   }
   if (gradient.median != nullptr) {
     constexpr int kBlock = 256;

@@ -7,6 +7,7 @@
 //   sort_pairs         pairs by tile; stable, so front to back within a tile
 //   find_tiles         where each tile's pairs start
 //   blend              pairs -> image
+//   blend_few          the same for three colours on small images; cuts the backward pass into pieces
 //   blend_flash, blend_tcgs   the same, approximately and faster, three colours, no state for a backward pass
 //   blend_backward     dL/dimage -> a row of sums for every Gaussian that was drawn
 //   project_backward   rows of sums -> gradients of the inputs
@@ -70,6 +71,19 @@ struct Rows {
   bool absgrad, median;
 };
 
+// Where an image has fewer tiles than this, a block a tile leaves most of the GPU idle and the longest list decides how
+// long it takes: the backward pass then takes a block for every kPiece pairs of a tile.
+constexpr int kFewTiles = 3000, kPiece = 256;
+
+// Pieces have a place each, empty ones included: those of a tile lie behind those of the tiles before it.
+SW_HD int64_t first_piece(int tile, int start) { return int64_t(start) / kPiece + tile; }
+inline int64_t piece_count(int64_t tiles, int64_t pairs) { return pairs / kPiece + tiles; }
+
+struct Pieces {
+  float4* behind;  // [pieces][kTile^2] by warp and lane of `blend_few`: transmittance at a piece's end, colours behind it
+  int2* where;     // [pieces] tile and first list position, or -1 if no pixel got that far; null: not cut
+};
+
 struct Image {  // what the forward pass writes, and the backward pass reads again
   int channels, color_channels;
   float* image;             // [channels][H][W]
@@ -80,6 +94,7 @@ struct Image {  // what the forward pass writes, and the backward pass reads aga
   int32_t* last;         // [H][W] 1-based list position of the last blended splat, or null
   float* median;         // [H][W] depth, or null
   int32_t* median_splat;  // [H][W] Gaussian of the median depth, -1 if none; or null
+  Pieces pieces;
 };
 
 struct ImageGradient {
@@ -105,22 +120,25 @@ void fill_channels(const Gaussians<float>& g, const Channels& channels, const Sp
 void visible_radii(const View<float>& view, const Gaussians<float>& g, const Settings& settings, int32_t* radii,
                    cudaStream_t stream);
 
-// Sorts `order` by `depth`. `scratch` null: only returns the bytes needed there. The result lies in `order` or in
-// `order_scratch`.
-size_t depth_order(void* scratch, size_t bytes, int count, uint32_t* depth, uint32_t* depth_scratch, int32_t* order,
-                   int32_t* order_scratch, int32_t** sorted, uint32_t** sorted_depth, cudaStream_t stream);
+// Sorts `order` by `depth`. The result lies in `order` or in `order_scratch`.
+size_t depth_order_scratch(int count);
+void depth_order(void* scratch, size_t bytes, int count, uint32_t* depth, uint32_t* depth_scratch, int32_t* order,
+                 int32_t* order_scratch, int32_t** sorted, uint32_t** sorted_depth, cudaStream_t stream);
 // Keys are uint16_t (`wide` false) or uint32_t. `compact` null: the values are splats as they are; else the splats are
 // also copied into depth order and the values count there.
 void emit(const View<float>& view, const Settings& settings, int count, const int32_t* order, const Splats& splats,
           const SplatWork& work, const Splats* compact, int channels, void* keys, bool wide, int32_t* values,
           Counters* counters, uint64_t* states, cudaStream_t stream);
-size_t sort_pairs(void* scratch, size_t bytes, int count, int key_bits, bool wide, void* keys, void* keys_scratch,
-                  int32_t* values, int32_t* values_scratch, void** sorted_keys, int32_t** sorted_values,
-                  cudaStream_t stream);
+size_t sort_pairs_scratch(int count, bool wide);
+void sort_pairs(void* scratch, size_t bytes, int count, int key_bits, bool wide, void* keys, void* keys_scratch,
+                int32_t* values, int32_t* values_scratch, void** sorted_keys, int32_t** sorted_values,
+                cudaStream_t stream);
 void find_tiles(int count, int tiles, const void* keys, bool wide, int32_t* start, cudaStream_t stream);
 
 void blend(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
            bool general, Counters* counters, const uint32_t* depth, cudaStream_t stream);
+void blend_few(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
+               cudaStream_t stream);
 // Into image.image, or into `bytes` [3][H][W] as 8-bit levels if that is not null; and image.alpha.
 void blend_flash(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
                  uint8_t* bytes, cudaStream_t stream);
@@ -128,8 +146,8 @@ void blend_tcgs(const View<float>& view, const Splats& splats, const TileLists& 
                 uint8_t* bytes, cudaStream_t stream);
 // The last `detached` channels do not influence the geometry; `pass_clamp`: the gradient passes the clamp of alpha.
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
-                    const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
-                    cudaStream_t stream);
+                    int64_t pairs, const Image& image, bool general, const ImageGradient& gradient, int detached,
+                    const Rows& rows, cudaStream_t stream);
 void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
                       const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
                       cudaStream_t stream);
