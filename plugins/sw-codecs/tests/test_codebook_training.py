@@ -83,6 +83,14 @@ def test_every_one_of_many_tight_clusters_gets_an_entry():
     assert error(plain, x) > 100 * error(vq, x)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_training_by_batches_misses_no_tight_cluster_whatever_the_seed(seed):
+    x = clusters(4000, 100, noise=0.01)
+    vq = VectorQuantizer(170)  # drawn blindly, they miss a cluster in six
+    vq.train(x, None, 50, 1500, generator=gen(seed))
+    assert error(vq, x) < 1.1 * 8 * 0.01**2
+
+
 def test_the_start_from_rows_is_drawn_by_weight_without_replacement():
     x = torch.arange(1000.0)[:, None]
     weights = torch.where(x[:, 0] < 100, 1000.0, 1e-3)
@@ -207,7 +215,7 @@ def test_ema_is_no_worse_than_official_and_fit_no_worse_than_both(k, size, noise
     assert error(vq, x, weights) <= 1.02 * found["ema"]
 
 
-def test_starved_entries_start_again_at_the_heaviest_rows_but_not_at_the_end():
+def test_starved_entries_start_again_at_the_costliest_rows_but_not_at_the_end():
     x = torch.cat([torch.randn(500, 2, generator=gen()) * 0.1, torch.tensor([[50.0, 50.0]])])
     weights = torch.ones(501)
     weights[500] = 100.0
@@ -318,5 +326,6 @@ def test_cuda_codebooks_are_as_good():
         found.append(float((vq.decode(symbols, side) - x.to(device)).square().sum(1).mean()))
         vq.train(x.to(device), None, 50, 5000, generator=torch.Generator(device).manual_seed(0))
         found.append(error(vq, x.to(device)))
+    # The devices draw other rows from one seed; of ten seeds on a CPU either error differs by less than 1 %.
     assert found[2] == pytest.approx(found[0], rel=0.05)
     assert found[3] == pytest.approx(found[1], rel=0.05)

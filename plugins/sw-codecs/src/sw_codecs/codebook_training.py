@@ -5,6 +5,8 @@ ema           rows by weight, distinct     N = g N + (1-g) n, M = g M + (1-g) m,
 official      U(-b, b), b = sqrt(6/(K d))  N = g N + (1-g) n,                    c = g c + (1-g) m / N'
 batch-mean    U(min x, max x)                                                    c = g c + (1-g) m / (n + 1e-5)
 
+`ema` also mends its start: starved entries begin again where the error is largest, and in the first half entries move
+as those of k-means do (`relocation.py`). Without it, what is reached depends on which rows were drawn first.
 N' is N with Laplace smoothing, (N + e) / (sum N + K e) * sum N, e = 1e-5. Under `official` and `batch-mean` an entry
 without rows shrinks towards 0; with these starts that is what brings it to the data.
 `ema` is ours. `official` is the loop that came with LightGaussian (arXiv 2311.17245) and that ChimeraGS uses;
@@ -20,12 +22,14 @@ from torch import Tensor
 
 from splatwizard_core.progress import track
 from sw_codecs.nearest import nearest
+from sw_codecs.relocation import relocate
 from sw_codecs.weighted_rows import draw, gather
 
 RULES = ("ema", "official", "batch-mean")
 EPSILON = 1e-5
 SETTLED = 0.9  # ema seeds no entries anew in the last tenth
 STARVED = 0.05  # nor those with more than this share of the mean count
+MOVES_EVERY = 10  # iterations; ema moves entries in the first half alone, since a batch is but a sample
 
 
 def train_codebook(
@@ -71,11 +75,16 @@ def train_codebook(
                 counts = decay * counts + (1 - decay) * n
                 if rule == "ema":
                     sums = decay * sums + (1 - decay) * m
+                    if reseed and i % MOVES_EVERY == MOVES_EVERY - 1 and i < iterations // 2:
+                        _move(counts, sums, n, m, relocate(rows, importance, index, distance, n, m, generator))
                     entries = (sums / smoothed(counts)[:, None]).to(x.dtype)
                 else:
                     entries = (decay * entries + (1 - decay) * m / smoothed(counts)[:, None]).to(x.dtype)
                 if reseed and (rule == "official" or i < SETTLED * iterations):
-                    _reseed(entries, counts, sums, rows, importance, drawn, reseed, starved_only=rule == "ema")
+                    # Ours goes by what an entry at the row would spare: weights, equal ones above all, hardly ever
+                    # point to a cluster that has no entry yet.
+                    worth = importance * distance if rule == "ema" else importance
+                    _reseed(entries, counts, sums, rows, worth, drawn, reseed, starved_only=rule == "ema")
             if project is not None:
                 entries = project(entries)
             bar.advance(1, error=errors[i])
@@ -88,6 +97,12 @@ def smoothed(counts: Tensor) -> Tensor:
     """Counts with Laplace smoothing: none is 0, their sum stays."""
     total = counts.sum()
     return ((counts + EPSILON) / (total + len(counts) * EPSILON) * total).clamp_min(1e-30)
+
+
+def _move(counts: Tensor, sums: Tensor, n: Tensor, m: Tensor, moved: tuple[Tensor, Tensor]) -> None:
+    """Where `moved` differs from the batch's n and m, an entry forgets what it was, in place."""
+    anew = (moved[0] != n) | (moved[1] != m).any(1)
+    counts[anew], sums[anew] = moved[0][anew], moved[1][anew]
 
 
 def _start(x: Tensor, weights: Tensor, size: int, rule: str, generator: torch.Generator) -> Tensor:
@@ -108,23 +123,23 @@ def _reseed(
     counts: Tensor,
     sums: Tensor,
     rows: Tensor,
-    importance: Tensor,
+    worth: Tensor,
     drawn: Tensor,
     most: int,
     *,
     starved_only: bool,
 ) -> None:
-    """Overwrite up to `most` entries of the smallest counts with the rows of the largest weights, in place."""
+    """Overwrite up to `most` entries of the smallest counts with the rows of the largest `worth`, in place."""
     weakest = torch.topk(counts, min(most, len(counts)), largest=False).indices
-    heaviest = torch.topk(importance, min(8 * most if starved_only else most, len(rows))).indices
+    best = torch.topk(worth, min(8 * most if starved_only else most, len(rows))).indices
     if starved_only:
         mean = counts.sum() / len(counts)
         weakest = weakest[counts[weakest] < STARVED * mean]
         # A row that the batch holds twice makes one entry.
-        rows_once = dict(zip(reversed(drawn[heaviest].tolist()), reversed(heaviest.tolist()), strict=True))
-        heaviest = heaviest.new_tensor(list(reversed(rows_once.values())))
-    weakest, heaviest = weakest[: len(heaviest)], heaviest[: len(weakest)]
-    entries[weakest] = rows[heaviest]
+        rows_once = dict(zip(reversed(drawn[best].tolist()), reversed(best.tolist()), strict=True))
+        best = best.new_tensor(list(reversed(rows_once.values())))
+    weakest, best = weakest[: len(best)], best[: len(weakest)]
+    entries[weakest] = rows[best]
     if starved_only:
         counts[weakest] = mean
         sums[weakest] = mean * entries[weakest].to(torch.float64)

@@ -100,9 +100,10 @@ class VectorQuantizer:
         batch       rows drawn with replacement for each iteration, at most N
         generator   seeds the start and the batches
         rule        "ema", "official" or "batch-mean": start and update, see sw_codecs.codebook_training
-        reseed      entries at most that are overwritten after an iteration, those of the smallest counts, with the
-                    batch's rows of the largest weights. "ema": only entries with less than 5 % of the mean count, and
-                    none in the last tenth; "official": always; "batch-mean": never
+        reseed      entries at most that are overwritten after an iteration, those of the smallest counts, with rows of
+                    the batch. "ema": only entries with less than 5 % of the mean count, with the rows of the largest
+                    weighted error, and none in the last tenth (in the first half entries also move, unless it is 0);
+                    "official": always, with the rows of the largest weights; "batch-mean": never
         start       [K, d], instead of the start of the rule
         project     codebook -> codebook, applied after each iteration (shapes with trace 1, say)
         label       what the progress display calls it
