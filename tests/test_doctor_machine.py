@@ -104,3 +104,20 @@ def test_without_the_method_the_main_job_cannot_run():
     assert done.returncode == 1
     job = checks_of(done)["sw run --method 3dgs --scene demo"]
     assert (job["state"], job["mend"]) == ("broken", "unset SW_PLUGINS")
+
+
+def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
+    import importlib.util
+
+    import torch
+
+    from splatwizard_core.experiments.doctor import probe
+    from splatwizard_core.plugins import load_plugins
+
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *a: None if name == "gsplat" else find_spec(name, *a))
+    plugins = load_plugins()
+    found = probe._check_rasterizer(plugins.rasterizers.entry("gsplat"), plugins)
+    assert (found.state, found.detail) == ("missing", "gsplat is not installed")
+    assert found.mend == "pip install 'sw-gsplat[gsplat]'"
