@@ -1,7 +1,9 @@
 """Codebooks of `vq` beside scikit-learn's MiniBatchKMeans: seconds, memory, error after equal passes over equal rows.
 
     python benchmarks/vector_quantization.py [--rows 1000000] [--codes 8192] [--passes 5] [--device cpu] [--data sh]
-    python benchmarks/vector_quantization.py --rows 50000 --codes 512        # seconds instead of minutes
+    python benchmarks/vector_quantization.py --rows 50000 --codes 512          # seconds instead of minutes
+    python benchmarks/vector_quantization.py --only fit --only train           # without scikit-learn
+    python benchmarks/vector_quantization.py --only sklearn                    # scikit-learn alone, on another machine
 
 Each contestant runs in a process of its own, so that its peak memory is its own; all use the threads that
 OMP_NUM_THREADS allows. A pass is one look at as many rows as there are: N * K distances. What each does before its
@@ -18,7 +20,6 @@ import argparse
 import importlib.util
 import json
 import os
-import resource
 import subprocess
 import sys
 import tempfile
@@ -28,6 +29,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from splatwizard_core.memory import peak_rss_bytes
 from splatwizard_core.plugins import load_plugins
 
 CONTESTANTS = {"fit": "vq.fit", "train": "vq.train, ema", "sklearn": "MiniBatchKMeans"}
@@ -78,8 +80,8 @@ def contest(options):
         seconds = time.perf_counter() - start
     np.save(options.save, codebook)
     gpu = torch.cuda.max_memory_allocated() if options.device.startswith("cuda") else 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
-    print(json.dumps({"seconds": seconds, "memory": peak, "gpu": gpu}))
+    # Not getrusage: a child's figure there begins with what its parent held.
+    print(json.dumps({"seconds": seconds, "memory": peak_rss_bytes(), "gpu": gpu}))
 
 
 def main():
