@@ -168,3 +168,29 @@ def test_the_state_of_a_phase_survives_a_checkpoint(begun):
     assert [p.requires_grad for p in again.parameters()] == [p.requires_grad for p in model.parameters()]
     rows = torch.arange(5)
     assert torch.equal(again.predict(rows).means[1], model.predict(rows).means[1])
+
+
+@pytest.mark.parametrize("values", [{}, {"context__refine": True}, {"context__units": "steps"}])
+def test_what_training_forecasts_for_a_sample_is_what_is_predicted(begun, values):
+    stage, model, optimizer = begun(**values)
+    stage.setup_triplane(model, optimizer)
+    stage.round_planes(model)
+    with torch.no_grad():
+        for network in model.context.slices.networks.values():
+            network[-1].weight.fill_(0.01)
+        for plane in model.context.triplane.planes:
+            plane *= 100
+    rows, drawn = torch.arange(model.num_rows).flip(0), torch.tensor([3, 1])
+    learned = [p for name, p in model.context.named_parameters() if not name.startswith("arms")]
+    noisy = torch.cat(model.raw(rows), dim=1).detach()
+    context = model.refine(model.predict(rows), noisy[:, : model.features.shape[1]])
+    forecast = model.forecast(rows)
+    mean, scale = forecast.sample(drawn, forecast.hidden[drawn], noisy[drawn])
+    expected = [torch.cat(parts, dim=1) for parts in (context.steps, context.means, context.scales)]
+    expected = [expected[0], expected[1][drawn], expected[2][drawn]]
+    found = [forecast.steps, mean, scale]
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+    gradients = [torch.autograd.grad(sum(part.sum() for part in each), learned) for each in (found, expected)]
+    for a, b in zip(*gradients, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)

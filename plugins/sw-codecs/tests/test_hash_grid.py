@@ -7,6 +7,7 @@ import torch
 
 from splatwizard_core.plugins import load_plugins
 from sw_codecs.hash_grid import HashGrid, MixedHashGrid
+from sw_codecs.rates import mask_bits
 
 
 def generator(seed=0):
@@ -220,3 +221,34 @@ def test_cuda_equals_cpu():
     there = grid.cuda()
     torch.testing.assert_close(there(codes.cuda() / 65535).cpu(), features, atol=1e-5, rtol=1e-5)
     assert torch.equal(there.integer_features(codes.cuda()).cpu(), integers)
+
+
+def test_all_grids_in_one_lookup_equal_them_one_by_one():
+    grid = MixedHashGrid([6, 9, 20], [9, 40], features=3, log2_space=7, log2_planes=6, generator=generator())
+    with torch.no_grad():
+        for each in grid.grids:
+            each.table.copy_(torch.randn(each.table.shape, generator=generator(1)))
+    x = torch.cat([torch.rand(50, 3, generator=generator(2)), torch.tensor([[0.0, 1.0, 1.2]])])
+    weights = torch.randn(51, grid.width, generator=generator(3))
+
+    def one_by_one():
+        values = [each.values() for each in grid.grids]
+        found = [each(x[:, list(axes)], v) for each, axes, v in zip(grid.grids, grid.AXES, values, strict=True)]
+        ones = torch.cat([(v.reshape(-1) + 1) / 2 for v in values])
+        return torch.cat(found, dim=1), mask_bits(ones)
+
+    places = grid.places(x)
+    halves = grid.places(x[:20]), grid.places(x[20:])
+    assert all(torch.equal(a, torch.cat(b)) for a, b in zip(places, zip(*halves, strict=True), strict=True))
+    assert all(torch.equal(a[5:7], b) for a, b in zip(places, places.rows(torch.tensor([5, 6])), strict=True))
+    assert grid.place_bytes == sum(each[0].numel() * each.element_size() for each in places)
+    tables = [each.table for each in grid.grids]
+    results, gradients = [], []
+    for found in (grid.at_places(places), one_by_one()):
+        results.append(found)
+        gradients.append(torch.autograd.grad((found[0] * weights).sum() + 0.3 * found[1], tables))
+    for a, b in zip(results[0], results[1], strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+    for a, b in zip(*gradients, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+    assert grid.at_places(grid.places(torch.zeros(0, 3)))[0].shape == (0, grid.width)

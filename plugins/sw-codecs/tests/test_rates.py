@@ -89,3 +89,20 @@ def test_mask_bits_count_ones_and_the_stored_share():
     mask.requires_grad_()
     rates.mask_bits(mask).backward()
     assert (mask.grad > 0).all()  # fewer than half are ones: one more costs more
+
+
+@pytest.mark.parametrize("grad_below_bound", [True, False])
+def test_the_gradient_of_gaussian_bits_is_that_of_its_parts(grad_below_bound):
+    g = torch.Generator().manual_seed(0)
+    x, mu = (torch.randn(40, 6, generator=g, dtype=torch.float64) for _ in range(2))
+    x[:4] *= 30  # far out: below the bound
+    sigma = torch.rand(40, 6, generator=g, dtype=torch.float64) + 0.02
+    step = torch.rand(40, 1, generator=g, dtype=torch.float64) + 0.1
+    weights = torch.randn(40, 6, generator=g, dtype=torch.float64)
+    leaves = [t.requires_grad_() for t in (x, mu, sigma, step)]
+    found = rates.gaussian_bits(*leaves, p_min=1e-6, grad_below_bound=grad_below_bound)
+    expected = rates.bits_of(rates.gaussian_mass(*leaves), 1e-6, grad_below_bound)
+    torch.testing.assert_close(found, expected)
+    assert float(found.detach().max()) == pytest.approx(19.93, abs=0.01)
+    for a, b in zip(*(torch.autograd.grad((each * weights).sum(), leaves) for each in (found, expected)), strict=True):
+        torch.testing.assert_close(a, b)

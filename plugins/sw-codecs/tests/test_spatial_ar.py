@@ -152,3 +152,22 @@ def test_gradients_pull_a_scale_back_into_the_range_of_the_coder():
         made.layers[-1].bias.copy_(torch.tensor([0.0, 20.0]))  # scale e^-10, values 1: too narrow by far
     made.bits(torch.ones(1, 3, 3)).sum().backward()
     assert made.layers[-1].bias.grad[1] > 0
+
+
+@pytest.mark.parametrize("learn", [True, False])
+def test_all_planes_in_one_node_cost_what_they_cost_one_by_one(learn):
+    g = torch.Generator().manual_seed(0)
+    networks = [SpatialAr(g) for _ in range(3)]
+    with torch.no_grad():
+        for network in networks:
+            for parameter in network.parameters():
+                parameter.add_(torch.randn(parameter.shape, generator=g) * 0.2)
+            network.layers[-1].weight[1] *= 20  # some scales beyond the coder's
+    planes = [(torch.randn(3, 2, *size, generator=g) * 4).requires_grad_(learn) for size in ((1, 1), (5, 7), (9, 4))]
+    leaves = [*(planes if learn else []), *(p for network in networks for p in network.parameters())]
+    found = SpatialAr.joint_bits(networks, planes)
+    expected = sum(a.bits(each).sum() for plane in planes for a, each in zip(networks, plane, strict=True))
+    torch.testing.assert_close(found, expected, rtol=1e-5, atol=0)
+    for a, b in zip(*(torch.autograd.grad(3 * each, leaves) for each in (found, expected)), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4 * float(b.abs().max()))
+        assert a.data_ptr() % 16 == 0

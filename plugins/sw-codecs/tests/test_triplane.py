@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.outliers import inliers, local_outlier_factor
 from sw_codecs.principal_frame import UNIT, PrincipalFrame, contract
-from sw_codecs.triplane import Triplane
+from sw_codecs.triplane import GAIN, Triplane
 
 
 def cloud(n=2000, seed=0):
@@ -169,3 +169,29 @@ def test_places_and_features_are_the_same_integers_on_cuda():
     integers = made.integers()
     assert torch.equal(made.exact([i.cuda() for i in integers], places.cuda()).cpu(), made.exact(integers, places))
     assert (made.cuda()(places.cuda()).cpu() - made.cpu()(places)).abs().max() < 1e-4
+
+
+@pytest.mark.parametrize("rounded", [True, False])
+def test_one_node_samples_as_grid_sample_does(rounded):
+    planes = Triplane(4, 3, (1, 2, 3), generator=torch.Generator().manual_seed(0))
+    places = torch.randint(0, UNIT + 1, (30, 3), generator=torch.Generator().manual_seed(1))
+    weights = torch.randn(30, planes.width, generator=torch.Generator().manual_seed(2))
+    with torch.no_grad():
+        for plane in planes.planes:
+            plane *= 100
+
+    def written_out():
+        sites = planes.sites(places)
+        total, found = 0, []
+        for plane in planes.planes:
+            if rounded:
+                plane = plane + (torch.round(plane * GAIN) / GAIN - plane).detach()
+            total = total + torch.nn.functional.grid_sample(plane, sites, padding_mode="border", align_corners=True)
+            found.append(total[:, :, 0])
+        return torch.cat(found).flatten(0, 1).T
+
+    results = planes(places, rounded=rounded), written_out()
+    torch.testing.assert_close(*results, atol=1e-6, rtol=1e-5)
+    gradients = [torch.autograd.grad((each * weights).sum(), list(planes.planes)) for each in results]
+    for a, b in zip(*gradients, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)

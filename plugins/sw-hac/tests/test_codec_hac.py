@@ -290,8 +290,9 @@ def test_a_damaged_section_is_answered(name, place, value, how):
         found = decoded(damaged)
     except BitstreamError:
         return
-    # Some bytes are plain numbers: bounds, weights of the networks that only draw.
-    assert name in ("anchors", "networks")
+    # Some bytes are plain numbers: bounds, weights of the networks that only draw. And the last bits of a stream may be
+    # any: what they decode to is the same.
+    assert name in ("anchors", "networks") or found.digest() == decoded(BLOCK).digest()
     assert how == "flip"
     assert all(bool(torch.isfinite(p).all()) for p in found.parameters())
 

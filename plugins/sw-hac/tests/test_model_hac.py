@@ -143,3 +143,23 @@ def test_the_state_of_grid_and_network_is_part_of_the_digest():
 
 def test_the_entropy_model_is_the_registrys():
     assert type(make().entropy) is PLUGINS.entropy_models.load("gaussian-exact")
+
+
+@pytest.mark.parametrize("in_steps", [True, False])
+@pytest.mark.parametrize("kept", [True, False])
+def test_what_training_forecasts_for_a_sample_is_what_is_predicted(in_steps, kept, monkeypatch):
+    monkeypatch.setattr("sw_hac.model.PLACES_LIMIT", 1 << 30 if kept else 0)
+    model = make(in_steps=in_steps)
+    rows, drawn = torch.tensor([7, 3, 250, 20]), torch.tensor([3, 1])
+    parameters = [*model.mlp_grid.parameters(), *model.grid.parameters()]
+    context, forecast = model.predict(rows), model.forecast(rows)
+    mean, scale = forecast.sample(drawn, forecast.hidden[drawn], torch.zeros(2, 26))
+    expected = [torch.cat(parts, dim=1) for parts in (context.steps, context.means, context.scales)]
+    expected = [expected[0], expected[1][drawn], expected[2][drawn], context.own_bits]
+    found = [forecast.steps, mean, scale, forecast.own_bits]
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+    gradients = [torch.autograd.grad(sum(part.square().sum() for part in each[:3]) + each[3], parameters)
+                 for each in (found, expected)]  # fmt: skip
+    for a, b in zip(*gradients, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-4)

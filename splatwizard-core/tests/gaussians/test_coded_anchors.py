@@ -144,9 +144,10 @@ def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
     rows = torch.arange(60)
     rate = model.attributes(rows).extras["rate"]
     assert rate.numbers == 40 * (5 + 6 + 12)
-    masks, context = model.masks(rows), model.predict(rows)
+    masks, forecast = model.masks(rows), model.forecast(rows)
     values = tuple(v.detach() for v in model.raw(rows))
-    again = model.rate(rows, values, context, masks)
+    steps = forecast.steps.repeat_interleave(torch.tensor([5, 6, 12]), dim=1)
+    again = model.rate(torch.cat(values, dim=1), steps, forecast, masks)
     bits = Gaussians().bits(values[2], Gaussians.FloatContext(0.0, 1.0, 0.2, 1e-6)) * masks.repeat_interleave(3, 1)
     torch.testing.assert_close(again.by_group[2], bits[20:].sum().detach(), rtol=1e-4, atol=0.01)
     torch.testing.assert_close(again.bits, again.by_group.sum() / rate.numbers * 40 / 60)

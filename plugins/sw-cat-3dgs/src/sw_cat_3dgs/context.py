@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.gaussians.coded_anchors import AnchorContext
+from splatwizard_core.gaussians.coded_anchors import AnchorContext, AnchorForecast
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
@@ -145,13 +145,44 @@ class CatContext(nn.Module):
         means, scales = (tuple(out[2 * i + second] * unit for i, unit in enumerate(self.units)) for second in (0, 1))
         return AnchorContext(means, scales, tuple(steps.split(1, dim=1)))
 
+    def forecast(self, sites: Tensor, base_steps: Tensor) -> AnchorForecast:
+        """The same for training: of anchors at sites [3,1,V,2] of the triplane; base_steps [3] of the shape.
+
+        All anchors have noise of their own steps; means and scales are computed for the sample alone.
+        """
+        first, last = self.network[0], self.network[2]
+        assert isinstance(first, nn.Linear)
+        assert isinstance(last, nn.Linear)
+        hidden = torch.relu(first(self.triplane.at_sites(sites, rounded=self.rounded)))
+        widths = self.shape.splits[:-1]
+        weights = last.weight.split([sum(widths), PLANES])
+        biases = last.bias.split([sum(widths), PLANES])
+        steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
+
+        def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
+            assert hidden is not None
+            out = nn.functional.linear(hidden, weights[0], biases[0]).split(widths, dim=1)
+            if self.in_steps:
+                out = tuple(
+                    part * unit for part, unit in zip(out, (u for u in self.units for _ in (0, 1)), strict=True)
+                )
+            first, second = self._refined(out[0::2], out[1::2], values[:, : self.shape.features])
+            return torch.cat(first, dim=1), torch.cat(second, dim=1)
+
+        return AnchorForecast(steps, None, hidden, sample)
+
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
         """The context once features [V,F] are known: each slice sees those before it."""
-        found = [self.slices(features, context.means[0], context.scales[0])]
-        for name, mean, scale in zip(("scales", "offsets"), context.means[1:], context.scales[1:], strict=True):
-            found.append(self.slices.refine(name, features, mean, scale) if self.shape.refine else (mean, scale))
-        means, scales = zip(*found, strict=True)
+        means, scales = self._refined(context.means, context.scales, features)
         return dataclasses.replace(context, means=means, scales=scales)
+
+    def _refined(self, means: Any, scales: Any, features: Tensor) -> tuple[Any, Any]:
+        """Means and scales by group."""
+        found = [self.slices(features, means[0], scales[0])]
+        for name, mean, scale in zip(("scales", "offsets"), means[1:], scales[1:], strict=True):
+            found.append(self.slices.refine(name, features, mean, scale) if self.shape.refine else (mean, scale))
+        first, second = zip(*found, strict=True)
+        return first, second
 
     def triplane_bits(self, noise: Any, share: float = 1.0) -> Tensor:
         """Bits of the planes with noise in place of rounding; symbols and their neighbours alike.
@@ -162,12 +193,9 @@ class CatContext(nn.Module):
         channels = self.shape.channels
         count = max(1, round(share * channels))
         chosen = torch.argsort(noise(channels))[:count] if count < channels else None
-        total = self.frame.new_zeros(())
-        for plane in self.triplane.planes:
-            values = 16 * (plane if chosen is None else plane[:, chosen])
-            values = values + noise(*values.shape) - 0.5
-            bits = [arm.bits(each).sum() for arm, each in zip(self.arms, values, strict=True)]
-            total = total + torch.stack(bits).sum()
+        planes = [plane if chosen is None else plane.index_select(1, chosen) for plane in self.triplane.planes]
+        values = [noise(*plane.shape).sub_(0.5).add(plane, alpha=16) for plane in planes]
+        total: Tensor = self.arms[0].joint_bits(list(self.arms), values)
         return total * (channels / count)
 
 

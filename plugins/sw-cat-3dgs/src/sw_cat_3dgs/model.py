@@ -8,7 +8,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.coded_anchors import AnchorContext, CodedAnchors
+from splatwizard_core.gaussians.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
@@ -37,7 +37,7 @@ class CatAnchors(CodedAnchors):
         self.views_stale = True
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
-        self._places: tuple[Tensor, Tensor, int, Tensor] | None = None
+        self._places: tuple[Tensor, Tensor, int, Tensor, Tensor] | None = None
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -45,22 +45,32 @@ class CatAnchors(CodedAnchors):
     @torch.no_grad()
     def count_views(self, cameras: Iterable[Camera], rasterizer: Rasterizer) -> None:
         """Weigh each anchor by how many of the cameras see it; what none sees is dropped."""
-        seen = torch.zeros_like(self.view_weights)
+        seen, balls = torch.zeros_like(self.view_weights), self.balls()
         for camera in cameras:
-            seen[self.visible_anchors(camera.to(self.device), rasterizer)] += 1
+            seen += rasterizer.visible_filter(balls, camera.to(self.device)) > 0
         self.view_weights = self.view_factor * seen / seen.mean().clamp(min=1e-12)
         self.views_stale = False
 
     def places(self) -> Tensor:
         """[N,3] integer places of the anchors in the triplane, kept until anchors or frame are others."""
+        return self._kept_places()[0]
+
+    def _kept_places(self) -> tuple[Tensor, Tensor]:
+        """The places, and their sites on the planes."""
         codes, frame = self.codes(), self.context.frame
         kept = self._places
         if kept is None or kept[0] is not codes or kept[1] is not frame or kept[2] != frame._version:
-            kept = self._places = (codes, frame, frame._version, self.context.places(codes, self.bounds))
-        return kept[3]
+            places = self.context.places(codes, self.bounds)
+            kept = self._places = (codes, frame, frame._version, places, self.context.triplane.sites(places))
+        return kept[3], kept[4]
 
     def predict(self, rows: Tensor) -> AnchorContext:
         found: AnchorContext = self.context(self.places()[rows])
+        return found
+
+    def forecast(self, rows: Tensor) -> AnchorForecast:
+        sites = self._kept_places()[1].index_select(2, rows)
+        found: AnchorForecast = self.context.forecast(sites, self.base_steps_like(sites))
         return found
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,6 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from sw_codecs.binary import SteBinary
-from sw_codecs.rates import mask_bits
 
 PRIMES = (1, 2654435761, 805459861)
 INITIAL = 1e-4
@@ -30,6 +29,10 @@ FRACTION = 12
 POSITION_TOP = 65535
 INTEGER_ROWS = 1 << 14
 """Rows of `integer_features` that are looked up together."""
+PLACE_ROWS = 1 << 16
+"""Rows of `places` that are worked out together."""
+SUMMED = 1 << 26
+"""Numbers of a gradient that are summed together, at most about so many: bounds memory."""
 
 
 @dataclass(frozen=True)
@@ -152,6 +155,19 @@ class HashGrid(nn.Module):
         n, levels = len(x), len(self.levels)
         if n == 0:
             return values.new_zeros(0, self.width)
+        index, weights = self._corners_of(x)
+        index, weights = index.view(n * levels, -1), weights.to(values.dtype).view(n * levels, -1)
+        found = _WeightedRows.apply(values, index, weights, levels)
+        return self._sorted(found.view(n, levels, self.features))
+
+    @torch.no_grad()
+    def places(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Entries of the table (int32) and their weights (dtype of x), both [n, levels, 2^d], levels in their order."""
+        index, weights = self._corners_of(x)
+        return (index, weights) if self._in_order else (index[:, self._order], weights[:, self._order])
+
+    def _corners_of(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The same in the order of the buffers; weights are differentiable for x."""
         inside = ((x >= 0) & (x <= 1)).all(dim=1, keepdim=True)
         lower, ends = [], []
         for coordinate in x.clamp(0, 1).unbind(1):
@@ -168,10 +184,7 @@ class HashGrid(nn.Module):
                 total = torch.where(total > 0, total, torch.ones_like(total))
                 near, far = near / total * inside, far / total * inside
             ends.append((near, far))
-        weights = _corners(ends, torch.mul).to(values.dtype)
-        index = self._entries(lower)
-        found = _WeightedRows.apply(values, index.view(n * levels, -1), weights.view(n * levels, -1), levels)
-        return self._sorted(found.view(n, levels, self.features))
+        return self._entries(lower), _corners(ends, torch.mul)
 
     def integer_features(self, codes: Tensor) -> Tensor:
         """[n, width] int64 with 12 fractional bits, of 16-bit codes [n,d] (x = code / 65535); integers alone.
@@ -236,6 +249,23 @@ class HashGrid(nn.Module):
         return f"{kind}, {self.dimensions} axes, resolutions {[level.resolution for level in self.levels]}"
 
 
+class GridPlaces(NamedTuple):
+    """Of n points in a MixedHashGrid: entries (int32, of all its tables in a row) and weights of the corners.
+
+    space, space_weights        [n, levels over space, 8]
+    planes, planes_weights      [n, levels over the three planes, 4]
+    """
+
+    space: Tensor
+    space_weights: Tensor
+    planes: Tensor
+    planes_weights: Tensor
+
+    def rows(self, rows: Tensor) -> GridPlaces:
+        """Those of some of the points."""
+        return GridPlaces(*(each.index_select(0, rows) for each in self))
+
+
 class MixedHashGrid(nn.Module):
     """Binary grids over (x,y,z), (x,y), (x,z) and (y,z), outputs in this order: the context of HAC.
 
@@ -290,13 +320,36 @@ class MixedHashGrid(nn.Module):
         return self.with_bits(x)[0]
 
     def with_bits(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """The features, and the bits of all signs under their own share of ones (+ 32), a differentiable scalar."""
-        values = [grid.values() for grid in self._all()]
-        found = [
-            grid(x[:, list(axes)], signs) for grid, axes, signs in zip(self._all(), self.AXES, values, strict=True)
-        ]
-        ones = torch.cat([(signs.reshape(-1) + 1) / 2 for signs in values])
-        return torch.cat(found, dim=1), mask_bits(ones)
+        """The features, and the bits of all signs under their own share of ones (+ 32), a differentiable scalar.
+
+        Not differentiable for x.
+        """
+        return self.at_places(self.places(x))
+
+    @property
+    def place_bytes(self) -> int:
+        """Of `places`, a row."""
+        return sum(8 * len(grid.levels) << grid.dimensions for grid in self._all())
+
+    @torch.no_grad()
+    def places(self, x: Tensor) -> GridPlaces:
+        """Where [n,3] in [0,1] lie: what a lookup needs, and no training changes."""
+        blocks = [self._places(block) for block in x.split(PLACE_ROWS)]
+        return blocks[0] if len(blocks) == 1 else GridPlaces(*(torch.cat(each) for each in zip(*blocks, strict=True)))
+
+    def _places(self, x: Tensor) -> GridPlaces:
+        start, found = 0, []
+        for grid, axes in zip(self._all(), self.AXES, strict=True):
+            index, weights = grid.places(x[:, list(axes)])
+            found.append((index + start, weights))
+            start += len(grid.table)
+        planes = [torch.cat([each[i] for each in found[1:]], dim=1) for i in (0, 1)]
+        return GridPlaces(*found[0], *planes)
+
+    def at_places(self, places: GridPlaces) -> tuple[Tensor, Tensor]:
+        """`with_bits` of what `places` was made from."""
+        features, bits = _BinaryLookup.apply(*places, *(grid.table for grid in self._all()))
+        return features, bits
 
     def integer_features(self, codes: Tensor) -> Tensor:
         """[n,3] 16-bit codes -> [n, width] int64 with 12 fractional bits."""
@@ -366,3 +419,59 @@ class _WeightedRows(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             for_weights = (values[index.to(torch.int64)] * grad[:, None]).sum(dim=2)
         return for_values, None, for_weights, None
+
+
+class _BinaryLookup(torch.autograd.Function):
+    """Features [n, width] and the bits of all signs, of a MixedHashGrid at GridPlaces: all its grids in one node.
+
+    The tables get a straight-through gradient within [-1,1], as of `SteBinary`, and that of `rates.mask_bits`.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, space: Tensor, space_weights: Tensor, planes: Tensor, planes_weights: Tensor, *tables: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        table = torch.cat(tables)
+        positive = table >= 0
+        signs = positive.to(table.dtype).mul_(2).sub_(1)
+        found = [
+            F.embedding_bag(i.flatten(0, 1), signs, per_sample_weights=w.flatten(0, 1), mode="sum").view(
+                len(i), i.shape[1] * table.shape[1]
+            )
+            for i, w in ((space, space_weights), (planes, planes_weights))
+        ]
+        ones = positive.sum(dtype=table.dtype)
+        share = (ones / table.numel()).clamp(1e-6, 1 - 1e-6)
+        one, zero = -torch.log2(share), -torch.log2(1 - share)  # bits of each
+        ctx.save_for_backward(space, space_weights, planes, planes_weights, table, one - zero)
+        ctx.sizes = [len(t) for t in tables]
+        return torch.cat(found, dim=1), ones * one + (table.numel() - ones) * zero + 32
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_features: Tensor, to_bits: Tensor) -> tuple[Tensor | None, ...]:
+        space, space_weights, planes, planes_weights, table, dearer = ctx.saved_tensors
+        width = space.shape[1] * table.shape[1]
+        total = torch.zeros_like(table)
+        for index, weights, part in (
+            (space, space_weights, to_features[:, :width]),
+            (planes, planes_weights, to_features[:, width:]),
+        ):
+            _add_weighted_rows(total, index, weights, part.unflatten(1, (index.shape[1], table.shape[1])))
+        total += to_bits * dearer / 2  # a sign is twice its bit, less one
+        total *= table.abs() <= 1
+        return None, None, None, None, *total.split(ctx.sizes)
+
+
+def _add_weighted_rows(total: Tensor, index: Tensor, weights: Tensor, grad: Tensor) -> None:
+    """total[index] += weights * grad, for index and weights [n,L,c], grad [n,L,F], total [entries,F]; all summed."""
+    features = total.shape[1]
+    at_once = max(1, SUMMED // max(index[:1].numel() * features, 1))
+    columns = None if total.is_cuda else torch.arange(features)
+    for i, w, g in zip(index.split(at_once), weights.split(at_once), grad.split(at_once), strict=True):
+        source = w[..., None] * g[:, :, None]
+        if columns is None:
+            total.index_add_(0, i.reshape(-1), source.view(-1, features))
+        else:  # on a CPU a seventh of the time of the above
+            places = i.to(torch.int64)[..., None] * features + columns
+            total.view(-1).scatter_add_(0, places.reshape(-1), source.reshape(-1))

@@ -8,10 +8,11 @@ mode of the codec library, rules 1 and 2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from sw_codecs.principal_frame import UNIT, PrincipalFrame
 
@@ -21,6 +22,7 @@ GAIN = 16
 """Integers of the file are round(GAIN * value)."""
 INTEGER_LIMIT = 1 << 24
 ROWS_AT_ONCE = 1 << 13
+_SAMPLING = (0, 1, True)  # bilinear, border, align_corners, as torch numbers them
 
 
 class Triplane(nn.Module):
@@ -62,16 +64,17 @@ class Triplane(nn.Module):
 
         rounded     planes as the file will have them; the gradient passes straight through the rounding
         """
+        return self.at_sites(self.sites(places), rounded=rounded)
+
+    def sites(self, places: Tensor) -> Tensor:
+        """Where `places` lie on the planes, [3,1,n,2] in -1..1: what no training changes."""
         at = places.to(self.planes[0]) * (2.0 / UNIT) - 1
-        grid = torch.stack([at[:, pair] for pair in PAIRS])[:, None]  # [3,1,n,2]
-        total, found = None, []
-        for plane in self.planes:
-            if rounded:
-                plane = plane + (torch.round(plane.detach() * GAIN) / GAIN - plane.detach())
-            sample = nn.functional.grid_sample(plane, grid, padding_mode="border", align_corners=True)  # [3,C,1,n]
-            total = sample if total is None else total + sample
-            found.append(total[:, :, 0])
-        return torch.cat(found).flatten(0, 1).T
+        return torch.stack([at[:, pair] for pair in PAIRS])[:, None]
+
+    def at_sites(self, sites: Tensor, *, rounded: bool = True) -> Tensor:
+        """`forward` of the places that `sites` was made from."""
+        found: Tensor = _Sampled.apply(sites, rounded, *self.planes)  # type: ignore[no-untyped-call]
+        return found
 
     def integers(self) -> list[Tensor]:
         """What goes into the file: int64 [3, C, m B, m B] per scale. Raises ValueError if a value is not finite."""
@@ -92,6 +95,33 @@ class Triplane(nn.Module):
         corners = [plane.flatten(2).transpose(1, 2).contiguous() for plane in integers]  # [3, R*R, C]
         found = [_exact_rows(integers, corners, block) for block in places.split(ROWS_AT_ONCE)]
         return torch.cat(found)
+
+
+class _Sampled(torch.autograd.Function):
+    """Features [n, width] of planes at sites; bilinear, border as padding, corners aligned."""
+
+    @staticmethod
+    def forward(ctx: Any, sites: Tensor, rounded: bool, *planes: Tensor) -> Tensor:
+        values = [torch.round(plane * GAIN).div_(GAIN) for plane in planes] if rounded else list(planes)
+        found: list[Tensor] = []
+        for plane in values:
+            sample = torch.grid_sampler_2d(plane, sites, *_SAMPLING)  # [3,C,1,n]
+            found.append(sample.add_(found[-1]) if found else sample)
+        ctx.save_for_backward(sites, *values)
+        return torch.cat(found).flatten(0, 2).T
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        sites, *values = ctx.saved_tensors
+        parts = grad.T.reshape(len(values), *values[0].shape[:2], 1, len(grad)).unbind(0)
+        total: Tensor | None = None
+        found: list[Tensor] = []
+        for plane, part in zip(reversed(values), reversed(parts), strict=True):
+            total = part if total is None else total + part  # a plane is in its own feature and all finer ones
+            to_plane, _ = torch.ops.aten.grid_sampler_2d_backward(total, plane, sites, *_SAMPLING, [True, False])
+            found.append(to_plane)
+        return None, None, *reversed(found)
 
 
 def _exact_rows(integers: Sequence[Tensor], corners: Sequence[Tensor], places: Tensor) -> Tensor:

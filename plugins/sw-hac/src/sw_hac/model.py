@@ -15,10 +15,13 @@ from torch import Tensor, nn
 
 from splatwizard_core.gaussians.anchor_lattice import TOP
 from splatwizard_core.gaussians.anchors import two_layers
-from splatwizard_core.gaussians.coded_anchors import AnchorContext, CodedAnchors
+from splatwizard_core.gaussians.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
+
+PLACES_LIMIT = 1 << 30
+"""Bytes that the places of all anchors in the grid may take to be kept, 1,152 an anchor in the published one."""
 
 
 def group_widths(feature_dim: int, num_offsets: int) -> tuple[int, int, int]:
@@ -61,6 +64,7 @@ class HACAnchors(CodedAnchors):
         super().__init__(*tensors, generator=generator, **kwargs)
         widths = output_widths(self.features.shape[1], self.num_offsets)
         self.grid = grid.to(self.features)
+        self._places: tuple[Tensor, Any] | None = None
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
         units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0] * 3
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
@@ -69,8 +73,41 @@ class HACAnchors(CodedAnchors):
         """What the file holds besides the grid, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
+    def _looked_up(self, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Features of the grid at anchors `rows`, and the bits of its signs."""
+        codes = self.codes()
+        if self._places is None or self._places[0] is not codes:
+            fits = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
+            self._places = (codes, self.grid.places(codes.to(self.features) / TOP) if fits else None)
+        places = self._places[1]
+        if places is None:
+            places = self.grid.places(codes.index_select(0, rows).to(self.features) / TOP)
+        else:
+            places = places.rows(rows)
+        features, bits = self.grid.at_places(places)
+        return features, bits
+
+    def forecast(self, rows: Tensor) -> AnchorForecast:
+        features, bits = self._looked_up(rows)
+        first, last = self.mlp_grid[0], self.mlp_grid[2]
+        hidden = torch.relu(first(features))
+        # All anchors have noise of their own steps; the rest of the last layer is for the sample.
+        widths = output_widths(self.features.shape[1], self.num_offsets)
+        count = sum(widths[:6])
+        weights, biases = last.weight.split([count, 3]), last.bias.split([count, 3])
+        steps = torch.tanh(torch.nn.functional.linear(hidden, weights[1], biases[1]))
+        steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
+
+        def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
+            assert hidden is not None
+            outputs = torch.nn.functional.linear(hidden, weights[0], biases[0]) * self.units[:count]
+            parts = outputs.split(widths[:6], dim=1)
+            return torch.cat(parts[0::2], dim=1), torch.cat(parts[1::2], dim=1)
+
+        return AnchorForecast(steps, bits, hidden, sample)
+
     def predict(self, rows: Tensor) -> AnchorContext:
-        features, bits = self.grid.with_bits(self.codes()[rows].to(self.features) / TOP)
+        features, bits = self._looked_up(rows)
         outputs = self.mlp_grid(features) * self.units
         return context_of(outputs, self.features.shape[1], self.num_offsets, self.base_steps, own_bits=bits)
 

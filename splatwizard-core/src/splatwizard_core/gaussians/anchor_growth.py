@@ -37,12 +37,14 @@ def accumulate_anchor_statistics(
     gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d)
     radii       [M] pixels; Gaussians with radius 0 do not count
     """
-    model.opacity_accum.index_add_(0, selection.rows, selection.opacities.clamp(min=0).sum(dim=1))
-    model.anchor_denom.index_add_(0, selection.rows, torch.ones_like(selection.rows, dtype=model.anchor_denom.dtype))
-    at = selection.offset_index()[radii > 0]
-    norms = torch.linalg.vector_norm(gradients, dim=1)[radii > 0]
-    model.offset_grad_accum.view(-1).index_add_(0, at, norms.to(model.offset_grad_accum))
-    model.offset_denom.view(-1).index_add_(0, at, torch.ones_like(norms, dtype=model.offset_denom.dtype))
+    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
+    rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
+    model.opacity_accum.index_add_(0, rows, selection.opacities.clamp(min=0).sum(dim=1))
+    model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
+    at = selection.offset_index()
+    norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
+    model.offset_grad_accum.view(-1).index_add_(0, at, norms * seen)
+    model.offset_denom.view(-1).index_add_(0, at, seen)
 
 
 @torch.no_grad()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.errors import SceneError, ShapeError
+from splatwizard_core.gaussians.anchor_decoding import GEOMETRY, spawn
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -24,8 +25,6 @@ if TYPE_CHECKING:
 
 MIN_SQUARED_DISTANCE = 1e-7
 """Floor of the squared neighbour distance that sets an anchor's first scales, world units squared."""
-_GEOMETRY = 7
-"""Outputs of the covariance network per Gaussian: 3 scale factors, 4 quaternion components."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +80,11 @@ class AnchorSplats(SplatModel):
     mlp_cov: nn.Sequential
     mlp_color: nn.Sequential
 
+    _opaque: tuple[Any, Tensor, Tensor] | None = None
+
     def make_networks(self, features: int, offsets: int, hidden: int, generator: torch.Generator, like: Tensor) -> None:
         """The three networks, at random from `generator`, with device and dtype of `like`."""
-        for name, outputs in zip(self.NETWORKS, (1, _GEOMETRY, 3), strict=True):
+        for name, outputs in zip(self.NETWORKS, (1, GEOMETRY, 3), strict=True):
             setattr(self, name, two_layers(features + 4, hidden, outputs * offsets, generator).to(like))
 
     @property
@@ -104,13 +105,21 @@ class AnchorSplats(SplatModel):
         raise NotImplementedError
 
     @torch.no_grad()
+    def balls(self) -> GaussianInputs:
+        """What the rasterizer's test of visibility is given: an opaque ball for every anchor."""
+        positions = self.positions()
+        key = (len(positions), positions.dtype, positions.device)
+        if self._opaque is None or self._opaque[0] != key:
+            # Made on the CPU, and anew at each step, they would have to be waited for on a GPU.
+            one, identity = positions.new_ones(1), torch.eye(1, 4, dtype=positions.dtype, device=positions.device)
+            self._opaque = (key, one.expand(len(positions)), identity.expand(len(positions), 4))
+        _, opacities, quats = self._opaque
+        return GaussianInputs(positions, opacities, self.reach(), quats, colors=positions)
+
+    @torch.no_grad()
     def visible_anchors(self, camera: Camera, rasterizer: Rasterizer) -> Tensor:
         """[V] int64: anchors whose ball of offset scales reaches the picture."""
-        positions = self.positions()
-        n = len(positions)
-        identity = positions.new_tensor([1.0, 0.0, 0.0, 0.0]).expand(n, 4)
-        balls = GaussianInputs(positions, positions.new_ones(n), self.reach(), identity, colors=positions)
-        return torch.nonzero(rasterizer.visible_filter(balls, camera) > 0).squeeze(1)
+        return torch.nonzero(rasterizer.visible_filter(self.balls(), camera) > 0).squeeze(1)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The Gaussians of the visible anchors; `extras["anchors"]` is the AnchorSelection."""
@@ -119,26 +128,17 @@ class AnchorSplats(SplatModel):
     def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
         """The Gaussians of the anchors `rows` [V] as `camera` sees them; those of opacity <= 0 are left out."""
         a = self.attributes(rows)
-        k = self.num_offsets
-        toward = a.positions - camera.center.to(a.positions)
-        distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
-        context = torch.cat([a.features, toward / distance, distance], dim=1)  # [V, F+4]
-
-        opacities = torch.tanh(self.mlp_opacity(context))  # [V,k]
-        if a.masks is not None:
-            opacities = opacities * a.masks
-        drawn = torch.nonzero(opacities.detach().reshape(-1) > 0).squeeze(1)  # [M]
-        owner = drawn // k
-        geometry = self.mlp_cov(context).reshape(-1, _GEOMETRY)[drawn]
-        scales = a.scales[owner]  # [M,6]
+        found = spawn(
+            camera.center.to(a.positions), a.positions, a.features, a.offsets, a.scales, a.masks,
+            (self.mlp_opacity, self.mlp_cov, self.mlp_color),
+        )  # fmt: skip
         return GaussianInputs(
-            means=a.positions[owner] + a.offsets.reshape(-1, 3)[drawn] * scales[:, :3],
-            opacities=opacities.reshape(-1)[drawn],
-            # Noise or rounding may take a base scale through zero: a Gaussian of scale -s is that of scale s.
-            scales=scales[:, 3:].abs() * torch.sigmoid(geometry[:, :3]),
-            quats=torch.nn.functional.normalize(geometry[:, 3:], dim=1),
-            colors=torch.sigmoid(self.mlp_color(context)).reshape(-1, 3)[drawn],
-            extras={**a.extras, "anchors": AnchorSelection(rows, opacities.detach(), drawn)},
+            means=found.means,
+            opacities=found.opacities,
+            scales=found.scales,
+            quats=found.quats,
+            colors=found.colors,
+            extras={**a.extras, "anchors": AnchorSelection(rows, found.all_opacities, found.drawn)},
         )
 
 

@@ -6,6 +6,7 @@ of quantisation, and the rate of a sample of the visible anchors. A method adds 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.gaussians.anchor_lattice import Margin, bounds_of, coded_positions, position_codes
+from splatwizard_core.gaussians.anchor_values import anchor_values, take_rows, widen
 from splatwizard_core.gaussians.anchors import AnchorAttributes, AnchorModel
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
@@ -45,19 +47,36 @@ class AnchorContext:
 
 
 @dataclass(frozen=True)
+class AnchorForecast:
+    """An AnchorContext for training: steps of all V anchors now, distributions of a sample once it is drawn.
+
+    steps       [V,3] quantiser step of each group; differentiable
+    own_bits    as in AnchorContext
+    hidden      [V,H] what `sample` starts from, or None; rows of the sample are taken from it
+    sample      (rows [S] of the V, their rows of `hidden`, their values [S,C]) -> means and scales [S,C]; the columns
+                are those of all groups side by side
+    """
+
+    steps: Tensor
+    own_bits: Tensor | None
+    hidden: Tensor | None
+    sample: Callable[[Tensor, Tensor | None, Tensor], tuple[Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
 class AnchorRate:
     """The rate of one view's anchors; `RenderResult.extras["rate"]` in the entropy phase.
 
     bits        scalar, differentiable: bits a number over a sample of visible, kept anchors, times the share of visible
                 anchors that are kept; 0 for an empty sample
     by_group    [3] bits of features, scales and offsets in the sample, detached
-    numbers     how many numbers the sample has
+    numbers     scalar: how many numbers the sample has
     own_bits    of the context
     """
 
     bits: Tensor
     by_group: Tensor
-    numbers: int
+    numbers: Tensor
     own_bits: Tensor | None = None
 
 
@@ -110,6 +129,7 @@ class CodedAnchors(AnchorModel):
         self.sample, self.smallest_probability = sample, smallest_probability
         self.entropy = entropy
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
+        self._groups: tuple[tuple[Any, ...], Tensor, Tensor, Tensor] | None = None
 
     # Positions
 
@@ -178,41 +198,84 @@ class CodedAnchors(AnchorModel):
         """The context once (noisy or rounded) features [V,F] are known; here it stays as it is."""
         return context
 
+    def forecast(self, rows: Tensor) -> AnchorForecast:
+        """`predict` and `refine` for training, where only a sample of the anchors `rows` is asked for distributions.
+
+        A method whose network can do with less overrides it.
+        """
+        context = self.predict(rows)
+
+        def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
+            parts = (*context.means, *context.scales, *context.steps)
+            taken = [part.index_select(0, drawn) for part in parts]
+            known = AnchorContext(_triple(taken[:3]), _triple(taken[3:6]), _triple(taken[6:]))
+            known = self.refine(known, values[:, : self.features.shape[1]])
+            return torch.cat(known.means, dim=1), torch.cat(known.scales, dim=1)
+
+        return AnchorForecast(torch.cat(context.steps, dim=1), context.own_bits, None, sample)
+
     def attributes(self, rows: Tensor) -> AnchorAttributes:
-        values, masks = self.raw(rows), self.masks(rows)
+        """Raw, noisy or rounded, by phase and mode; each of `rows` at most once."""
+        values, masks = anchor_values(
+            rows, self.features, self.log_scales, self.offsets, self.mask_logits, self.mask_weights(), MASK_THRESHOLD
+        )
         extras: dict[str, Any] = {}
-        if self.phase == QUANTIZED:
-            steps = [
-                values[0].new_tensor(step * (self.noise_factor if self.training else 1)) for step in self.base_steps
-            ]
-            values = self._noisy(values, steps) if self.training else self._rounded(values, steps)
+        if self.phase != FULL and not self.training:
+            groups = _triple(torch.split(values, self._widths(), dim=1))
+            steps = self.base_steps_like(values) if self.phase == QUANTIZED else self.predict(rows).steps
+            values = torch.cat(self._rounded(groups, steps), dim=1)
+        elif self.phase == QUANTIZED:
+            group, _ = self._columns(values)
+            base = self.base_steps_like(values).index_select(0, group) * self.noise_factor
+            values = torch.addcmul(values, self._draws(values), base)
         elif self.phase == ENTROPY:
-            context = self.predict(rows)
-            if self.training:
-                values = self._noisy(values, context.steps)
-                extras["rate"] = self.rate(rows, values, self.refine(context, values[0]), masks)
-            else:
-                values = self._rounded(values, context.steps)
-        features, scales, offsets = values
+            forecast = self.forecast(rows)
+            wide = widen(forecast.steps, *self._columns(values))
+            values = torch.addcmul(values, self._draws(values), wide)
+            extras["rate"] = self.rate(values, wide, forecast, masks)
+        features, scales, offsets = torch.split(values, self._widths(), dim=1)
         return AnchorAttributes(
-            self.positions()[rows],
+            self.positions().index_select(0, rows),
             features,
-            offsets.view(len(rows), self.num_offsets, 3),
+            offsets.reshape(-1, self.num_offsets, 3),
             scales,
             masks=masks,
             extras=extras,
         )
+
+    def _widths(self) -> list[int]:
+        """Numbers of an anchor by group."""
+        return [self.features.shape[1], 6, 3 * self.num_offsets]
+
+    def _columns(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """The group of each number of an anchor [C], and the same as zeros and ones [C,3]; kept on the device."""
+        key = (like.device, like.dtype, *self._widths())
+        if self._groups is None or self._groups[0] != key:
+            group = torch.arange(3).repeat_interleave(torch.tensor(self._widths()))
+            one_hot = torch.nn.functional.one_hot(group, 3).to(like)
+            self._groups = (key, group.to(like.device), one_hot, like.new_tensor(self.base_steps))
+        return self._groups[1], self._groups[2]
+
+    def base_steps_like(self, like: Tensor) -> Tensor:
+        """[3] base_steps on the device and in the dtype of `like`: made anew, they would be waited for."""
+        self._columns(like)
+        assert self._groups is not None
+        return self._groups[3]
 
     def uniform(self, *shape: int) -> Tensor:
         """Draws of U(0,1) on the model's device."""
         own = self.noise is not None and self.noise.device.type == self.device.type
         return torch.rand(shape, generator=self.noise if own else None, device=self.device)
 
-    def _noisy(self, values: Triple, steps: Any) -> Triple:
-        draws = self.uniform(len(values[0]), sum(v.shape[1] for v in values)) - 0.5
-        noise = torch.split(draws, [v.shape[1] for v in values], dim=1)
-        features, scales, offsets = (v + u * step for v, u, step in zip(values, noise, steps, strict=True))
-        return features, scales, offsets
+    def _draws(self, values: Tensor) -> Tensor:
+        return self.uniform(*values.shape).sub_(0.5)
+
+    def _sample(self, count: int) -> Tensor:
+        """[S] int64: which of `count` anchors are drawn. On the host: to count them, one would wait for a GPU."""
+        on_host = self.noise is None or self.noise.device.type == "cpu"
+        where = "cpu" if on_host else self.device
+        drawn = torch.rand(count, generator=self.noise, device=where) < self.sample
+        return torch.nonzero(drawn).squeeze(1).to(self.device, non_blocking=True)
 
     @torch.no_grad()
     def _rounded(self, values: Triple, steps: Any) -> Triple:
@@ -229,32 +292,35 @@ class CodedAnchors(AnchorModel):
                                      for v in self.raw(torch.nonzero(self.kept()).squeeze(1)))  # fmt: skip
         return features, scales, offsets
 
-    def rate(self, rows: Tensor, values: Triple, context: AnchorContext, masks: Tensor) -> AnchorRate:
-        """Bits of a sample of the anchors `rows`, each drawn with probability `sample` if it is kept.
+    def rate(self, values: Tensor, steps: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
+        """Bits of a sample of V anchors, each drawn with probability `sample`, if it is kept.
 
-        values      [V,C] of each group, noisy
-        masks       [V,k], with gradient: the bits of a masked offset do not count, its numbers do
+        values, steps   [V,C] noisy numbers of all groups, and the quantiser step of each
+        masks           [V,k], with gradient: the bits of a masked offset do not count, its numbers do
         """
-        kept = masks.detach().amax(dim=1) > 0
-        drawn = torch.nonzero((self.uniform(len(rows)) < self.sample) & kept).squeeze(1)
-        numbers = len(drawn) * sum(v.shape[1] for v in values)
-        if numbers == 0:
+        kept = masks.detach().amax(dim=1)
+        drawn = self._sample(len(values))
+        if not len(drawn):
             nothing = self.mask_logits.new_zeros(())
-            return AnchorRate(nothing, nothing.new_zeros(3), 0, context.own_bits)
-        # An anchor's three coordinates of an offset share its mask.
-        factors = (None, None, masks[drawn].repeat_interleave(3, dim=1))
-        bits = []
-        for value, mean, scale, step, factor in zip(
-            values, context.means, context.scales, context.steps, factors, strict=True
-        ):
-            distribution = self.entropy.FloatContext(
-                mean[drawn], scale[drawn].clamp(min=1e-9), step[drawn], smallest_probability=self.smallest_probability
-            )
-            found = self.entropy.bits(value[drawn], distribution)
-            bits.append((found if factor is None else found * factor).sum())
-        share = kept.to(bits[0]).mean()
-        total = torch.stack(bits)
-        return AnchorRate(total.sum() / numbers * share, total.detach(), numbers, context.own_bits)
+            return AnchorRate(nothing, nothing.new_zeros(3), nothing, forecast.own_bits)
+        hidden = None
+        if forecast.hidden is None:
+            x, step, mask = take_rows(drawn, values, steps, masks)
+        else:
+            x, step, mask, hidden = take_rows(drawn, values, steps, masks, forecast.hidden)
+        mean, scale = forecast.sample(drawn, hidden, x)
+        distribution = self.entropy.FloatContext(
+            mean, scale.clamp(min=1e-9), step, smallest_probability=self.smallest_probability
+        )
+        # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
+        counted = kept.index_select(0, drawn)
+        widths = self._widths()
+        alone = counted[:, None].expand(-1, widths[0] + widths[1])
+        factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
+        bits = self.entropy.bits(x, distribution) * factors
+        numbers = counted.sum() * sum(widths)
+        by_group = torch.stack([part.sum() for part in torch.split(bits.detach(), widths, dim=1)])
+        return AnchorRate(bits.sum() * (kept.mean() / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
 
     # State
 
@@ -269,6 +335,11 @@ class CodedAnchors(AnchorModel):
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         super().load_state_dict_extra(extra)
         self.phase = str(extra["phase"])
+
+
+def _triple(parts: Any) -> Triple:
+    first, second, third = parts
+    return first, second, third
 
 
 def rounded_indices(values: Tensor, steps: Tensor, centre: Tensor) -> Tensor:

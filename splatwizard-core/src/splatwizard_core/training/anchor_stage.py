@@ -9,9 +9,8 @@ import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from splatwizard_core.gaussians.anchor_growth import accumulate_anchor_statistics, adjust_anchors
+from splatwizard_core.gaussians.anchor_values import mean_product
 from splatwizard_core.gaussians.coded_anchors import CodedAnchors
 from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
 from splatwizard_core.training.anchor_params import AnchorParams
@@ -131,7 +130,6 @@ class AnchorStage(Stage):
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
         assert inputs.scales is not None
-        volume = inputs.scales.prod(dim=1).sum() / max(len(inputs), 1)  # nothing drawn: 0, not NaN
-        terms = {"volume": settings.volume * volume, **self.extra_loss(model, result, step)}
-        total = found.total + torch.stack(list(terms.values())).sum()
+        terms = {"volume": settings.volume * mean_product(inputs.scales), **self.extra_loss(model, result, step)}
+        total = sum(terms.values(), start=found.total)
         return LossPack(total, found.parts | {name: term.detach() for name, term in terms.items()})
