@@ -174,13 +174,17 @@ class Trainer:
         return record
 
     def _backward(self, total: Tensor) -> None:
-        if not total.is_cuda:
+        if total.dim() > 0 or total.dtype != self._one.dtype or total.device != self._one.device:
             total.backward()  # type: ignore[no-untyped-call]
             return
+        # `backward(one)` would import sympy to compare two shapes, which takes seconds, and `backward()` makes a one of
+        # its own at each step: so the engine is called as both would.
+        engine: Any = torch.autograd.Variable._execution_engine
         # In this thread: torch's thread for the GPU would be woken up, and take the interpreter's lock, each time.
         with torch.autograd.set_multithreading_enabled(False):
-            usual = total.dim() == 0 and total.dtype == self._one.dtype and total.device == self._one.device
-            total.backward(self._one if usual else None)  # type: ignore[no-untyped-call]
+            engine.run_backward(
+                (total,), (self._one,), False, False, (), allow_unreachable=True, accumulate_grad=True
+            )  # fmt: skip
 
     def _record(self, step: int, view: View, loss: LossPack) -> StepRecord:
         record = StepRecord(
