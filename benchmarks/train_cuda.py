@@ -5,8 +5,8 @@
 
 A scene is FOLDER[:PICTURES][=PREPARED]; PREPARED is the folder that prep_scene.py, beside the trainer of gsplat, wrote
 from the same files. Without it, or where gsplat cannot be imported, only ours is measured. gsplat's trainer takes its
-SSIM from the package fused_ssim where that is installed, else from torch's convolutions, which slows it down: the
-output says which.
+SSIM from the package fused_ssim where that is installed, else from our kernels, so that torch's convolutions do not
+slow it down: the output says which.
 
 One after the other, so that nothing shares the GPU. Iterations a second count the loop alone, densification included,
 as both trainers report it; PSNR is the mean over the held-out views, memory the peak of torch's allocator in the loop.
@@ -21,6 +21,7 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
+import os
 import statistics
 import subprocess
 import sys
@@ -46,6 +47,11 @@ from splatwizard_core.training.trainer import StepRecord
 
 WINDOW = 40  # steps that are timed, and as many after them that are profiled
 MIB = 1 << 20
+SSIM_FOR_GSPLAT = """
+from splatwizard_core.training.losses import ssim
+def fused_ssim(img1, img2, padding="same", train=True):
+    return ssim(img1, img2, padding=padding)
+"""
 
 
 @dataclass
@@ -156,10 +162,14 @@ def theirs(script: Path, prepared: str, iterations: int, seed: int, white: bool)
         return f"{script} is not there"
     command = [sys.executable, str(script), prepared, "--iters", str(iterations), "--eval", str(iterations)]
     command += ["--seed", str(seed)] + ["--white"] * white
-    if importlib.util.find_spec("fused_ssim") is not None:
-        command += ["--ssim", "fused_ssim"]  # its faster way
+    module = "fused_ssim" if importlib.util.find_spec("fused_ssim") is not None else "ssim_of_splatwizard"
     with tempfile.TemporaryDirectory() as scratch:
-        done = subprocess.run(command, capture_output=True, text=True, cwd=scratch, check=False)
+        (Path(scratch) / "ssim_of_splatwizard.py").write_text(SSIM_FOR_GSPLAT)
+        paths = os.pathsep.join([scratch, os.environ.get("PYTHONPATH", "")])
+        done = subprocess.run(
+            [*command, "--ssim", module], capture_output=True, text=True, cwd=scratch, check=False,
+            env={**os.environ, "PYTHONPATH": paths},
+        )  # fmt: skip
     lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     if done.returncode != 0 or not lines:
         return f"it failed: {(done.stderr.strip().splitlines() or ['no output'])[-1][:200]}"
