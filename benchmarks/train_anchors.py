@@ -51,6 +51,9 @@ WAITS_ON_CUDA = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSyn
 WAITS = ("aten::_local_scalar_dense", "aten::nonzero", "aten::masked_select", "aten::_unique2", "aten::unique_dim")
 """Operators that make the host wait for a GPU; what they stand in (item, indexing by a mask) ends in one of them."""
 
+PRODUCTS = ("aten::addmm", "aten::mm", "aten::linear", "aten::threshold_backward", "aten::relu_")
+"""Operators of the MLPs that decode Gaussians, which run within the node `_Spawn`."""
+
 # Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.
 # Of nested ones the innermost counts.
 PARTS = {
@@ -58,7 +61,7 @@ PARTS = {
     "rasterizer.visible_filter": "visibility",
     "model.gaussians": "decoding",
     "model._noisy": "noise",
-    "model.heads": "anchor MLPs",
+    "model.forecast": "context MLPs",
     "model.mlp_opacity.forward": "anchor MLPs",
     "model.mlp_cov.forward": "anchor MLPs",
     "model.mlp_color.forward": "anchor MLPs",
@@ -66,7 +69,10 @@ PARTS = {
     "model.context.network.forward": "context MLPs",
     "model.context.slices.forward": "context MLPs",
     "model.grid.with_bits": "grid or planes",
+    "model._looked_up": "grid or planes",
     "model.context.triplane.forward": "grid or planes",
+    "model._kept_places": "grid or planes",
+    "model.context.triplane.at_sites": "grid or planes",
     "model.context.triplane_bits": "planes' rate",
     "model.rate": "rate",
     "stage.loss": "loss",
@@ -177,7 +183,10 @@ def report(watched: Any, steps: int, *, cuda: bool, rows: int) -> list[str]:
     for event in events:
         if str(event.device_type).endswith("CUDA"):
             continue
-        part = parts[part_of(event, forward)]
+        name = part_of(event, forward)
+        if name == "decoding" and _within(event, PRODUCTS):
+            name = "anchor MLPs"
+        part = parts[name]
         part.host += event.self_cpu_time_total
         part.operators += event.name.startswith("aten::") and not _inside_operator(event)
         part.waits += event.name in (WAITS_ON_CUDA if cuda else WAITS)
@@ -223,6 +232,12 @@ def _sections(events: list[Any]) -> tuple[Callable[[Any, dict[int, str]], str], 
             # Operators that make no node carry the number of the next one that does: the last to have it made it.
             forward[event.sequence_nr] = part_of(event, {})
     return part_of, forward
+
+
+def _within(event: Any, names: tuple[str, ...]) -> bool:
+    while event is not None and event.name not in names:
+        event = event.cpu_parent
+    return event is not None
 
 
 def _inside_operator(event: Any) -> bool:

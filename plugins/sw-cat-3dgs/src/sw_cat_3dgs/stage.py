@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.rendering.rasterizer import RenderResult
+    from splatwizard_core.scene.camera import Camera
     from splatwizard_core.scene.scene import View
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
     from splatwizard_core.training.scheduler import Scheduler
@@ -39,6 +40,7 @@ class CatStage(AnchorStage):
 
     def begin(self, context: StageContext) -> SplatModel:
         self.plane_draws = context.generator("triplane")
+        self._cameras: list[Camera] | None = None
         return super().begin(context)
 
     def at(self, step: int) -> int:
@@ -83,7 +85,9 @@ class CatStage(AnchorStage):
 
     def update_cam_mask(self, model: CatAnchors, cameras: CameraIterator, rasterizer: Rasterizer) -> None:
         if model.views_stale:
-            model.count_views([view.camera for view in cameras], rasterizer)
+            if self._cameras is None:  # moved once: moving to a GPU waits for it
+                self._cameras = [view.camera.to(model.device) for view in cameras]
+            model.count_views(self._cameras, rasterizer)
 
     def adjust_anchor(self, model: CatAnchors, optimizer: SplatOptimizer, step: int) -> None:  # type: ignore[override]
         super().adjust_anchor(model, optimizer, step)

@@ -121,7 +121,7 @@ class _Spawn(torch.autograd.Function):
         columns = [
             to_means * own_scales[:, :3],  # of the offsets: 0 to 2
             to_means * own_offsets,  # of the scales: 3 to 8
-            to_sizes * factors * own_scales[:, 3:].sign(),
+            to_sizes * factors * own_scales.sign()[:, 3:],
             to_sizes * sizes * (1 - factors),  # of the covariance network: 9 to 15
             (to_quats - quats * (quats * to_quats).sum(dim=1, keepdim=True)) / norms,
             to_color * color * (1 - color),  # of the colour network: 16 to 18
@@ -143,8 +143,11 @@ class _Spawn(torch.autograd.Function):
             dense[:, 9:16].reshape(n, GEOMETRY * k),
             dense[:, 16:19].reshape(n, 3 * k),
         )
-        to_hidden = torch.cat([torch.mm(out, weight) for out, weight in zip(outputs, last, strict=True)], dim=1)
-        to_hidden = torch.ops.aten.threshold_backward(to_hidden, hidden, 0)
+        to_hidden = torch.empty_like(hidden)
+        for part, out, weight in zip(torch.split(to_hidden, ctx.widths, dim=1), outputs, last, strict=True):
+            torch.mm(out, weight, out=part)
+        # In place: fresh memory costs a CPU more than the arithmetic.
+        torch.ops.aten.threshold_backward.grad_input(to_hidden, hidden, 0, grad_input=to_hidden)
         to_weights = torch.split(torch.mm(to_hidden.t(), context), ctx.widths)
         to_biases = [part.sum(dim=0) for part in torch.split(to_hidden, ctx.widths, dim=1)]
         to_parameters: list[Tensor | None] = []

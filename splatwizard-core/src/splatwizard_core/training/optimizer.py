@@ -328,8 +328,13 @@ class SplatOptimizer:
 
 
 def _parameter(model: SplatModel, name: str) -> nn.Parameter:
-    found = model._parameters.get(name)  # nearly always: asked for at every step
-    return model.get_parameter(name) if found is None else found
+    # Asked for at every step, of networks a name a layer: torch's own way looks for each attribute several times.
+    *path, leaf = name.split(".")
+    owner: Any = model
+    for part in path:
+        owner = owner._modules[part]
+    found: nn.Parameter = owner._parameters[leaf]
+    return found
 
 
 def _attribute(model: SplatModel, name: str) -> Tensor:
