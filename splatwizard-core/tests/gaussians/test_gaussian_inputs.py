@@ -49,13 +49,19 @@ def test_harmonics_have_exactly_one_storage_form():
         {"dc": DC, "codebook": codebook, "indices": INDICES},
     )  # fmt: skip
     for form in forms:
-        inputs(colors=None, sh=SH(**form)).validate()
+        inputs(colors=None, sh=SH(**form, active_degree=0)).validate()
     for form in (
         {}, {"rest": REST}, {"dense": DENSE, "dc": DC}, {"dc": DC, "codebook": codebook},
         {"dc": DC, "rest": REST, "codebook": codebook, "indices": INDICES},
     ):  # fmt: skip
         with pytest.raises(ShapeError, match="SH holds"):
             inputs(colors=None, sh=SH(**form)).validate()
+
+
+@pytest.mark.parametrize("form", [{"dc": DC}, {"dense": DENSE}, {"dc": DC, "rest": REST}])
+def test_the_active_degree_has_its_coefficients(form):
+    with pytest.raises(ShapeError, match="SH degree 3 needs 16 coefficients, here are"):
+        inputs(colors=None, sh=SH(**form)).validate()
 
 
 def test_a_tensor_on_another_device_is_named():

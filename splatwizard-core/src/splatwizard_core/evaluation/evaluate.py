@@ -175,7 +175,8 @@ def evaluate(
             if save_to is not None:
                 saved.append(file_name)
                 pending.append(writer.submit(save_png, image.cpu(), save_to / file_name))
-            bar.advance(1, **({"PSNR": values["psnr"][-1]} if values.get("psnr") else {}))
+            so_far = values.get("psnr")
+            bar.advance(1, **({"PSNR": sum(so_far) / len(so_far)} if so_far else {}))
     for written in pending:
         written.result()  # a full disk must not pass unseen
     return EvaluationResult(

@@ -52,6 +52,14 @@ class SH:
                 "or codebook and indices (and dc)"
             )
 
+    def check_degree(self) -> None:
+        """Raise ShapeError unless the coefficients of the active degree are there."""
+        rest = next((t for t in (self.dense, self.rest, self.codebook) if t is not None), None)
+        held = (0 if self.dc is None else 1) + (0 if rest is None else rest.shape[1])
+        needed = (self.active_degree + 1) ** 2
+        if held < needed:
+            raise ShapeError(f"SH degree {self.active_degree} needs {needed} coefficients, here are {held}")
+
     def __len__(self) -> int:
         for tensor in (self.dense, self.dc, self.indices):
             if tensor is not None:
@@ -165,6 +173,7 @@ class GaussianInputs:
             need("sh.rest", self.sh.rest, n, "K-1", 3)
             need("sh.codebook", self.sh.codebook, "M", "K", 3)
             need("sh.indices", self.sh.indices, n)
+            self.sh.check_degree()
         device = self.means.device
         for name, tensor in self.tensors().items():
             if tensor.device != device:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from importlib.metadata import Distribution, PackageNotFoundError
@@ -131,7 +132,10 @@ def _extra_check(extra: str, requirements: list[Requirement], problems: dict[str
         else:
             there.append(f"{requirement.name} {importlib.metadata.version(requirement.name)}")
     if broken:
-        mend = f"pip install --upgrade --force-reinstall --no-deps {broken[0].split()[0]}"
+        lacks = re.search(r"No module named '([^'.]+)", broken[0])
+        name = broken[0].split()[0]
+        # Without its dependencies: one of them may be torch.
+        mend = f"pip install {lacks[1]}" if lacks else f"pip install --upgrade --force-reinstall --no-deps {name}"
         return Check("packages", extra, "broken", one_line("; ".join(broken)), mend)
     if absent:
         return Check("packages", extra, "missing", f"not installed: {', '.join(absent)}", f"pip install '{extra}'")
