@@ -108,3 +108,23 @@ def test_rows_columns_and_products_have_their_gradients():
     torch.testing.assert_close(mean_product(scales), scales.prod(dim=1).mean())
     assert torch.autograd.gradcheck(mean_product, scales)
     assert float(mean_product(torch.zeros(0, 3))) == 0
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
+    g, n, k = torch.Generator().manual_seed(0), 300, 5
+    networks = tuple(two_layers(11, 6, out * k, g) for out in (1, 7, 3))
+    tensors = [torch.randn(size, generator=g) for size in ((3,), (n, 3), (n, 7), (n, k, 3), (n, 6))]
+    masks = (torch.rand(n, k, generator=g) > 0.3).float()
+    found = []
+    for device in ("cpu", "cuda"):
+        moved = tuple(network.to(device) for network in networks)
+        leaves = [t.to(device).requires_grad_() for t in (*tensors[1:], masks)]
+        spawned = spawn(tensors[0].to(device), *leaves, moved)
+        leaves += [p for network in moved for p in network.parameters()]
+        parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
+        gradients = torch.autograd.grad(sum(part.square().mean() for part in parts), leaves)
+        found.append([each.detach().cpu() for each in (*parts, *gradients)])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)

@@ -319,7 +319,7 @@ class CodedAnchors(AnchorModel):
         factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
         bits = self.entropy.bits(x, distribution) * factors
         numbers = counted.sum() * sum(widths)
-        by_group = torch.stack([part.sum() for part in torch.split(bits.detach(), widths, dim=1)])
+        by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
         return AnchorRate(bits.sum() * (kept.mean() / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
 
     # State
