@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.experiments.keys import dotted
 from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.training.pruner import load_pruner
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
 from sw_chimerags.model import MaskedGaussians
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from splatwizard_core.coding.container import ContainerReader, ContainerWriter
     from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.pruner import Pruner
     from splatwizard_core.training.stage import Stage
 
 
@@ -58,23 +58,15 @@ class ChimeraGS(Method):
         preset = str(values.pop("preset", "paper"))
         return create_method(self.plugins, name, values, preset=preset)
 
-    def _pruner(self) -> Pruner:
-        """Whose scores say how well the file keeps a Gaussian."""
-        score = self.config.score
-        if score.pruner not in self.plugins.pruners:
-            known = ", ".join(sorted(entry.name for entry in self.plugins.pruners))
-            raise ConfigError(f"no pruner is called '{score.pruner}'; installed: {known}", key="score.pruner")
-        own = {"v_pow": score.v_pow} if score.pruner == "lightgaussian" else {}
-        pruner: Pruner = self.plugins.pruners.load(score.pruner)(**own)
-        return pruner
-
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         return self._student().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
         file.check_coder(self.plugins, self.config.vq.codec)  # now, and not when all is trained
         quantizer = self.plugins.quantizers.load("ste-mask")(self.config.mask.threshold)
-        return [*self._student().stages(), MaskedDistillation(self.config, quantizer, self._pruner())]
+        score = self.config.score  # whose scores say how well the file keeps a Gaussian
+        pruner = load_pruner(self.plugins, score.pruner, {"lightgaussian": {"v_pow": score.v_pow}}, key="score.pruner")
+        return [*self._student().stages(), MaskedDistillation(self.config, quantizer, pruner)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, MaskedGaussians):

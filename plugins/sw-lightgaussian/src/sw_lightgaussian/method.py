@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
 from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.training.pruner import load_pruner
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.presets import PRESETS, RATES
 from sw_lightgaussian.significance import Significance
@@ -18,7 +19,6 @@ if TYPE_CHECKING:
     from splatwizard_core.coding.container import ContainerReader, ContainerWriter
     from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.pruner import Pruner
     from splatwizard_core.training.stage import Stage
 
 
@@ -41,7 +41,9 @@ class LightGaussian(Method):
 
     def stages(self) -> Sequence[Stage]:
         check_gaussian_codec(self.plugins, self.config.codec.name, "codec.name")
-        return [PruneStage(self.config, self._pruner()), DistillStage(self.config, self._significance())]
+        score = self.config.score.model_dump()
+        pruner = load_pruner(self.plugins, self.config.prune.pruner, {"lightgaussian": score})
+        return [PruneStage(self.config, pruner), DistillStage(self.config, Significance(**score))]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         codec = self.config.codec
@@ -55,14 +57,3 @@ class LightGaussian(Method):
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
         return decode_gaussians(self.plugins, reader)
-
-    def _significance(self) -> Significance:
-        return Significance(**self.config.score.model_dump())
-
-    def _pruner(self) -> Pruner:
-        """The one that the config names; settings are known of the own one alone."""
-        name: str = self.config.prune.pruner
-        if name == "lightgaussian":
-            return self._significance()
-        pruner: Pruner = self.plugins.pruners.load(name)()
-        return pruner

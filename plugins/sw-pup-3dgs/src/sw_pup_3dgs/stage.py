@@ -8,6 +8,7 @@ from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
 from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.pruner import load_pruner
 from splatwizard_core.training.pruning import PruneByScore
 
 if TYPE_CHECKING:
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
 
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.pruner import Pruner
     from splatwizard_core.training.scheduler import Scheduler
     from sw_pup_3dgs.config import Pup3DGSConfig
 
@@ -35,12 +35,8 @@ class PupStage(FineTuningStage):
     def __init__(self, config: Pup3DGSConfig, plugins: PluginManager) -> None:
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
         prune = config.prune
-        if prune.pruner not in plugins.pruners:
-            known = ", ".join(sorted(entry.name for entry in plugins.pruners))
-            raise ConfigError(f"no pruner is called '{prune.pruner}'; installed: {known}", key="prune.pruner")
-        settings = {"resolution": prune.resolution} if prune.pruner == OWN else {}
         self.prune = prune
-        self.pruner: Pruner = plugins.pruners.load(prune.pruner)(**settings)
+        self.pruner = load_pruner(plugins, prune.pruner, {OWN: {"resolution": prune.resolution}})
         self.statistics = self.pruner.uses_statistics
         if len(self.round_starts()) != len(prune.steps) or len(self.removals()) != len(prune.steps):
             raise ConfigError(f"rounds at {prune.steps} are too close together for this run", key="prune.steps")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import RenderResult
 from splatwizard_core.training.plan import When, scaled
+from splatwizard_core.training.pruner import load_pruner
 from splatwizard_core.training.pruning import PruneByScore
 from splatwizard_core.training.scheduler import Scheduler
 from splatwizard_core.training.stage import Stage
@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from splatwizard_core.scene.scene import Scene, View
     from splatwizard_core.training.optimizer import SplatOptimizer
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.pruner import Pruner
     from splatwizard_core.training.stage import CameraSampler, LossPack, StageContext
     from sw_speedy_splat.config import SpeedySplatConfig
 
@@ -51,11 +50,7 @@ class SpeedySplatStage(Stage):
         self.config, self.plugins = config, plugins
         (self.base,) = base.stages()
         self.densify_stop: int = base.config.densify.stop
-        settings = {"channel_mode": config.prune.channel_mode} if config.prune.pruner == OWN else {}
-        if config.prune.pruner not in plugins.pruners:
-            known = ", ".join(sorted(entry.name for entry in plugins.pruners))
-            raise ConfigError(f"no pruner is called '{config.prune.pruner}'; installed: {known}", key="prune.pruner")
-        self.pruner: Pruner = plugins.pruners.load(config.prune.pruner)(**settings)
+        self.pruner = load_pruner(plugins, config.prune.pruner, {OWN: {"channel_mode": config.prune.channel_mode}})
 
     def when(self, when: When) -> When:
         """A plan of the full run, in steps of this one."""

@@ -6,12 +6,13 @@ import logging
 import math
 from typing import TYPE_CHECKING
 
-from splatwizard_core.errors import ConfigError, EmptyModel
+from splatwizard_core.errors import EmptyModel
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
 from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.pruner import Pruner, load_pruner
 from splatwizard_core.training.pruning import PruneByScore, scores_of
 from splatwizard_core.training.stage import CameraIterator
 from sw_trimming_the_fat.score import doomed, mean_gradients
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.pruner import Pruner
     from splatwizard_core.training.scheduler import Scheduler
     from splatwizard_core.training.stage import StageContext
     from sw_trimming_the_fat.config import TrimmingTheFatConfig
@@ -42,13 +42,9 @@ class TrimmingStage(FineTuningStage):
 
     def __init__(self, config: TrimmingTheFatConfig, plugins: PluginManager) -> None:
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
-        prune = config.prune
-        if prune.pruner not in plugins.pruners:
-            known = ", ".join(sorted(entry.name for entry in plugins.pruners))
-            raise ConfigError(f"no pruner is called '{prune.pruner}'; installed: {known}", key="prune.pruner")
-        self.prune = prune
-        self.pruner: Pruner = plugins.pruners.load(prune.pruner)()
-        self.statistics = self.pruner.uses_statistics and prune.statistics == "fresh"
+        self.prune = config.prune
+        self.pruner = load_pruner(plugins, config.prune.pruner)
+        self.statistics = self.pruner.uses_statistics and config.prune.statistics == "fresh"
 
     def begin(self, context: StageContext) -> SplatModel:
         left_over = {name: getattr(context.model, name).clone() for name in STATISTICS if hasattr(context.model, name)}
