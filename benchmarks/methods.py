@@ -5,8 +5,9 @@
     python benchmarks/methods.py demo out/methods --preset quick --methods 3dgs,lightgaussian,chimerags --rates all
 
 A scene is what `--scene` takes, with `:PICTURES` for a COLMAP scene's picture folder. Runs are those of `sw run`:
-finished ones are not repeated, and the trained 3DGS scene that many methods start from is trained once. --shrink K
-divides every plan and iteration count by K; the records say so.
+finished ones are not repeated, and the trained 3DGS scene that many methods start from is trained once, before the
+others. --shrink K divides every plan and iteration count by K; the records say so. --parallel N runs N of them at a
+time, on the GPUs in turn, which spoils their times. One that fails is told at the end and does not stop the others.
 
 The claims compare with 3DGS of the same run: a trained scene of 30,000 steps (or its K-th part). A float32 .ply has 248
 bytes a Gaussian. BD-rates and the plot: `sw report OUT`, which `sw run` has written to OUT/<scene>/report.html.
@@ -16,12 +17,15 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from rich.console import Console
 from rich.table import Table
 
@@ -59,20 +63,38 @@ def main() -> None:
     parser.add_argument("--shrink", type=int, default=1, help="divide every schedule by this (default: 1)")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
     parser.add_argument("--set", dest="sets", action="append", default=[], metavar="KEY=VALUE", help="for all runs")
+    parser.add_argument("--parallel", type=int, default=1, help="runs at a time (default: 1)")
     args = parser.parse_args()
+    names = args.methods.split(",")
+    failed: list[str] = []
+    for first in (True, False):  # what the others start from, then the others
+        work = [(scene, name) for scene in args.scenes for name in names if (name == SWEEPS[0]) == first]
+        with ThreadPoolExecutor(args.parallel) as pool:
+            jobs = [pool.submit(run, args, place, *what) for place, what in enumerate(work)]
+            failed += [told for job in jobs if (told := job.result()) is not None]
     for scene in args.scenes:
-        spec, _, pictures = scene.partition(":")
-        for method in args.methods.split(","):
-            rates = args.rates or ("all" if method in SWEEPS else "default")
-            command = [sys.executable, "-m", "splatwizard_core", "run", "--method", method, "--scene", spec]
-            command += ["--rate", rates, "--preset", args.preset, "--device", args.device, "--out", str(args.out)]
-            command += ["--images", pictures] if pictures else []
-            for value in (*shrunk(method, args.shrink), *args.sets):
-                command += ["--set", value]
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
-        runs = read(args.out / Path(spec).name)
-        print_table(Path(spec).name, runs)
-        print_claims(runs)
+        folder = args.out / Path(scene.partition(":")[0]).name
+        if runs := read(folder):
+            print_table(folder.name, runs)
+            print_claims(runs)
+    if failed:
+        sys.exit("\n".join(failed))
+
+
+def run(args: argparse.Namespace, place: int, scene: str, method: str) -> str | None:
+    """`sw run` of one method on one scene; what to tell if it fails."""
+    spec, _, pictures = scene.partition(":")
+    rates = args.rates or ("all" if method in SWEEPS else "default")
+    command = [sys.executable, "-m", "splatwizard_core", "run", "--method", method, "--scene", spec]
+    command += ["--rate", rates, "--preset", args.preset, "--device", args.device, "--out", str(args.out)]
+    command += ["--images", pictures] if pictures else []
+    for value in (*shrunk(method, args.shrink), *args.sets):
+        command += ["--set", value]
+    environment = dict(os.environ)
+    if args.parallel > 1 and torch.cuda.device_count() > 1:
+        environment["CUDA_VISIBLE_DEVICES"] = str(place % torch.cuda.device_count())
+    status = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, env=environment).returncode
+    return None if status == 0 else f"{method} on {spec} failed with exit status {status}, see above"
 
 
 def shrunk(method: str, factor: int) -> list[str]:
