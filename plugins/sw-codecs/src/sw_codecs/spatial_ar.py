@@ -119,6 +119,7 @@ class SpatialAr(nn.Module):
 _WINDOW = (3, 5)
 """Rows and columns that hold the neighbours: its first twelve places in raster order."""
 _BORDER = (2, 2, 2, 0)  # left, right, above, below
+_ABOVE = 10  # neighbours in full rows of the window; the other two are to the left
 _SHAPES = ((HIDDEN, len(NEIGHBORS)), *((HIDDEN, HIDDEN),) * RESIDUALS, (2, HIDDEN))
 _PIECES = tuple(size for out, inputs in _SHAPES for size in (out * inputs, out))
 """Numbers of weight and bias of each layer."""
@@ -126,41 +127,40 @@ _PARAMETER_SHAPES = tuple(shape for out, inputs in _SHAPES for shape in ((out, i
 
 
 class _JointBits(torch.autograd.Function):
-    """Planes per scale [K,C,H,W], then weight and bias of each layer of K networks -> bits of all values."""
+    """Planes per scale [K,C,H,W], then weight and bias of each layer of K networks -> bits of all values.
+
+    Products are taken channel by channel: a gradient of a weight is a sum over all values, which a GPU takes in one
+    thread block per product, so that three products of a million values each would leave it idle. Inputs of a layer
+    have a last row of ones, whose weights are the biases: no pass of their own over all values adds or sums them.
+    """
 
     @staticmethod
     def forward(ctx: Any, scales: int, *tensors: Tensor) -> Tensor:
         planes, parameters = tensors[:scales], tensors[scales:]
         k, channels = planes[0].shape[:2]
         counts = [plane.shape[2] * plane.shape[3] for plane in planes]
-        flat = torch.cat([p.reshape(-1) for p in parameters]).view(k, -1)
-        pieces = flat.split(_PIECES, dim=1)
-        weights = [piece.view(k, *shape) for piece, shape in zip(pieces[0::2], _SHAPES, strict=True)]
-        skip = torch.eye(HIDDEN, dtype=flat.dtype, device=flat.device)
-        weights[1:-1] = [weight + skip for weight in weights[1:-1]]  # the identity skip is part of the layer
-        # [K,12,C,n]: a column for each value of all scales.
-        around = flat.new_empty(k, len(NEIGHBORS), channels, sum(counts))
-        for plane, place in zip(planes, around.split(counts, dim=3), strict=True):
-            padded = nn.functional.pad(plane.reshape(1, k * channels, *plane.shape[2:]), _BORDER)
-            window = nn.functional.unfold(padded, _WINDOW).view(k, channels, -1, plane.shape[2] * plane.shape[3])
-            place.copy_(window[:, :, : len(NEIGHBORS)].transpose(1, 2))
-        layers = [around.flatten(2)]
-        for weight, bias in zip(weights, pieces[1::2], strict=True):
-            layers.append(torch.baddbmm(bias[:, :, None], weight, layers[-1]))
-            if len(layers) <= len(weights):
-                layers[-1].relu_()
-        mean, s = layers.pop().unbind(1)
+        weights = _channel_weights(torch.cat([p.reshape(-1) for p in parameters]).view(k, -1), channels)
+        # [K C, inputs + 1, n] of each layer: a column for each value of all scales. The first has fewer inputs.
+        stored = weights[0].new_empty(len(_SHAPES), k * channels, HIDDEN + 1, sum(counts))
+        stored[:, :, HIDDEN] = 1
+        layers = [stored[0, :, HIDDEN - len(NEIGHBORS) :], *stored[1:].unbind(0)]
+        for plane, place in zip(planes, layers[0].split(counts, dim=2), strict=True):
+            _gather_neighbors(plane.flatten(0, 1), place)
+        for weight, inputs, following in zip(weights, layers, layers[1:], strict=False):
+            torch.bmm(weight, inputs, out=following[:, :HIDDEN])
+            following[:, :HIDDEN].relu_()
+        mean, s = torch.bmm(weights[-1], layers[-1]).unbind(1)  # [K C, n]
 
-        offset = torch.cat([plane.flatten(2) for plane in planes], dim=2).flatten(1) - mean  # [K, C n]
+        offset = torch.cat([plane.flatten(0, 1).flatten(1) for plane in planes], dim=1).sub_(mean)
         narrowing = torch.exp(0.5 * s.clamp(*_S_RANGE))  # 1 / b
         away = offset.abs()
-        near, far = (away - 0.5) * narrowing, (away + 0.5) * narrowing
-        at_near, at_far = torch.exp(-near.abs()).mul_(0.5), torch.exp(-far).mul_(0.5)
-        p = torch.where(near >= 0, at_near, 1 - at_near) - at_far  # as `rates.laplace_mass`
+        near, far = (away - 0.5).mul_(narrowing), (away + 0.5).mul_(narrowing)
+        at_near, at_far = near.abs().neg_().exp_().mul_(0.5), (-far).exp_().mul_(0.5)
+        p = torch.where(near >= 0, at_near, 1 - at_near).sub_(at_far)  # as `rates.laplace_mass`
         ctx.save_for_backward(offset, s, narrowing, near, far, at_near, at_far, p, *layers, *weights)
         ctx.shapes, ctx.counts = [plane.shape for plane in planes], counts
         ctx.planes_learn = any(ctx.needs_input_grad[1 : 1 + scales])
-        return -torch.log2(p.clamp_min(P_MIN)).sum()
+        return -p.clamp_min(P_MIN).log2_().sum()
 
     @staticmethod
     @once_differentiable
@@ -170,39 +170,70 @@ class _JointBits(torch.autograd.Function):
         k, channels = ctx.shapes[0][:2]
         # Below its floor a probability still has the gradient that raises it, and a scale out of range that which
         # brings it back, as in `rates.lower_bound`.
-        slope = grad / (p.clamp_min(P_MIN) * -math.log(2))
-        slope = slope * ((p >= P_MIN) | (slope < 0))
-        to_near, to_far = -slope * at_near, slope * at_far
-        to_x = (to_near + to_far) * narrowing * offset.sign()
-        to_s = 0.5 * (to_near * near + to_far * far)
-        to_s = to_s * ((s >= _S_RANGE[0]) | (to_s < 0)) * ((s <= _S_RANGE[1]) | (to_s > 0))
+        slope = grad / p.clamp_min(P_MIN).mul_(-math.log(2))
+        slope *= (p >= P_MIN) | (slope < 0)
+        to_far = slope * at_far
+        to_near = slope.mul_(at_near).neg_()
+        out = torch.stack([to_near + to_far, to_near * near + to_far * far], dim=1)  # [K C, 2, n]
+        to_x, to_s = out.unbind(1)
+        to_x.mul_(narrowing).mul_(offset.sign())
+        own = to_x.clone() if ctx.planes_learn else None
+        to_x.neg_()
+        to_s.mul_(0.5).mul_((s >= _S_RANGE[0]) | (to_s < 0)).mul_((s <= _S_RANGE[1]) | (to_s > 0))
 
-        out = torch.stack([-to_x, to_s], dim=1)  # [K, 2, C n]
         found = []
         for i in reversed(range(len(weights))):
-            found.append((torch.bmm(out, layers[i].transpose(1, 2)).flatten(1), out.sum(dim=2)))
+            found.append(torch.bmm(out, layers[i].transpose(1, 2)).unflatten(0, (k, channels)).sum(dim=1))
             if i > 0:
-                out = torch.bmm(weights[i].transpose(1, 2), out)
-                out = torch.ops.aten.threshold_backward(out, layers[i], 0)
+                inputs = layers[i][:, :HIDDEN]
+                out = torch.bmm(weights[i][:, :, :-1].transpose(1, 2), out)
+                torch.ops.aten.threshold_backward.grad_input(out, inputs, 0, grad_input=out)
+        pieces = [part.flatten(1) for both in reversed(found) for part in (both[:, :, :-1], both[:, :, -1:])]
         # Two columns more: then each piece is aligned as the optimizer's kernel asks for (16 bytes).
-        joined = torch.cat([piece for pair in reversed(found) for piece in pair] + [found[0][1]], dim=1)
         to_parameters = [
             piece.view(shape)
-            for row in joined
+            for row in torch.cat([*pieces, pieces[-1]], dim=1)
             for piece, shape in zip(row.split([*_PIECES, 2]), _PARAMETER_SHAPES, strict=False)
         ]
-        if not ctx.planes_learn:
+        if own is None:
             return None, *[None] * len(ctx.shapes), *to_parameters
-        to_around = torch.bmm(weights[0].transpose(1, 2), out).view(k, len(NEIGHBORS), channels, sum(ctx.counts))
+        # The window's last places are no neighbours: rows of zeros, so that `fold` can take the products as they are.
+        rest_of_window = _WINDOW[0] * _WINDOW[1] - len(NEIGHBORS)
+        first = nn.functional.pad(weights[0][:, :, :-1], (0, rest_of_window)).transpose(1, 2)
         to_planes = []
-        own = to_x.view(k, channels, sum(ctx.counts)).split(ctx.counts, dim=2)
-        for shape, part, direct in zip(ctx.shapes, to_around.split(ctx.counts, dim=3), own, strict=True):
+        parts = zip(ctx.shapes, out.split(ctx.counts, dim=2), own.split(ctx.counts, dim=1), strict=True)
+        for shape, part, direct in parts:
             h, w = shape[2:]
-            window = part.new_zeros(k, channels, _WINDOW[0] * _WINDOW[1], h * w)
-            window[:, :, : len(NEIGHBORS)].copy_(part.transpose(1, 2))
-            folded = nn.functional.fold(window.view(1, -1, h * w), (h + 2, w + 4), _WINDOW)[:, :, 2:, 2:-2]
+            window = torch.bmm(first, part).view(1, -1, h * w)
+            folded = nn.functional.fold(window, (h + 2, w + 4), _WINDOW)[:, :, 2:, 2:-2]
             to_planes.append(folded.reshape(shape) + direct.reshape(shape))
         return None, *to_planes, *to_parameters
+
+
+def _channel_weights(flat: Tensor, channels: int) -> list[Tensor]:
+    """[K C, outputs, inputs + 1] of each layer, biases last: the parameters flat [K, P], once for each channel."""
+    k = len(flat)
+    between = RESIDUALS * (HIDDEN + 1) * HIDDEN
+    first, middle, last = flat.split([sum(_PIECES[:2]), between, sum(_PIECES[-2:])], dim=1)
+    middle = middle.reshape(k * RESIDUALS, -1)  # these layers are alike
+    joined = []
+    for part, (out, inputs) in ((first, _SHAPES[0]), (middle, _SHAPES[1]), (last, _SHAPES[-1])):
+        weight, bias = part.split([out * inputs, out], dim=1)
+        joined.append(torch.cat([weight.unflatten(1, (out, inputs)), bias[:, :, None]], dim=2))
+    # The identity skip is part of the layer.
+    joined[1] = (joined[1] + torch.eye(HIDDEN, HIDDEN + 1, dtype=flat.dtype, device=flat.device)).view(
+        k, RESIDUALS, HIDDEN, HIDDEN + 1
+    )
+    first, middle, last = (each[:, None].expand(-1, channels, *each.shape[1:]).flatten(0, 1) for each in joined)
+    return [first, *middle.unbind(1), last]
+
+
+def _gather_neighbors(planes: Tensor, into: Tensor) -> None:
+    """Write the neighbours of each value of planes [P,H,W] into the first rows of `into` [P, 12 or more, H W]."""
+    h, w = planes.shape[1:]
+    window = nn.functional.pad(planes, _BORDER).unfold(1, h, 1).unfold(2, w, 1)  # [P, 3, 5, H, W]
+    into[:, :_ABOVE].unflatten(2, (h, w)).unflatten(1, (2, _WINDOW[1])).copy_(window[:, :2])
+    into[:, _ABOVE : len(NEIGHBORS)].unflatten(2, (h, w)).copy_(window[:, 2, :2])
 
 
 class ExactSpatialAr:
