@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
+from splatwizard_core.experiments.gaussian_method import GaussianMethod
 from splatwizard_core.experiments.keys import dotted
 from splatwizard_core.experiments.method import Method, create_method
 from sw_speedy_splat.config import SpeedySplatConfig
@@ -15,13 +15,12 @@ from sw_speedy_splat.stage import SpeedySplatStage
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
     from splatwizard_core.gaussians.splat_model import SplatModel
     from splatwizard_core.scene.scene import Scene
     from splatwizard_core.training.stage import Stage
 
 
-class SpeedySplat(Method):
+class SpeedySplat(GaussianMethod):
     """Hanson, Tu, Lin, Singla, Zwicker, Goldstein: Speedy-Splat, CVPR 2025 (arXiv 2412.00578)."""
 
     name: ClassVar[str] = "speedy-splat"
@@ -42,12 +41,4 @@ class SpeedySplat(Method):
         return self._base().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
-        check_gaussian_codec(self.plugins, self.config.codec)
         return [SpeedySplatStage(self.config, self._base(), self.plugins)]
-
-    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        encode_gaussians(self.plugins, self.config.codec, model, writer)
-
-    def decode(self, reader: ContainerReader) -> SplatModel:
-        self.check_version(reader)
-        return decode_gaussians(self.plugins, reader)
