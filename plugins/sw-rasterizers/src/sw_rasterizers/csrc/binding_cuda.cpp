@@ -86,7 +86,7 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   if (few && save && tally.pairs() > 0) {
     const int64_t pieces = piece_count(tiles, tally.pairs());
     saved[kBehind] = make({pieces, kTile * kTile, 4}), saved[kWhere] = make_as({pieces, 2}, at::kInt);
-    image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere])};
+    image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere]), pieces};
   }
   if (fast)
     (in.flags & kFlash ? blend_flash : blend_tcgs)(view, binned.drawn, binned.lists(), image,
@@ -159,13 +159,13 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   image.background_is_image = background.has_value() && background->dim() == 3;
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
-  image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere])};
+  image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere]), saved[kWhere].size(0)};
   const ImageGradient gradient{data<float>(image_gradient), data<float>(alpha_gradient), data<float>(median_gradient)};
   const Splats splats = splats_of(saved[kShape], saved[kChannelRows]);
   const bool general = channels.total() != 3 || channels.colors != 3 || median;
   if (saved[kSplat].numel() > 0)
     blend_backward(view, flags & kPassClamp, splats, {data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])},
-                   saved[kSplat].numel(), image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, stream);
+                   image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
   return {row_memory, clock.seconds()};

@@ -141,8 +141,10 @@ struct Tally {
     C10_CUDA_KERNEL_LAUNCH_CHECK();
     mailbox.counted.wait();
     used = true;
-    TORCH_CHECK(pairs() <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", pairs(),
-                " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
+    // Positions are 32-bit numbers, and the kernels look up to three stages of 256 ahead of the last one.
+    constexpr int64_t most = std::numeric_limits<int32_t>::max() - 1024;
+    TORCH_CHECK(pairs() <= most, "sw_rasterizers: ", pairs(), " splat-tile pairs are more than ", most,
+                "; render fewer Gaussians or a smaller image");
   }
   int64_t splats() const { return published->splats; }
   int64_t pairs() const { return published->pairs; }

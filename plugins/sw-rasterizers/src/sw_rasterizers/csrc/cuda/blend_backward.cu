@@ -218,10 +218,10 @@ __global__ void median_kernel(int64_t pixels, const int32_t* median_splat, const
 }  // namespace
 
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
-                    int64_t pairs, const Image& image, bool general, const ImageGradient& gradient, int detached,
-                    const Rows& rows, cudaStream_t stream) {
+                    const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
+                    cudaStream_t stream) {
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
-  const unsigned blocks = unsigned(image.pieces.where != nullptr ? piece_count(tiles, pairs) : tiles);
+  const unsigned blocks = unsigned(image.pieces.where != nullptr ? image.pieces.count : tiles);
   const float clamp_limit = pass_clamp ? 3e38f : float(kAlphaMax);
   const auto kernel = general ? (rows.absgrad ? backward_kernel<true, true> : backward_kernel<true, false>)
                               : (rows.absgrad ? backward_kernel<false, true> : backward_kernel<false, false>);

@@ -110,7 +110,9 @@ __global__ void __launch_bounds__(kThreads) few_kernel(View<float> view, Splats 
     const unsigned warp_last = warp_max(unsigned(last));
     if (lane_index() == 0) atomicMax(&block_last, warp_last);
     __syncthreads();
-    const int places = int(first_piece(tile + 1, end) - piece);
+    // The last tile's are all that are left: pairs that no tile claims (emit.cu) have places, too.
+    const int64_t next = tile + 1 < int(gridDim.x) ? first_piece(tile + 1, end) : image.pieces.count;
+    const int places = int(next - piece);
     for (int i = thread; i < places; i += kThreads)
       image.pieces.where[piece + i] = i * kPiece < int(block_last) ? make_int2(tile, i * kPiece) : make_int2(-1, 0);
     // From the colours of each piece to those behind it.

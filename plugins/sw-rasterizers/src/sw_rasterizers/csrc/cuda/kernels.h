@@ -82,6 +82,7 @@ inline int64_t piece_count(int64_t tiles, int64_t pairs) { return pairs / kPiece
 struct Pieces {
   float4* behind;  // [pieces][kTile^2] by warp and lane of `blend_few`: transmittance at a piece's end, colours behind it
   int2* where;     // [pieces] tile and first list position, or -1 if no pixel got that far; null: not cut
+  int64_t count;
 };
 
 struct Image {  // what the forward pass writes, and the backward pass reads again
@@ -146,8 +147,8 @@ void blend_tcgs(const View<float>& view, const Splats& splats, const TileLists& 
                 uint8_t* bytes, cudaStream_t stream);
 // The last `detached` channels do not influence the geometry; `pass_clamp`: the gradient passes the clamp of alpha.
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
-                    int64_t pairs, const Image& image, bool general, const ImageGradient& gradient, int detached,
-                    const Rows& rows, cudaStream_t stream);
+                    const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
+                    cudaStream_t stream);
 void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
                       const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
                       cudaStream_t stream);

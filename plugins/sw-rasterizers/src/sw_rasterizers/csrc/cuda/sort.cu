@@ -17,16 +17,21 @@ void sort_as(void* scratch, size_t& bytes, int count, int key_bits, void* keys, 
   if (sorted_values != nullptr) *sorted_values = value_buffer.Current();
 }
 
-// To ask CUB costs as much host time as a launch, so it is asked once for all counts up to the next power of two.
+// To ask CUB costs as much host time as a launch, so it is asked once for all counts up to the next power of two; on
+// each GPU, since the answer depends on how many multiprocessors it has.
 template <class Key>
 size_t scratch_bytes(int count) {
-  static thread_local size_t known[32] = {};
-  int bits = 0;
+  constexpr int kGpus = 16;  // on further ones it is asked each time
+  static thread_local size_t known[kGpus][32] = {};
+  int bits = 0, gpu = kGpus;
   while (bits < 31 && (count >> bits) != 0) ++bits;
-  if (known[bits] == 0)
-    sort_as<Key>(nullptr, known[bits], int((1u << bits) - 1), int(8 * sizeof(Key)), nullptr, nullptr, nullptr, nullptr,
+  cudaGetDevice(&gpu);
+  size_t asked = 0;
+  size_t& bytes = gpu < kGpus ? known[gpu][bits] : asked;
+  if (bytes == 0)
+    sort_as<Key>(nullptr, bytes, int((1u << bits) - 1), int(8 * sizeof(Key)), nullptr, nullptr, nullptr, nullptr,
                  nullptr, nullptr, nullptr);
-  return known[bits];
+  return bytes;
 }
 
 }  // namespace
