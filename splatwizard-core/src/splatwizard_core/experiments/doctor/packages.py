@@ -132,10 +132,13 @@ def _extra_check(extra: str, requirements: list[Requirement], problems: dict[str
         else:
             there.append(f"{requirement.name} {importlib.metadata.version(requirement.name)}")
     if broken:
-        lacks = re.search(r"No module named '([^'.]+)", broken[0])
         name = broken[0].split()[0]
-        # Without its dependencies: one of them may be torch.
-        mend = f"pip install {lacks[1]}" if lacks else f"pip install --upgrade --force-reinstall --no-deps {name}"
+        # A part that is lacking ('gsplat.csrc') is one of a package that is there: pip would leave it as it is.
+        lacks = re.search(r"No module named '([^'.]+)'", broken[0])
+        if lacks is not None and canonicalize_name(lacks[1]) != canonicalize_name(name):
+            mend = f"pip install {lacks[1]}"
+        else:  # without its dependencies: one of them may be torch
+            mend = f"pip install --upgrade --force-reinstall --no-deps {name}"
         return Check("packages", extra, "broken", one_line("; ".join(broken)), mend)
     if absent:
         return Check("packages", extra, "missing", f"not installed: {', '.join(absent)}", f"pip install '{extra}'")
