@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.outliers import inliers, local_outlier_factor
 from sw_codecs.principal_frame import UNIT, PrincipalFrame, contract
-from sw_codecs.triplane import GAIN, Triplane
+from sw_codecs.triplane import GAIN, PAIRS, Triplane
 
 
 def cloud(n=2000, seed=0):
@@ -181,7 +181,8 @@ def test_one_node_samples_as_grid_sample_does(rounded):
             plane *= 100
 
     def written_out():
-        sites = planes.sites(places)
+        at = places * (2.0 / UNIT) - 1
+        sites = torch.stack([at[:, pair] for pair in PAIRS])[:, None]
         total, found = 0, []
         for plane in planes.planes:
             if rounded:
@@ -195,3 +196,18 @@ def test_one_node_samples_as_grid_sample_does(rounded):
     gradients = [torch.autograd.grad((each * weights).sum(), list(planes.planes)) for each in results]
     for a, b in zip(*gradients, strict=True):
         torch.testing.assert_close(a, b, atol=1e-5, rtol=1e-5)
+
+
+@pytest.mark.parametrize("resolution", [1, 2, 5])
+def test_sites_of_some_places_are_rows_of_all(resolution):
+    made = triplane(resolution)
+    places = torch.randint(0, UNIT + 1, (20, 3), generator=torch.Generator().manual_seed(1))
+    places = torch.cat([places, torch.tensor([[0, 0, 0], [UNIT] * 3, [UNIT, 0, UNIT - 1]])])
+    sites, rows = made.sites(places), torch.tensor([22, 3, 20, 21])
+    assert torch.equal(made.at_sites(sites.rows(rows)), made(places[rows]))
+    # Four places of one plane each, whose weights sum to one: the border needs no others.
+    for i, plane in enumerate(made.planes):
+        cells, size = sites.cells[:, i], plane.shape[-1] ** 2
+        assert (cells // size == torch.arange(3)[:, None]).all()
+    torch.testing.assert_close(sites.weights.sum(dim=3), torch.ones(23, 2, 3))
+    assert (sites.weights >= 0).all()

@@ -145,8 +145,8 @@ class CatContext(nn.Module):
         means, scales = (tuple(out[2 * i + second] * unit for i, unit in enumerate(self.units)) for second in (0, 1))
         return AnchorContext(means, scales, tuple(steps.split(1, dim=1)))
 
-    def forecast(self, sites: Tensor, base_steps: Tensor) -> AnchorForecast:
-        """The same for training: of anchors at sites [3,1,V,2] of the triplane; base_steps [3] of the shape.
+    def forecast(self, sites: Any, base_steps: Tensor) -> AnchorForecast:
+        """The same for training: of V anchors at `sites` of the triplane; base_steps [3] of the shape.
 
         All anchors have noise of their own steps; means and scales are computed for the sample alone.
         """

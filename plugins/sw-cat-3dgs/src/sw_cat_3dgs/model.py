@@ -37,7 +37,7 @@ class CatAnchors(CodedAnchors):
         self.views_stale = True
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
-        self._places: tuple[Tensor, Tensor, int, Tensor, Tensor] | None = None
+        self._places: tuple[tuple[Any, ...], Tensor, Any] | None = None
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -55,22 +55,23 @@ class CatAnchors(CodedAnchors):
         """[N,3] integer places of the anchors in the triplane, kept until anchors or frame are others."""
         return self._kept_places()[0]
 
-    def _kept_places(self) -> tuple[Tensor, Tensor]:
+    def _kept_places(self) -> tuple[Tensor, Any]:
         """The places, and their sites on the planes."""
-        codes, frame = self.codes(), self.context.frame
+        codes, context = self.codes(), self.context
+        key = (codes, context.frame, context.frame._version, context.resolution)
         kept = self._places
-        if kept is None or kept[0] is not codes or kept[1] is not frame or kept[2] != frame._version:
-            places = self.context.places(codes, self.bounds)
-            kept = self._places = (codes, frame, frame._version, places, self.context.triplane.sites(places))
-        return kept[3], kept[4]
+        if kept is None or kept[0][0] is not key[0] or kept[0][1] is not key[1] or kept[0][2:] != key[2:]:
+            places = context.places(codes, self.bounds)
+            kept = self._places = (key, places, context.triplane.sites(places))
+        return kept[1], kept[2]
 
     def predict(self, rows: Tensor) -> AnchorContext:
         found: AnchorContext = self.context(self.places()[rows])
         return found
 
     def forecast(self, rows: Tensor) -> AnchorForecast:
-        sites = self._kept_places()[1].index_select(2, rows)
-        found: AnchorForecast = self.context.forecast(sites, self.base_steps_like(sites))
+        sites = self._kept_places()[1].rows(rows)
+        found: AnchorForecast = self.context.forecast(sites, self.base_steps_like(sites.weights))
         return found
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:

@@ -8,7 +8,7 @@ mode of the codec library, rules 1 and 2.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +22,21 @@ GAIN = 16
 """Integers of the file are round(GAIN * value)."""
 INTEGER_LIMIT = 1 << 24
 ROWS_AT_ONCE = 1 << 13
-_SAMPLING = (0, 1, True)  # bilinear, border, align_corners, as torch numbers them
+
+
+class PlaneSites(NamedTuple):
+    """Where n places lie on the planes of each scale: what no training changes while resolutions stay.
+
+    cells       [n, scales, 3, 4] int32: the four values around a place, in a table of the 3 H W places of a scale
+    weights     [n, scales, 3, 4]
+    """
+
+    cells: Tensor
+    weights: Tensor
+
+    def rows(self, rows: Tensor) -> PlaneSites:
+        """Those of some of the places."""
+        return PlaneSites(self.cells.index_select(0, rows), self.weights.index_select(0, rows))
 
 
 class Triplane(nn.Module):
@@ -66,14 +80,28 @@ class Triplane(nn.Module):
         """
         return self.at_sites(self.sites(places), rounded=rounded)
 
-    def sites(self, places: Tensor) -> Tensor:
-        """Where `places` lie on the planes, [3,1,n,2] in -1..1: what no training changes."""
-        at = places.to(self.planes[0]) * (2.0 / UNIT) - 1
-        return torch.stack([at[:, pair] for pair in PAIRS])[:, None]
+    @torch.no_grad()
+    def sites(self, places: Tensor) -> PlaneSites:
+        """Where `places` lie on the planes."""
+        cells, weights = [], []
+        for plane in self.planes:
+            size = plane.shape[-1]
+            at = places.to(plane) * ((size - 1) / UNIT)  # [n,3]
+            cell = at.floor().clamp_(0, max(size - 2, 0))
+            far, last = at - cell, size - 1
+            lower, upper = cell.int(), (cell.int() + 1).clamp_(max=last)
+            for i, (a, b) in enumerate(PAIRS):
+                columns = torch.stack([lower[:, a], upper[:, a]], dim=1)
+                rows = torch.stack([lower[:, b], upper[:, b]], dim=1) * size + i * size * size
+                cells.append((rows[:, :, None] + columns[:, None]).flatten(1))
+                shares = (torch.stack([1 - far[:, axis], far[:, axis]], dim=1) for axis in (b, a))
+                weights.append((next(shares)[:, :, None] * next(shares)[:, None]).flatten(1))
+        shape = (len(places), len(self.planes), len(PAIRS), 4)
+        return PlaneSites(torch.stack(cells, dim=1).view(shape), torch.stack(weights, dim=1).view(shape))
 
-    def at_sites(self, sites: Tensor, *, rounded: bool = True) -> Tensor:
+    def at_sites(self, sites: PlaneSites, *, rounded: bool = True) -> Tensor:
         """`forward` of the places that `sites` was made from."""
-        found: Tensor = _Sampled.apply(sites, rounded, *self.planes)  # type: ignore[no-untyped-call]
+        found: Tensor = _Sampled.apply(*sites, rounded, *self.planes)  # type: ignore[no-untyped-call]
         return found
 
     def integers(self) -> list[Tensor]:
@@ -98,30 +126,50 @@ class Triplane(nn.Module):
 
 
 class _Sampled(torch.autograd.Function):
-    """Features [n, width] of planes at sites; bilinear, border as padding, corners aligned."""
+    """Features [n, width] of planes at PlaneSites.
+
+    As tables of all channels of a place: four rows are read where `grid_sample` reads each channel in another part of
+    memory, and on the way back rows are added, where it would also find the derivative by the sites.
+    """
 
     @staticmethod
-    def forward(ctx: Any, sites: Tensor, rounded: bool, *planes: Tensor) -> Tensor:
-        values = [torch.round(plane * GAIN).div_(GAIN) for plane in planes] if rounded else list(planes)
-        found: list[Tensor] = []
-        for plane in values:
-            sample = torch.grid_sampler_2d(plane, sites, *_SAMPLING)  # [3,C,1,n]
-            found.append(sample.add_(found[-1]) if found else sample)
-        ctx.save_for_backward(sites, *values)
-        return torch.cat(found).flatten(0, 2).T
+    def forward(ctx: Any, cells: Tensor, weights: Tensor, rounded: bool, *planes: Tensor) -> Tensor:
+        n, channels = len(cells), planes[0].shape[1]
+        ctx.save_for_backward(cells, weights)
+        ctx.shapes = [plane.shape for plane in planes]
+        width = len(PAIRS) * channels
+        features = weights.new_empty(n, len(planes), width)
+        for i, plane in enumerate(planes):
+            table = plane.movedim(1, 3).reshape(-1, channels)  # [3 H W, C]
+            if rounded:
+                table = torch.round(table * GAIN).div_(GAIN)
+            index, share = cells[:, i].reshape(-1, 4), weights[:, i].reshape(-1, 4)
+            found = nn.functional.embedding_bag(index, table, per_sample_weights=share, mode="sum").view(n, width)
+            if i == 0:
+                features[:, i] = found
+            else:
+                torch.add(found, features[:, i - 1], out=features[:, i])
+        return features.flatten(1)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        sites, *values = ctx.saved_tensors
-        parts = grad.T.reshape(len(values), *values[0].shape[:2], 1, len(grad)).unbind(0)
+        cells, weights = ctx.saved_tensors
+        parts = grad.unflatten(1, (len(ctx.shapes), len(PAIRS), -1))  # [n, scales, 3, C]
         total: Tensor | None = None
         found: list[Tensor] = []
-        for plane, part in zip(reversed(values), reversed(parts), strict=True):
+        for i in reversed(range(len(ctx.shapes))):
+            part = parts[:, i]
             total = part if total is None else total + part  # a plane is in its own feature and all finer ones
-            to_plane, _ = torch.ops.aten.grid_sampler_2d_backward(total, plane, sites, *_SAMPLING, [True, False])
-            found.append(to_plane)
-        return None, None, *reversed(found)
+            k, channels, h, w = ctx.shapes[i]
+            table = grad.new_zeros(k * h * w, channels)
+            rows = total.reshape(-1, channels)
+            weighted = torch.empty_like(rows)  # one for all: fresh memory costs a CPU more than the arithmetic
+            for index, share in zip(cells[:, i].unbind(2), weights[:, i].unbind(2), strict=True):
+                torch.mul(rows, share.reshape(-1, 1), out=weighted)
+                table.index_add_(0, index.reshape(-1), weighted)
+            found.append(table.view(k, h, w, channels).movedim(3, 1).contiguous())
+        return None, None, None, *reversed(found)
 
 
 def _exact_rows(integers: Sequence[Tensor], corners: Sequence[Tensor], places: Tensor) -> Tensor:
