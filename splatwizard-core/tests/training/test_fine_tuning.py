@@ -5,7 +5,15 @@ import math
 import pytest
 import torch
 
-from splatwizard_core.training.fine_tuning import FineTuningRates, FineTuningStage, UpdateRates, collect_statistics
+from splatwizard_core.training.fine_tuning import (
+    FineTuningRates,
+    FineTuningStage,
+    UpdateRates,
+    clear_statistics,
+    collect_anew,
+    collect_statistics,
+    windows_before,
+)
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.scheduler import build_schedulers
@@ -78,3 +86,35 @@ def test_a_stage_starts_from_the_trained_scene_with_all_bands_and_fresh_statisti
     assert float(outcome.model.grad_accum.max()) > 0
     assert not torch.equal(outcome.model.means, trained.means)
     assert math.isfinite(float(outcome.model.means.sum()))
+
+
+@pytest.mark.parametrize(
+    ("removals", "length", "windows"),
+    [
+        ([100, 600], 99, [range(1, 100), range(501, 600)]),
+        ([100, 150], 99, [range(1, 100), range(101, 150)]),  # not behind the removal at 100
+        ([1, 2, 5], 3, [range(1, 2), range(2, 3), range(3, 5)]),  # the first two have their own step alone
+        ([], 9, []),
+    ],
+)
+def test_gradients_are_those_of_the_steps_before_each_removal(removals, length, windows):
+    assert windows_before(removals, length) == windows
+
+
+class Anew(FineTuningStage):
+    name = "anew"
+    statistics = True
+
+    def register_post_task(self, scheduler, ppl, opt):
+        collect_anew(scheduler, windows_before([4, 9], 3))
+
+
+def test_each_window_begins_with_sums_of_its_own(toy):
+    stage = Anew(Params(iterations=12), FineTuningRates())
+    _, post = build_schedulers(stage, None)
+    plan = {step: [r.task for r in post.registrations if r.due(step)] for step in range(1, 13)}
+    assert [step for step in plan if clear_statistics in plan[step]] == [1, 6]
+    assert [step for step in plan if collect_statistics in plan[step]] == [1, 2, 3, 6, 7, 8]
+    assert plan[6] == [clear_statistics, collect_statistics]
+    outcome = toy.train([stage], trained=lambda name: toy.make_model(toy.scene))
+    assert float(outcome.model.denom.max()) == 3

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
+from splatwizard_core.training.fine_tuning import FineTuningStage, collect_anew, windows_before
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.pruner import load_pruner
 from splatwizard_core.training.pruning import PruneByScore
@@ -20,8 +19,6 @@ if TYPE_CHECKING:
     from sw_pup_3dgs.config import Pup3DGSConfig
 
 OWN = "pup-3dgs"
-STATISTICS = ("grad_accum", "denom")
-CLEAR = -1  # before the same step's statistics are added
 
 
 class PupStage(FineTuningStage):
@@ -75,16 +72,7 @@ class PupStage(FineTuningStage):
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         removals = self.removals()
         if self.statistics:
-            before = [0, *removals]  # no window reaches behind a removal, whose own sums it would clear
-            windows = [
-                range(max(last + 1, at - self.window), max(at, last + 2))
-                for last, at in zip(before, removals, strict=False)
-            ]
-            scheduler.register_task(
-                [window.start for window in windows], clear_statistics, priority=CLEAR, name="clear gradient statistics"
-            )
-            collecting = [step for window in windows for step in window]
-            scheduler.register_task(collecting, collect_statistics, name="collect gradient statistics")
+            collect_anew(scheduler, windows_before(removals, self.window))
         task = PruneByScore(self.pruner, removals, count_rule=self.prune.count_rule)
         name = "PUP prune" if self.prune.pruner == OWN else f"prune by {self.prune.pruner}"
         scheduler.register_task(list(removals), task, name=name)
@@ -93,9 +81,3 @@ class PupStage(FineTuningStage):
 def start_round(optimizer: SplatOptimizer) -> None:
     """Schedule task: Adam forgets its moments and counts its steps anew, as a new process would."""
     optimizer.load_state_dict({**optimizer.state_dict(), "moments": {}})
-
-
-def clear_statistics(model: GaussianModel) -> None:
-    """Schedule task: forgets the gradients that were added up so far."""
-    for name in STATISTICS:
-        getattr(model, name).zero_()

@@ -10,7 +10,13 @@ from splatwizard_core.errors import EmptyModel
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
+from splatwizard_core.training.fine_tuning import (
+    GRADIENT_STATISTICS,
+    FineTuningStage,
+    collect_anew,
+    collect_statistics,
+    windows_before,
+)
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.pruner import Pruner, load_pruner
 from splatwizard_core.training.pruning import PruneByScore, scores_of
@@ -28,8 +34,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 OWN = "trimming-the-fat"
-STATISTICS = ("grad_accum", "denom")
-CLEAR = -1  # before the same step's statistics are added
 
 
 class TrimmingStage(FineTuningStage):
@@ -47,7 +51,8 @@ class TrimmingStage(FineTuningStage):
         self.statistics = self.pruner.uses_statistics and config.prune.statistics == "fresh"
 
     def begin(self, context: StageContext) -> SplatModel:
-        left_over = {name: getattr(context.model, name).clone() for name in STATISTICS if hasattr(context.model, name)}
+        before = context.model
+        left_over = {name: getattr(before, name).clone() for name in GRADIENT_STATISTICS if hasattr(before, name)}
         model = super().begin(context)
         if self.prune.statistics == "checkpoint":
             for name, values in left_over.items():
@@ -68,27 +73,11 @@ class TrimmingStage(FineTuningStage):
         assert isinstance(plan, range)
         return max(1, plan.stop - 1)
 
-    def windows(self) -> list[range]:
-        """Steps at which gradients are added up, one range each time that the sums begin anew.
-
-        Of removals in successive steps each has the gradients of its own step, which are collected first.
-        """
-        if self.prune.refresh == "once":
-            return [range(self.window + 1)]
-        before = [0, *self.removals]
-        return [
-            range(max(last + 1, at - self.window), max(at, last + 2))
-            for last, at in zip(before, self.removals, strict=False)
-        ]
-
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        if self.statistics:
-            windows = self.windows()
-            if len(windows) > 1:
-                anew = [window.start for window in windows]
-                scheduler.register_task(anew, clear_statistics, priority=CLEAR, name="clear gradient statistics")
-            collecting = windows[0] if len(windows) == 1 else [step for window in windows for step in window]
-            scheduler.register_task(collecting, collect_statistics, name="collect gradient statistics")
+        if self.statistics and self.prune.refresh == "once":
+            scheduler.register_task(range(self.window + 1), collect_statistics, name="collect gradient statistics")
+        elif self.statistics:
+            collect_anew(scheduler, windows_before(self.removals, self.window))
         if self.prune.pruner == OWN:
             window = self.window if self.statistics else None
             rule = PruneBelowBoth(self.pruner, self.prune.level, window, scale=self.opt.schedule_scale)
@@ -96,12 +85,6 @@ class TrimmingStage(FineTuningStage):
         else:
             by_score = PruneByScore(self.pruner, self.prune.fraction_or_default, carry_grad=True)
             scheduler.register_task(self.removals, by_score, name=f"prune by {self.prune.pruner}")
-
-
-def clear_statistics(model: GaussianModel) -> None:
-    """Schedule task: forgets the gradients that were added up so far."""
-    for name in STATISTICS:
-        getattr(model, name).zero_()
 
 
 class PruneBelowBoth:

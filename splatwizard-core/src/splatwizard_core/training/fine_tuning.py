@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from pydantic import Field
 from torch import Tensor
@@ -19,6 +19,9 @@ from splatwizard_core.training.plan import When, scaled
 from splatwizard_core.training.scheduler import Scheduler
 from splatwizard_core.training.stage import LossPack, Stage, StageContext
 from splatwizard_core.training.statistics import accumulate_statistics
+
+GRADIENT_STATISTICS = ("grad_accum", "denom")
+CLEAR = -1  # before the same step's statistics are added
 
 
 class FineTuningRates(Params):
@@ -75,6 +78,30 @@ def collect_statistics(model: GaussianModel, result: RenderResult) -> None:
     if result.grad2d is None:
         raise ValueError("gradient statistics need RasterOptions(grad2d=True)")
     accumulate_statistics(model, result.grad2d.value, result.radii)
+
+
+def clear_statistics(model: GaussianModel) -> None:
+    """Schedule task: forgets the screen-space gradients that were added up so far."""
+    for name in GRADIENT_STATISTICS:
+        getattr(model, name).zero_()
+
+
+def windows_before(removals: Iterable[int], length: int) -> list[range]:
+    """The steps over which gradients are averaged for each of `removals` (steps, ascending): the `length` before it.
+
+    No window reaches behind the removal before. Of removals in successive steps each has the gradients of its own step,
+    which are collected first.
+    """
+    steps = list(removals)
+    return [range(max(last + 1, at - length), max(at, last + 2)) for last, at in zip([0, *steps], steps, strict=False)]
+
+
+def collect_anew(scheduler: Scheduler, windows: Sequence[range]) -> None:
+    """Post tasks that add gradients up over each of the `windows`, every time from zero."""
+    starts = [window.start for window in windows]
+    scheduler.register_task(starts, clear_statistics, priority=CLEAR, name="clear gradient statistics")
+    steps = [step for window in windows for step in window]
+    scheduler.register_task(steps, collect_statistics, name="collect gradient statistics")
 
 
 class FineTuningStage(Stage):
