@@ -91,8 +91,10 @@ def run(args: argparse.Namespace, place: int, scene: str, method: str) -> str | 
     for value in (*shrunk(method, args.shrink), *args.sets):
         command += ["--set", value]
     environment = dict(os.environ)
-    if args.parallel > 1 and torch.cuda.device_count() > 1:
-        environment["CUDA_VISIBLE_DEVICES"] = str(place % torch.cuda.device_count())
+    gpus = torch.cuda.device_count()
+    if args.parallel > 1 and gpus > 1:
+        allowed = environment.get("CUDA_VISIBLE_DEVICES", "").split(",")  # of those that we may use, if that was said
+        environment["CUDA_VISIBLE_DEVICES"] = allowed[place % gpus] if len(allowed) >= gpus else str(place % gpus)
     status = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, env=environment).returncode
     return None if status == 0 else f"{method} on {spec} failed with exit status {status}, see above"
 
