@@ -2,14 +2,17 @@
 
 import ast
 import importlib.util
+import re
 import sys
 from pathlib import Path
 
-import bitstream_page_reader as page
+import bitstream_page
 import numpy as np
 import pytest
 import torch
 import zstandard
+from bitstream_page import container as page_container
+from bitstream_page import entropy_coders, entropy_models, method_files, positions
 
 from splatwizard_core.cli.main import main
 from splatwizard_core.coding import container, strict_json
@@ -18,7 +21,10 @@ from splatwizard_core.plugins import load_plugins
 from sw_codecs import column_plan, point_limit
 
 TESTS = Path(__file__).parent
+PAGE = TESTS.parent / "docs" / "bitstream.md"
+READER = sorted(Path(bitstream_page.__file__).parent.glob("*.py"))
 CODECS = TESTS.parent / "plugins" / "sw-codecs"
+EXACT_TABLES = CODECS / "src" / "sw_codecs" / "data" / "exact_tables.bin"
 GOLDEN = sorted((TESTS / "golden").glob("*.swz"))
 RATES = ("r1", "r3", "r5", "r6")
 
@@ -33,8 +39,8 @@ def load(path: Path):
 def assert_page_agrees(path: Path) -> dict[str, np.ndarray]:
     """Decode a file both ways; the parameters must be the same to the bit."""
     model, _ = open_model(path, load_plugins(), torch.device("cpu"))
-    tables = page.ExactTables((CODECS / "src" / "sw_codecs" / "data" / "exact_tables.bin").read_bytes())
-    found = page.decode(path.read_bytes(), zstandard.ZstdDecompressor().decompress, tables)
+    tables = entropy_models.ExactTables(EXACT_TABLES.read_bytes())
+    found = method_files.decode(path.read_bytes(), zstandard.ZstdDecompressor().decompress, tables)
     ours = {name: parameter.numpy() for name, parameter in model.named_parameters()}
     assert set(found) == set(ours)
     for name, array in ours.items():
@@ -43,13 +49,27 @@ def assert_page_agrees(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def test_the_reader_shares_no_code_with_the_packages():
-    tree = ast.parse(Path(page.__file__).read_text())
+@pytest.mark.parametrize("path", READER, ids=lambda path: path.stem)
+def test_the_reader_shares_no_code_with_the_packages(path):
+    tree = ast.parse(path.read_text())
     imported = {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
-    imported |= {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    assert {name.partition(".")[0] for name in imported} - set(sys.stdlib_module_names) == {"numpy"}
+    froms = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)]
+    assert all(node.level == 0 for node in froms), "a relative import"
+    imported |= {node.module for node in froms}
+    foreign = {name.partition(".")[0] for name in imported} - set(sys.stdlib_module_names)
+    assert foreign <= {"numpy", bitstream_page.__name__}
     called = {node.func.id for node in ast.walk(tree) if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)}
     assert not called & {"__import__", "exec", "eval"}
+
+
+def test_the_reader_has_a_file_for_each_chapter_of_the_page():
+    """But the last, which is about what a reader refuses."""
+    chapters = re.findall(r"^## (\d [^(\n]+?)(?: \(.*| `.*)?$", PAGE.read_text(), re.MULTILINE)
+    *described, refused = chapters
+    assert refused == "7 What a file may claim"
+    opening = "\n".join(path.read_text().partition("\n")[0] for path in READER)
+    for number, _, title in (chapter.partition(" ") for chapter in described):
+        assert f"Chapter {number}: {title}" in opening
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
@@ -58,15 +78,15 @@ def test_it_decodes_the_golden_files(path):
 
 
 def test_the_page_names_every_header_value_and_section():
-    text = (TESTS.parent / "docs" / "bitstream.md").read_text()
+    text = PAGE.read_text()
     for path in GOLDEN:
-        header, sections = page.container(path.read_bytes())
+        header, sections = page_container.container(path.read_bytes())
         for name in (*header, *header["static"], *sections):
             assert f"`{name}`" in text, f"{path.stem}: {name}"
 
 
 def test_the_page_states_the_caps_of_the_code():
-    text = (TESTS.parent / "docs" / "bitstream.md").read_text()
+    text = PAGE.read_text()
     assert f"at most {container.MAX_HEADER:,} |" in text
     assert (
         f"{container.MAX_HEADER >> 10} KiB, {strict_json.MAX_DEPTH} levels, {container.MAX_SECTIONS:,} sections" in text
@@ -94,7 +114,7 @@ def trained(tmp_path_factory):
 def test_it_decodes_a_trained_model(trained, tmp_path, rate):
     path = tmp_path / f"{rate}.swz"
     assert main(["encode", str(trained), "--rate", rate, "--out", str(path)]) == 0
-    header, _ = page.container(path.read_bytes())
+    header, _ = page_container.container(path.read_bytes())
     assert header["static"]["active_sh_degree"] == 3
     found = assert_page_agrees(path)
     assert len(found["means"]) > 300
@@ -107,25 +127,25 @@ def test_it_decodes_the_payload_of_every_coder_and_entropy_model(name):
     tables = [row.astype(int).tolist() for row in cases.tables.counts]
     numbers = cases.tables.index.tolist()
     contexts = [getattr(cases.context, field).tolist() for field in ("mean", "scale", "multiplier")]
-    exact = page.ExactTables((CODECS / "src" / "sw_codecs" / "data" / "exact_tables.bin").read_bytes())
+    exact = entropy_models.ExactTables(EXACT_TABLES.read_bytes())
     unzstd = zstandard.ZstdDecompressor().decompress
     decoders = {
-        "columns_v1": lambda data: np.transpose(page.columns(data, *cases.matrix.shape)),
-        "categorical_v1": lambda data: page.categorical(data, 9, 3, cases.categorical.index.tolist()),
-        "mixture_v1": lambda data: np.transpose(page.density_tables(data, 300, 2)),
-        "factorised_v1": lambda data: page.density_tables(data, 300, 1)[0],
-        "bernoulli_v1": lambda data: page.bernoulli(data, 300),
-        "gaussian_exact_v1": lambda data: page.exact(data, "gaussian", exact, *contexts),
-        "laplace_exact_v1": lambda data: page.exact(data, "laplace", exact, *contexts),
-        "octree_v1": page.octree,
-        "morton_delta_v1": page.plain_positions,
-        "raw_v1": lambda data: page.plain_positions(data, unzstd=unzstd),
-        "byte_planes_v1": lambda data: page.byte_planes(data, "i2", cases.halves.shape, unzstd),
-        "byte_planes_plain_v1": lambda data: page.byte_planes(data, "i8", cases.hashes.shape, unzstd),
-        "float_delta_v1": lambda data: page.float_delta(data, cases.floats.shape, unzstd),
-        "packed_bits_v1": lambda data: page.packed_bits(data, 300, 12),
+        "columns_v1": lambda data: np.transpose(entropy_models.columns(data, *cases.matrix.shape)),
+        "categorical_v1": lambda data: entropy_models.categorical(data, 9, 3, cases.categorical.index.tolist()),
+        "mixture_v1": lambda data: np.transpose(entropy_models.density_tables(data, 300, 2)),
+        "factorised_v1": lambda data: entropy_models.density_tables(data, 300, 1)[0],
+        "bernoulli_v1": lambda data: entropy_models.bernoulli(data, 300),
+        "gaussian_exact_v1": lambda data: entropy_models.exact(data, "gaussian", exact, *contexts),
+        "laplace_exact_v1": lambda data: entropy_models.exact(data, "laplace", exact, *contexts),
+        "octree_v1": positions.octree,
+        "morton_delta_v1": positions.plain_positions,
+        "raw_v1": lambda data: positions.plain_positions(data, unzstd=unzstd),
+        "byte_planes_v1": lambda data: positions.byte_planes(data, "i2", cases.halves.shape, unzstd),
+        "byte_planes_plain_v1": lambda data: positions.byte_planes(data, "i8", cases.hashes.shape, unzstd),
+        "float_delta_v1": lambda data: positions.float_delta(data, cases.floats.shape, unzstd),
+        "packed_bits_v1": lambda data: positions.packed_bits(data, 300, 12),
         **{
-            coder: lambda data, coder=coder: page.coder_symbols(coder, data, tables, numbers)
+            coder: lambda data, coder=coder: entropy_coders.coder_symbols(coder, data, tables, numbers)
             for coder in ("range", "rans", "huffman")
         },
     }

@@ -1,0 +1,236 @@
+"""Chapter 4: Entropy models, but for the networks and grids that predict their parameters (integer_networks.py)."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from bitstream_page.building_blocks import (
+    RangeWords,
+    bernoulli_model,
+    class_e,
+    class_smallest,
+    crc_i32,
+    crc_i64,
+    raw_bits,
+    stored_tables,
+    symbols_by_table,
+    symbols_of,
+)
+from bitstream_page.entropy_coders import coder_chunks, coder_symbols
+from bitstream_page.fields import Bytes, check, unzigzag
+
+
+def columns(data: bytes, rows: int, width: int) -> list[list[int]]:
+    """The columns of the matrix."""
+    file = Bytes(data)
+    check(file.unpack("BIH") == (1, rows, width), "head of columns")
+    crc = file.one("I")
+    plans = []
+    for _ in range(width):
+        scheme, p = file.unpack("BB")
+        offset, length = file.signed(), file.varint()
+        first = file.signed() if scheme >= 16 else None
+        gaps = [file.varint() for _ in range(length - 1)] if scheme % 16 == 3 else []
+        plans.append((scheme % 16, p, offset, length, first, gaps))
+    tables = stored_tables(file, [plan[3] for plan in plans if plan[0] != 0])
+    chunks = Bytes(file.take(file.varint()))
+    classes = coded_classes(chunks, tables, rows)
+    chunks.done()
+    found = []
+    for scheme, p, offset, _, first, gaps in plans:
+        if scheme == 0:
+            values = [offset] * rows
+        else:
+            values = column_values(file, next(classes), scheme, p, offset, gaps)
+        if first is not None:
+            above = first
+            for i in range(rows):
+                above += values[i]
+                values[i] = above
+        found.append(values)
+    file.done()
+    check(crc_i64([v for column in found for v in column]) == crc, "CRC of columns")
+    return found
+
+
+def coded_classes(chunks: Bytes, tables: Sequence[Sequence[int]], rows: int) -> Iterator[list[int]]:
+    """The classes of each coded column; a chunk holds up to 2^20 symbols, in pieces of up to 2^20 rows."""
+    found: list[list[int]] = []
+    chunk: list[int] = []
+    words, crc = RangeWords(b""), 0
+    for table in tables:
+        column: list[int] = []
+        for start in range(0, rows, 1 << 20):
+            piece = min(1 << 20, rows - start)
+            if (not found and not column) or len(chunk) + piece > 1 << 20:
+                check(crc_i32(chunk) == crc, "CRC of a chunk of classes")
+                length, crc = chunks.unpack("II")
+                words, chunk = RangeWords(chunks.take(length)), []
+            symbols = symbols_of(words, table, piece)
+            chunk += symbols
+            column += symbols
+        found.append(column)
+    check(crc_i32(chunk) == crc, "CRC of a chunk of classes")
+    return iter(found)
+
+
+def column_values(file: Bytes, classes: list[int], scheme: int, p: int, offset: int, gaps: list[int]) -> list[int]:
+    if scheme == 3:
+        distinct = [offset]
+        for gap in gaps:
+            distinct.append(distinct[-1] + gap)
+        return [distinct[c] for c in classes]
+    if scheme == 1:
+        return [offset + (c << p) + low for c, low in zip(classes, raw_bits(file, len(classes), p), strict=True)]
+    check(scheme == 2, "scheme")
+    values = [class_smallest(c, p) for c in classes]
+    for e in sorted({class_e(c, p) for c in classes} - {0}):
+        rows = [i for i, c in enumerate(classes) if class_e(c, p) == e]
+        for i, low in zip(rows, raw_bits(file, len(rows), e), strict=True):
+            values[i] += low
+    return [unzigzag(value) + offset for value in values]
+
+
+def categorical(data: bytes, size: int, tables: int, numbers: Sequence[int]) -> list[int]:
+    file = Bytes(data)
+    check(file.one("B") == 1, "version")
+    if not numbers:
+        return []
+    stored = [table if any(table) else [1] * size for table in stored_tables(file, [size] * tables)]
+    return coder_symbols("range", file.rest(), stored, numbers)
+
+
+def bernoulli(data: bytes, n: int) -> list[int]:
+    file = Bytes(data)
+    p = min(max(file.varint() / n, 2.0**-24), 1 - 2.0**-24)
+
+    def payload(content: bytes, first: int, count: int, kmin: int, kmax: int) -> list[int]:
+        words, model = RangeWords(content), bernoulli_model(p)
+        return [words.symbol(model) for _ in range(count)]
+
+    return coder_chunks(file.rest(), n, payload)
+
+
+class ExactTables:
+    """The table file of sw-codecs."""
+
+    def __init__(self, data: bytes) -> None:
+        file = Bytes(data)
+        check(file.take(4) == b"SPWT", "magic of the tables")
+        self.version = file.one("H")
+        file.one("I")
+        self.multipliers = file.unpack("128H")
+        file.take(64 * 4)  # scales: for encoders
+        self.thresholds = file.unpack("63I")
+        self.radius, self.tables = {}, {}
+        for family in ("gaussian", "laplace"):
+            self.radius[family] = file.unpack("64H")
+            self.tables[family] = [
+                [count + 1 for count in file.unpack(f"{2 * radius + 2}H")]
+                for radius in self.radius[family]
+                for _ in range(8)
+            ]
+        self.crc = file.one("I")
+        file.done()
+
+
+def escape(bits: Iterator[str]) -> tuple[bool, int]:
+    """A sign bit and an Exp-Golomb code."""
+    negative, zeros = next(bits) == "1", 0
+    while next(bits) == "0":
+        zeros += 1
+    return negative, int("1" + "".join(next(bits) for _ in range(zeros)), 2) - 1
+
+
+def density_tables(data: bytes, rows: int, width: int) -> list[list[int]]:
+    """`factorised` and `mixture`: the columns of the matrix."""
+    file = Bytes(data)
+    check(file.unpack("BIH") == (1, rows, width), "head of density tables")
+    crc = file.one("I")
+    spans = [(file.signed(), file.varint()) for _ in range(width)]
+    tables = stored_tables(file, [length + 1 for _, length in spans])
+    chunks = Bytes(file.take(file.varint()))
+    entries = coded_classes(chunks, tables, rows)
+    chunks.done()
+    bits, found = file.bits(), []
+    for (a, length), column in zip(spans, entries, strict=True):
+        values = [a + i for i in column]
+        for row in [row for row, i in enumerate(column) if i == length]:
+            negative, v = escape(bits)
+            values[row] = a - 1 - v if negative else a + length + v
+        found.append(values)
+    check(crc_i64([v for column in found for v in column]) == crc, "CRC of density tables")
+    return found
+
+
+def centre_and_table(mean: int, level: int, m: int) -> tuple[int, int]:
+    """I and the number of the table."""
+    eighths = (8 * mean + m // 2) // m
+    centre = (eighths + 4) // 8
+    return centre, 8 * level + eighths + 4 - 8 * centre
+
+
+def coded_values(
+    words: RangeWords, bits: Iterator[str], tables: ExactTables, family: str, numbers: Sequence[int]
+) -> list[int]:
+    """s for each entry of `numbers`, the tables."""
+    entries = symbols_by_table(words, tables.tables[family], numbers)
+    values = [0] * len(numbers)
+    for i in sorted(range(len(numbers)), key=lambda i: numbers[i]):  # stable: table by table, in order
+        radius = tables.radius[family][numbers[i] // 8]
+        values[i] = entries[i] - radius
+        if entries[i] == 2 * radius + 1:
+            negative, v = escape(bits)
+            values[i] = -(v + radius + 1) if negative else v + radius + 1
+    return values
+
+
+def exact(
+    data: bytes, family: str, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
+) -> list[int]:
+    """`gaussian-exact` and `laplace-exact`."""
+    file = Bytes(data)
+    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    centres, numbers = [], []
+    for mu, sigma, m in zip(mean, scale, multiplier, strict=True):
+        level = bisect.bisect_left(tables.thresholds, (max(sigma, 0) << 12) // m)
+        centre, number = centre_and_table(mu, level, m)
+        centres.append(centre)
+        numbers.append(number)
+
+    found: list[int] = []
+    while len(found) < len(centres):
+        count, _, _, length, crc = file.unpack("IiiII")
+        start = len(found)
+        chunk = Bytes(file.take(length))
+        words = RangeWords(chunk.take(chunk.varint()))
+        coded = coded_values(words, chunk.bits(), tables, family, numbers[start : start + count])
+        values = [value + centre for value, centre in zip(coded, centres[start : start + count], strict=True)]
+        check(crc_i32(values) == crc, "CRC of a chunk")
+        found += values
+    file.done()
+    return found
+
+
+def conditional(
+    section: bytes,
+    tables: ExactTables,
+    c: int,
+    mean: np.ndarray,
+    scale: np.ndarray,
+    steps: np.ndarray,
+    there: np.ndarray,
+) -> np.ndarray:
+    """`conditional-gaussian`: integers like `mean` [n,C]; 0 where not `there`."""
+    file, found, rows = Bytes(section), np.zeros(mean.shape, np.int64), max(1, (1 << 20) // c)
+    for start in range(0, len(mean), rows):
+        part = slice(start, start + rows)
+        present = there[part]
+        spread = np.broadcast_to(steps[part], mean[part].shape)
+        parameters = [each[present].tolist() for each in (mean[part], scale[part], spread)]
+        found[part][present] = exact(file.take(file.varint()), "gaussian", tables, *parameters)
+    file.done()
+    return found

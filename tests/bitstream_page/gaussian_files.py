@@ -1,0 +1,157 @@
+"""Chapter 6: The files of each method, those of Gaussians."""
+
+from __future__ import annotations
+
+import bisect
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from bitstream_page.container import array
+from bitstream_page.entropy_models import columns
+from bitstream_page.fields import Bytes, check
+from bitstream_page.positions import byte_planes, float_delta, importance_vq, octree
+
+
+def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    return {name: array(section) for name, section in sections.items()}
+
+
+def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
+    n, active = static["num_gaussians"], static["active_sh_degree"]
+    points = octree(sections["positions"])
+    check(len(points) == n, "number of points")
+    base = {name: np.array(columns(sections[name], n, width), np.float64).reshape(width, n)
+            for name, width in (("color", 3), ("opacity", 1), ("scales", 3), ("quats", 3))}  # fmt: skip
+    rest = np.zeros((n, (static["max_sh_degree"] + 1) ** 2 - 1, 3), np.float32)
+    activity = [0] * n
+    for band in range(1, active + 1):
+        matrix = band_columns(sections[f"sh{band}"], n, band, 1 if band == 1 else static["sh_classes"], activity)
+        activity = [sum(map(abs, row), done) for row, done in zip(zip(*matrix, strict=True), activity, strict=True)]
+        colors = np.array(matrix, np.float64).reshape(2 * band + 1, 3, n) * static["rest_step"]
+        for k, (y, u, v) in enumerate(colors):
+            rest[:, band**2 - 1 + k] = rgb(y, u, v)
+    x, y, z = base["quats"] * static["quat_step"]
+    norm = x * x + y * y + z * z
+    w, long = np.sqrt(np.maximum(1 - norm, 0)), np.sqrt(np.maximum(norm, 1))
+    return {
+        "means": np.stack([coordinates(points[:, a], static, a) for a in range(3)], 1),
+        "sh_dc": rgb(*(base["color"] * static["dc_step"]))[:, None],
+        "sh_rest": rest,
+        "opacity_logits": (base["opacity"][0] * static["opacity_step"]).astype(np.float32),
+        "log_scales": (base["scales"] * static["scale_step"]).T.astype(np.float32),
+        "quats": np.stack([w / long, x / long, y / long, z / long], 1).astype(np.float32),
+    }
+
+
+def coordinates(q: np.ndarray, static: dict[str, Any], axis: int) -> np.ndarray:
+    top = float(static["top"][axis])
+    v = (q + 0.5) * (2 * top * 2.0 ** -static["position_bits"]) - top
+    a = np.abs(v)
+    floor = np.floor(a)
+    u = np.where(a < 1, a, (1 + (a - floor)) * 2.0 ** (floor - 1))
+    u = np.where(v < 0, -u, u)
+    return (u * static["width"][axis] + static["center"][axis]).astype(np.float32)
+
+
+def rgb(y: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    a, b, c, d = 1 / np.sqrt(3.0), 1 / np.sqrt(2.0), 1 / np.sqrt(6.0), -2 / np.sqrt(6.0)
+    return np.stack([a * y + b * u + c * v, a * y + 0 * u + d * v, a * y - b * u + c * v], 1).astype(np.float32)
+
+
+def band_columns(section: bytes, n: int, band: int, classes: int, activity: list[int]) -> list[list[int]]:
+    """The columns of one SH band, rows of all classes in place."""
+    file, width = Bytes(section), 3 * (2 * band + 1)
+    lengths = file.unpack("I" * classes)
+    limits = [sorted(activity)[n * i // classes] for i in range(1, classes)] if n else []
+    class_of = [bisect.bisect_right(limits, value) for value in activity]
+    found = [[0] * n for _ in range(width)]
+    for number, length in enumerate(lengths):
+        rows = [i for i in range(n) if class_of[i] == number]
+        content = file.take(length)
+        check(bool(rows) == bool(content), "a class and its rows")
+        for column, values in zip(found, columns(content, len(rows), width) if rows else [], strict=False):
+            for i, value in zip(rows, values, strict=True):
+                column[i] = value
+    file.done()
+    return found
+
+
+def ply(static: dict[str, Any], section: bytes) -> dict[str, np.ndarray]:
+    n, r = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1
+    names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(3 * r)),
+             "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    file = Bytes(section)
+    for line in lines:
+        check(file.take(len(line) + 1) == f"{line}\n".encode("ascii"), "header of the .ply")
+    table = np.frombuffer(file.rest(), "<f4").reshape(n, len(names))
+    return {
+        "means": table[:, :3],
+        "sh_dc": table[:, None, 6:9],
+        "sh_rest": table[:, 9 : 9 + 3 * r].reshape(n, 3, r).transpose(0, 2, 1),
+        "opacity_logits": table[:, 9 + 3 * r],
+        "log_scales": table[:, 10 + 3 * r : 13 + 3 * r],
+        "quats": table[:, 13 + 3 * r :],
+    }
+
+
+def packed(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    n, r = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1
+    tails = {"sh_dc": (1, 3), "sh_rest": (r, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
+    planes = {name: byte_planes(sections[name], "f4", (n, *tail), unzstd) for name, tail in tails.items()}
+    return {"means": float_delta(sections["means"], (n, 3), unzstd), **planes}
+
+
+def vectree(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    n, bands = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2
+    parts = [sections[name] for name in ("vq", "mask", "index", "codebook", "sh_keep")]
+    colors = importance_vq(*parts, n, 3 * bands, unzstd).astype("<f4")
+    attributes = byte_planes(sections["attr"], "f2", (n, 8), unzstd).astype("<f4")
+    return {
+        "means": float_delta(sections["xyz"], (n, 3), unzstd),
+        "sh_dc": colors[:, None, :3],
+        "sh_rest": colors[:, 3:].reshape(n, 3, bands - 1).transpose(0, 2, 1),
+        "opacity_logits": attributes[:, 0],
+        "log_scales": attributes[:, 1:4],
+        "quats": attributes[:, 4:],
+    }
+
+
+def chimera(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    check(static["max_sh_degree"] == 3 and static["vq"] == "importance-vq", "coder of the vectors")
+    groups = []
+    for group, n, rest in (("sh2", static["num_gaussians"] - static["num_sh3"], 8), ("sh3", static["num_sh3"], 15)):
+        d = 3 + 3 * rest
+        means, attributes, colors = np.zeros((0, 3), "<f4"), np.zeros((0, 8), "<f4"), np.zeros((0, d), "<f4")
+        if n:
+            means = chimera_means(static["xyz"], group, n, sections, unzstd)
+            attributes = byte_planes(sections[f"{group}/attributes"], "f2", (n, 8), unzstd).astype("<f4")
+            parts = [sections[f"{group}/vq/{name}"] for name in ("header", "mask", "indices", "codebook", "own")]
+            colors = importance_vq(*parts, n, d, unzstd).astype("<f4")
+        higher = np.zeros((n, 15, 3), "<f4")
+        higher[:, :rest] = colors[:, 3:].reshape(n, 3, rest).transpose(0, 2, 1)
+        groups.append((means, colors[:, None, :3], higher, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:]))
+    names = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
+    return {name: np.concatenate(both) for name, *both in zip(names, *groups, strict=True)}
+
+
+def chimera_means(
+    xyz: str, group: str, n: int, sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> np.ndarray:
+    section = sections[f"{group}/xyz"]
+    if xyz == "float32":
+        return float_delta(section, (n, 3), unzstd)
+    if xyz == "float16":
+        return byte_planes(section, "f2", (n, 3), unzstd).astype("<f4")
+    check(xyz == "uniform16", "positions")
+    low, high = array(sections[f"{group}/box"])
+    return (low + octree(section) / 65535 * (high - low)).astype("<f4")
