@@ -245,5 +245,10 @@ def test_steps_make_the_file_smaller_and_values_multiples_of_them(student):
 
 
 @pytest.mark.cuda
-def test_a_model_on_a_gpu_makes_the_file_that_it_makes_on_the_cpu(student):
-    assert writer_of(student().cuda()).to_bytes() == writer_of(student()).to_bytes()
+def test_what_a_gpu_writes_decodes_alike_on_both(student):
+    """Codebooks are trained where the model is, so that their bytes may differ; what stands in the file may not."""
+    ours, theirs = decoded(writer_of(student().cuda())), decoded(writer_of(student()))
+    assert ours.num_rows == theirs.num_rows
+    for name in ("means", "opacity_logits", "log_scales", "quats"):
+        assert torch.equal(getattr(ours, name), getattr(theirs, name)), name
+    assert writer_of(student().cuda(), **EXACT).to_bytes() == writer_of(student(), **EXACT).to_bytes()
