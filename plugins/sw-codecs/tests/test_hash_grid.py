@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from splatwizard_core.plugins import load_plugins
+from sw_codecs import hash_grid
 from sw_codecs.hash_grid import HashGrid, MixedHashGrid
 from sw_codecs.rates import mask_bits
 
@@ -223,7 +224,7 @@ def test_cuda_equals_cpu():
     assert torch.equal(there.integer_features(codes.cuda()).cpu(), integers)
 
 
-def test_all_grids_in_one_lookup_equal_them_one_by_one():
+def test_all_grids_in_one_lookup_equal_them_one_by_one(monkeypatch):
     grid = MixedHashGrid([6, 9, 20], [9, 40], features=3, log2_space=7, log2_planes=6, generator=generator())
     with torch.no_grad():
         for each in grid.grids:
@@ -241,6 +242,9 @@ def test_all_grids_in_one_lookup_equal_them_one_by_one():
     halves = grid.places(x[:20]), grid.places(x[20:])
     assert all(torch.equal(a, torch.cat(b)) for a, b in zip(places, zip(*halves, strict=True), strict=True))
     assert all(torch.equal(a[5:7], b) for a, b in zip(places, places.rows(torch.tensor([5, 6])), strict=True))
+    with monkeypatch.context() as patch:
+        patch.setattr(hash_grid, "PLACE_ROWS", 16)
+        assert all(torch.equal(a, b) for a, b in zip(places, grid.places(x), strict=True))
     assert grid.place_bytes == sum(each[0].numel() * each.element_size() for each in places)
     tables = [each.table for each in grid.grids]
     results, gradients = [], []

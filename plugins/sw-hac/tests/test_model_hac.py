@@ -1,5 +1,7 @@
 """The model has the published sizes, predicts by the formulas, and learns through noise, masks and rate."""
 
+import copy
+
 import pytest
 import torch
 from hac_models import PLUGINS, generator, make, method
@@ -186,3 +188,12 @@ def test_on_a_gpu_neither_values_nor_rate_are_waited_for():
         torch.cuda.set_sync_debug_mode("default")
     assert float(rate.bits) > 0
     assert all(bool(torch.isfinite(p.grad).all()) for p in model.parameters() if p.grad is not None)
+
+
+def test_a_copy_leaves_behind_where_anchors_lie():
+    model = make(40)
+    model.predict(torch.arange(4))
+    assert model._places is not None
+    twin = copy.deepcopy(model)
+    assert twin._places is None
+    assert twin.digest() == model.digest()

@@ -61,6 +61,7 @@ class CatAnchors(CodedAnchors):
         key = (codes, context.frame, context.frame._version, context.resolution)
         kept = self._places
         if kept is None or kept[0][0] is not key[0] or kept[0][1] is not key[1] or kept[0][2:] != key[2:]:
+            self._places = None  # the old ones go before the new ones come
             places = context.places(codes, self.bounds)
             kept = self._places = (key, places, context.triplane.sites(places))
         return kept[1], kept[2]

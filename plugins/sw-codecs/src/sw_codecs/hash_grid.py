@@ -334,8 +334,19 @@ class MixedHashGrid(nn.Module):
     @torch.no_grad()
     def places(self, x: Tensor) -> GridPlaces:
         """Where [n,3] in [0,1] lie: what a lookup needs, and no training changes."""
-        blocks = [self._places(block) for block in x.split(PLACE_ROWS)]
-        return blocks[0] if len(blocks) == 1 else GridPlaces(*(torch.cat(each) for each in zip(*blocks, strict=True)))
+        first, *others = x.split(PLACE_ROWS)
+        block = self._places(first)
+        if not others:
+            return block
+        # Written in place: joined afterwards, all of it would be there twice.
+        found = GridPlaces(*(each.new_empty(len(x), *each.shape[1:]) for each in block))
+        start = 0
+        for rows in (first, *others):
+            block = self._places(rows) if start else block
+            for whole, part in zip(found, block, strict=True):
+                whole[start : start + len(rows)] = part
+            start += len(rows)
+        return found
 
     def _places(self, x: Tensor) -> GridPlaces:
         start, found = 0, []

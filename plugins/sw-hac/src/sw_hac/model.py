@@ -69,6 +69,10 @@ class HACAnchors(CodedAnchors):
         units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0] * 3
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
 
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy works out anew where its anchors lie."""
+        return {**self.__dict__, "_places": None}
+
     def networks(self) -> dict[str, nn.Module]:
         """What the file holds besides the grid, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
@@ -78,6 +82,7 @@ class HACAnchors(CodedAnchors):
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
             fits = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
+            self._places = None  # the old ones go before the new ones come
             self._places = (codes, self.grid.places(codes.to(self.features) / TOP) if fits else None)
         places = self._places[1]
         if places is None:
