@@ -7,7 +7,7 @@
 A scene is what `--scene` takes, with `:PICTURES` for a COLMAP scene's picture folder. Runs are those of `sw run`:
 finished ones are not repeated, and the trained 3DGS scene that many methods start from is trained once, before the
 others. --shrink K divides every plan and iteration count by K; the records say so. --parallel N runs N of them at a
-time, on the GPUs in turn, which spoils their times. One that fails is told at the end and does not stop the others.
+time, spread over the GPUs, which spoils their times. One that fails is told at the end and does not stop the others.
 
 The claims compare with 3DGS of the same run: a trained scene of 30,000 steps (or its K-th part). A float32 .ply has 248
 bytes a Gaussian. Rate and distortion of all that lies in OUT/<scene> are drawn as rd.svg there, and told with
@@ -19,6 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import queue
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -70,10 +71,15 @@ def main() -> None:
     args = parser.parse_args()
     names = args.methods.split(",")
     failed: list[str] = []
+    visible = [gpu for gpu in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if gpu]
+    visible = visible or [str(i) for i in range(torch.cuda.device_count())] or [""]
     for first in (True, False):  # what the others start from, then the others
         work = [(scene, name) for scene in args.scenes for name in names if (name == SWEEPS[0]) == first]
+        gpus = queue.SimpleQueue[str]()
+        for place in range(args.parallel):
+            gpus.put(visible[place % len(visible)])
         with ThreadPoolExecutor(args.parallel) as pool:
-            jobs = [pool.submit(run, args, place, *what) for place, what in enumerate(work)]
+            jobs = [pool.submit(run, args, gpus, *what) for what in work]
             failed += [told for job in jobs if (told := job.result()) is not None]
     for scene in args.scenes:
         folder = args.out / Path(scene.partition(":")[0]).name
@@ -88,7 +94,7 @@ def main() -> None:
         sys.exit("\n".join(failed))
 
 
-def run(args: argparse.Namespace, place: int, scene: str, method: str) -> str | None:
+def run(args: argparse.Namespace, gpus: queue.SimpleQueue[str], scene: str, method: str) -> str | None:
     """`sw run` of one method on one scene; what to tell if it fails."""
     spec, _, pictures = scene.partition(":")
     rates = args.rates or ("all" if method in SWEEPS else "default")
@@ -97,12 +103,12 @@ def run(args: argparse.Namespace, place: int, scene: str, method: str) -> str | 
     command += ["--images", pictures] if pictures else []
     for value in (*shrunk(method, args.shrink), *args.sets):
         command += ["--set", value]
-    environment = dict(os.environ)
-    gpus = torch.cuda.device_count()
-    if args.parallel > 1 and gpus > 1:
-        allowed = environment.get("CUDA_VISIBLE_DEVICES", "").split(",")  # of those that we may use, if that was said
-        environment["CUDA_VISIBLE_DEVICES"] = allowed[place % gpus] if len(allowed) >= gpus else str(place % gpus)
-    status = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, env=environment).returncode
+    gpu = gpus.get()
+    try:
+        environment = {**os.environ, "CUDA_VISIBLE_DEVICES": gpu} if gpu else None
+        status = subprocess.run(command, check=False, stdout=subprocess.DEVNULL, env=environment).returncode
+    finally:
+        gpus.put(gpu)
     return None if status == 0 else f"{method} on {spec} failed with exit status {status}, see above"
 
 
