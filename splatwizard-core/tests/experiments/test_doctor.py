@@ -293,12 +293,13 @@ def test_each_package_that_does_not_work_has_its_line(site):
     [
         ("No module named 'jax'", "pip install jax"),
         ("No module named 'heavy_lib'", "pip install --upgrade --force-reinstall --no-deps heavy-lib"),
+        ("No module named 'weighty'", "pip install --upgrade --force-reinstall --no-deps heavy-lib"),
         ("No module named 'heavy_lib.csrc'", "pip install --upgrade --force-reinstall --no-deps heavy-lib"),
         ("OSError: libheavy.so", "pip install --upgrade --force-reinstall --no-deps heavy-lib"),
     ],
 )
 def test_an_extra_gets_what_it_lacks_or_is_put_there_anew(site, why, mend):
-    distribution(site, "heavy-lib")
+    distribution(site, "heavy-lib", weighty="")
     distribution(site, "sw-thing", requires=("heavy-lib; extra == 'fast'",), extras=("fast",))
     needs = packages.collect_needs(["sw-thing"])
     checks = {c.name: c for c in packages.package_checks(needs, {"heavy-lib": f"does not import: {why}"})}

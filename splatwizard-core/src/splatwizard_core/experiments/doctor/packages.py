@@ -135,7 +135,8 @@ def _extra_check(extra: str, requirements: list[Requirement], problems: dict[str
         name = broken[0].split()[0]
         # A part that is lacking ('gsplat.csrc') is one of a package that is there: pip would leave it as it is.
         lacks = re.search(r"No module named '([^'.]+)'", broken[0])
-        if lacks is not None and canonicalize_name(lacks[1]) != canonicalize_name(name):
+        own = {canonicalize_name(each) for each in (name, *import_names(importlib.metadata.distribution(name)))}
+        if lacks is not None and canonicalize_name(lacks[1]) not in own:
             mend = f"pip install {lacks[1]}"
         else:  # without its dependencies: one of them may be torch
             mend = f"pip install --upgrade --force-reinstall --no-deps {name}"
