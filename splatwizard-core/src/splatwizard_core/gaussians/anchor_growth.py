@@ -43,7 +43,7 @@ def accumulate_anchor_statistics(
     model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
     at = selection.offset_index()
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
-    model.offset_grad_accum.view(-1).index_add_(0, at, norms * seen)
+    model.offset_grad_accum.view(-1).index_add_(0, at, torch.where(seen > 0, norms, 0))
     model.offset_denom.view(-1).index_add_(0, at, seen)
 
 
