@@ -52,6 +52,7 @@ def split(g):
         ("split", RasterOptions(clamp_grad="pass", scale_modifier=1.4, eps2d=0.1, background=torch.rand(3)), {}),
         ("split", RasterOptions(alpha=True, depth=ALL_DEPTHS, grad2d=True, absgrad=True, antialias=True), {}),
         ("dense", RasterOptions(profile="dgr-exact", grad2d=True), {}),
+        ("dense", RasterOptions(grad2d=True, absgrad=True), {"width": 900, "height": 900}),  # whole lists: 3,249 tiles
         ("dense", RasterOptions(), {"features": 11}),
         ("dense", RasterOptions(features_detach_geometry=True), {"features": 11}),
         ("colors", RasterOptions(alpha=True), {"color": "colors", "channels": 10}),
@@ -59,7 +60,19 @@ def split(g):
         ("dense", RasterOptions(), {"degree": 3, "active_degree": 1}),
         ("split", RasterOptions(), {"degree": 1, "active_degree": 0}),
     ],
-    ids=["plain", "pass", "everything", "dgr-exact", "features", "detached", "ten-colors", "cov3d", "bands", "dc"],
+    ids=[
+        "plain",
+        "pass",
+        "everything",
+        "dgr-exact",
+        "large",
+        "features",
+        "detached",
+        "ten-colors",
+        "cov3d",
+        "bands",
+        "dc",
+    ],
 )
 def test_many_splats_equal_the_kernels_of_the_cpu(form, options, changes):
     """Tolerances of specs for unfiltered scenes: a cut may flip on rounding, in few places and by little."""
