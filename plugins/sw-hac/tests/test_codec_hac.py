@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.coding.float_mode import this_machine
 from splatwizard_core.errors import BitstreamError
+from splatwizard_core.experiments.measuring import file_flags
 from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.rendering.reference import ReferenceRasterizer
@@ -250,6 +251,12 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
     for changed in ({"device": "cpu other", "torch": torch.__version__}, {"device": "x", "torch": "1.0"}, None):
         with pytest.raises(BitstreamError, match=r"mode 'float' decodes only where it was encoded.*codec.mode=exact"):
             decoded(rewritten(data, made_on=changed))
+
+
+@pytest.mark.parametrize(("mode", "flags"), [("exact", []), ("float", ["device-bound"])])
+def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path):
+    (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
+    assert file_flags(tmp_path / "scene.swz") == flags
 
 
 def test_a_weight_that_does_not_fit_half_precision_is_named():

@@ -85,7 +85,7 @@ def evaluate(
     model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...) and keys
     of the run (raster.prefer, threads, ...).
     """
-    from splatwizard_core.experiments.measuring import measure, opener
+    from splatwizard_core.experiments.measuring import file_flags, measure, opener
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.scene.loaders import load_scene
 
@@ -147,6 +147,8 @@ def evaluate(
             load_kernels=session.load_kernels,
         )
         size = None if path.is_dir() else path.stat().st_size
+        if size is not None:
+            facts["flags"] += file_flags(path)
     if roundtrip and facts["digest"] != digest:
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
     facts = {"file": {"path": file, "bytes": size}, **facts}

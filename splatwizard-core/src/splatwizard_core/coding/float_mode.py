@@ -22,6 +22,11 @@ def this_machine() -> dict[str, str]:
     return {"device": f"cpu {torch.backends.cpu.get_cpu_capability()}", "torch": str(torch.__version__)}
 
 
+def is_device_bound(reader: ContainerReader) -> bool:
+    """Whether a file decodes on the machine alone that made it."""
+    return "made_on" in reader.static
+
+
 def check_machine(reader: ContainerReader) -> None:
     """Raise BitstreamError if a file of mode `float` was made elsewhere."""
     theirs, ours = reader.static.get("made_on"), this_machine()

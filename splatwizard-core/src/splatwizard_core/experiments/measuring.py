@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.coding.float_mode import is_device_bound
 from splatwizard_core.evaluation.evaluate import (
     INFINITE,
     NOT_A_NUMBER,
@@ -178,6 +180,14 @@ def _describe_scene(scene: Scene, quality: EvaluationResult) -> dict[str, Any]:
         "renders": quality.renders,
         "unknown": unknown,
     }
+
+
+def file_flags(path: Path) -> list[str]:
+    """What a reader of numbers must know of the file that they are about."""
+    told = {
+        "device-bound": path.suffix != ".ply" and is_device_bound(ContainerReader.open(path)),
+    }
+    return [name for name, holds in told.items() if holds]
 
 
 def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable[[], tuple[SplatModel, dict[str, Any]]]:

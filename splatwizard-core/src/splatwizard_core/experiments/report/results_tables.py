@@ -65,6 +65,8 @@ def runs_table(runs: Sequence[Run]) -> Table:
     notes = missing_metrics(runs)
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
+    if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
+        notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
     return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes)
 
 
