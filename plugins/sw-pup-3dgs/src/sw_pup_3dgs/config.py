@@ -18,7 +18,9 @@ class Prune(Params):
     steps: list[int] = Field([1, 5_001], description="first step of each round: it removes, and updates nothing")
     fractions: list[float] = Field([0.8, 0.5], description="share that goes in each round, of what is left")
     resolution: Literal[1, 2, 4, 8] = Field(
-        4, description="the score draws views at 1/resolution of their width and height"
+        4,
+        description="the score draws views at 1/resolution of their width and height; "
+        "4 is for photographs of 1,000 pixels and more, 1 for small ones",
     )
     count_rule: CountRule = Field(
         "exact", description="official: all up to the score at index int(share (N - 1)), as in the authors' code"
