@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
@@ -72,7 +72,8 @@ def test_another_context_is_noticed(mode):
 
 @settings(max_examples=60, deadline=None)
 @given(st.sampled_from(C.MODES), st.integers(0, 2**32 - 1), st.integers(0, 255), st.booleans())
-def test_damage_is_answered(mode, place, value, cut):
+@example("exact", 87, 1, False)  # of the last word of a range coder not every bit says something
+def test_damage_is_answered_or_changes_nothing(mode, place, value, cut):
     symbols, context = block(40, 3, mode=mode)
     data = bytearray(C(mode).encode(symbols, context))
     at = place % len(data)
@@ -80,8 +81,12 @@ def test_damage_is_answered(mode, place, value, cut):
         data = data[:at]
     else:
         data[at] ^= value or 1
-    with pytest.raises(BitstreamError):
-        C(mode).decode(bytes(data), context)
+    try:
+        found = C(mode).decode(bytes(data), context)
+    except BitstreamError:
+        return
+    assert not cut
+    assert np.array_equal(found, symbols)
 
 
 @pytest.mark.parametrize("mode", C.MODES)
