@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 CORE = ROOT / "splatwizard-core" / "src" / "splatwizard_core"
 PLUGINS = sorted(p for folder in ("plugins", "examples", "tests/plugins") for p in ROOT.glob(f"{folder}/*/src/sw_*"))
 
-BELOW_ALL = {"errors", "files", "progress", "streams", "memory"}
+BELOW_ALL = {"errors", "files", "progress", "streams", "memory", "cores"}
 """Single modules that know no room."""
 ROOMS = {
     "plugins": set(),

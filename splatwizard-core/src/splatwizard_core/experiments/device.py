@@ -8,6 +8,7 @@ from typing import Any
 
 import torch
 
+from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.plugins import PluginManager
 
@@ -73,8 +74,3 @@ def set_threads(asked: int) -> int:
     elif not os.environ.get("OMP_NUM_THREADS"):
         torch.set_num_threads(available_cores())
     return torch.get_num_threads()
-
-
-def available_cores() -> int:
-    """Cores that the scheduler gives to this process."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

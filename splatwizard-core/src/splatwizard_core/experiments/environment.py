@@ -10,7 +10,7 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.experiments.device import available_cores
+from splatwizard_core.cores import available_cores
 from splatwizard_core.plugins import PluginManager
 
 

@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import NativeBuildError
 
 SHARED_INCLUDE = Path(__file__).parent / "include"
@@ -57,9 +58,7 @@ def cores() -> int:
     limit = os.environ.get("MAX_JOBS", "")
     if limit.isdigit() and int(limit) > 0:
         return int(limit)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return available_cores()
 
 
 def find_compiler() -> list[str]:

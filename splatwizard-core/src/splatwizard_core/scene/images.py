@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import ConfigError, SceneError
 from splatwizard_core.progress import track
 from splatwizard_core.scene.scene import View
@@ -216,7 +217,7 @@ def _decode_once(view: View) -> None:
 
 
 def _workers() -> int:
-    return min(8, len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1)
+    return min(8, available_cores())
 
 
 @contextlib.contextmanager

@@ -11,6 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
+from splatwizard_core.cores import available_cores
 from splatwizard_core.experiments.doctor.check import Check, gigabytes, one_line
 from splatwizard_core.native import cache_root
 
@@ -53,7 +54,7 @@ def container_limit() -> int | None:
 
 
 def check_cores() -> Check:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    cores = available_cores()
     threads = os.environ.get("OMP_NUM_THREADS")
     said = f", OMP_NUM_THREADS={threads}" if threads else ""
     return Check(GROUP, "cores", "ok", f"{cores}{said}", facts={"cores": cores})
