@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ from hypothesis import strategies as st
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.coding.float_mode import this_machine
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.experiments.measuring import file_flags
+from splatwizard_core.experiments import measuring
 from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.rendering.reference import ReferenceRasterizer
+from splatwizard_core.scene.scene import Protocol
 from splatwizard_core.testing.rasterizer_checks import front_camera
 from sw_hac import codec
 from sw_hac.method import HAC
@@ -256,7 +258,9 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
 @pytest.mark.parametrize(("mode", "flags"), [("exact", []), ("float", ["device-bound"])])
 def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path):
     (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
-    assert file_flags(tmp_path / "scene.swz") == flags
+    bound = measuring.opener(tmp_path / "scene.swz", PLUGINS, torch.device("cpu"))().device_bound
+    scene, quality = SimpleNamespace(protocol=Protocol("test")), SimpleNamespace(metrics={})
+    assert measuring._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
 
 
 def test_a_weight_that_does_not_fit_half_precision_is_named():

@@ -37,7 +37,7 @@ from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.files import scratch_folder
 
 if TYPE_CHECKING:
-    from splatwizard_core.gaussians.splat_model import SplatModel
+    pass
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")
@@ -85,7 +85,7 @@ def evaluate(
     model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...) and keys
     of the run (raster.prefer, threads, ...).
     """
-    from splatwizard_core.experiments.measuring import file_flags, measure, opener
+    from splatwizard_core.experiments.measuring import Opened, measure, opener
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.scene.loaders import load_scene
 
@@ -129,9 +129,9 @@ def evaluate(
         else:
             from splatwizard_core.experiments.encoding import load_finished
 
-            def open_model() -> tuple[SplatModel, dict[str, Any]]:
+            def open_model() -> Opened:
                 trained = load_finished(session, resolved, path)
-                return trained.model.eval().requires_grad_(False), trained.facts["raster"]
+                return Opened(trained.model.eval().requires_grad_(False), trained.facts["raster"])
 
         facts: dict[str, Any] = measure(
             open_model,
@@ -147,8 +147,6 @@ def evaluate(
             load_kernels=session.load_kernels,
         )
         size = None if path.is_dir() else path.stat().st_size
-        if size is not None:
-            facts["flags"] += file_flags(path)
     if roundtrip and facts["digest"] != digest:
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
     facts = {"file": {"path": file, "bytes": size}, **facts}

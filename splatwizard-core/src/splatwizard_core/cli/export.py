@@ -32,7 +32,7 @@ def export(file: str, out: str, exporter: str | None, device: str | None, as_jso
     plugins = load_plugins()
     ppl, _, _ = resolve_run_options(None, assignments((), device=device))
     session = open_session(ppl, plugins)
-    model, _ = opener(path, plugins, session.device)()
+    model = opener(path, plugins, session.device)().model
     target = Path(out)
     name = export_model(model, target, plugins, exporter)
     facts = {"file": out, "format": name, "bytes": target.stat().st_size, "counts": model.counts()}

@@ -56,7 +56,7 @@ def render(
     plugins = load_plugins()
     ppl, scene_options, said_scene = resolve_run_options(config_file, assignments(sets, images=images, device=device))
     session = open_session(ppl, plugins)
-    model, raster = opener(path, plugins, session.device)()
+    model, raster, _ = opener(path, plugins, session.device)()
     output_folder(out)  # only now: a file that cannot be opened leaves no empty folder
     loaded = load_scene(scene or said_scene or "demo", scene_options, plugins)
     chosen = {"test": loaded.test, "train": loaded.train, "all": [*loaded.train, *loaded.test]}[views]

@@ -6,11 +6,10 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 
-from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.coding.float_mode import is_device_bound
 from splatwizard_core.evaluation.evaluate import (
     INFINITE,
@@ -37,8 +36,20 @@ from splatwizard_core.training.params import PipelineParams
 FEWEST_SPEED_VIEWS = 8
 
 
+class Opened(NamedTuple):
+    """A model on its device, and what there is to know of where it came from.
+
+    raster          what it asks of a rasterizer
+    device_bound    its file decodes on the machine alone that made it
+    """
+
+    model: SplatModel
+    raster: dict[str, Any]
+    device_bound: bool = False
+
+
 def measure(
-    open_model: Callable[[], tuple[SplatModel, dict[str, Any]]],
+    open_model: Callable[[], Opened],
     load_scene: Callable[[], Scene],
     plugins: PluginManager,
     device: torch.device,
@@ -53,7 +64,7 @@ def measure(
 ) -> dict[str, Any]:
     """Open a model, then its scene, and measure the one on the other. Plain values, as `sw eval --json` prints them.
 
-    open_model  () -> the model on `device`, and what it asks of a rasterizer; called first, before any picture is read
+    open_model  () -> the model on `device`; called first, before any picture is read
     load_scene  () -> the scene
     metrics     names; None: all that are installed
     lpips_weights   folder that LPIPS' backbones are looked for in first
@@ -70,7 +81,7 @@ def measure(
     meter = MemoryMeter(device)
     meter.start()
     began = time.perf_counter()
-    model, raster = open_model()
+    model, raster, device_bound = open_model()
     _synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
@@ -110,7 +121,7 @@ def measure(
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, ppl.seed),
-        "flags": _flags(scene, quality, meter),
+        "flags": _flags(scene, quality, meter, device_bound),
     }
     if report is not None:
         facts = asdict(report)
@@ -134,7 +145,7 @@ def measure(
     return found
 
 
-def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter) -> list[str]:
+def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter, device_bound: bool) -> list[str]:
     """What a reader of the numbers must know."""
     told = {
         "fit": scene.protocol.split == "all",
@@ -142,6 +153,7 @@ def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter) -> list[
         "infinite": any(metric.reason == INFINITE for metric in quality.metrics.values()),
         "not-a-number": any(metric.reason == NOT_A_NUMBER for metric in quality.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in quality.metrics.values()),
+        "device-bound": device_bound,
     }
     return [name for name, holds in told.items() if holds]
 
@@ -182,24 +194,16 @@ def _describe_scene(scene: Scene, quality: EvaluationResult) -> dict[str, Any]:
     }
 
 
-def file_flags(path: Path) -> list[str]:
-    """What a reader of numbers must know of the file that they are about."""
-    told = {
-        "device-bound": path.suffix != ".ply" and is_device_bound(ContainerReader.open(path)),
-    }
-    return [name for name, holds in told.items() if holds]
+def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable[[], Opened]:
+    """() -> the model of a .swz or .ply on `device`."""
 
-
-def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable[[], tuple[SplatModel, dict[str, Any]]]:
-    """() -> the model of a .swz or .ply on `device`, and what the file asks of a rasterizer."""
-
-    def open_file() -> tuple[SplatModel, dict[str, Any]]:
+    def open_file() -> Opened:
         if path.suffix == ".ply":
             from splatwizard_core.gaussians.ply import load_ply
 
-            return load_ply(path).to(device).eval().requires_grad_(False), {}
+            return Opened(load_ply(path).to(device).eval().requires_grad_(False), {})
         model, reader = open_model(path, plugins, device)
-        return model, reader.raster
+        return Opened(model, reader.raster, is_device_bound(reader))
 
     if path.suffix != ".ply":
         import_method(path, plugins)  # code is not memory of the model
