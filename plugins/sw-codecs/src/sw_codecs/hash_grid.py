@@ -11,6 +11,7 @@ has the same features. Source: specification of the codec library, context model
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -334,18 +335,16 @@ class MixedHashGrid(nn.Module):
     @torch.no_grad()
     def places(self, x: Tensor) -> GridPlaces:
         """Where [n,3] in [0,1] lie: what a lookup needs, and no training changes."""
-        first, *others = x.split(PLACE_ROWS)
-        block = self._places(first)
-        if not others:
-            return block
+        blocks = map(self._places, x.split(PLACE_ROWS))
+        first = next(blocks)
+        if len(first.space) == len(x):
+            return first
         # Written in place: joined afterwards, all of it would be there twice.
-        found = GridPlaces(*(each.new_empty(len(x), *each.shape[1:]) for each in block))
-        start = 0
-        for rows in (first, *others):
-            block = self._places(rows) if start else block
+        found, start = GridPlaces(*(each.new_empty(len(x), *each.shape[1:]) for each in first)), 0
+        for block in itertools.chain([first], blocks):
             for whole, part in zip(found, block, strict=True):
-                whole[start : start + len(rows)] = part
-            start += len(rows)
+                whole[start : start + len(part)] = part
+            start += len(part)
         return found
 
     def _places(self, x: Tensor) -> GridPlaces:
