@@ -32,7 +32,7 @@ from torch.utils._pytree import tree_leaves
 from splatwizard_core.experiments.config import resolve
 from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera, look_at
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 
@@ -46,15 +46,19 @@ class Moved(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         found = func(*args, **(kwargs or {}))
-        inputs = {t.untyped_storage().data_ptr() for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)}
+        inputs = [t for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)]
         outputs = [t for t in tree_leaves(found) if isinstance(t, Tensor)]
-        writes = func._schema.is_mutable
-        if writes or any(t.untyped_storage().data_ptr() not in inputs for t in outputs):
+        there = {t.untyped_storage().data_ptr() for t in inputs}
+        if func._schema.is_mutable or any(t.untyped_storage().data_ptr() not in there for t in outputs):
             self.operators += 1
-            tensors = [t for t in tree_leaves((args, kwargs)) if isinstance(t, Tensor)]
-            tensors += outputs
-            self.bytes += sum(t.numel() * t.element_size() for t in tensors if "empty" not in func.__name__)
+            if "empty" not in func.__name__:
+                self.bytes += sum(t.numel() * t.element_size() for t in (*inputs, *outputs))
         return found
+
+
+def camera_before() -> Camera:
+    """Three units before the anchors."""
+    return look_at(torch.tensor([0.0, 0, -3]), torch.zeros(3), torch.tensor([0.0, 1, 0]), width=8, height=8, fov_x=1)
 
 
 def made(name: str, count: int, preset: str, device: torch.device) -> tuple[Any, Any, Any]:
@@ -67,8 +71,7 @@ def made(name: str, count: int, preset: str, device: torch.device) -> tuple[Any,
     g = torch.Generator().manual_seed(0)
     points = torch.nn.functional.normalize(torch.randn(count, 3, generator=g), dim=1)
     points *= 1 + 0.1 * torch.sin(7 * points[:, :1])
-    camera = look_at(torch.tensor([0.0, 0, -3]), torch.zeros(3), torch.tensor([0.0, 1, 0]), width=8, height=8, fov_x=1)
-    view = View(camera, "0.png")
+    view = View(camera_before(), "0.png")
     scene = Scene("made", [view], [view], PointCloud(points, points.abs()), Protocol("made", background="black"))
     model = method.create_model(scene, stream(0, "init")).to(device)
     with torch.no_grad():
@@ -87,8 +90,7 @@ def made(name: str, count: int, preset: str, device: torch.device) -> tuple[Any,
 def parts(name: str, stage: Any, model: Any, optimizer: Any, share: float) -> dict[str, Callable[[], None]]:
     drawn = torch.rand(model.num_rows, generator=torch.Generator().manual_seed(1)) < share
     rows = torch.nonzero(drawn).squeeze(1).to(model.device)
-    camera = look_at(torch.tensor([0.0, 0, -3]), torch.zeros(3), torch.tensor([0.0, 1, 0]), width=8, height=8, fov_x=1)
-    camera = camera.to(model.device)
+    camera = camera_before().to(model.device)
 
     def decoding(phase: str) -> None:
         model.phase = phase

@@ -74,11 +74,11 @@ def main() -> None:
     failed: list[str] = []
     visible = [gpu for gpu in os.environ.get("CUDA_VISIBLE_DEVICES", "").split(",") if gpu]
     visible = visible or [str(i) for i in range(torch.cuda.device_count())] or [""]
+    gpus = queue.SimpleQueue[str]()
+    for place in range(args.parallel):
+        gpus.put(visible[place % len(visible)])
     for first in (True, False):  # what the others start from, then the others
         work = [(scene, name) for scene in args.scenes for name in names if (name == SWEEPS[0]) == first]
-        gpus = queue.SimpleQueue[str]()
-        for place in range(args.parallel):
-            gpus.put(visible[place % len(visible)])
         with ThreadPoolExecutor(args.parallel) as pool:
             jobs = [pool.submit(run, args, gpus, *what) for what in work]
             failed += [told for job in jobs if (told := job.result()) is not None]
@@ -186,10 +186,10 @@ def print_claims(runs: list[Run]) -> None:
         ratio, lost = ply / light.size, base.psnr - light.psnr
         row("lightgaussian", ">= 12x below the float32 .ply for <= 0.5 dB", f"{ratio:.1f}x, {-lost:+.2f} dB",
             ratio >= 12 and lost <= 0.5)  # fmt: skip
-    for own in [run for run in runs if run.method == "chimerags" and light]:
-        row("chimerags", f"{own.rate}: fewer bytes than lightgaussian at no less PSNR",
-            f"{own.size / light.size:.2f} of the bytes, {own.psnr - light.psnr:+.2f} dB",
-            own.size < light.size and own.psnr >= light.psnr)  # fmt: skip
+        for own in (run for run in runs if run.method == "chimerags"):
+            row("chimerags", f"{own.rate}: fewer bytes than lightgaussian at no less PSNR",
+                f"{own.size / light.size:.2f} of the bytes, {own.psnr - light.psnr:+.2f} dB",
+                own.size < light.size and own.psnr >= light.psnr)  # fmt: skip
     if hac := default["hac"]:
         good = [r for r in runs if r.method == "hac" and r.psnr >= base.psnr - 0.3]
         best = min(good, key=lambda r: r.size, default=hac)
