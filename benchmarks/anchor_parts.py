@@ -24,14 +24,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import torch
+from sw_anchors.coded_anchors import ENTROPY
 from torch import Tensor
 from torch.profiler import ProfilerActivity, profile
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-from splatwizard_core.experiments.config import resolve
-from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import Camera, look_at
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream

@@ -27,8 +27,7 @@ from PIL import Image
 from rich.console import Console
 from rich.table import Table
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
-
-from splatwizard_core.evaluation.torchvision_import import import_torchvision
+from sw_metrics.torchvision_import import import_torchvision
 
 if sys.version_info >= (3, 11):
     import tomllib

@@ -64,7 +64,7 @@ def measure(rasterizer: Rasterizer, n: int, width: int, height: int, threads: in
 
 
 def make_subset(g, count: int):
-    from splatwizard_core.testing.raster_scenes import permute_inputs
+    from sw_reference.testing.raster_scenes import permute_inputs
 
     subset = permute_inputs(g, torch.arange(count))
     for x in subset.tensors().values():
@@ -182,7 +182,7 @@ def main() -> None:
 
 def print_reference(repeats: int) -> None:
     """Against pure torch, on a scene that it can draw in seconds."""
-    from splatwizard_core.rendering.reference import ReferenceRasterizer
+    from sw_reference.rasterizer import ReferenceRasterizer
 
     n, width, height = 4000, 135, 240
     ours = measure(StandardRasterizer(), n, width, height, 1, repeats)

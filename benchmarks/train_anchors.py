@@ -30,14 +30,14 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile, record_function
 
-from splatwizard_core.experiments.config import resolve
-from splatwizard_core.experiments.session import Session
-from splatwizard_core.experiments.start import make_method
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import resolve
+from splatwizard_core.runs.session import Session
+from splatwizard_core.runs.start import make_method
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream

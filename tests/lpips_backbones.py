@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-
-from splatwizard_core.evaluation.lpips_weights import BACKBONES
+from sw_metrics.lpips_weights import BACKBONES
 
 
 def random_state(net: str) -> dict[str, torch.Tensor]:

@@ -14,7 +14,7 @@ import torch
 from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.scene.loading import load_scene
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "check_metrics.py"
 

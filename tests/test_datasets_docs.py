@@ -6,8 +6,9 @@ import re
 from dataclasses import fields
 from pathlib import Path
 
+from sw_datasets.families import BENCHMARKS
+
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.families import BENCHMARKS
 from splatwizard_core.scene.images import fitted_size
 
 DOCS = (Path(__file__).resolve().parents[1] / "docs" / "datasets.md").read_text(encoding="utf-8")

@@ -110,8 +110,8 @@ def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
     import importlib.util
 
     import torch
+    from sw_doctor import probe
 
-    from splatwizard_core.experiments.doctor import probe
     from splatwizard_core.plugins import load_plugins
 
     find_spec = importlib.util.find_spec

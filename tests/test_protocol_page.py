@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 from pydantic import BaseModel
+from sw_metrics.lpips_weights import BACKBONES
 
-from splatwizard_core.evaluation.lpips_weights import BACKBONES
-from splatwizard_core.experiments import measuring, record
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs import measuring, record
 from splatwizard_core.scene.scene import Protocol
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "protocol.md").read_text(encoding="utf-8")

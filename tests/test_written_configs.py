@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from splatwizard_core.cli.main import main
-from splatwizard_core.experiments.config import ResolvedConfig, resolve
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import ResolvedConfig, resolve
 
 METHODS = load_plugins().methods.names
 # Values of the run and the scene that no preset sets, one of them None.

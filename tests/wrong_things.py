@@ -22,7 +22,7 @@ def register_methods(registry):
 
 
 def __getattr__(name):
-    from splatwizard_core.experiments.method import Method
+    from splatwizard_core.method import Method
     from splatwizard_core.training.stage import Stage
 
     class FromTrained(Stage):
@@ -82,10 +82,11 @@ def copied(source: Path, name: str) -> Path:
 
 
 def make_scenes(root: Path) -> None:
+    from sw_datasets.write_scene import write_scene
+
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.scene.dataset import SceneOptions
-    from splatwizard_core.scene.loaders import load_scene
-    from splatwizard_core.scene.write_scene import write_scene
+    from splatwizard_core.scene.loading import load_scene
 
     scene, blender = root / "scene", root / "blender"
     drawn = load_scene("demo:tiny", SceneOptions(), load_plugins())

@@ -14,7 +14,7 @@ from PIL import Image
 
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.scene.loading import load_scene
 
 ROWS = (2, 9)  # test views
 GAP = 4  # pixels of white between pictures

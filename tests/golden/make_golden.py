@@ -19,12 +19,12 @@ import numpy as np
 import torch
 
 from splatwizard_core.coding.container import ContainerReader
-from splatwizard_core.experiments.decoding import decode_model
-from splatwizard_core.experiments.encoding import encode
-from splatwizard_core.experiments.method import create_method
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.method import create_method
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.decoding import decode_model
+from splatwizard_core.runs.encoding import encode
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 
 FOLDER = Path(__file__).resolve().parent

@@ -11,13 +11,13 @@ from hypothesis import strategies as st
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SplatwizardError, UserInputError
-from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import apply_overrides
 from sw_3dgs.config import ThreeDGSConfig
-from sw_3dgs.gauge import canonical
 from sw_3dgs.method import ThreeDGS
-from sw_3dgs.quantized import lattice, reconstruct
+from sw_codecs.models.gauge import canonical
+from sw_codecs.models.quantized import lattice, reconstruct
 
 QUANTIZED = [name for name in ThreeDGS.RATES if ThreeDGS.RATES[name]["codec.mode"] == "quantized"]
 

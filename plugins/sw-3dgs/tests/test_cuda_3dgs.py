@@ -4,9 +4,11 @@ import math
 
 import pytest
 import torch
+from sw_gaussians import density
+from sw_gaussians.mcmc import draw
+from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.statistics import accumulate_statistics
 
-from splatwizard_core.gaussians import density
-from splatwizard_core.gaussians.mcmc import draw
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -18,10 +20,8 @@ from splatwizard_core.training.native import TRAINING
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
-from splatwizard_core.training.statistics import accumulate_statistics
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
 from sw_3dgs.config import MCMC, ThreeDGSConfig
-from sw_3dgs.stage import ThreeDGSStage
 
 pytestmark = [
     pytest.mark.cuda,

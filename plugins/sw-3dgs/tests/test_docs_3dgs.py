@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from sw_3dgs.presets import PRESETS, RATES
-from sw_3dgs.quantized import SECTIONS, Layout
+from sw_codecs.models.quantized import SECTIONS, Layout
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "docs" / "methods" / "3dgs.md"

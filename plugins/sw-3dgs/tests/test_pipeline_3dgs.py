@@ -5,12 +5,12 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams

@@ -4,12 +4,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.experiments.config import apply_overrides, resolve
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import save_ply
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
@@ -19,8 +21,6 @@ from splatwizard_core.training.stage import CameraIterator
 from splatwizard_core.training.tasks import TaskContext
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
-from sw_3dgs.stage import ThreeDGSStage
-from sw_3dgs.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
 PAPER_PLAN = """\
 Stage | Task                        | Plan

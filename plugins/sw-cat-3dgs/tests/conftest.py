@@ -5,12 +5,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import torch
+from sw_anchors.coded_anchors import ENTROPY
 
-from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.streams import stream
 from sw_cat_3dgs.config import CatConfig

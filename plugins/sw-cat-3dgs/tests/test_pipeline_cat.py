@@ -7,10 +7,10 @@ import sys
 import numpy as np
 import pytest
 import torch
+from sw_anchors.coded_anchors import ENTROPY
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.streams import stream
@@ -83,7 +83,7 @@ def test_a_fresh_process_decodes_the_same_model(method, trained, tmp_path):
     path.write_bytes(encoded(trained, method))
     code = (
         "import torch, sys; torch.set_num_threads(2)\n"
-        "from splatwizard_core.experiments.decoding import open_model\n"
+        "from splatwizard_core.runs.decoding import open_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "print(open_model(sys.argv[1], load_plugins(), torch.device('cpu'))[0].digest())"
     )

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
 
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.experiments.config import resolve
-from splatwizard_core.gaussians.coded_anchors import ENTROPY, FULL, QUANTIZED
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_cat_3dgs.config import CatConfig

@@ -9,11 +9,11 @@ import torch
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, SplatwizardError
 from splatwizard_core.evaluation.evaluate import suggested_rasterizers
-from splatwizard_core.experiments.config import resolve
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import look_at
 from sw_chimerags.file import POSITIONS, ROW_BYTES
 from sw_chimerags.method import ChimeraGS

@@ -5,11 +5,11 @@ import copy
 import pytest
 import torch
 
-from splatwizard_core.experiments.config import resolve
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams

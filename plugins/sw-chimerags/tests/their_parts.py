@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 
 import numpy as np
+from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
 
-from splatwizard_core.experiments.method import Method
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.method import Method
 from splatwizard_core.plugins import Registry, hookimpl
-from splatwizard_core.training.fine_tuning import FineTuningRates, FineTuningStage
 from splatwizard_core.training.params import OptimizationParams
 
 

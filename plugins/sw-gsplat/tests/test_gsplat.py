@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
 from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 from sw_gsplat.availability import unavailable
 from sw_gsplat.rasterizer import GsplatRasterizer
 

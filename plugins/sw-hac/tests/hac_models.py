@@ -1,11 +1,11 @@
 """Small models of HAC with values that follow their predicted distributions, as those of a trained one do."""
 
 import torch
+from sw_anchors.coded_anchors import ENTROPY
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.experiments.config import apply_overrides
-from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import apply_overrides
 from sw_hac.config import HACConfig
 from sw_hac.method import HAC
 from sw_hac.model import HACAnchors

@@ -11,16 +11,16 @@ import torch
 from hac_models import PLUGINS, decoded, encoded, generator, make, method
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.float_mode import this_machine
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.rasterizer_checks import front_camera
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.coding.float_mode import this_machine
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.experiments import measuring
-from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.rendering.reference import ReferenceRasterizer
+from splatwizard_core.runs import measuring
 from splatwizard_core.scene.scene import Protocol
-from splatwizard_core.testing.rasterizer_checks import front_camera
 from sw_hac import codec
 from sw_hac.method import HAC
 
@@ -100,7 +100,7 @@ def test_another_process_decodes_the_same(tmp_path):
     code = (
         "import sys, torch\n"
         "from splatwizard_core.coding.container import ContainerReader\n"
-        "from splatwizard_core.experiments.decoding import decode_model\n"
+        "from splatwizard_core.runs.decoding import decode_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "torch.set_num_threads(2)\n"
         "for path in sys.argv[1:]:\n"

@@ -5,13 +5,13 @@ import copy
 import pytest
 import torch
 from hac_models import PLUGINS, generator, make, method
+from sw_anchors.coded_anchors import ENTROPY
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.rasterizer_checks import front_camera
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from splatwizard_core.testing.rasterizer_checks import front_camera
 from sw_hac.model import group_widths, output_widths
 from sw_hac.stage import HACStage
 

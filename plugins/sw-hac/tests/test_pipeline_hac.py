@@ -3,13 +3,13 @@
 import pytest
 import torch
 from hac_models import PLUGINS, decoded, method
+from sw_anchors.coded_anchors import ENTROPY
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.gaussians.coded_anchors import ENTROPY
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped, train_stages

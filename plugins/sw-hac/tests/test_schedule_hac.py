@@ -1,10 +1,10 @@
 """The plan of HAC is the published one, line by line."""
 
 import pytest
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
 
-from splatwizard_core.experiments.config import resolve
-from splatwizard_core.gaussians.coded_anchors import ENTROPY, FULL, QUANTIZED
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.tasks import TaskContext

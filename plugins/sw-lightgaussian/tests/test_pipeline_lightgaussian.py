@@ -5,14 +5,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_finetuning.pruning import scores_of
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.experiments.config import apply_overrides
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped, train_stages
-from splatwizard_core.training.pruning import scores_of
 from splatwizard_core.training.stage import CameraIterator
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.method import LightGaussian

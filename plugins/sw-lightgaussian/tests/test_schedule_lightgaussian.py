@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.experiments.config import apply_overrides, resolve
+from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_lightgaussian.config import LightGaussianConfig

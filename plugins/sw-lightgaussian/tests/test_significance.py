@@ -4,9 +4,9 @@ import math
 
 import pytest
 import torch
+from sw_finetuning.pruning import lowest, removal_count
 
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.training.pruning import lowest, removal_count
 from sw_lightgaussian.significance import Significance, volume_factor
 
 

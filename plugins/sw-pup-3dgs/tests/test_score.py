@@ -8,14 +8,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.scores import view_fisher
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.rendering.reference import ReferenceRasterizer
-from splatwizard_core.rendering.scores import view_fisher
 from splatwizard_core.scene.camera import look_at
 from sw_pup_3dgs.score import FLOOR, FisherScore, log_determinants, reduced, unpacked
 

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from splatwizard_core.errors import ConfigError, EmptyModel, SceneError
-from splatwizard_core.experiments.config import apply_overrides, resolve
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams

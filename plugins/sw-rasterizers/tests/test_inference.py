@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import pytest
 import torch
+from sw_reference.testing.raster_scenes import RasterCase, draw_scene
 
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.testing.raster_scenes import RasterCase, draw_scene
 from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
 
 KINDS = [FlashRasterizer, TensorCoreRasterizer]

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, margin_scene, with_tensors
+from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
 
 from splatwizard_core.errors import CapabilityError, ConfigError
 from splatwizard_core.gaussians.inputs import SH
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.rendering.reference import ReferenceRasterizer
 from splatwizard_core.scene.camera import look_at
-from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, margin_scene, with_tensors
-from splatwizard_core.testing.rasterizer_checks import checks_for, front_camera, splats
 from sw_rasterizers import scoring
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.scoring import CountRasterizer, PupRasterizer

@@ -7,15 +7,15 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_gradients import run
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, with_tensors
+from sw_reference.testing.rasterizer_checks import front_camera, splats
 
 from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.rasterizer import Feature, RasterOptions, ScoreSpec
-from splatwizard_core.rendering.reference import ReferenceRasterizer
-from splatwizard_core.testing.raster_gradients import run
-from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, with_tensors
-from splatwizard_core.testing.rasterizer_checks import front_camera, splats
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import visible_radii
 from sw_rasterizers.standard import StandardRasterizer

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_gradients import GRADIENT_CASES, applies, check_against, check_gradients
+from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.rendering.reference import ReferenceRasterizer
-from splatwizard_core.testing.raster_gradients import GRADIENT_CASES, applies, check_against, check_gradients
-from splatwizard_core.testing.rasterizer_checks import checks_for
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.standard import StandardRasterizer
 

@@ -7,22 +7,22 @@ from dataclasses import replace
 
 import pytest
 import torch
-
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.rendering.projection import rotation_matrices
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.rendering.reference import ReferenceRasterizer
-from splatwizard_core.testing.raster_gradients import GRADIENT_CASES, applies, check_against, outputs, run
-from splatwizard_core.testing.raster_scenes import (
+from sw_reference.projection import rotation_matrices
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_gradients import GRADIENT_CASES, applies, check_against, outputs, run
+from sw_reference.testing.raster_scenes import (
     RasterCase,
     cast_inputs,
     draw_scene,
     permute_inputs,
     with_tensors,
 )
-from splatwizard_core.testing.raster_surfels import surfels
-from splatwizard_core.testing.rasterizer_checks import checks_for, front_camera
+from sw_reference.testing.raster_surfels import surfels
+from sw_reference.testing.rasterizer_checks import checks_for, front_camera
+
+from splatwizard_core.errors import CapabilityError
+from splatwizard_core.gaussians.inputs import SH
+from splatwizard_core.rendering.rasterizer import RasterOptions
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.surfel import SurfelRasterizer
 

@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_gradients import GRADIENT_CASES, applies, check_against, check_gradients, run
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
+from sw_reference.testing.rasterizer_checks import checks_for
 
 from splatwizard_core.errors import CapabilityError, ShapeError
 from splatwizard_core.gaussians.inputs import SH
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, feature_names, required_features
-from splatwizard_core.rendering.reference import ReferenceRasterizer
-from splatwizard_core.testing.raster_gradients import GRADIENT_CASES, applies, check_against, check_gradients, run
-from splatwizard_core.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
-from splatwizard_core.testing.rasterizer_checks import checks_for
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.segments import Segments, Tables
 from sw_rasterizers.variants import AccelRasterizer, DepthRasterizer, IndexedRasterizer

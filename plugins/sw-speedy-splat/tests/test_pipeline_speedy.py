@@ -5,12 +5,12 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.experiments.config import resolve
-from splatwizard_core.experiments.method import create_method
+from splatwizard_core.method import create_method
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loaders import load_scene
+from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped, train_stages

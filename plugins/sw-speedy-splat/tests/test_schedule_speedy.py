@@ -2,17 +2,17 @@
 
 import pytest
 import torch
+from sw_finetuning.pruning import removal_count
 
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.experiments.config import resolve
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.rasterizer import GradBuffer, RenderResult
+from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pruning import removal_count
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator, StageContext
 from splatwizard_core.training.tasks import TaskContext

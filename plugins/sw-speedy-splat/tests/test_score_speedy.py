@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from sw_finetuning.pruning import lowest
 
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
@@ -10,7 +11,6 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
 from splatwizard_core.scene.camera import Camera, look_at
-from splatwizard_core.training.pruning import lowest
 from sw_speedy_splat.score import SpeedyScore
 
 

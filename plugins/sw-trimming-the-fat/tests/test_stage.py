@@ -4,13 +4,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.errors import ConfigError, SceneError, TaskError
-from splatwizard_core.experiments.config import apply_overrides, resolve
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import look_at
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.optimizer import SplatOptimizer
@@ -18,7 +19,6 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped, train_stages
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator
-from splatwizard_core.training.statistics import accumulate_statistics
 from splatwizard_core.training.tasks import TaskContext
 from sw_trimming_the_fat.config import TrimmingTheFatConfig
 from sw_trimming_the_fat.method import TrimmingTheFat

@@ -6,6 +6,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from sw_metrics.torchvision_import import import_torchvision
 
 from splatwizard_core.errors import CapabilityError, ShapeError
 from splatwizard_core.evaluation.image import (
@@ -20,7 +21,6 @@ from splatwizard_core.evaluation.image import (
     ssim_reflect,
     ssim_valid,
 )
-from splatwizard_core.evaluation.torchvision_import import import_torchvision
 
 
 def image(seed: int, height: int = 40, width: int = 52) -> torch.Tensor:

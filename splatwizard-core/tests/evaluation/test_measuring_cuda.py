@@ -49,7 +49,7 @@ def test_throughput_is_that_of_cudas_own_events():
 def test_lpips_on_a_gpu_equals_the_cpus(tmp_path: Path):
     if importlib.util.find_spec("lpips") is None:
         pytest.skip("LPIPS is the extra splatwizard-core[lpips]")
-    from splatwizard_core.evaluation.perceptual import ALEX, VGG, VGG_3DGS
+    from sw_metrics.perceptual import ALEX, VGG, VGG_3DGS
 
     write_backbones(tmp_path)
     generator = torch.Generator().manual_seed(0)

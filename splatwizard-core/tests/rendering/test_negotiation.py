@@ -6,14 +6,14 @@ from itertools import count
 
 import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_scenes import RasterCase, draw_scene, with_tensors
 
 from splatwizard_core import builtin
 from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry
 from splatwizard_core.rendering.rasterizer import Feature, RasterizerInfo, RasterOptions, ScoreSpec, check_offered
-from splatwizard_core.rendering.reference import ReferenceRasterizer
-from splatwizard_core.testing.raster_scenes import RasterCase, draw_scene, with_tensors
 
 _UNIQUE = count()
 NOT_HERE = "needs a GPU that is not here"

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from sw_gaussians import density
 
-from splatwizard_core.gaussians import density
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import GradBuffer, RasterizerInfo, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import look_at

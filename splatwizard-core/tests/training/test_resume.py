@@ -8,9 +8,9 @@ import signal
 import numpy as np
 import pytest
 import torch
+from sw_gaussians import density
 
 from splatwizard_core.errors import CheckpointError, NothingToDo, TaskError
-from splatwizard_core.gaussians import density
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import RenderResult
 from splatwizard_core.training.params import OptimizationParams, PipelineParams

@@ -8,10 +8,10 @@ import torch
 
 from splatwizard_core.errors import DeviceMemoryError, TaskError, TrainingDiverged
 from splatwizard_core.evaluation.evaluate import render_view
-from splatwizard_core.experiments.device import device_reason
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.device import device_reason
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.training import trainer as trainer_module
 from splatwizard_core.training.optimizer import SplatOptimizer

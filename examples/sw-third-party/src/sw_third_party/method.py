@@ -8,8 +8,8 @@ from pydantic import Field
 from torch import Tensor
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.method import Method, create_method
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams

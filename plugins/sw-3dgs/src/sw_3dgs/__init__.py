@@ -1,3 +1,3 @@
 """3D Gaussian Splatting, the baseline method of Splatwizard, and its densification tasks."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"

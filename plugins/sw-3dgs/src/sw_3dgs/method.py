@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.stage import ThreeDGSStage
+
 from splatwizard_core.errors import SceneError
-from splatwizard_core.experiments.method import Method
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import load_ply
-from sw_3dgs import exact, quantized
+from splatwizard_core.method import Method
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
-from sw_3dgs.stage import ThreeDGSStage
+from sw_codecs.models import exact, quantized
 
 if TYPE_CHECKING:
     import torch

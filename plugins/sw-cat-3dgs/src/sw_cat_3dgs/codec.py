@@ -1,6 +1,6 @@
 """The file: places of the anchors, networks, planes, then the attributes under what all of those predict.
 
-Sections: `anchors`, `masks` and `networks` (see splatwizard_core.coding.anchor_sections), `frame` and `triplane`, and
+Sections: `anchors`, `masks` and `networks` (see sw_anchors.sections), `frame` and `triplane`, and
 the integers of `features.1`, ... (a section a slice), `scalings` and `offsets`, block by block of anchors.
 Encoder and decoder walk over the rows in the same way (`walk`); only what happens to a block of symbols differs.
 """
@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-
-from splatwizard_core.coding.anchor_sections import (
+from sw_anchors.coded_anchors import GROUPS, MASK_THRESHOLD, rounded_indices
+from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.float_mode import check_machine, one_thread, this_machine
+from sw_anchors.sections import (
     AnchorPlaces,
     add_networks,
     add_places,
@@ -24,10 +25,9 @@ from splatwizard_core.coding.anchor_sections import (
     read_places,
     round_networks,
 )
-from splatwizard_core.coding.float_mode import check_machine, one_thread, this_machine
+from torch import Tensor, nn
+
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.gaussians.coded_anchors import GROUPS, MASK_THRESHOLD, rounded_indices
-from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
 from sw_cat_3dgs.predictors import PREDICTORS

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from pydantic import Field
+from sw_anchors.params import AnchorLearningRates, AnchorParams
 
-from splatwizard_core.training.anchor_params import AnchorLearningRates, AnchorParams
 from splatwizard_core.training.params import Params
 
 FULL_RUN = 40_000

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from sw_anchors.coded_anchors import AnchorContext, AnchorForecast
 from torch import Tensor, nn
-
-from splatwizard_core.gaussians.coded_anchors import AnchorContext, AnchorForecast
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager

@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-
-from splatwizard_core.gaussians.coded_anchors import rounded_indices
+from sw_anchors.coded_anchors import rounded_indices
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager

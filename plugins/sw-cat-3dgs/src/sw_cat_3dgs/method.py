@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.errors import ConfigError, SceneError
-from splatwizard_core.experiments.method import Method
+from splatwizard_core.method import Method
 from sw_cat_3dgs import codec
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.context import CatContext, ContextShape

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 import torch
+from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from torch import Tensor
 
-from splatwizard_core.gaussians.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from sw_anchors.coded_anchors import GROUPS
 from torch import Tensor
-
-from splatwizard_core.gaussians.coded_anchors import GROUPS
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager

@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
+from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
+from sw_anchors.stage import AnchorStage
 
-from splatwizard_core.gaussians.coded_anchors import ENTROPY, QUANTIZED
 from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.training.anchor_stage import AnchorStage
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.scheduler import PhaseSwitch
 from splatwizard_core.training.stage import CameraIterator, LossPack

@@ -6,9 +6,9 @@ Defaults: the code of the Splatwizard paper's authors and the two methods whose 
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
+from sw_finetuning.distillation import DistillLoss
+from sw_finetuning.fine_tuning import FineTuningRates
 
-from splatwizard_core.training.distillation import DistillLoss
-from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
 
 

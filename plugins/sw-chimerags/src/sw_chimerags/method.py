@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.experiments.keys import dotted
-from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.method import Method, create_method
+from splatwizard_core.runs.keys import dotted
 from splatwizard_core.training.pruner import load_pruner
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig

@@ -5,14 +5,15 @@ from __future__ import annotations
 import copy
 from typing import TYPE_CHECKING
 
+from sw_finetuning.distillation import DistillationStage, PseudoViewSampler
+from sw_finetuning.pruning import scores_of
+
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.distillation import DistillationStage, PseudoViewSampler
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.pruner import Pruner
-from splatwizard_core.training.pruning import scores_of
 from splatwizard_core.training.stage import CameraIterator, LossPack
 from sw_chimerags.model import MaskedGaussians, MaskQuantizer
 

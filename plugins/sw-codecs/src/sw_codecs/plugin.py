@@ -59,16 +59,35 @@ def register_context_models(registry: Registry) -> None:
 
 @hookimpl
 def register_coders(registry: Registry) -> None:
-    registry.add("range", "sw_codecs.coders:RangeCoder", summary="arithmetic coding under a ModelSpec")
-    registry.add("rans", "sw_codecs.coders:RansCoder", summary="rANS under a ModelSpec")
-    registry.add("huffman", "sw_codecs.huffman_coder:HuffmanCoder", summary="Huffman codes from count tables")
-    registry.add("octree", "sw_codecs.octree:Octree", summary="point positions as octree occupancy")
-    registry.add("morton-delta", "sw_codecs.position_codecs:MortonDelta", summary="point positions as Morton steps")
-    registry.add("raw", "sw_codecs.position_codecs:RawPositions", summary="point positions as they are, zstd")
-    registry.add("draco", "sw_codecs.draco:Draco", available="sw_codecs.draco:unavailable",
+    registry.add("range", "sw_codecs.coders:RangeCoder", codes="symbols", summary="arithmetic coding under a ModelSpec")
+    registry.add("rans", "sw_codecs.coders:RansCoder", codes="symbols", summary="rANS under a ModelSpec")
+    registry.add(
+        "huffman", "sw_codecs.huffman_coder:HuffmanCoder", codes="symbols", summary="Huffman codes from count tables"
+    )
+    registry.add("octree", "sw_codecs.octree:Octree", codes="positions", summary="point positions as octree occupancy")
+    registry.add(
+        "morton-delta",
+        "sw_codecs.position_codecs:MortonDelta",
+        codes="positions",
+        summary="point positions as Morton steps",
+    )
+    registry.add(
+        "raw", "sw_codecs.position_codecs:RawPositions", codes="positions", summary="point positions as they are, zstd"
+    )
+    registry.add("draco", "sw_codecs.draco:Draco", codes="positions", available="sw_codecs.draco:unavailable",
                  summary="point positions by Draco (pip install 'sw-codecs[draco]')")  # fmt: skip
-    registry.add("byte-planes", "sw_codecs.byte_planes:BytePlanes",
+    registry.add("byte-planes", "sw_codecs.byte_planes:BytePlanes", codes="arrays",
                  summary="float or integer arrays without loss: byte planes, zstd")  # fmt: skip
-    registry.add("float-delta", "sw_codecs.byte_planes:FloatDelta",
+    registry.add("float-delta", "sw_codecs.byte_planes:FloatDelta", codes="arrays",
                  summary="float32 positions without loss: steps as byte planes, zstd")  # fmt: skip
-    registry.add("packed-bits", "sw_codecs.packed_bits:PackedBits", summary="indices of 1 to 16 bits, packed")
+    registry.add(
+        "packed-bits", "sw_codecs.packed_bits:PackedBits", codes="indices", summary="indices of 1 to 16 bits, packed"
+    )
+    registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",
+                 summary="whole Gaussian models, float32 as trained")  # fmt: skip
+    registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians",
+                 summary="whole Gaussian models on a lattice, octree positions, range coded")  # fmt: skip
+    registry.add("gaussians-ply", "sw_codecs.models.codecs:Ply", codes="gaussians",
+                 summary="whole Gaussian models, the .ply of 3DGS bit for bit")  # fmt: skip
+    registry.add("gaussians-zstd", "sw_codecs.models.codecs:Lossless", codes="gaussians",
+                 summary="whole Gaussian models, float32 as trained, packed without loss")  # fmt: skip

@@ -1,6 +1,6 @@
 """The file. What the decoder needs to predict every distribution stands before what is coded with it.
 
-Sections: `anchors`, `masks` and `networks` (see splatwizard_core.coding.anchor_sections), `grids` (a bit for every
+Sections: `anchors`, `masks` and `networks` (see sw_anchors.sections), `grids` (a bit for every
 sign, `bernoulli`), and the integers of `features`, `scalings` and `offsets`, block by block of anchors
 (`conditional-gaussian`).
 """
@@ -15,9 +15,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor, nn
-
-from splatwizard_core.coding.anchor_sections import (
+from sw_anchors.anchors import two_layers
+from sw_anchors.coded_anchors import ENTROPY, rounded_indices
+from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.float_mode import check_machine, one_thread, this_machine
+from sw_anchors.lattice import TOP
+from sw_anchors.sections import (
     AnchorPlaces,
     add_networks,
     add_places,
@@ -26,12 +29,9 @@ from splatwizard_core.coding.anchor_sections import (
     read_places,
     round_networks,
 )
-from splatwizard_core.coding.float_mode import check_machine, one_thread, this_machine
+from torch import Tensor, nn
+
 from splatwizard_core.errors import BitstreamError
-from splatwizard_core.gaussians.anchor_lattice import TOP
-from splatwizard_core.gaussians.anchors import two_layers
-from splatwizard_core.gaussians.coded_anchors import ENTROPY, rounded_indices
-from splatwizard_core.gaussians.decoded_anchors import DecodedAnchors
 from sw_hac.model import HACAnchors, context_of, group_widths, output_widths
 
 if TYPE_CHECKING:

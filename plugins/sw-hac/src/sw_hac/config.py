@@ -3,8 +3,8 @@
 from typing import Annotated, Literal
 
 from pydantic import Field
+from sw_anchors.params import AnchorLearningRates, AnchorParams
 
-from splatwizard_core.training.anchor_params import AnchorLearningRates, AnchorParams
 from splatwizard_core.training.params import Params
 
 Resolution = Annotated[int, Field(ge=3, le=4096)]

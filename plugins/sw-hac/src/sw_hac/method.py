@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.experiments.method import Method
+from splatwizard_core.method import Method
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors

@@ -11,11 +11,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from sw_anchors.anchors import two_layers
+from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
+from sw_anchors.lattice import TOP
 from torch import Tensor, nn
-
-from splatwizard_core.gaussians.anchor_lattice import TOP
-from splatwizard_core.gaussians.anchors import two_layers
-from splatwizard_core.gaussians.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""

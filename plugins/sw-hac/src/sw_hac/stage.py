@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from splatwizard_core.gaussians.coded_anchors import ENTROPY, QUANTIZED, AnchorRate
-from splatwizard_core.training.anchor_stage import AnchorStage
+from sw_anchors.coded_anchors import ENTROPY, QUANTIZED, AnchorRate
+from sw_anchors.stage import AnchorStage
+
 from splatwizard_core.training.scheduler import PhaseSwitch
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors

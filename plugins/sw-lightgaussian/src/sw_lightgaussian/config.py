@@ -3,11 +3,11 @@
 from typing import ClassVar
 
 from pydantic import Field
+from sw_finetuning.distillation import DistillLoss
+from sw_finetuning.fine_tuning import FineTuningRates
+from sw_finetuning.pruning import CountRule
 
-from splatwizard_core.training.distillation import DistillLoss
-from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
-from splatwizard_core.training.pruning import CountRule
 from sw_lightgaussian.importance_vq import Training
 from sw_lightgaussian.significance import Kind, VolumeNorm
 

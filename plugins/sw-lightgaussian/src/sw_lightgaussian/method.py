@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
-from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.method import Method, create_method
 from splatwizard_core.training.pruner import load_pruner
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.presets import PRESETS, RATES

@@ -6,16 +6,16 @@ import logging
 from typing import TYPE_CHECKING
 
 import torch
+from sw_finetuning.distillation import DistillationStage
+from sw_finetuning.fine_tuning import FineTuningStage, collect_statistics
+from sw_finetuning.pruning import PruneByScore, scores_of
 from torch import Tensor
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.distillation import DistillationStage
-from splatwizard_core.training.fine_tuning import FineTuningStage, collect_statistics
 from splatwizard_core.training.pruner import Pruner
-from splatwizard_core.training.pruning import PruneByScore, scores_of
 from splatwizard_core.training.stage import CameraIterator
 from sw_lightgaussian.config import LightGaussianConfig
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
+from sw_finetuning.fine_tuning import FineTuningRates
+from sw_finetuning.pruning import CountRule
 
-from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
-from splatwizard_core.training.pruning import CountRule
 
 
 class Prune(Params):

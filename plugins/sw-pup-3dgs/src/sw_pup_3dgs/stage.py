@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
+from sw_finetuning.pruning import PruneByScore
+
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.training.fine_tuning import FineTuningStage, collect_anew, windows_before
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.pruner import load_pruner
-from splatwizard_core.training.pruning import PruneByScore
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
+from sw_reference.scores import check_scores, score_dtype
 from torch import Tensor
 
 from splatwizard_core.errors import CapabilityError, ShapeError
@@ -13,7 +14,6 @@ from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.rendering.checks import check_placement, check_request
 from splatwizard_core.rendering.negotiation import declared_info
 from splatwizard_core.rendering.rasterizer import AccumOutput, RasterOptions, RenderResult, ScoreSpec
-from splatwizard_core.rendering.scores import check_scores, score_dtype
 from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.native import MODULE

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.experiments.gaussian_method import GaussianMethod
-from splatwizard_core.experiments.keys import dotted
-from splatwizard_core.experiments.method import Method, create_method
+from splatwizard_core.method import Method, create_method
+from splatwizard_core.runs.gaussian_method import GaussianMethod
+from splatwizard_core.runs.keys import dotted
 from sw_speedy_splat.config import SpeedySplatConfig
 from sw_speedy_splat.presets import PRESETS, RATES
 from sw_speedy_splat.stage import SpeedySplatStage

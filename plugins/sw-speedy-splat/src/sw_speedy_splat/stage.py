@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from sw_finetuning.pruning import PruneByScore
+from sw_gaussians.statistics import accumulate_statistics
+
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import RenderResult
 from splatwizard_core.training.plan import When, scaled
 from splatwizard_core.training.pruner import load_pruner
-from splatwizard_core.training.pruning import PruneByScore
 from splatwizard_core.training.scheduler import Scheduler
 from splatwizard_core.training.stage import Stage
-from splatwizard_core.training.statistics import accumulate_statistics
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from splatwizard_core.experiments.method import Method
     from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.method import Method
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.rendering.rasterizer import RasterOptions
     from splatwizard_core.scene.scene import Scene, View

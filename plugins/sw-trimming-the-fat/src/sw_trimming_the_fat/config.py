@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
+from sw_finetuning.fine_tuning import FineTuningRates
 
-from splatwizard_core.training.fine_tuning import FineTuningRates
 from splatwizard_core.training.params import OptimizationParams, Params
 
 

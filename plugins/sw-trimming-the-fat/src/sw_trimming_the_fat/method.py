@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.experiments.gaussian_method import GaussianMethod
+from splatwizard_core.runs.gaussian_method import GaussianMethod
 from sw_trimming_the_fat.config import TrimmingTheFatConfig
 from sw_trimming_the_fat.presets import PRESETS, RATES
 from sw_trimming_the_fat.stage import TrimmingStage

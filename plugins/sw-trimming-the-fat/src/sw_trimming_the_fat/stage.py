@@ -6,20 +6,21 @@ import logging
 import math
 from typing import TYPE_CHECKING
 
-from splatwizard_core.errors import EmptyModel
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.fine_tuning import (
+from sw_finetuning.fine_tuning import (
     GRADIENT_STATISTICS,
     FineTuningStage,
     collect_anew,
     collect_statistics,
     windows_before,
 )
+from sw_finetuning.pruning import PruneByScore, scores_of
+
+from splatwizard_core.errors import EmptyModel
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.rendering.rasterizer import Rasterizer
+from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.pruner import Pruner, load_pruner
-from splatwizard_core.training.pruning import PruneByScore, scores_of
 from splatwizard_core.training.stage import CameraIterator
 from sw_trimming_the_fat.score import doomed, mean_gradients
 

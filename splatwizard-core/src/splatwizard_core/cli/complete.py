@@ -77,7 +77,7 @@ def scene_or_file(context: click.Context, parameter: click.Parameter, incomplete
 
 def datasets(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Known data sets; after a slash, the scenes of one."""
-    from splatwizard_core.scene.registry import load_registry
+    from sw_datasets.downloads.registry import load_registry
 
     try:
         known = load_registry(None)

@@ -85,9 +85,9 @@ def evaluate(
     model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...) and keys
     of the run (raster.prefer, threads, ...).
     """
-    from splatwizard_core.experiments.measuring import Opened, measure, opener
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.loaders import load_scene
+    from splatwizard_core.runs.measuring import Opened, measure, opener
+    from splatwizard_core.scene.loading import load_scene
 
     path = existing(file)
     wanted = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
@@ -119,15 +119,15 @@ def evaluate(
         if not stored:
             open_model = opener(path, plugins, session.device)
         elif roundtrip:
-            from splatwizard_core.experiments.encoding import encode_directory
-            from splatwizard_core.experiments.fresh import decode_fresh
+            from splatwizard_core.runs.encoding import encode_directory
+            from splatwizard_core.runs.fresh import decode_fresh
 
             path = stack.enter_context(scratch_folder("roundtrip")) / "scene.swz"
             encode_directory(session, resolved, Path(file), path)
             digest = decode_fresh(path, str(session.device))["digest"]
             open_model = opener(path, plugins, session.device)
         else:
-            from splatwizard_core.experiments.encoding import load_finished
+            from splatwizard_core.runs.encoding import load_finished
 
             def open_model() -> Opened:
                 trained = load_finished(session, resolved, path)

@@ -59,8 +59,8 @@ def _starts_with(path: Path, magic: bytes) -> bool:
 def file_facts(path: Path) -> dict[str, Any]:
     """Header and bytes by section of a .swz, which sum to its size; and what is missing here to decode it, and why."""
     from splatwizard_core.coding.container import ContainerReader
-    from splatwizard_core.experiments.file_needs import missing_parts, missing_plugin
     from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.runs.file_needs import missing_parts, missing_plugin
 
     reader, plugins = ContainerReader.open(path), load_plugins()
     missing = {f"{kind} {name}": str(missing_plugin(reader, plugins, kind, name))
@@ -70,7 +70,7 @@ def file_facts(path: Path) -> dict[str, Any]:
 
 def _record_facts(path: Path) -> dict[str, Any]:
     """The gist of a result record: what was run, its scores, and who served which phase."""
-    from splatwizard_core.experiments.record import read_record
+    from splatwizard_core.runs.record import read_record
 
     record = read_record(path)
     return {
@@ -91,8 +91,7 @@ def _record_facts(path: Path) -> dict[str, Any]:
 def _print_record(facts: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
-
-    from splatwizard_core.experiments.report.facts import PhaseFacts, TrainFacts
+    from sw_report.facts import PhaseFacts, TrainFacts
 
     train = TrainFacts.model_validate(facts["train"])
     gist = {k: v for k, v in facts.items() if k not in ("phases", "train")} | {"steps": train.steps}
@@ -136,7 +135,7 @@ def _scene_facts(spec: str, images: str | None, sets: tuple[str, ...]) -> dict[s
     from splatwizard_core.cli.setup import resolve_run_options
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.scene.describe import describe
-    from splatwizard_core.scene.loaders import load_scene
+    from splatwizard_core.scene.loading import load_scene
 
     _, options_, _ = resolve_run_options(None, assignments(sets, images=images))
     return describe(load_scene(spec, options_, load_plugins()))

@@ -11,27 +11,24 @@ from splatwizard_core.cli.options import console, debug_option, json_option, opt
 
 @click.command("list-plugins", short_help="what is installed, what is broken and why")
 @options(json_option, debug_option)
-@click.pass_context
-def list_plugins(ctx: click.Context, as_json: bool) -> None:
+def list_plugins(as_json: bool) -> None:
     """Installed packages, what each provides, and what is broken and why.
 
     SW_PLUGINS=a,b in the environment restricts what is loaded (empty: the core alone).
     """
-    found = gather(ctx.find_root().command)
+    found = gather()
     if as_json:
         print_json(found)
     else:
         _print(found)
 
 
-def gather(root: click.Command) -> dict[str, Any]:
-    """What is installed, as plain values: {"plugins": [...], "clashes": [...]}."""
-    from splatwizard_core.cli.main import COMMANDS, LazyGroup
+def gather() -> dict[str, Any]:
+    """Installed plugins, name clashes and commands as plain values."""
+    from splatwizard_core.cli.main import command_entries
     from splatwizard_core.plugins import load_plugins
 
     plugins = load_plugins()
-    if isinstance(root, LazyGroup):
-        root.ask_plugins()  # a command that cannot be added makes its plugin a broken one
     rows = []
     for info in plugins.plugins:
         provides = [
@@ -53,8 +50,7 @@ def gather(root: click.Command) -> dict[str, Any]:
         for kind, registry in plugins.registries.items()
         for name, entries in registry.clashes.items()
     ]
-    extra = sorted(root.commands) if isinstance(root, LazyGroup) else []
-    return {"plugins": rows, "clashes": clashes, "commands": [*COMMANDS, *extra]}
+    return {"plugins": rows, "clashes": clashes, "commands": [entry.name for entry in command_entries()]}
 
 
 def _print(found: dict[str, Any]) -> None:

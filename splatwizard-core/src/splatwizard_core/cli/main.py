@@ -3,65 +3,45 @@
 from __future__ import annotations
 
 import contextlib
-import importlib
 import logging
+import math
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
-from splatwizard_core.errors import DiskFullError, PluginError, SplatwizardError
+from splatwizard_core.errors import DiskFullError, SplatwizardError
 from splatwizard_core.files import FULL
 
-COMMANDS = {
-    "run": "splatwizard_core.cli.run:run",
-    "train": "splatwizard_core.cli.train:train",
-    "encode": "splatwizard_core.cli.codec:encode",
-    "decode": "splatwizard_core.cli.codec:decode",
-    "eval": "splatwizard_core.cli.evaluate:evaluate",
-    "render": "splatwizard_core.cli.render:render",
-    "report": "splatwizard_core.cli.report:report",
-    "export": "splatwizard_core.cli.export:export",
-    "info": "splatwizard_core.cli.info:info",
-    "list-plugins": "splatwizard_core.cli.list_plugins:list_plugins",
-    "schedule": "splatwizard_core.cli.schedule:schedule",
-    "data": "splatwizard_core.cli.data:data",
-    "build-kernels": "splatwizard_core.cli.build_kernels:build_kernels",
-    "doctor": "splatwizard_core.cli.doctor:doctor",
-    "completion": "splatwizard_core.cli.completion:completion",
-}
+if TYPE_CHECKING:
+    from splatwizard_core.plugins import Entry
+
 # A path that somebody gave does not fit what is on the disk; a full disk is another matter.
 PATH_ERRORS = (FileNotFoundError, FileExistsError, NotADirectoryError, IsADirectoryError, PermissionError)
 SIGPIPE_STATUS = 141  # what a shell reports of a program whose reader has gone
 
 
 class LazyGroup(click.Group):
-    """A group whose own commands are imported when asked for; plugins add theirs through `register_commands`."""
-
-    _plugins_asked = False
+    """A group whose commands come from the registry and are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        self.ask_plugins()
-        return [*COMMANDS, *sorted(self.commands)]
+        return [entry.name for entry in command_entries()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        target = COMMANDS.get(cmd_name)
-        if target is not None:
-            module, _, attribute = target.partition(":")
-            command: click.Command = getattr(importlib.import_module(module), attribute)
-            return command
-        self.ask_plugins()
-        return super().get_command(ctx, cmd_name)
+        from splatwizard_core.plugins import load_plugins
 
-    def add_command(self, cmd: click.Command, name: str | None = None) -> None:
-        """Called by plugins. Raises PluginError for a name that is taken."""
-        taken = name or cmd.name
-        if taken in COMMANDS or taken in self.commands:
-            raise PluginError(f"command '{taken}' already exists")
-        super().add_command(cmd, name)
+        commands = load_plugins().commands
+        if cmd_name not in commands and cmd_name not in commands.clashes:
+            return None
+        return commands.load(cmd_name)
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        """One line a command, from the registry: `sw --help` imports none of them."""
+        with formatter.section("Commands"):
+            formatter.write_dl([(entry.name, entry.summary) for entry in command_entries()])
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
         with _quiet_about_readers():
@@ -74,25 +54,23 @@ class LazyGroup(click.Group):
             sys.stdout.flush()
         return result
 
-    def ask_plugins(self) -> None:
-        """Let every plugin add its commands, once."""
-        if not self._plugins_asked:
-            from splatwizard_core.plugins import load_plugins
-
-            self._plugins_asked = True
-            load_plugins().register_commands(self)
-
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        import difflib
+        from splatwizard_core.plugins.registry import nearest
 
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
-            hint = f"did you mean '{near[0]}'?" if near else "`sw --help` lists all"
+            hint = nearest("command", args[0], self.list_commands(ctx))
             raise click.UsageError(f"no command '{args[0]}': {hint}", ctx) from error
+
+
+def command_entries() -> list[Entry]:
+    """The commands in the order of the help: those with a declared `position` by it, then by name."""
+    from splatwizard_core.plugins import load_plugins
+
+    return sorted(load_plugins().commands, key=lambda e: (e.declared.get("position", math.inf), e.name))
 
 
 @contextlib.contextmanager

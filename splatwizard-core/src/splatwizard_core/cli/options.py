@@ -97,7 +97,7 @@ def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
 def assignments(sets: Sequence[str], **named: Any) -> dict[str, Any]:
     """The values of --set together with those that have an option of their own (None: not given)."""
     from splatwizard_core.errors import ConfigError
-    from splatwizard_core.experiments.config import parse_set
+    from splatwizard_core.runs.config import parse_set
 
     values: dict[str, Any] = dict(parse_set(sets))
     for key, value in named.items():

@@ -48,9 +48,9 @@ def render(
     as_json: bool,
 ) -> None:
     """Draw FILE (.swz or .ply) from the cameras of a scene, as 8-bit PNG."""
-    from splatwizard_core.experiments.measuring import opener, render_views
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.loaders import load_scene
+    from splatwizard_core.runs.measuring import opener, render_views
+    from splatwizard_core.scene.loading import load_scene
 
     path = existing_file(file)
     plugins = load_plugins()

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +12,7 @@ from splatwizard_core.cli.options import (
     assignments,
     changed_plan_option,
     config_option,
+    console,
     debug_option,
     device_option,
     images_option,
@@ -29,7 +28,6 @@ from splatwizard_core.cli.options import (
     seed_option,
     set_option,
 )
-from splatwizard_core.cli.results import print_results
 from splatwizard_core.cli.setup import (
     lpips_folder,
     method_names,
@@ -39,10 +37,6 @@ from splatwizard_core.cli.setup import (
     say,
     say_device,
 )
-
-if TYPE_CHECKING:
-    from splatwizard_core.experiments.record import Record
-    from splatwizard_core.scene.scene import Scene
 
 
 @click.command(short_help="train, encode, decode, evaluate, report: one scene")
@@ -87,10 +81,11 @@ def run(
     Finished steps are not done again; an interrupted run goes on from its last checkpoint. Several runs end in one
     table, one page and rd.svg, their rate-distortion curves, in the folder above theirs.
     """
-    from splatwizard_core.experiments.config import is_demo
-    from splatwizard_core.experiments.run import RunRequest
-    from splatwizard_core.experiments.run import run as run_one
     from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.runs.config import is_demo
+    from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
+    from splatwizard_core.runs.run import RunRequest
+    from splatwizard_core.runs.run import run as run_one
 
     plugins = load_plugins()
     values = assignments(sets, images=images, device=device, seed=seed, init=init)
@@ -106,41 +101,20 @@ def run(
     say_device(resolved[0].ppl, session)
     if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
-    done: list[tuple[Record, Path]] = []
-    pages: list[Path] = []
+    finished: list[FinishedRun] = []
+    written: list[Path] = []
+    out_console = None if as_json else console()
     for each in resolved:
         request = RunRequest(
             each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, lpips_weights=weights,
             repeats=repeats,
         )  # fmt: skip
-        done.append(run_one(session, request))
-        pages += page_of_run(done[-1][1], partial(session.scene, each))
-    above = above_runs([directory for _, directory in done])
+        record, directory = run_one(session, request)
+        finished.append(FinishedRun(directory, record, partial(session.scene, each)))
+        plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, out_console, say, written))
+    if len(finished) > 1:
+        written.clear()  # the pages of single runs lie beside their records
+    plugins.hook.run_finished(runs=FinishedRuns(finished, True, out_console, say, written))
     if as_json:
-        runs = [{"directory": str(d), "record": r.model_dump(mode="json")} for r, d in done]
-        print_json({"runs": runs, "written": [str(path) for path in above]})
-    else:
-        print_results(done, above or pages)
-
-
-def page_of_run(directory: Path, open_scene: Callable[[], Scene]) -> list[Path]:
-    """report.html of a run directory; without jinja2 a line says what to install."""
-    try:
-        from splatwizard_core.experiments.report.after_run import report_run
-    except ModuleNotFoundError as error:
-        if error.name not in ("jinja2", "markupsafe"):
-            raise
-        say("no report.html: it needs jinja2 (pip install 'splatwizard-core[report]')")
-        return []
-    page = report_run(directory, open_scene, say)
-    return [] if page is None else [page]
-
-
-def above_runs(directories: list[Path]) -> list[Path]:
-    """What is about all that one command ran, in the folder above: the page, and rate and distortion as a file."""
-    try:
-        from splatwizard_core.experiments.report.after_run import plot_above, report_above
-    except ModuleNotFoundError:
-        return []  # told already
-    found = [report_above(directories, say), plot_above(directories, say)]
-    return [path for path in found if path is not None]
+        runs = [{"directory": str(f.directory), "record": f.record.model_dump(mode="json")} for f in finished]
+        print_json({"runs": runs, "written": [str(path) for path in written]})

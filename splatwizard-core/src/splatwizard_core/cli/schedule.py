@@ -58,8 +58,8 @@ def schedule(
     resolved = resolve_one(
         plugins, method, rate, preset=preset, config_file=config_file, values=assignments(sets), scene=None
     )
-    from splatwizard_core.experiments.phases import stage_parts
     from splatwizard_core.plugins.origins import Origins
+    from splatwizard_core.runs.phases import stage_parts
 
     entry, origins = plugins.methods.entry(method), Origins(plugins)
     stages = list(plugins.methods.load(method)(plugins, resolved.config).stages())

@@ -12,10 +12,10 @@ import click
 from splatwizard_core.cli.streams import without_orders
 
 if TYPE_CHECKING:
-    from splatwizard_core.experiments.config import ResolvedConfig
-    from splatwizard_core.experiments.method import Method
-    from splatwizard_core.experiments.session import Session
+    from splatwizard_core.method import Method
     from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.runs.config import ResolvedConfig
+    from splatwizard_core.runs.session import Session
     from splatwizard_core.scene.dataset import SceneOptions
     from splatwizard_core.training.params import PipelineParams
 
@@ -36,7 +36,7 @@ def method_names(methods: Sequence[str], config_file: str | None) -> list[str]:
         raise click.UsageError("--method is empty: give a name, or leave it out")
     if config_file is not None:
         from splatwizard_core.errors import ConfigError
-        from splatwizard_core.experiments.config import read_config_file
+        from splatwizard_core.runs.config import read_config_file
 
         said = read_config_file(config_file).get("method", DEFAULT_METHOD)
         if not isinstance(said, str) or not said.strip():
@@ -62,8 +62,8 @@ def resolve_all(
     scene: str | None,
 ) -> list[ResolvedConfig]:
     """One configuration for every method and rate point that was asked for; wrong input fails before anything runs."""
-    from splatwizard_core.experiments.config import rate_points, resolve
-    from splatwizard_core.experiments.start import settled
+    from splatwizard_core.runs.config import rate_points, resolve
+    from splatwizard_core.runs.start import settled
 
     found = []
     for name in methods:
@@ -75,7 +75,7 @@ def resolve_all(
 
 def _left_to_those_with_a_use(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
     """Of several methods, those that start from nothing trained leave --init and `pretrained.KEY` to the others."""
-    from splatwizard_core.experiments.start import of_no_use
+    from splatwizard_core.runs.start import of_no_use
 
     alone: dict[str, dict[str, Any]] = {"init": {"pretrained": {}}, "pretrained": {"init": ""}}
     without: dict[str, dict[str, Any]] = {"init": {"init": ""}, "pretrained": {"pretrained": {}}}
@@ -115,8 +115,8 @@ def rate_values(plugins: PluginManager, method: str | None, rate: str, config_fi
 
     Raises ConfigError for an unknown rate point.
     """
-    from splatwizard_core.experiments.config import read_config_file, resolve
-    from splatwizard_core.experiments.keys import value_at
+    from splatwizard_core.runs.config import read_config_file, resolve
+    from splatwizard_core.runs.keys import value_at
 
     (name,) = method_names([] if method is None else [method], config_file)
     cls = load_method(plugins, name)
@@ -128,7 +128,7 @@ def rate_values(plugins: PluginManager, method: str | None, rate: str, config_fi
 
 def field_in_config(method: type[Method], key: str) -> bool:
     """Whether a dotted key is one of the method's own config."""
-    from splatwizard_core.experiments.keys import field_at
+    from splatwizard_core.runs.keys import field_at
 
     return field_at(method.Config, key) is not None
 
@@ -141,9 +141,9 @@ def resolve_run_options(
     Keys of a method in the file are passed over.
     """
     from splatwizard_core.errors import ConfigError
-    from splatwizard_core.experiments.config import RESERVED, SCENE_KEYS, read_config_file, resolve
-    from splatwizard_core.experiments.keys import block_keys, field_at, flatten
-    from splatwizard_core.experiments.method import Method
+    from splatwizard_core.method import Method
+    from splatwizard_core.runs.config import RESERVED, SCENE_KEYS, read_config_file, resolve
+    from splatwizard_core.runs.keys import block_keys, field_at, flatten
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
 
     class NoMethod(Method):
@@ -168,8 +168,8 @@ def resolve_run_options(
 
 def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
     """Threads and device as asked. Raises PluginError for rasterizers that are not installed, CapabilityError."""
-    from splatwizard_core.experiments.device import choose_device, set_threads
-    from splatwizard_core.experiments.session import Session
+    from splatwizard_core.runs.device import choose_device, set_threads
+    from splatwizard_core.runs.session import Session
 
     for name in (*ppl.raster.prefer, *ppl.raster.forbid):
         plugins.rasterizers.entry(name)
@@ -179,7 +179,7 @@ def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
 
 def say_device(ppl: PipelineParams, session: Session) -> None:
     """Tell where a training computes, and why there."""
-    from splatwizard_core.experiments.device import device_reason
+    from splatwizard_core.runs.device import device_reason
 
     say(device_reason(ppl.device, session.device, session.plugins))
 
@@ -189,8 +189,8 @@ def lpips_folder(folder: str | None, *, quiet: bool = False) -> Path | None:
 
     Raises UserInputError for a folder without weights, or with damaged ones.
     """
-    from splatwizard_core.evaluation.lpips_weights import check_folder
-    from splatwizard_core.evaluation.perceptual import not_available
+    from sw_metrics.lpips_weights import check_folder
+    from sw_metrics.perceptual import not_available
 
     found = None if folder is None else Path(folder).resolve()
     if found is not None:

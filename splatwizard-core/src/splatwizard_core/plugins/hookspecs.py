@@ -1,7 +1,8 @@
-"""The whole plugin surface: what an installed distribution may provide.
+"""The whole plugin surface: every hook that an installed distribution may implement.
 
-Every hook gets a registry and adds light entries to it: a name, a lazy "module:attribute" target, a
-one-line summary, and the fields that its kind declares. Nothing heavy is imported by a hook.
+A `register_*` hook gets a registry and adds light entries to it: a name, a lazy "module:attribute" target, a one-line
+summary, and the fields that its kind declares. Nothing heavy is imported by a hook. The hooks are called through pluggy,
+so `specname`, `tryfirst`, `trylast` and wrappers work as its documentation says.
 """
 
 from __future__ import annotations
@@ -11,9 +12,8 @@ from typing import TYPE_CHECKING
 import pluggy
 
 if TYPE_CHECKING:
-    import click
-
     from splatwizard_core.plugins.registry import Registry
+    from splatwizard_core.runs.observers import FinishedRuns, StartedTraining, TrainingObserver
 
 PROJECT = "splatwizard"
 ENTRY_POINT_GROUP = "splatwizard"
@@ -49,7 +49,7 @@ def register_context_models(registry: Registry) -> None:
 
 @hookspec
 def register_coders(registry: Registry) -> None:
-    """Add entropy coders (symbols <-> bytes under a ModelSpec), position codecs, and coders of plain arrays."""
+    """Add coders: of symbols, positions, arrays, or whole Gaussian models, as the field `codes` declares."""
 
 
 @hookspec
@@ -59,7 +59,7 @@ def register_tasks(registry: Registry) -> None:
 
 @hookspec
 def register_methods(registry: Registry) -> None:
-    """Add methods: subclasses of splatwizard_core.experiments.method.Method."""
+    """Add methods: subclasses of splatwizard_core.api.Method, with their presets and rate points."""
 
 
 @hookspec
@@ -74,14 +74,39 @@ def register_metrics(registry: Registry) -> None:
 
 @hookspec
 def register_exporters(registry: Registry) -> None:
-    """Add exporters: callables (model, path) that write an interchange format."""
+    """Add exporters: callables (model, path) that write an interchange format, with its file name suffix."""
+
+
+@hookspec
+def register_importers(registry: Registry) -> None:
+    """Add importers: callables (path) -> GaussianModel that read an interchange format, with its file name suffix."""
 
 
 @hookspec
 def register_executors(registry: Registry) -> None:
-    """Add executors: where the runs of a sweep happen (local processes, a cluster)."""
+    """Add executors: where the runs of a sweep happen (local processes, a cluster). Nothing calls them yet."""
 
 
 @hookspec
-def register_commands(cli: click.Group) -> None:
-    """Add subcommands to `sw`."""
+def register_checks(registry: Registry) -> None:
+    """Add checks of the machine: callables () -> findings, each a line of the diagnosis that somebody asks for."""
+
+
+@hookspec
+def register_downloads(registry: Registry) -> None:
+    """Add downloads: callables () -> the registry of data sets (TOML bytes) that can be fetched."""
+
+
+@hookspec
+def register_commands(registry: Registry) -> None:
+    """Add subcommands of `sw`: click commands, imported when they are called; the summary is their line in the help."""
+
+
+@hookspec
+def run_started(training: StartedTraining) -> TrainingObserver | None:
+    """Return an observer of a training that begins (a viewer, a logger), or None."""
+
+
+@hookspec
+def run_finished(runs: FinishedRuns) -> None:
+    """Make something of finished runs: called after each (a page), and once after the last (tables, plots)."""

@@ -1,4 +1,4 @@
-"""Finds plugins through entry points, loads each on its own, and composes what they provide."""
+"""Composes what the installed plugins provide: each is loaded on its own, its hooks are called through pluggy."""
 
 from __future__ import annotations
 
@@ -7,50 +7,40 @@ import functools
 import importlib.metadata
 import logging
 import os
-import re
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins import hookspecs
-from splatwizard_core.plugins.registry import Entry, Registry
+from splatwizard_core.plugins.catalogue import normal_name
+from splatwizard_core.plugins.guards import guarded_hooks, one_line
+from splatwizard_core.plugins.loading import PluginInfo, names_of, plugin_info, unmet_requirement
+from splatwizard_core.plugins.registry import Coders, Entry, Registry
 
 if TYPE_CHECKING:
     import click
 
+    from splatwizard_core.coding.contracts import (
+        ArrayCoder,
+        ContextModel,
+        EntropyCoder,
+        EntropyModel,
+        GaussianCodec,
+        PositionCodec,
+        Quantizer,
+    )
+    from splatwizard_core.evaluation.metrics import AnyMetric
+    from splatwizard_core.gaussians.model import GaussianModel
+    from splatwizard_core.method import Method
+    from splatwizard_core.rendering.rasterizer import Rasterizer
+    from splatwizard_core.scene.dataset import Dataset
+    from splatwizard_core.training.pruner import Pruner
+
 log = logging.getLogger(__name__)
 
-KINDS = {
-    "rasterizer": "register_rasterizers",
-    "pruner": "register_pruners",
-    "quantizer": "register_quantizers",
-    "entropy model": "register_entropy_models",
-    "context model": "register_context_models",
-    "coder": "register_coders",
-    "task": "register_tasks",
-    "method": "register_methods",
-    "dataset": "register_datasets",
-    "metric": "register_metrics",
-    "exporter": "register_exporters",
-    "executor": "register_executors",
-}
-
-
-@dataclass
-class PluginInfo:
-    """One installed distribution that has a `splatwizard` entry point.
-
-    error   why it could not be loaded, or None
-    """
-
-    key: str
-    distribution: str
-    version: str
-    module: str
-    error: str | None = None
+CORE_KEY = "core"  # entry point of the core itself: it loads first and whatever SW_PLUGINS says
 
 
 class PluginManager:
@@ -62,63 +52,93 @@ class PluginManager:
 
     def __init__(self, entry_points: Iterable[importlib.metadata.EntryPoint], only: set[str] | None = None) -> None:
         self.plugins: list[PluginInfo] = []
-        self.registries = {kind: Registry(kind) for kind in KINDS}
+        self.rasterizers: Registry[Callable[[], Rasterizer]] = Registry("rasterizer")
+        self.pruners: Registry[Callable[..., Pruner]] = Registry("pruner")
+        self.quantizers: Registry[Callable[..., Quantizer]] = Registry("quantizer")
+        self.entropy_models: Registry[Callable[..., EntropyModel]] = Registry("entropy model")
+        self.context_models: Registry[Callable[..., ContextModel]] = Registry("context model")
+        self.coders: Registry[Callable[..., Any]] = Registry("coder")
+        self.entropy_coders: Coders[EntropyCoder] = Coders(self.coders, "symbols")
+        self.position_codecs: Coders[PositionCodec] = Coders(self.coders, "positions")
+        self.array_coders: Coders[ArrayCoder] = Coders(self.coders, "arrays")
+        self.gaussian_codecs: Coders[GaussianCodec] = Coders(self.coders, "gaussians")
+        self.tasks: Registry[Callable[..., Any]] = Registry("task")
+        self.methods: Registry[type[Method]] = Registry("method")
+        self.datasets: Registry[type[Dataset] | Dataset] = Registry("dataset")
+        self.metrics: Registry[AnyMetric] = Registry("metric")
+        self.exporters: Registry[Callable[..., None]] = Registry("exporter")
+        self.importers: Registry[Callable[..., GaussianModel]] = Registry("importer")
+        self.executors: Registry[Any] = Registry("executor")
+        self.checks: Registry[Callable[..., Any]] = Registry("check")
+        self.downloads: Registry[Callable[[], bytes]] = Registry("download")
+        self.commands: Registry[click.Command] = Registry("command")
+        self._filled_by: dict[str, Registry[Any]] = {
+            "register_rasterizers": self.rasterizers,
+            "register_pruners": self.pruners,
+            "register_quantizers": self.quantizers,
+            "register_entropy_models": self.entropy_models,
+            "register_context_models": self.context_models,
+            "register_coders": self.coders,
+            "register_tasks": self.tasks,
+            "register_methods": self.methods,
+            "register_datasets": self.datasets,
+            "register_metrics": self.metrics,
+            "register_exporters": self.exporters,
+            "register_importers": self.importers,
+            "register_executors": self.executors,
+            "register_checks": self.checks,
+            "register_downloads": self.downloads,
+            "register_commands": self.commands,
+        }
+        self.registries: dict[str, Registry[Any]] = {r.kind: r for r in self._filled_by.values()}
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
-        self._modules: list[tuple[PluginInfo, Any]] = []
-        found = sorted(entry_points, key=lambda e: (e.name != "core", e.name))
-        if only is not None:
-            chosen = {_normal(name) for name in only}
-            unknown = [name for name in sorted(only) if not any(_normal(name) in _names(e) for e in found)]
-            if unknown:
-                raise PluginError(
-                    f"SW_PLUGINS names '{', '.join(unknown)}', which is not installed; there are: "
-                    f"{', '.join(e.name for e in found if e.name != 'core') or 'no plugins'}"
-                )
-            found = [e for e in found if e.name == "core" or chosen & _names(e)]
-        for entry_point in found:
+        for entry_point in _chosen(entry_points, only):
             self._load(entry_point)
+        for hook, registry in self._filled_by.items():
+            getattr(self._pluggy.hook, hook)(registry=registry)
 
     def _load(self, entry_point: importlib.metadata.EntryPoint) -> None:
-        dist = entry_point.dist
-        info = PluginInfo(
-            entry_point.name,
-            dist.metadata["Name"] if dist else entry_point.name,
-            dist.version if dist else "",
-            entry_point.value,
-        )
+        info = plugin_info(entry_point)
         self.plugins.append(info)
         try:
-            for requirement in missing_requirements(dist):
-                raise PluginError(f"needs {requirement}, which is not installed: pip install {requirement}")
-            module = entry_point.load()
-            self._pluggy.register(module, name=entry_point.name)
+            unmet = unmet_requirement(entry_point.dist)
+            if unmet is not None:
+                raise PluginError(unmet)
+            hooks = guarded_hooks(entry_point.load(), self._pluggy, functools.partial(self._guard, info))
+            self._pluggy.register(hooks, name=entry_point.name)
             self._pluggy.check_pending()
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
-            reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
-            info.error = " ".join(reason.split())
+            info.error = one_line(error)
             if self._pluggy.has_plugin(entry_point.name):
                 self._pluggy.unregister(name=entry_point.name)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
-            return
-        self._register(info, module)
-        self._modules.append((info, module))
 
-    def _register(self, info: PluginInfo, module: Any) -> None:
-        """Call every hook of one plugin. If one fails, everything that the plugin added is taken back."""
-        for kind, hook in KINDS.items():
-            function: Callable[[Registry], None] | None = getattr(module, hook, None)
-            if function is None:
-                continue
-            registry = self.registries[kind]
-            registry._owner = (info.distribution, info.version)
-            try:
-                function(registry)
-            except Exception as error:
-                info.error = f"{hook}: {type(error).__name__}: {error}"
-                for each in self.registries.values():
-                    each._withdraw(info.distribution)
+    @contextlib.contextmanager
+    def _guard(self, info: PluginInfo, hook: str, arguments: Iterable[Any]) -> Iterator[None]:
+        """Let a hook implementation fail alone.
+
+        Of a plugin that fails to register, everything is taken back and the reason recorded; any other failure is told.
+        """
+        registering = hook in self._filled_by
+        for argument in arguments:
+            if isinstance(argument, Registry):
+                argument._owner = (info.distribution, info.version)
+        try:
+            yield
+        except (Exception, SystemExit) as error:
+            log.debug("plugin %s: %s failed", info.distribution, hook, exc_info=True)
+            if not registering:
+                log.warning("%s %s: %s failed: %s", info.distribution, info.version, hook, one_line(error))
                 return
+            info.error = f"{hook}: {one_line(error)}"
+            for each in self.registries.values():
+                each._withdraw(info.distribution)
+
+    @property
+    def hook(self) -> pluggy.HookRelay:
+        """The hooks, as pluggy calls them."""
+        return self._pluggy.hook
 
     def provided_by(self, info: PluginInfo) -> list[Entry]:
         """What one plugin added, clashing names included."""
@@ -127,14 +147,6 @@ class PluginManager:
             clashing = [e for entries in registry.clashes.values() for e in entries]
             found += [e for e in [*registry, *clashing] if e.distribution == info.distribution]
         return found
-
-    def __getattr__(self, name: str) -> Registry:
-        """`plugins.methods`, `plugins.rasterizers`, `plugins.entropy_models`, ..."""
-        kind = re.sub("s$", "", name).replace("_", " ")
-        registries: dict[str, Registry] = self.__dict__.get("registries", {})
-        if kind in registries:
-            return registries[kind]
-        raise AttributeError(name)
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[list[Entry]]:
@@ -153,42 +165,22 @@ class PluginManager:
         """Those that could not be loaded, or whose hooks failed."""
         return [p for p in self.plugins if p.error is not None]
 
-    def register_commands(self, cli: click.Group) -> None:
-        """Let every plugin add its commands; one that fails is recorded as broken, `sw` works on."""
-        for info, module in self._modules:
-            function = getattr(module, "register_commands", None)
-            if function is None or info.error is not None:
-                continue
-            try:
-                function(cli)
-            except Exception as error:
-                info.error = f"register_commands: {type(error).__name__}: {error}"
 
-
-def _normal(name: str) -> str:
-    """Distribution names are compared without case, and with `-`, `_` and `.` alike (PEP 503)."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def _names(entry_point: importlib.metadata.EntryPoint) -> set[str]:
-    """What a user may call a plugin: its entry point, its distribution."""
-    dist = entry_point.dist
-    return {_normal(name) for name in (entry_point.name, dist.metadata["Name"] if dist else None) if name}
-
-
-def missing_requirements(dist: importlib.metadata.Distribution | None) -> list[str]:
-    """The sw-* distributions that `dist` lists as (unconditional) dependencies and that are not installed."""
-    missing = []
-    for requirement in (dist.requires if dist else None) or []:
-        spec, _, marker = requirement.partition(";")
-        name = re.split(r"[ <>=!~\[(]", spec.strip(), maxsplit=1)[0]
-        if marker.strip() or not name.startswith(("sw-", "sw_", "splatwizard-")):
-            continue
-        try:
-            importlib.metadata.distribution(name)
-        except importlib.metadata.PackageNotFoundError:
-            missing.append(name)
-    return missing
+def _chosen(
+    entry_points: Iterable[importlib.metadata.EntryPoint], only: set[str] | None
+) -> list[importlib.metadata.EntryPoint]:
+    """The entry points to load, the core's first. Raises PluginError for a name in `only` that is not installed."""
+    found = sorted(entry_points, key=lambda e: (e.name != CORE_KEY, e.name))
+    if only is None:
+        return found
+    unknown = [name for name in sorted(only) if not any(normal_name(name) in names_of(e) for e in found)]
+    if unknown:
+        raise PluginError(
+            f"SW_PLUGINS names '{', '.join(unknown)}', which is not installed; there are: "
+            f"{', '.join(e.name for e in found if e.name != CORE_KEY) or 'no plugins'}"
+        )
+    chosen = {normal_name(name) for name in only}
+    return [e for e in found if e.name == CORE_KEY or chosen & names_of(e)]
 
 
 @functools.cache

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from splatwizard_core.errors import PluginError
+from splatwizard_core.plugins.catalogue import is_ours, package_of
+
+T = TypeVar("T")
+T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True)
@@ -47,8 +51,8 @@ class Entry:
         return found
 
 
-class Registry:
-    """The entries of one kind, by name. Plugins see only `add`."""
+class Registry(Generic[T_co]):
+    """The entries of one kind, by name; T_co is the type of their targets. Plugins see only `add`."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -109,8 +113,16 @@ class Registry:
         """Sorted names that can be asked for."""
         return sorted(self._entries)
 
+    @property
+    def default(self) -> str | None:
+        """Name of the entry that a package of ours declares as default; None: it is not installed."""
+        return next((e.name for e in self if e.declared.get("default") and is_ours(e.distribution)), None)
+
     def entry(self, name: str) -> Entry:
-        """The entry called `name`. Raises PluginError that suggests the nearest installed name."""
+        """The entry called `name`.
+
+        Raises PluginError that names the package to install, or suggests the nearest installed name.
+        """
         if name in self._entries:
             return self._entries[name]
         if name in self._clashes:
@@ -118,15 +130,52 @@ class Registry:
             raise PluginError(
                 f"{self.kind} '{name}' is claimed by {owners}: uninstall one, or restrict with SW_PLUGINS"
             )
-        near = difflib.get_close_matches(name, self.names, n=1)
-        hint = f"did you mean '{near[0]}'?" if near else f"installed: {', '.join(self.names) or 'none'}"
         raise PluginError(
-            f"no {self.kind} is called '{name}'; {hint} (`sw list-plugins` shows all)", kind=self.kind, name=name
+            f"no {self.kind} is called '{name}'; {nearest(self.kind, name, self.names)} (`sw list-plugins` shows all)",
+            kind=self.kind,
+            name=name,
         )
 
-    def load(self, name: str) -> Any:
-        """Import and return what `name` stands for."""
+    def load(self, name: str) -> T_co:
+        """Import and return what `name` stands for. Raises PluginError as `entry` does, or if the import fails."""
         entry = self.entry(name)
         for record in self._recorders:
             record.append(entry)
-        return entry.load()
+        found: T_co = entry.load()
+        return found
+
+
+class Coders(Generic[T]):
+    """The coders of one sort, typed: those entries of the coder registry that declare `codes` so."""
+
+    def __init__(self, registry: Registry[Any], codes: str) -> None:
+        self._registry = registry
+        self.codes = codes
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    @property
+    def names(self) -> list[str]:
+        """Sorted names that can be asked for."""
+        return [entry.name for entry in self._registry if entry.declared.get("codes") == self.codes]
+
+    def load(self, name: str) -> Callable[..., T]:
+        """The class or factory called `name`. Raises PluginError if none of this sort is."""
+        if name in self._registry and name not in self.names:
+            raise PluginError(
+                f"coder '{name}' does not code {self.codes}; those that do: {', '.join(self.names) or 'none'}",
+                kind=self._registry.kind,
+                name=name,
+            )
+        found: Callable[..., T] = self._registry.load(name)
+        return found
+
+
+def nearest(kind: str, name: str, installed: list[str]) -> str:
+    """Where `name` could come from: its package, the installed name spelt most alike, or all installed names."""
+    package = package_of(kind, name)
+    if package is not None:
+        return f"it comes with {package}: pip install {package}"
+    near = difflib.get_close_matches(name, installed, n=1)
+    return f"did you mean '{near[0]}'?" if near else f"installed: {', '.join(installed) or 'none'}"

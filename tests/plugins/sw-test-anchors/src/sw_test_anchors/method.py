@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 import torch
 from pydantic import Field
+from sw_anchors.anchors import AnchorModel
+from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from torch import Tensor
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import SceneError
-from splatwizard_core.experiments.method import Method
-from splatwizard_core.gaussians.anchor_growth import accumulate_anchor_statistics, adjust_anchors
-from splatwizard_core.gaussians.anchors import AnchorModel
+from splatwizard_core.method import Method
 from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.losses import photometric_loss

@@ -3,9 +3,9 @@
 from typing import Any
 
 import torch
+from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from torch import Tensor, nn
 
-from splatwizard_core.gaussians.anchors import AnchorAttributes, AnchorModel
 from splatwizard_core.plugins import PluginManager
 
 POSITION_BITS = 16

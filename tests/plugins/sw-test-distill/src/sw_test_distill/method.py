@@ -10,9 +10,9 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.experiments.method import Method, create_method
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.method import Method, create_method
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View

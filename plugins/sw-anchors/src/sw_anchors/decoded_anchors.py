@@ -1,0 +1,58 @@
+"""Anchors as they come out of a file: dequantised, with final masks, ready to render."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from sw_anchors.anchors import AnchorAttributes, AnchorSplats
+
+
+class DecodedAnchors(AnchorSplats):
+    """N anchors whose values are final; nothing is predicted or rounded when they are drawn.
+
+    anchors     [N,3] world units
+    features    [N,F]
+    offsets     [N,k,3]
+    scales      [N,6] linear, world units; a coarse quantiser may leave zeros
+    masks       [N,k] bool: which Gaussians there are
+    """
+
+    ROWS = ("anchors", "features", "offsets", "scales", "masks")
+
+    masks: Tensor
+
+    def __init__(
+        self, anchors: Tensor, features: Tensor, offsets: Tensor, scales: Tensor, masks: Tensor, *, hidden: int
+    ) -> None:
+        """The networks are zero until their state is loaded."""
+        super().__init__()
+        self.anchors, self.features = nn.Parameter(anchors), nn.Parameter(features)
+        self.offsets, self.scales = nn.Parameter(offsets), nn.Parameter(scales)
+        self.register_buffer("masks", masks)
+        self.make_networks(features.shape[1], offsets.shape[1], hidden, torch.Generator(), anchors)
+        for name in self.NETWORKS:
+            for parameter in getattr(self, name).parameters():
+                nn.init.zeros_(parameter)
+
+    @property
+    def num_offsets(self) -> int:
+        return self.offsets.shape[1]
+
+    def counts(self) -> dict[str, int]:
+        return {"num_anchors": self.num_rows, "num_gaussians": int(self.masks.sum())}
+
+    def positions(self) -> Tensor:
+        return self.anchors
+
+    def reach(self) -> Tensor:
+        return self.scales[:, :3].abs()
+
+    def attributes(self, rows: Tensor) -> AnchorAttributes:
+        return AnchorAttributes(
+            self.anchors[rows],
+            self.features[rows],
+            self.offsets[rows],
+            self.scales[rows],
+            masks=self.masks[rows].to(self.features),
+        )

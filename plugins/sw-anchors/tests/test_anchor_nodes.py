@@ -1,0 +1,129 @@
+"""The parts of an anchor model that are one node of the graph each, against the same written out."""
+
+import pytest
+import torch
+from sw_anchors.anchors import two_layers
+from sw_anchors.decoding import spawn
+from sw_anchors.values import anchor_values, mean_product, take_rows, widen
+
+
+def written_out(center, positions, features, offsets, scales, masks, networks):
+    k = offsets.shape[1]
+    toward = positions - center
+    distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
+    context = torch.cat([features, toward / distance, distance], dim=1)
+    opacity, covariance, color = networks
+    opacities = torch.tanh(opacity(context))
+    if masks is not None:
+        opacities = opacities * masks
+    drawn = torch.nonzero(opacities.reshape(-1) > 0).squeeze(1)
+    owner = drawn // k
+    geometry = covariance(context).reshape(-1, 7)[drawn]
+    own = scales[owner]
+    return (
+        positions[owner] + offsets.reshape(-1, 3)[drawn] * own[:, :3],
+        opacities.reshape(-1)[drawn],
+        own[:, 3:].abs() * torch.sigmoid(geometry[:, :3]),
+        torch.nn.functional.normalize(geometry[:, 3:], dim=1),
+        torch.sigmoid(color(context)).reshape(-1, 3)[drawn],
+        opacities,
+        drawn,
+    )
+
+
+def gradients(found, leaves, generator):
+    """Of a random combination of the first five."""
+    total = sum((f * torch.randn(f.shape, generator=generator).to(f)).sum() for f in found[:5])
+    return torch.autograd.grad(total, leaves)
+
+
+@pytest.mark.parametrize("masked", [True, False])
+@pytest.mark.parametrize(("n", "dtype", "tolerance"), [(40, torch.float32, 1e-5), (40, torch.float64, 1e-10),
+                                                       (0, torch.float32, 0)])  # fmt: skip
+def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
+    g, k, width = torch.Generator().manual_seed(0), 5, 7
+
+    def leaf(*shape):
+        return torch.randn(shape, generator=g).to(dtype).requires_grad_()
+
+    networks = tuple(two_layers(width + 4, 6, out * k, g).to(dtype) for out in (1, 7, 3))
+    masks = (torch.rand(n, k, generator=g) > 0.3).to(dtype).requires_grad_() if masked else None
+    tensors = [leaf(n, 3), leaf(n, width), leaf(n, k, 3), leaf(n, 6)]
+    center = torch.tensor([0.3, -2.0, 5.0], dtype=dtype)
+    leaves = [*tensors, *([masks] if masked else []), *(p for network in networks for p in network.parameters())]
+    expected = written_out(center, *tensors, masks, networks)
+    found = spawn(center, *tensors, masks, networks)
+    found = tuple(getattr(found, name) for name in
+                  ("means", "opacities", "scales", "quats", "colors", "all_opacities", "drawn"))  # fmt: skip
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, atol=tolerance, rtol=tolerance)
+    pairs = [gradients(each, leaves, torch.Generator().manual_seed(1)) for each in (found, expected)]
+    for a, b in zip(*pairs, strict=True):
+        torch.testing.assert_close(a, b, atol=10 * tolerance, rtol=10 * tolerance)
+
+
+def test_gradients_of_networks_are_aligned_for_the_optimizer():
+    g, k = torch.Generator().manual_seed(0), 2
+    networks = tuple(two_layers(9, 5, out * k, g) for out in (1, 7, 3))  # 45 weights in each first layer
+    found = spawn(torch.zeros(3), *(torch.randn(size, generator=g) for size in ((6, 3), (6, 5), (6, k, 3), (6, 6))),
+                  None, networks)  # fmt: skip
+    (found.means.sum() + found.opacities.sum() + found.scales.sum() + found.colors.sum()).backward()
+    for network in networks:
+        for parameter in network.parameters():
+            assert parameter.grad.is_contiguous()
+            assert parameter.grad.data_ptr() % 16 == 0
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_values_and_masks_equal_indexing(weighted):
+    g, n, k = torch.Generator().manual_seed(0), 9, 2
+    leaves = [torch.randn(size, generator=g, dtype=torch.float64).requires_grad_()
+              for size in ((n, 4), (n, 6), (n, k, 3), (n, k))]  # fmt: skip
+    features, log_scales, offsets, logits = leaves
+    weights = torch.rand(n, 1, generator=g, dtype=torch.float64) if weighted else None
+    rows = torch.tensor([7, 0, 3, 8])
+    values, masks = anchor_values(rows, *leaves, weights, 0.4)
+    soft = torch.sigmoid(logits)[rows] * (weights[rows] if weighted else 1)
+    expected = torch.cat([features[rows], log_scales[rows].exp(), offsets[rows].flatten(1)], dim=1)
+    torch.testing.assert_close(values, expected)
+    assert torch.equal(masks, (soft > 0.4).to(soft))
+    assert set(masks.unique().tolist()) == {0.0, 1.0}
+    to_values, to_masks = torch.randn(values.shape, generator=g).double(), torch.randn(4, k, generator=g).double()
+    found = torch.autograd.grad((values * to_values).sum() + (masks * to_masks).sum(), leaves)
+    right = torch.autograd.grad((expected * to_values).sum() + (soft * to_masks).sum(), leaves)
+    for a, b in zip(found, right, strict=True):
+        torch.testing.assert_close(a, b)
+
+
+def test_rows_columns_and_products_have_their_gradients():
+    g = torch.Generator().manual_seed(0)
+    a, b, scales = (torch.randn(n, 3, generator=g, dtype=torch.float64).requires_grad_() for n in (6, 6, 5))
+    rows, group = torch.tensor([4, 1, 5]), torch.tensor([0, 0, 1, 2, 2])
+    one_hot = torch.nn.functional.one_hot(group, 3).double()
+    assert torch.equal(widen(a, group, one_hot), a[:, group])
+    assert torch.autograd.gradcheck(lambda x: widen(x, group, one_hot), a)
+    assert all(torch.equal(x, y[rows]) for x, y in zip(take_rows(rows, a, b), (a, b), strict=True))
+    assert torch.autograd.gradcheck(lambda x, y: take_rows(rows, x, y), (a, b))
+    torch.testing.assert_close(mean_product(scales), scales.prod(dim=1).mean())
+    assert torch.autograd.gradcheck(mean_product, scales)
+    assert float(mean_product(torch.zeros(0, 3))) == 0
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
+    g, n, k = torch.Generator().manual_seed(0), 300, 5
+    networks = tuple(two_layers(11, 6, out * k, g) for out in (1, 7, 3))
+    tensors = [torch.randn(size, generator=g) for size in ((3,), (n, 3), (n, 7), (n, k, 3), (n, 6))]
+    masks = (torch.rand(n, k, generator=g) > 0.3).float()
+    found = []
+    for device in ("cpu", "cuda"):
+        moved = tuple(network.to(device) for network in networks)
+        leaves = [t.to(device).requires_grad_() for t in (*tensors[1:], masks)]
+        spawned = spawn(tensors[0].to(device), *leaves, moved)
+        leaves += [p for network in moved for p in network.parameters()]
+        parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
+        gradients = torch.autograd.grad(sum(part.square().mean() for part in parts), leaves)
+        found.append([each.detach().cpu() for each in (*parts, *gradients)])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)

@@ -1,0 +1,134 @@
+"""The stage that methods on anchors share: its plan, its rates, its statistics, its loss."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from sw_anchors.anchors import AnchorModel
+from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.params import AnchorGrowth, AnchorLearningRates, AnchorParams
+from sw_anchors.stage import AnchorStage
+from sw_reference.rasterizer import ReferenceRasterizer
+
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.streams import stream
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.scheduler import build_schedulers, format_plan
+
+RASTERIZER = ReferenceRasterizer()
+
+PLAN = """\
+Stage | Task                        | Plan
+------+-----------------------------+------------------------
+Pre   | update lr                   | range(30000)
+Pre   | update anchor bound         | 1
+Post  | collect gradient statistics | range(15000)
+Post  | adjust anchor               | range(1500, 3000, 100)
+Post  | adjust anchor               | range(4000, 15000, 100)"""
+
+
+def model_of(cls=CodedAnchors, **kwargs):
+    points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    kwargs |= {} if cls is AnchorModel else {"entropy": None}
+    return cls.from_points(PointCloud(points), voxel_size=0.05, num_offsets=3, feature_dim=4, hidden=6,
+                           generator=torch.Generator().manual_seed(1), **kwargs)  # fmt: skip
+
+
+def scene_of(extent=2.0):
+    up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
+    eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])
+    views = [View(look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)]
+    scene = Scene("tiny", views, views[:1], None, Protocol("test", background="black"))
+    return SimpleNamespace(extent=extent, train=scene.train, views=views)
+
+
+def begin(stage, model, scene=None):
+    return stage.begin(SimpleNamespace(model=model, scene=scene or scene_of(), generator=lambda name: stream(3, name)))
+
+
+def test_the_plan_is_the_papers():
+    assert format_plan(*build_schedulers(AnchorStage(AnchorParams()), PipelineParams())) == PLAN
+
+
+def test_a_scaled_plan_keeps_its_shape():
+    stage = AnchorStage(AnchorParams(iterations=600, scale_schedule=True))
+    plan = format_plan(*build_schedulers(stage, PipelineParams()))
+    assert "range(30, 60, 2)" in plan
+    assert "range(80, 300, 2)" in plan
+    assert stage.learning_rates(600)["mlp_opacity"] == pytest.approx(2e-5)
+
+
+def test_rates_decay_and_those_of_places_grow_with_the_scene():
+    stage = AnchorStage(AnchorParams())
+    scene = scene_of(extent=2.0)
+    model = begin(stage, model_of(), scene)
+    optimizer = stage.create_optimizer(model, scene)
+    expected = {
+        "offsets": (0.02, 2e-4), "mask_logits": (0.02, 2e-4), "features": (0.0075, 0.0075),
+        "log_scales": (0.007, 0.007), "mlp_opacity": (0.002, 2e-5), "mlp_cov": (0.004, 0.004),
+        "mlp_color": (0.008, 5e-5),
+    }  # fmt: skip
+    assert {name: optimizer.lr(name) for name in optimizer.groups} == pytest.approx(
+        {k: v[0] for k, v in expected.items()}
+    )
+    stage.update_lr(optimizer, 30_000)
+    assert {name: optimizer.lr(name) for name in optimizer.groups} == pytest.approx(
+        {k: v[1] for k, v in expected.items()}
+    )
+    stage.update_lr(optimizer, 15_000)
+    assert optimizer.lr("offsets") == pytest.approx((0.02 * 2e-4) ** 0.5)
+
+
+def rendered(model, camera):
+    return RASTERIZER.render(model.gaussians(camera, RASTERIZER), camera, RasterOptions(grad2d=True))
+
+
+def test_early_statistics_are_dropped():
+    stage = AnchorStage(AnchorParams(growth=AnchorGrowth(start_stat=5)))
+    model = begin(stage, model_of())
+    result = rendered(model, scene_of().views[0].camera)
+    result.image.sum().backward()
+    stage.collect_gradient_statistics(model, result, 5)
+    assert not bool(model.anchor_denom.any())
+    stage.collect_gradient_statistics(model, result, 6)
+    assert bool(model.anchor_denom.any())
+
+
+def test_the_loss_adds_volume_and_what_a_method_adds():
+    class More(AnchorStage):
+        def extra_loss(self, model, result, step):
+            return {"more": torch.tensor(0.25 * step)}
+
+    stage = More(AnchorParams())
+    model, view = begin(stage, model_of()), scene_of().views[0]
+    result = rendered(model, view.camera)
+    image = torch.rand(3, 24, 24, generator=torch.Generator().manual_seed(0))
+    seen = SimpleNamespace(image=lambda background, device: image)
+    pack = stage.loss(model, seen, result, torch.zeros(3), step=2)
+    volume = 0.01 * float(result.inputs.scales.detach().prod(1).mean())
+    assert float(pack.parts["volume"]) == pytest.approx(volume)
+    expected = 0.8 * float(pack.parts["l1"]) + 0.2 * (1 - float(pack.parts["ssim"])) + volume + 0.5
+    assert float(pack.total.detach()) == pytest.approx(expected, rel=1e-5)
+
+
+def test_a_view_without_gaussians_has_a_finite_loss():
+    stage = AnchorStage(AnchorParams())
+    model, view = begin(stage, model_of()), scene_of().views[0]
+    with torch.no_grad():
+        model.mask_logits.fill_(-9)
+    result = rendered(model, view.camera)
+    seen = SimpleNamespace(image=lambda background, device: torch.zeros(3, 24, 24))
+    assert float(stage.loss(model, seen, result, torch.zeros(3), step=1).total.detach()) == 0
+    assert model.counts() == {"num_anchors": 0, "num_gaussians": 0}
+
+
+def test_only_anchors_with_a_lattice_are_trained():
+    with pytest.raises(TypeError, match="not a AnchorModel"):
+        begin(AnchorStage(AnchorParams()), model_of(AnchorModel))
+
+
+def test_a_rate_that_never_decays_is_constant():
+    stage = AnchorStage(AnchorParams(lr=AnchorLearningRates(max_steps=100)))
+    assert stage.learning_rates(50)["mlp_cov"] == pytest.approx(0.004)

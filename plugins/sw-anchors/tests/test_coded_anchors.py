@@ -1,0 +1,235 @@
+"""Anchors with a lattice, masks and phases: what HAC and CAT-3DGS share."""
+
+import copy
+import math
+
+import pytest
+import torch
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, AnchorContext, CodedAnchors
+from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.growth import adjust_anchors
+from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.rasterizer_checks import front_camera
+
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+
+RASTERIZER = ReferenceRasterizer()
+
+
+class Gaussians:
+    """Bits under a density, as an entropy model of the registry gives them."""
+
+    class FloatContext:
+        def __init__(self, mean, scale, step, smallest_probability):
+            self.mean, self.scale, self.step, self.least = mean, scale, step, smallest_probability
+
+    def bits(self, x, c):
+        z = torch.distributions.Normal(c.mean, c.scale)
+        return -torch.log2((z.cdf(x + c.step / 2) - z.cdf(x - c.step / 2)).clamp(min=c.least))
+
+
+class Flat(CodedAnchors):
+    """One distribution for all anchors."""
+
+    def __init__(self, *args, **kwargs):
+        super().__init__(*args, **kwargs)
+        self.log_steps = torch.nn.Parameter(torch.tensor([0.0, math.log(0.01), math.log(0.2)]))
+
+    def predict(self, rows):
+        n, k = len(rows), self.num_offsets
+        widths = (self.features.shape[1], 6, 3 * k)
+        steps = self.log_steps.exp()
+        return AnchorContext(
+            tuple(torch.zeros(n, w) for w in widths),
+            tuple(torch.ones(n, w) for w in widths),
+            tuple(step.expand(n, 1) for step in steps),
+        )
+
+
+def make(n=8, k=4, feature_dim=5, seed=0, **kwargs):
+    g = torch.Generator().manual_seed(seed)
+    return Flat(
+        torch.rand(n, 3, generator=g) * 2 - torch.tensor([1.0, 1.0, -3.0]),
+        torch.randn(n, feature_dim, generator=g),
+        torch.randn(n, k, 3, generator=g),
+        torch.randn(n, 6, generator=g) * 0.3 - 2,
+        voxel_size=0.1, hidden=8, generator=g, entropy=Gaussians(), **kwargs,
+    )  # fmt: skip
+
+
+def test_positions_lie_on_the_lattice_below_the_anchors():
+    x = torch.randn(500, 3, generator=torch.Generator().manual_seed(0)) * torch.tensor([1.0, 30.0, 0.01])
+    bounds = bounds_of(x)
+    step = (bounds[1].double() - bounds[0].double()) / TOP
+    codes = position_codes(x, bounds)
+    assert codes.amin(0).tolist() == [0, 0, 0]
+    assert codes.amax(0).tolist() == [TOP] * 3
+    below = x.double() - (codes * step + bounds[0].double())
+    assert float(below.min()) >= 0
+    assert bool((below < step * (1 + 1e-9)).all())
+    torch.testing.assert_close(coded_positions(codes, bounds), x, atol=float(step.max()), rtol=0)
+
+
+def test_bounds_have_the_published_margin_or_a_tenth_of_the_extent():
+    x = torch.tensor([[-1.0, 2.0, 0.0], [4.0, 3.0, -5.0]])
+    torch.testing.assert_close(bounds_of(x, "hac"), torch.tensor([[-1.2, 1.6, -6.0], [4.8, 3.6, 0.0]]))
+    torch.testing.assert_close(bounds_of(x, "extent"), torch.tensor([[-1.5, 1.9, -5.5], [4.5, 3.1, 0.5]]))
+    torch.testing.assert_close(bounds_of(x, "none"), torch.tensor([[-1.0, 2.0, -5.0], [4.0, 3.0, 0.0]]))
+
+
+def test_anchors_in_one_plane_and_outside_the_bounds_have_codes():
+    x = torch.tensor([[0.5, 0.0, 0.0], [0.5, 1.0, 2.0]])
+    bounds = bounds_of(x)
+    codes = position_codes(torch.cat([x, torch.tensor([[9.0, -3.0, 1.0]])]), bounds)
+    assert codes[:2, 0].tolist() == [0, 0]
+    assert codes[2].tolist() == [TOP, 0, TOP // 2]
+
+
+def test_positions_follow_anchors_and_bounds():
+    model = make()
+    first = model.positions()
+    assert model.positions() is first
+    with torch.no_grad():
+        model.anchors[0] += 0.01
+    assert model.positions() is not first
+    second = model.positions()
+    model.update_bounds("extent")
+    assert not torch.equal(model.positions(), second)
+
+
+def test_each_phase_moves_values_by_its_own_step():
+    model, rows = make(n=400), torch.arange(400)
+    raw = model.raw(rows)
+    for phase, steps in ((FULL, (0, 0, 0)), (QUANTIZED, (1.0, 0.001, 0.2)), (ENTROPY, (1.0, 0.01, 0.2))):
+        model.phase = phase
+        for training in (True, False):
+            model.train(training)
+            a = model.attributes(rows)
+            found = (a.features, a.scales, a.offsets.flatten(1))
+            for x, y, step in zip(raw, found, steps, strict=True):
+                moved = (y - x).detach().abs().max()
+                assert float(moved) <= step / 2 + 1e-6
+                assert float(moved) >= 0.45 * step
+                if not training and step:
+                    torch.testing.assert_close(torch.round(y / step) * step, y)
+            assert ("rate" in a.extras) == (phase == ENTROPY and training)
+
+
+def test_noise_of_the_second_phase_has_its_own_factor():
+    model, rows = make(n=400, noise_factor=1.1), torch.arange(400)
+    model.phase = QUANTIZED
+    moved = (model.attributes(rows).features - model.features).detach().abs().max()
+    assert 0.5 < float(moved) <= 0.55
+
+
+def test_a_larger_step_is_learned_through_the_noise_and_the_bin():
+    model = make(n=50)
+    model.phase, model.sample = ENTROPY, 1.0
+    a = model.attributes(torch.arange(50))
+    a.features.square().sum().backward(retain_graph=True)
+    assert float(model.log_steps.grad[0]) != 0
+    model.zero_grad()
+    a.extras["rate"].bits.backward()
+    assert bool((model.log_steps.grad < 0).all())  # wider bins cost fewer bits
+
+
+def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
+    model = make(n=60)
+    with torch.no_grad():
+        model.mask_logits[:20] = -6  # these anchors go
+        model.mask_logits[20:30, 1] = -6
+    model.phase, model.sample = ENTROPY, 1.0
+    rows = torch.arange(60)
+    rate = model.attributes(rows).extras["rate"]
+    assert rate.numbers == 40 * (5 + 6 + 12)
+    masks, forecast = model.masks(rows), model.forecast(rows)
+    values = tuple(v.detach() for v in model.raw(rows))
+    steps = forecast.steps.repeat_interleave(torch.tensor([5, 6, 12]), dim=1)
+    again = model.rate(torch.cat(values, dim=1), steps, forecast, masks)
+    bits = Gaussians().bits(values[2], Gaussians.FloatContext(0.0, 1.0, 0.2, 1e-6)) * masks.repeat_interleave(3, 1)
+    torch.testing.assert_close(again.by_group[2], bits[20:].sum().detach(), rtol=1e-4, atol=0.01)
+    torch.testing.assert_close(again.bits, again.by_group.sum() / rate.numbers * 40 / 60)
+
+
+def test_an_empty_sample_costs_nothing():
+    model = make()
+    model.phase, model.sample = ENTROPY, 0.0
+    rate = model.attributes(torch.arange(8)).extras["rate"]
+    assert (float(rate.bits), rate.numbers) == (0.0, 0)
+    assert float(model.attributes(torch.arange(0)).extras["rate"].bits) == 0.0
+
+
+def test_masks_remove_gaussians_and_learn_from_picture_and_rate():
+    model, cam = make(n=30), front_camera()
+    with torch.no_grad():
+        model.mask_logits[:, 2] = -5  # sigmoid 0.0067
+        model.mask_logits[3] = -5
+    assert model.kept().tolist() == [i != 3 for i in range(30)]
+    assert model.counts() == {"num_anchors": 29, "num_gaussians": 87}
+    model.phase, model.sample = ENTROPY, 1.0
+    inputs = model.gaussians(cam, RASTERIZER)
+    selection = inputs.extras["anchors"]
+    assert bool((selection.drawn % 4 != 2).all())
+    RASTERIZER.render(inputs, cam, RasterOptions()).image.square().sum().backward()
+    assert float(model.mask_logits.grad.abs().max()) > 0
+    model.zero_grad()
+    model.attributes(torch.arange(30)).extras["rate"].bits.backward()
+    assert float(model.mask_logits.grad[model.kept(), :2].min()) > 0  # fewer offsets, fewer bits
+
+
+def test_negative_scales_draw_as_positive_ones():
+    model, cam = make(), front_camera()
+    a = model.attributes(torch.arange(8))
+    scales = a.scales.detach().clone()
+    scales[:, 3:] *= -1
+    masks = torch.ones(8, 4, dtype=torch.bool)
+    decoded = DecodedAnchors(a.positions, a.features.detach(), a.offsets.detach(), scales, masks, hidden=8)
+    for name in model.NETWORKS:
+        getattr(decoded, name).load_state_dict(getattr(model, name).state_dict())
+    options = RasterOptions()
+    with torch.no_grad():
+        ours = RASTERIZER.render(model.gaussians(cam, RASTERIZER), cam, options).image
+        theirs = RASTERIZER.render(decoded.gaussians(cam, RASTERIZER), cam, options).image
+    assert torch.equal(ours, theirs)
+    assert decoded.counts() == {"num_anchors": 8, "num_gaussians": 32}
+
+
+def test_growth_extends_masks_and_their_moments():
+    model = make()
+    groups = [ParamGroup(name, 0.01) for name in ("features", "offsets", "log_scales", "mask_logits")]
+    optimizer = SplatOptimizer(model, groups)
+    model.mask_logits.square().sum().backward()
+    optimizer.step()
+    model.offset_denom.fill_(50)
+    model.offset_grad_accum.fill_(50.0)
+    report = adjust_anchors(model, optimizer, step=100, generator=torch.Generator().manual_seed(0))
+    assert report.grown > 0
+    assert bool((model.mask_logits[8:] == 1).all())
+    assert model.codes().shape == (report.total, 3)
+    assert not bool(optimizer.moments("mask_logits")[0][8:].any())
+
+
+def test_phase_and_bounds_are_part_of_the_state():
+    model, other = make(), make(seed=3)
+    model.phase = ENTROPY
+    model.update_bounds("extent")
+    other.load_resized(model.state_dict())
+    other.load_state_dict_extra(model.state_dict_extra())
+    assert other.digest() == model.digest()
+    assert other.phase == ENTROPY
+    assert torch.equal(other.positions(), model.positions())
+    assert copy.deepcopy(model).digest() == model.digest()
+
+
+def test_far_values_are_clamped_about_the_mean_of_the_kept():
+    model = make(n=4)
+    with torch.no_grad():
+        model.features[0, 0] = 1e6
+    model.phase = QUANTIZED
+    model.eval()
+    with torch.no_grad():
+        found = model.attributes(torch.arange(4)).features[0, 0]
+    mean = float(model.features.detach().double().mean())
+    assert float(found) == pytest.approx(round(mean) + 15_000)

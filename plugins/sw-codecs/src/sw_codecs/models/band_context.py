@@ -1,0 +1,79 @@
+"""Higher SH bands with one set of statistics for each class of activity.
+
+A Gaussian whose lower bands are large has large higher bands too, and one that few views saw has none. So rows are
+classed by the sum of magnitudes of the bands already coded, in classes of about equal size, and each class is coded
+with its own statistics. It is integer arithmetic on decoded symbols; only the number of classes is transmitted.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from splatwizard_core.errors import BitstreamError
+from sw_codecs.models.attributes import MAX_SYMBOL
+
+MAX_CLASSES = 16
+ROWS_PER_CLASS = 2048
+"""A class must repay its count tables, about 100 bytes for each of up to 21 columns."""
+
+
+def suitable_classes(rows: int) -> int:
+    """How many classes pay for this many Gaussians: a power of two, 1 .. 8."""
+    count = 1
+    while count < 8 and rows >= 2 * count * ROWS_PER_CLASS:
+        count *= 2
+    return count
+
+
+def activity_classes(lower: NDArray[np.int32], count: int) -> NDArray[np.int64]:
+    """Class 0 .. count - 1 of each row of the symbols [N,C] of lower bands, by the sum of magnitudes."""
+    activity = np.zeros(len(lower), np.int64)
+    for column in lower.T:  # one at a time: the whole matrix in 64 bits would be the largest thing in memory
+        activity += np.abs(column)
+    ordered = np.sort(activity)
+    limits = ordered[[len(ordered) * i // count for i in range(1, count)]] if len(ordered) else ordered
+    return np.searchsorted(limits, activity, side="right")
+
+
+def encode_band(columns: Any, symbols: NDArray[np.int32], classes: NDArray[np.int64], count: int) -> bytes:
+    """u32 byte length of each class, then the classes; an empty class has no bytes.
+
+    columns     the entropy model for integer matrices
+    """
+    parts = []
+    for k in range(count):
+        rows = symbols[classes == k]
+        parts.append(columns.encode(rows, None) if len(rows) else b"")
+    return struct.pack(f"<{count}I", *map(len, parts)) + b"".join(parts)
+
+
+def decode_matrix(columns: Any, data: bytes, rows: int, width: int) -> NDArray[np.int64]:
+    """Symbols [rows,width], each within +-2^30. Raises BitstreamError."""
+    symbols: NDArray[np.int64] = columns.decode(data, (rows, width))
+    if symbols.size and not -MAX_SYMBOL <= int(symbols.min()) <= int(symbols.max()) <= MAX_SYMBOL:
+        raise BitstreamError("a quantised value is beyond 2^30")
+    return symbols
+
+
+def decode_band(columns: Any, data: bytes, classes: NDArray[np.int64], count: int, width: int) -> NDArray[np.int32]:
+    """Symbols [N,width]. Raises BitstreamError."""
+    start = 4 * count
+    if len(data) < start:
+        raise BitstreamError(f"{len(data)} bytes cannot hold the lengths of {count} classes")
+    lengths = struct.unpack_from(f"<{count}I", data)
+    if start + sum(lengths) != len(data):
+        raise BitstreamError(f"{len(data):,} bytes, the class lengths say {start + sum(lengths):,}")
+    symbols = np.empty((len(classes), width), dtype=np.int32)
+    for k, length in enumerate(lengths):
+        rows = classes == k
+        found = int(rows.sum())
+        if (found == 0) != (length == 0):
+            raise BitstreamError(f"class {k} has {found:,} rows, but {length:,} bytes")
+        if found:
+            symbols[rows] = decode_matrix(columns, data[start : start + length], found, width)
+        start += length
+    return symbols

@@ -1,0 +1,65 @@
+"""The files of 3DGS as codecs that any method of explicit Gaussians may ask for by name (coding/gaussian_codec.py)."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from sw_codecs.models import exact, lossless, ply_section, quantized
+from sw_codecs.models.settings import Codec
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.model import GaussianModel
+    from splatwizard_core.plugins import PluginManager
+
+
+class Exact:
+    """float32 as trained, 236 bytes a Gaussian at SH degree 3."""
+
+    def __init__(self, plugins: PluginManager) -> None:
+        pass
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        exact.encode(model, writer)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return exact.decode(reader)
+
+
+class Quantized:
+    """Octree positions, all else on a lattice and range coded; settings: `sw_codecs.models.settings.Codec` (defaults: rate r5)."""
+
+    def __init__(self, plugins: PluginManager, **settings: Any) -> None:
+        self.plugins, self.codec = plugins, Codec(mode="quantized", **settings)
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        quantized.encode(model, writer, self.codec, self.plugins)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return quantized.decode(reader, self.plugins)
+
+
+class Ply:
+    """The .ply of 3DGS as it is, 248 bytes a Gaussian at SH degree 3: the size that pruning papers report."""
+
+    def __init__(self, plugins: PluginManager) -> None:
+        pass
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        ply_section.encode(model, writer)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return ply_section.decode(reader)
+
+
+class Lossless:
+    """float32 as trained, in spatial order, byte planes and zstd: every bit comes back."""
+
+    def __init__(self, plugins: PluginManager) -> None:
+        self.plugins = plugins
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        lossless.encode(model, writer, self.plugins)
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        return lossless.decode(reader, self.plugins)

@@ -1,0 +1,220 @@
+"""The file in mode `quantized`: positions through the octree codec, all else on a lattice and range coded.
+
+Rows are in Morton order of their grid cell. Gaussians that can never be drawn (opacity below 1/255, or a parameter that
+is not finite) are left out. The decoder needs integers and exact arithmetic only.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import Field, ValidationError
+
+from splatwizard_core.coding.gaussian_codec import BORROWED
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.gaussians.model import GaussianModel, logit
+from splatwizard_core.training.params import Params
+from sw_codecs.models.attributes import BASE_COLUMNS, Steps, Values, dequantize, quantize
+from sw_codecs.models.band_context import (
+    MAX_CLASSES,
+    activity_classes,
+    decode_band,
+    decode_matrix,
+    encode_band,
+    suitable_classes,
+)
+from sw_codecs.models.position_grid import MAX_TOP, PositionGrid
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.plugins import PluginManager
+    from sw_codecs.models.settings import Codec
+
+log = logging.getLogger(__name__)
+
+FAINTEST = logit(1 / 255)
+"""Rasterizers skip a splat whose alpha is below 1/255, and alpha never exceeds the opacity."""
+
+SECTIONS = {"color": (0, 3), "opacity": (3, 4), "scales": (4, 7), "quats": (7, 10)}
+"""Columns of the attribute matrix by section; SH bands 1 to 3 follow with one section each."""
+
+ROWS_AT_ONCE = 1 << 12
+"""Rows that are dequantised together: intermediate doubles of all rows would outweigh the model several times."""
+
+
+class Layout(Params):
+    """What the header says of a quantised file; everything has bounds, since a stranger may have written it."""
+
+    num_gaussians: int = Field(ge=0, lt=2**32)
+    max_sh_degree: int = Field(ge=0, le=3)
+    active_sh_degree: int = Field(ge=0, le=3)
+    position_bits: int = Field(ge=1, le=21)
+    center: tuple[float, float, float]
+    width: tuple[float, float, float]
+    top: tuple[int, int, int]
+    dc_step: float = Field(gt=0, le=1e3)
+    rest_step: float = Field(gt=0, le=1e3)
+    opacity_step: float = Field(gt=0, le=1e3)
+    scale_step: float = Field(gt=0, le=1e3)
+    quat_step: float = Field(gt=0, le=1e3)
+    sh_classes: int = Field(ge=1, le=MAX_CLASSES)
+
+    @property
+    def decoded_bytes(self) -> int:
+        """Of the model in float32: 236 a Gaussian at SH degree 3."""
+        return 4 * self.num_gaussians * (14 + 3 * ((self.max_sh_degree + 1) ** 2 - 1))
+
+    @property
+    def grid(self) -> PositionGrid:
+        return PositionGrid(self.center, self.width, self.top, self.position_bits)
+
+    @property
+    def steps(self) -> Steps:
+        return Steps(self.dc_step, self.rest_step, self.opacity_step, self.scale_step, self.quat_step)
+
+
+def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> None:
+    """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
+    octree = plugins.coders.load("octree")()
+    layout, cells, symbols = lattice(model, codec, octree.sort)
+    writer.raster["sh_degree"] = layout.max_sh_degree
+    writer.static.update(layout.model_dump(mode="json"))
+    writer.add("positions", octree.encode(cells, layout.position_bits))
+    columns = plugins.entropy_models.load("columns")()
+    for name, (start, stop) in SECTIONS.items():
+        writer.add(name, columns.encode(symbols[:, start:stop], None))
+    for band, start, stop in _bands(layout):
+        classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
+        writer.add(f"sh{band}", encode_band(columns, symbols[:, start:stop], classes, count))
+    writer.allow(layout.decoded_bytes, f"a model of {layout.num_gaussians:,} Gaussians")
+
+
+def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
+    """The model on the lattice. Raises BitstreamError."""
+    layout = _layout(reader)
+    n = layout.num_gaussians
+    reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
+    with reader.decoding("positions") as data:
+        cells = plugins.coders.load("octree")(max_points=n).decode(data)
+        if cells.shape != (n, 3):
+            raise BitstreamError(f"holds {len(cells):,} points, header says {n:,}")
+        if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
+            raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
+    columns = plugins.entropy_models.load("columns")()
+    symbols = np.empty((n, BASE_COLUMNS + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
+    for name, (start, stop) in SECTIONS.items():
+        with reader.decoding(name) as data:
+            symbols[:, start:stop] = decode_matrix(columns, data, n, stop - start)
+    for band, start, stop in _bands(layout):
+        classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
+        with reader.decoding(f"sh{band}") as data:
+            symbols[:, start:stop] = decode_band(columns, data, classes, count, stop - start)
+    model = reconstruct(layout, cells, symbols)
+    for name, parameter in model.named_parameters():
+        if not bool(torch.isfinite(parameter).all()):
+            raise BitstreamError(f"{reader.name}: decoded '{name}' is not finite: the file is damaged or hostile")
+    return model
+
+
+def lattice(
+    model: GaussianModel, codec: Codec, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:
+    """What is coded: the header, grid cells [N,3] in the order of `sort`, and the attribute integers [N,C] likewise."""
+    arrays = {
+        name: getattr(model, name).detach().cpu().numpy()
+        for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
+    }
+    keep = arrays["opacity_logits"] >= FAINTEST
+    for array in arrays.values():
+        # +inf is a legitimate logit (opacity 1); everything else must be finite to be drawn.
+        finite = ~np.isnan(array) if array is arrays["opacity_logits"] else np.isfinite(array)
+        keep &= finite.all(axis=tuple(range(1, finite.ndim)))
+    if not keep.all():
+        log.info("%d of %d Gaussians can never be drawn and are left out", int((~keep).sum()), len(keep))
+    arrays = {name: array[keep] for name, array in arrays.items()}
+    grid = PositionGrid.fit(arrays["means"], codec.position_bits)
+    cells = grid.quantize(arrays["means"])
+    order = sort(cells)
+    active = (model.active_sh_degree + 1) ** 2 - 1
+    values = Values(
+        dc=arrays["sh_dc"][order, 0],
+        rest=arrays["sh_rest"][order, :active],
+        opacity_logits=arrays["opacity_logits"][order],
+        log_scales=arrays["log_scales"][order],
+        quats=arrays["quats"][order],
+    )
+    layout = Layout(
+        num_gaussians=len(order),
+        max_sh_degree=model.max_sh_degree,
+        active_sh_degree=model.active_sh_degree,
+        position_bits=codec.position_bits,
+        center=grid.center,
+        width=grid.width,
+        top=grid.top,
+        dc_step=codec.dc_step,
+        rest_step=codec.rest_step,
+        opacity_step=codec.opacity_step,
+        scale_step=codec.scale_step,
+        quat_step=codec.quat_step,
+        sh_classes=suitable_classes(len(order)),
+    )
+    return layout, cells[order], quantize(values, layout.steps)
+
+
+def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.int32]) -> GaussianModel:
+    """The model that these integers stand for; what the decoder returns."""
+    n, grid, steps = layout.num_gaussians, layout.grid, layout.steps
+    tails = {"means": (3,), "dc": (3,), "rest": ((layout.max_sh_degree + 1) ** 2 - 1, 3), "opacity_logits": (),
+             "log_scales": (3,), "quats": (4,)}  # fmt: skip
+    found = {name: np.zeros((n, *tail), dtype=np.float32) for name, tail in tails.items()}
+    for start in range(0, n, ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        with np.errstate(over="ignore", invalid="ignore"):  # a hostile header may overflow; the caller looks
+            values = dequantize(symbols[part], steps)
+            found["means"][part] = grid.dequantize(cells[part])
+        found["rest"][part, : values.rest.shape[1]] = values.rest
+        for name in ("dc", "opacity_logits", "log_scales", "quats"):
+            found[name][part] = getattr(values, name)
+    found["dc"] = found["dc"][:, None, :]
+    return GaussianModel(
+        *(torch.from_numpy(array) for array in found.values()), active_sh_degree=layout.active_sh_degree
+    )
+
+
+def _bands(layout: Layout) -> list[tuple[int, int, int]]:
+    """(band, first column, end) of the SH bands that are stored."""
+    return [
+        (band, BASE_COLUMNS + 3 * (band**2 - 1), BASE_COLUMNS + 3 * ((band + 1) ** 2 - 1))
+        for band in range(1, layout.active_sh_degree + 1)
+    ]
+
+
+def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArray[np.int64], int]:
+    """Class of each row for one band, and how many classes; the first band has nothing to go by."""
+    if band == 1:
+        return np.zeros(len(lower), dtype=np.int64), 1
+    return activity_classes(lower, layout.sh_classes), layout.sh_classes
+
+
+def _layout(reader: ContainerReader) -> Layout:
+    try:
+        layout = Layout.model_validate({k: v for k, v in reader.static.items() if k not in ("mode", *BORROWED)})
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise BitstreamError(f"{reader.name}: header value '{key}': {first['msg']}", section="header") from None
+    if layout.active_sh_degree > layout.max_sh_degree:
+        raise BitstreamError(f"{reader.name}: header activates more SH bands than there are", section="header")
+    grid_fits = (
+        all(np.isfinite(layout.center))
+        and all(0 < w < 1e30 for w in layout.width)
+        and all(1 <= t <= MAX_TOP for t in layout.top)
+    )
+    if not grid_fits:
+        raise BitstreamError(f"{reader.name}: header describes no usable position grid", section="header")
+    return layout

@@ -1,0 +1,23 @@
+"""Settings of the quantised file of Gaussians."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from splatwizard_core.training.params import Params
+
+
+class Codec(Params):
+    """What the file holds."""
+
+    mode: Literal["exact", "quantized"] = Field(
+        "exact", description="float32 as trained, or quantised and entropy-coded"
+    )
+    position_bits: int = Field(18, ge=8, le=21, description="bits per axis of the position grid")
+    dc_step: float = Field(
+        0.02, ge=1e-6, le=1e3, description="quantiser step of SH band 0 (SH coefficient; 0.28 of it in colour)"
+    )
+    rest_step: float = Field(0.012, ge=1e-6, le=1e3, description="quantiser step of SH bands 1 to 3 (SH coefficient)")
+    opacity_step: float = Field(0.08, ge=1e-6, le=1e3, description="quantiser step of the opacity logits")
+    scale_step: float = Field(0.03, ge=1e-6, le=1e3, description="quantiser step of the log scales (0.03: 3 % in size)")
+    quat_step: float = Field(0.007, ge=1e-6, le=0.5, description="quantiser step of the unit quaternion's x, y, z")

@@ -1,0 +1,45 @@
+"""The procedural scene as a dataset family: `demo`, or `demo:tiny` for tests."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from splatwizard_core.errors import SceneError
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.images import fitted_size
+from splatwizard_core.scene.scene import Scene
+from sw_datasets.demo.synthetic import SIZES, make_scene
+from sw_datasets.families import DEMO
+from sw_datasets.rules import of_no_use, settle
+
+NO_USE = ("principal_point", "mask_background", "legacy_8bit_composite", "init_points")
+"""Scene options that change nothing here: the pictures are drawn, and the size of the scene says how many points."""
+
+
+class DemoDataset:
+    """No folder is ever of this family; the name `demo` asks for it."""
+
+    def detect(self, path: Path) -> float:
+        """0: the scene is not read from anywhere."""
+        return 0.0
+
+    def load(self, path: Path, options: SceneOptions) -> Scene:
+        """path: `demo` or `tiny`, the name of a size. Raises SceneError for another one, ConfigError for `images`."""
+        variant = str(path)
+        if variant not in SIZES:
+            raise SceneError(f"there is no demo scene '{variant}': use demo or demo:tiny")
+        size = SIZES[variant]
+        rules = settle(replace(DEMO, split=f"every{size.test_every}"), variant, options)
+        width, height = fitted_size(size.width, size.height, rules.resolution)
+        scene = make_scene(
+            replace(size, width=width, height=height),
+            name="demo" if variant == "demo" else f"demo-{variant}",
+            init_seed=options.seed,
+            background=rules.background,
+            split=rules.split,
+            source_size=(size.width, size.height),
+            resolution=rules.resolution,
+        )
+        scene.warnings += of_no_use(options, NO_USE, DEMO)
+        return scene

@@ -1,0 +1,1 @@
+"""Archives of the published data sets: where they are, fetched, checked, unpacked."""

@@ -1,0 +1,114 @@
+"""From a family's table and what the user asked for to the rules one scene is read by, every value decided."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.scene import Protocol
+from sw_datasets.families import PROTOCOLS, Family
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How one scene is read.
+
+    family      row of the table
+    scene       its published scene, None for any other folder
+    asked       named protocol whose pictures are the default
+    images      picture folder; None: the layout has none to choose
+    the rest    as in Protocol
+    """
+
+    family: Family
+    scene: str | None
+    asked: str
+    images: str | None
+    resolution: int
+    split: str
+    background: str
+    principal_point: str
+    masked: bool
+    composite8: bool
+
+    @property
+    def name(self) -> str:
+        """The named protocol that these very rules are, else "custom"."""
+        if self.scene is None:
+            return "custom"
+        plain = (self.family.split, self.family.background, "center", False, False)
+        if (self.split, self.background, self.principal_point, self.masked, self.composite8) != plain:
+            return "custom"
+        for name in (self.asked, *PROTOCOLS):
+            pictures = self.family.pictures[name]
+            if (self.images, self.resolution) == (pictures.folder_of(self.scene), pictures.resolution):
+                return name
+        return "custom"
+
+    def protocol(self, label: str | None = None) -> Protocol:
+        """What the record keeps.
+
+        label   stands for the picture folder where the layout has none
+        """
+        return Protocol(
+            self.family.name,
+            images=self.images or label or "",
+            resolution=self.resolution,
+            split=self.split,
+            background=self.background,
+            principal_point=self.principal_point,
+            masked=self.masked,
+            composite8=self.composite8,
+            name=self.name,
+        )
+
+
+def settle(family: Family, folder: str, options: SceneOptions) -> Rules:
+    """The rules for a scene folder: what the user gave, else what the family's table says.
+
+    folder  name of the scene's folder
+
+    Raises ConfigError for two splits at once, and for a picture folder where there is none to choose.
+    """
+    if options.split is not None and options.test_every is not None and options.split != f"every{options.test_every}":
+        raise ConfigError(
+            f"split = {options.split} contradicts test_every = {options.test_every}: give one of them", key="split"
+        )
+    scene = family.scene_of(folder)
+    asked = options.protocol or PROTOCOLS[0]
+    pictures = family.pictures[asked]
+    images = pictures.folder_of(scene or folder)
+    if options.images is not None:
+        if images is None:
+            raise ConfigError(
+                f"--images {options.images}: there is no picture folder to choose in a scene of the family "
+                f"'{family.name}'; leave it out",
+                key="images",
+            )
+        images = options.images
+    split = options.split or (family.split if options.test_every is None else f"every{options.test_every}")
+    return Rules(
+        family,
+        scene,
+        asked,
+        images,
+        pictures.resolution if options.resolution is None else options.resolution,
+        split,
+        options.background or family.background,
+        options.principal_point,
+        options.mask_background,
+        options.legacy_8bit_composite,
+    )
+
+
+def of_no_use(options: SceneOptions, keys: Iterable[str], family: Family) -> list[str]:
+    """A warning for each of `keys` that was given a value although scenes of the family have no use for it.
+
+    A named protocol is of no use where nothing is published.
+    """
+    defaults = {f.name: f.default for f in fields(SceneOptions)}
+    keys = [*keys] if family.scenes else ["protocol", *keys]
+    given = [key for key in keys if getattr(options, key) != defaults[key]]
+    return [f"{key} = {getattr(options, key)} is of no use for a scene of the family '{family.name}'" for key in given]

@@ -1,0 +1,134 @@
+"""All checks, run side by side, in the order in which they are read."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from typing import Any
+
+from splatwizard_core.errors import PluginError
+from sw_doctor import child, compilers, packages, system
+from sw_doctor.check import SLOWLY, Check, one_line
+
+DIED_IN = {"torch": ("torch", "CUDA"), "metrics": ("LPIPS",), "rasterizers": ("rasterizers",), "main job": ("sw run",)}
+PROBE = "sw_doctor.probe"
+METRICS = "sw_metrics.check"
+PROBE_SECONDS = 120.0  # torch from a slow network disk takes long; a hang has to end all the same
+GROUPS = (
+    "main job", "system", "torch", "compilers", "kernels", "rasterizers", "plugins", "packages", "metrics", "data",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What was found, in reading order.
+
+    ok  `sw run` on the demo scene can run: no needed check is missing or broken
+    """
+
+    checks: list[Check]
+    seconds: float
+
+    @property
+    def ok(self) -> bool:
+        return all(c.state == "ok" for c in self.checks if c.needed)
+
+    def as_dict(self) -> dict[str, Any]:
+        """What `sw doctor --json` prints."""
+        return {"ok": self.ok, "seconds": round(self.seconds, 2), "checks": [c.as_dict() for c in self.checks]}
+
+
+def examine(method: str) -> Diagnosis:
+    """Try everything; `method` is what `sw run` trains unless told otherwise.
+
+    What torch is needed for, what packages do when imported and what compilers do happens in other processes at the
+    same time, so a crash there is a finding here.
+    """
+    started = time.monotonic()
+    with ThreadPoolExecutor(max_workers=5) as pool:
+        probe = pool.submit(child.ask, PROBE, [method], timeout=PROBE_SECONDS)
+        metrics = pool.submit(child.ask, METRICS, timeout=PROBE_SECONDS)
+        cxx = pool.submit(_guarded, "C++", compilers.check_cxx)
+        nvcc = pool.submit(_guarded, "nvcc", compilers.check_nvcc)
+        checks, distributions = plugin_checks()
+        needs = packages.collect_needs(distributions)
+        problems = pool.submit(packages.try_imports, needs.names())
+        for check in (system.check_python, system.check_memory, system.check_cores, system.check_cache,
+                      system.check_working_folder):  # fmt: skip
+            checks.append(_guarded(check.__name__, check))
+        checks += probed(probe.result())
+        if any(c.name == "torch" and c.state == "ok" for c in checks):  # without it that process can only fail
+            checks += probed(metrics.result(), needed=False)
+        torch_cuda = next((c.facts.get("cuda") for c in checks if c.name == "torch"), None)
+        checks += [cxx.result(), compilers.judge_nvcc(nvcc.result(), torch_cuda)]
+        checks += packages.package_checks(needs, problems.result())
+    obstacle = next((c for c in checks if c.name in ("C++", "cache folder") and c.state != "ok"), None)
+    if obstacle is not None:
+        checks = [_without_builds(c, obstacle) for c in checks]
+    order = {group: place for place, group in enumerate(GROUPS)}
+    checks.sort(key=lambda c: order.get(c.group, len(order)))
+    return Diagnosis(checks, time.monotonic() - started)
+
+
+def probed(answer: child.Answer, *, needed: bool = True) -> list[Check]:
+    """The checks of a process; what it died in, if it died, is broken, and with it the main job if that does the same.
+
+    needed  the main job does what this process did
+    """
+    checks = list(answer.checks)
+    if answer.died_in is not None:
+        step, how = answer.died_in
+        group = next((g for g, steps in DIED_IN.items() if step in steps), "kernels" if ":" in step else "plugins")
+        mend = "sw build-kernels --force" if group == "kernels" else "pip install --force-reinstall torch"
+        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, needed))
+    return checks
+
+
+def plugin_checks() -> tuple[list[Check], list[str]]:
+    """(one check a plugin and one a clash of names, names of the distributions)."""
+    from splatwizard_core.plugins import load_plugins
+
+    try:
+        plugins = load_plugins()
+    except PluginError as error:
+        wrong = Check("plugins", "SW_PLUGINS", "broken", one_line(error), "unset SW_PLUGINS", True)
+        return [wrong], ["splatwizard-core"]
+    checks = []
+    restricted = os.environ.get("SW_PLUGINS")
+    if restricted is not None:
+        detail = f"only these load: {restricted or 'none, the core alone'}"
+        checks.append(Check("plugins", "SW_PLUGINS", "ok", detail))
+    for info in plugins.plugins:
+        if info.error is None:
+            provided = len(plugins.provided_by(info))
+            checks.append(Check("plugins", info.distribution, "ok", f"{info.version}, provides {provided}"))
+            continue
+        _, found, advice = info.error.rpartition("pip install ")
+        mend = f"pip install {advice}" if found else f"pip install --upgrade --force-reinstall {info.distribution}"
+        checks.append(Check("plugins", info.distribution, "broken", one_line(f"{info.version}: {info.error}"), mend))
+    for kind, registry in plugins.registries.items():
+        for name, entries in registry.clashes.items():
+            owners = [e.distribution for e in entries]
+            checks.append(Check("plugins", f"{kind} {name}", "broken", f"claimed by {' and '.join(owners)}",
+                                f"pip uninstall {owners[-1]}"))  # fmt: skip
+    return checks, [info.distribution for info in plugins.plugins]
+
+
+def _guarded(name: str, check: Callable[[], Check]) -> Check:
+    """A test that fails in a way nobody foresaw is a finding as well."""
+    try:
+        return check()
+    except Exception as error:
+        return Check("system", name, "broken", one_line(f"the test failed: {type(error).__name__}: {error}"))
+
+
+def _without_builds(check: Check, obstacle: Check) -> Check:
+    """A check, knowing that nothing can be compiled here until the obstacle is gone: its line is what mends."""
+    if check.facts.get("compiled_first"):
+        return replace(check, detail=f"on {check.facts['device']}, but {SLOWLY}", mend=obstacle.mend)
+    if check.mend is not None and check.mend.startswith("sw build-kernels"):
+        return replace(check, mend=obstacle.mend)
+    return check

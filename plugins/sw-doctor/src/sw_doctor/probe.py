@@ -1,0 +1,310 @@
+"""`python -m sw_doctor.probe METHOD`: everything that needs torch, tried in this process.
+
+Kernels are loaded and pictures drawn here, so that a crash takes this process and not the one that reports it. Nothing
+is compiled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import logging
+import os
+import re
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from splatwizard_core.errors import NativeBuildError, PluginError, SplatwizardError
+from splatwizard_core.native.build import declared_modules, resolve_module
+from splatwizard_core.plugins import PluginManager, load_plugins
+from splatwizard_core.plugins.registry import Entry
+from sw_doctor.check import SLOWLY, Check, State, one_line
+from sw_doctor.child import Step, serve
+
+MOST_FOLDERS = 500  # a data folder may be a file server; who has more scenes sees how many were looked at
+
+
+def steps(method: str) -> Iterator[tuple[str, Step]]:
+    """All of them, in order; the later ones need torch, and without it there are none.
+
+    method  what `sw run` trains unless told otherwise
+    """
+    yield "torch", check_torch
+    if not _imports("torch"):
+        return
+    yield "CUDA", check_cuda
+    try:
+        plugins = load_plugins()
+    except PluginError:  # $SW_PLUGINS names one that is not there: the asking process says so
+        return
+    for target in declared_modules(plugins):
+        yield target, lambda target=target: [check_kernels(target)]  # type: ignore[misc]
+    yield "entries", lambda: check_entries(plugins)
+    yield "rasterizers", lambda: check_rasterizers(plugins)
+    yield "scenes", lambda: [check_scenes(plugins)]
+    yield "sw run", lambda: [check_main_job(plugins, method)]
+
+
+def _imports(module: str) -> bool:
+    try:
+        importlib.import_module(module)
+    except Exception:
+        return False
+    return True
+
+
+def check_torch() -> list[Check]:
+    """Import it and multiply two matrices."""
+    again = "pip install --force-reinstall torch -c constraints.txt"
+    try:
+        import torch
+
+        product = torch.ones(8, 8) @ torch.ones(8, 8)
+    except Exception as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == "torch":
+            return [Check("torch", "torch", "missing", "not installed", "pip install torch -c constraints.txt", True)]
+        why = one_line(f"does not import: {type(error).__name__}: {error}")
+        return [Check("torch", "torch", "broken", why, again, True)]
+    if float(product.sum()) != 8.0**3:
+        return [Check("torch", "torch", "broken", "multiplies two matrices wrongly", again, True)]
+    version = str(torch.__version__)
+    facts = {"version": version, "cuda": torch.version.cuda, "threads": torch.get_num_threads()}
+    return [Check("torch", "torch", "ok", f"{version}, {torch.get_num_threads()} threads", None, True, facts)]
+
+
+def check_cuda() -> list[Check]:
+    """Add two numbers on every GPU, or say why there is none."""
+    import torch
+
+    built, driver = torch.version.cuda, nvidia_driver()
+    if built is None and driver is None:
+        return [_cuda("missing", "no NVIDIA driver here, and this torch has no CUDA: the CPU computes")]
+    if built is None:
+        public = str(torch.__version__).partition("+")[0]
+        detail = f"there is an NVIDIA driver ({driver}), but torch {torch.__version__} is built without CUDA"
+        return [_cuda("broken", detail, f"pip install --force-reinstall torch=={public}")]
+    if driver is None:
+        detail = f"torch is built for CUDA {built}, but there is no NVIDIA driver: the CPU computes"
+        return [_cuda("missing", detail, "install the NVIDIA driver, if there is such a GPU")]
+    try:
+        names = _try_gpus()
+    except Exception as error:
+        mend = f"bring driver ({driver}) and CUDA {built} together: `nvidia-smi` shows what the driver can"
+        return [_cuda("broken", one_line(error), mend)]
+    if not names:
+        return [_cuda("missing", "the driver shows no GPU", "see `nvidia-smi`, and $CUDA_VISIBLE_DEVICES if it is set")]
+    shown = "; ".join(f"{names.count(name)} x {name}" for name in dict.fromkeys(names))
+    return [Check("torch", "CUDA", "ok", f"{built}, {shown}", facts={"gpus": names, "driver": driver})]
+
+
+def _cuda(state: State, detail: str, mend: str | None = None) -> Check:
+    return Check("torch", "CUDA", state, detail, mend)
+
+
+def _try_gpus() -> list[str]:
+    """Name, memory and capability of every GPU that adds rightly. Raises what torch raises, or RuntimeError."""
+    import torch
+
+    torch.cuda.init()  # type: ignore[no-untyped-call]
+    names = []
+    for index in range(torch.cuda.device_count()):
+        if (torch.ones(1, device=f"cuda:{index}") + 1).item() != 2:
+            raise RuntimeError(f"GPU {index} adds wrongly")
+        gpu = torch.cuda.get_device_properties(index)
+        names.append(f"{gpu.name}, {gpu.total_memory / 1e9:,.0f} GB, compute capability {gpu.major}.{gpu.minor}")
+    return names
+
+
+def nvidia_driver() -> str | None:
+    """Version of the kernel's NVIDIA module; None if it is not loaded."""
+    with contextlib.suppress(OSError, IndexError):
+        line = Path("/proc/driver/nvidia/version").read_text().splitlines()[0]
+        return next((word for word in line.split() if word[0].isdigit() and "." in word), line.strip())
+    return None
+
+
+def check_kernels(target: str) -> Check:
+    """Load a native module if it is built; it compiles nothing."""
+    try:
+        module = resolve_module(target)
+    except NativeBuildError as error:
+        return Check("kernels", target, "broken", one_line(error), "install the package again")
+    build = "sw build-kernels"
+    try:
+        state = module.state()
+        loaded = module.load_built()
+    except NativeBuildError as error:
+        switched_off = "SPLATWIZARD_NATIVE" in str(error)
+        mend = "unset SPLATWIZARD_NATIVE" if switched_off else f"{build} --force"
+        return Check("kernels", module.name, "missing" if switched_off else "broken", one_line(error), mend)
+    facts = {"state": state["state"], "path": state["path"], "target": state["target"]}
+    if loaded:
+        detail = f"{state['state']} build for {state['target']}, loaded"
+        return Check("kernels", module.name, "ok", detail, facts=facts)
+    if state["state"] == "damaged":
+        detail = "the build in the cache is damaged"
+        return Check("kernels", module.name, "broken", detail, f"{build} --force", facts=facts)
+    detail = f"not built; compiled when first used (about {module.seconds} s)"
+    return Check("kernels", module.name, "missing", f"{detail}. Without: {module.without}", build, facts=facts)
+
+
+def check_entries(plugins: PluginManager) -> list[Check]:
+    """Import every lazy target of every plugin."""
+    checks, loaded = [], 0
+    for registry in plugins.registries.values():
+        for entry in registry:
+            try:
+                entry.load()
+            except PluginError as error:
+                mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
+                checks.append(Check("plugins", f"{entry.kind} {entry.name}", "broken", one_line(error), mend))
+            else:
+                loaded += 1
+    return [Check("plugins", "entries", "ok", f"{loaded} methods, rasterizers, coders, ... load"), *checks]
+
+
+def check_rasterizers(plugins: PluginManager) -> list[Check]:
+    """Let every rasterizer that can run here without a compiler draw a small picture, forward and backward."""
+    return [_check_rasterizer(entry, plugins) for entry in plugins.rasterizers]
+
+
+def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
+    import torch
+
+    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry, obstacle
+
+    device = "cpu" if "cpu" in entry.declared.get("devices", ("cpu",)) else "cuda"
+    where = ", ".join(entry.declared.get("devices", ("cpu",)))
+    if device == "cuda" and not torch.cuda.is_available():
+        return Check("rasterizers", entry.name, "missing", f"runs on {where} only, and there is none")
+    lacking = _lacking_kernels(entry)
+    if lacking is not None:
+        detail = f"its kernels '{lacking.name}' are not loaded"
+        return Check("rasterizers", entry.name, lacking.state, detail, lacking.mend)
+    try:
+        why = obstacle(info_from_entry(entry).on(device), torch.device(device))
+        if why is not None:
+            what, mend = _with_command_apart(why)
+            return Check("rasterizers", entry.name, "missing", one_line(what), mend)
+        exactness = entry.declared.get("exactness", "exact")
+        alone = [name for name in plugins.rasterizers.names if name != entry.name]
+        rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=alone, exactness=[exactness])
+        flat = "SURFEL" in entry.declared.get("needs", ())
+        _draw(rasterizer, device, backward="BACKWARD" in entry.declared.get("features", ()), axes=2 if flat else 3)
+    except Exception as error:
+        mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
+        return Check("rasterizers", entry.name, "broken", one_line(f"{type(error).__name__}: {error}"), mend)
+    return Check("rasterizers", entry.name, "ok", f"drew a test picture on {device} (runs on {where})")
+
+
+def _with_command_apart(why: str) -> tuple[str, str | None]:
+    """`gsplat is not installed (pip install X)` as `gsplat is not installed` and `pip install X`."""
+    found = re.fullmatch(r"(.*\S) \((pip install [^()]+)\)", why)
+    return (why, None) if found is None else (found[1], found[2])
+
+
+def _lacking_kernels(entry: Entry) -> Check | None:
+    """The check of a native module that this rasterizer needs and that did not load."""
+    native = entry.declared.get("native") or ()
+    checks = [check_kernels(target) for target in ((native,) if isinstance(native, str) else native)]
+    return next((check for check in checks if check.state != "ok"), None)
+
+
+def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> None:
+    """Sixteen splats (two axes: surfels) on 32 x 24 pixels. Raises if the picture is empty, a gradient not finite."""
+    import torch
+
+    from splatwizard_core.gaussians.inputs import GaussianInputs
+    from splatwizard_core.rendering.rasterizer import RasterOptions
+    from splatwizard_core.scene.camera import Camera
+
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(16, 3, generator=generator) - 0.5
+    means.requires_grad_(backward)
+    splats = GaussianInputs(
+        means=means.to(device),
+        opacities=torch.full((16,), 0.8, device=device),
+        scales=torch.full((16, axes), 0.1, device=device),
+        quats=torch.tensor([[1.0, 0.0, 0.0, 0.0]], device=device).repeat(16, 1),
+        colors=torch.ones(16, 3, device=device),
+    )
+    camera = Camera(
+        32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3, device=device), torch.tensor([0.0, 0, 2], device=device)
+    )
+    with torch.set_grad_enabled(backward):
+        image = rasterizer.render(splats, camera, RasterOptions()).image  # type: ignore[attr-defined]
+    if not bool(torch.isfinite(image).all()) or float(image.detach().max()) < 0.5:
+        raise SplatwizardError("drew a wrong picture of sixteen white splats")
+    if backward:
+        image.square().sum().backward()
+        if means.grad is None or not bool(torch.isfinite(means.grad).all()) or not bool(means.grad.any()):
+            raise SplatwizardError("gave wrong gradients of sixteen white splats")
+
+
+def check_scenes(plugins: PluginManager) -> Check:
+    """Scenes below $SPLATWIZARD_DATA, recognised as `--scene dataset/scene` would."""
+    root = os.environ.get("SPLATWIZARD_DATA")
+    if not root:
+        mend = "export SPLATWIZARD_DATA=/path/to/datasets  (the demo scene needs none)"
+        return Check("data", "SPLATWIZARD_DATA", "missing", "not set: dataset/scene names are not looked up", mend)
+    folder = Path(root).expanduser()
+    try:
+        collections = sorted(p for p in folder.iterdir() if p.is_dir())
+        inside = [p for c in collections for p in sorted(c.iterdir()) if p.is_dir()][: MOST_FOLDERS + 1]
+    except OSError as error:
+        mend = "set SPLATWIZARD_DATA to the folder that holds the data sets"
+        return Check("data", "SPLATWIZARD_DATA", "broken", f"{error.filename}: {error.strerror}", mend)
+    families = [entry.load() for entry in plugins.datasets]
+    detectors = [target() if isinstance(target, type) else target for target in families]
+    found: dict[str, int] = {}
+    for path in inside[:MOST_FOLDERS]:
+        if any(detector.detect(path) > 0 for detector in detectors):
+            found[path.parent.name] = found.get(path.parent.name, 0) + 1
+    more = f" (of the first {MOST_FOLDERS} folders)" if len(inside) > MOST_FOLDERS else ""
+    if not found:
+        mend = "put scenes at $SPLATWIZARD_DATA/dataset/scene"
+        return Check("data", "SPLATWIZARD_DATA", "missing", f"{folder}: no scene is in it{more}", mend)
+    shown = ", ".join(f"{name} {count}" for name, count in found.items())
+    return Check("data", "SPLATWIZARD_DATA", "ok", f"{folder}: {shown}{more}", facts={"scenes": found})
+
+
+def check_main_job(plugins: PluginManager, method: str) -> Check:
+    """Resolve `sw run` on the demo scene, and draw as its trainer would with what is built."""
+    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+    from splatwizard_core.runs.config import resolve
+    from splatwizard_core.runs.device import choose_device
+    from splatwizard_core.runs.run import run  # noqa: F401 (its imports are what `sw run` needs)
+
+    name = f"sw run --method {method} --scene demo"
+    try:
+        resolved = resolve(plugins.methods.load(method), scene="demo")
+        plugins.datasets.load("demo")
+        device = choose_device(resolved.ppl.device, plugins)
+        lacking = {e.name: check for e in plugins.rasterizers if (check := _lacking_kernels(e)) is not None}
+        rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=lacking)
+        _draw(rasterizer, str(device), backward=True)
+    except Exception as error:
+        mend = None if method in plugins.methods else _how_to_get(f"sw-{method}")
+        why = str(error) if isinstance(error, SplatwizardError) else f"{type(error).__name__}: {error}"
+        return Check("main job", name, "broken", one_line(why), mend, needed=True)
+    drawn_by = next(iter(rasterizer.choices.values()))
+    fast = plugins.rasterizers.entry(drawn_by).declared.get("speed", 0) > 0
+    compiled_first = [] if fast else [n for n, c in lacking.items() if c.mend is not None and "build-kernels" in c.mend]
+    facts = {"device": str(device), "rasterizer": drawn_by, "compiled_first": compiled_first}
+    if compiled_first:
+        detail = f"on {device}; the kernels of {' and '.join(compiled_first)} are compiled first"
+        return Check("main job", name, "ok", detail, None, True, facts)
+    if fast:
+        return Check("main job", name, "ok", f"on {device}, drawn by '{drawn_by}'", None, True, facts)
+    mend = next((c.mend for c in lacking.values() if c.mend), _how_to_get("sw-rasterizers"))
+    return Check("main job", name, "ok", f"on {device}, but {SLOWLY}", mend, True, facts)
+
+
+def _how_to_get(distribution: str) -> str:
+    return f"pip install {distribution}" if os.environ.get("SW_PLUGINS") is None else "unset SW_PLUGINS"
+
+
+if __name__ == "__main__":
+    logging.disable(logging.WARNING)  # what negotiation warns of is in the checks
+    serve(steps(sys.argv[1]))

@@ -1,0 +1,153 @@
+"""Adaptive density control of 3DGS: which Gaussians are cloned, split and pruned, and by what statistics.
+
+Functions on a model and on whatever edits its rows; schedule tasks around them are the business of plugins.
+Source: 3DGS (arXiv 2308.04079), following the authors' code where it differs from the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import EmptyModel
+from splatwizard_core.gaussians.model import GaussianModel, logit
+from splatwizard_core.training.optimizer import SplatOptimizer
+
+SPLIT_CHILDREN = 2
+SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN
+"""Scales of the children of a split are divided by this."""
+
+
+@dataclass(frozen=True)
+class DensityReport:
+    """What one densification did: counts of Gaussians."""
+
+    cloned: int
+    split: int
+    pruned: int
+    total: int
+
+
+@torch.no_grad()
+def accumulate_statistics(model: GaussianModel, gradients: Tensor, radii: Tensor) -> None:
+    """Add one view to `grad_accum`, `denom` and `max_radii2d`, in place; Gaussians with radius 0 are left alone.
+
+    gradients   [N,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d or absgrad2d)
+    radii       [N] pixels, 0 = not visible
+
+    Dense and in place on purpose: gathering the visible rows first costs more than touching all of them. Squares
+    and a root rather than torch.hypot, which is not vectorised (0.2 ms instead of 4.6 for 250,000 rows).
+    """
+    hidden = radii <= 0
+    x, y = gradients[:, 0], gradients[:, 1]
+    norms = (x * x).addcmul_(y, y).sqrt_()  # [N]
+    model.grad_accum.add_(norms.masked_fill_(hidden, 0.0))
+    model.denom.add_(~hidden)
+    torch.maximum(model.max_radii2d, radii.to(model.max_radii2d.dtype), out=model.max_radii2d)
+
+
+@torch.no_grad()
+def densify_and_prune(
+    model: GaussianModel,
+    rows: SplatOptimizer,
+    *,
+    step: int,
+    extent: float,
+    grad_threshold: float = 2e-4,
+    percent_dense: float = 0.01,
+    min_opacity: float = 0.005,
+    world_prune: float = 0.1,
+    size_rules_after: int = 3000,
+    prune_screen_px: float | None = None,
+    revised_opacity: bool = False,
+) -> DensityReport:
+    """Clone small, split large Gaussians whose mean screen-space gradient is high; prune faint and huge ones.
+
+    extent              E, world units: scale of the two size thresholds
+    grad_threshold      NDC units per view (`>=`)
+    percent_dense       largest scale <= percent_dense * E is cloned, above it split
+    min_opacity         below it a Gaussian is pruned, 0..1
+    world_prune         largest scale > world_prune * E is pruned, but only at steps after `size_rules_after`
+    prune_screen_px     pruned if its largest radius since the last densification exceeds this, under the same
+                        condition; None (as in the published evaluation): never
+    revised_opacity     children of a split get 1 - sqrt(1 - opacity), so that the pair is as opaque as the parent
+
+    Order of rows afterwards: survivors in their old order, clones, first children, second children. All three
+    statistics start again at zero. Raises EmptyModel if nothing is left.
+    """
+    n = model.num_rows
+    mean_gradient = (model.grad_accum / model.denom).nan_to_num_(nan=0.0)  # never seen: 0 / 0
+    largest = model.scales.amax(dim=1)  # [N]
+    hot = mean_gradient >= grad_threshold
+    small = largest <= percent_dense * extent
+    cloned = (hot & small).nonzero().squeeze(1)  # [C]
+    parents = (hot & ~small).nonzero().squeeze(1)  # [P]
+
+    doomed = torch.zeros(n, dtype=torch.bool, device=hot.device)
+    if prune_screen_px is not None and step > size_rules_after:
+        doomed = model.max_radii2d > prune_screen_px
+    doomed[parents] = True
+
+    children = _split(model, parents, revised_opacity)
+    new_rows = {
+        name: torch.cat([getattr(model, name).detach()[cloned], children[name]])  # [C + 2P, ...]
+        for name, _ in model.named_parameters(recurse=False)
+        if name in model.ROWS
+    }
+    count = cloned.numel() + SPLIT_CHILDREN * parents.numel()
+    if count:
+        rows.append_rows(model, new_rows)
+        doomed = torch.cat([doomed, doomed.new_zeros(count)])
+    for name in ("grad_accum", "denom", "max_radii2d"):
+        getattr(model, name).zero_()
+
+    doomed |= model.opacities < min_opacity
+    if step > size_rules_after:
+        doomed |= model.scales.amax(dim=1) > world_prune * extent
+    kept = int((~doomed).sum())
+    if kept == 0:
+        raise EmptyModel(step)
+    rows.keep_rows(model, ~doomed)
+    total = n + count
+    return DensityReport(
+        cloned=cloned.numel(), split=parents.numel(), pruned=total - kept - parents.numel(), total=kept
+    )
+
+
+def _split(model: GaussianModel, parents: Tensor, revised_opacity: bool) -> dict[str, Tensor]:
+    """Rows of the two children of each parent, all first children before all second ones; tensors [2P, ...]."""
+    rows = {
+        name: parameter.detach()[parents].repeat(SPLIT_CHILDREN, *[1] * (parameter.dim() - 1))
+        for name, parameter in model.named_parameters(recurse=False)
+        if name in model.ROWS
+    }
+    scales = rows["log_scales"].exp()
+    noise = torch.randn(scales.shape, generator=model.next_split_generator(), dtype=torch.float32)
+    rows["means"] = rows["means"] + rotate(rows["quats"], noise.to(scales) * scales)
+    rows["log_scales"] = (scales / SPLIT_SHRINK).log()
+    if revised_opacity:
+        opacity = torch.sigmoid(rows["opacity_logits"])
+        rows["opacity_logits"] = torch.logit(1 - (1 - opacity).sqrt(), eps=1e-6)
+    return rows
+
+
+def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
+    """Vectors [N,3] turned by quaternions [N,4] (w,x,y,z), any norm."""
+    unit = torch.nn.functional.normalize(quats, dim=1, eps=1e-12)
+    w, axis = unit[:, :1], unit[:, 1:]
+    turned = 2 * torch.linalg.cross(axis, vectors)
+    rotated: Tensor = vectors + w * turned + torch.linalg.cross(axis, turned)
+    return rotated
+
+
+@torch.no_grad()
+def reset_opacity(model: GaussianModel, rows: SplatOptimizer, *, ceiling: float = 0.01) -> None:
+    """Lower every opacity to at most `ceiling`; the Adam moments of the opacities become zero, their step stays."""
+    rows.replace(model, "opacity_logits", model.opacity_logits.detach().clamp_max(logit(ceiling)))
+
+
+def increase_sh_degree(model: GaussianModel) -> None:
+    """Draw and train one more band of spherical harmonics, up to the model's own degree."""
+    model.active_sh_degree = min(model.active_sh_degree + 1, model.max_sh_degree)

@@ -1,0 +1,154 @@
+"""Densification as Markov chain Monte Carlo: dead Gaussians move to live ones, a few more join them, all are shaken.
+
+Functions on a model and on whatever edits its rows; schedule tasks around them are the business of plugins.
+Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.training.optimizer import SplatOptimizer
+from sw_gaussians.density import rotate
+
+MAX_COPIES = 51
+"""More copies of one Gaussian than this are treated as this many (the paper's code has binomials up to there)."""
+STEEPNESS = 100.0
+"""Of the logistic that turns the noise off as a Gaussian becomes opaque."""
+
+
+@functools.cache
+def _coefficients() -> Tensor:
+    """[MAX_COPIES+1, MAX_COPIES+1] float64: C(n, j) (-1)^(j-1) / sqrt(j) at [j, n], 0 for j = 0 and j > n."""
+    table = torch.zeros(MAX_COPIES + 1, MAX_COPIES + 1, dtype=torch.float64)
+    for n in range(1, MAX_COPIES + 1):
+        for j in range(1, n + 1):
+            table[j, n] = math.comb(n, j) * (-1) ** (j - 1) / math.sqrt(j)
+    return table
+
+
+@torch.no_grad()
+def shared_among(opacities: Tensor, scales: Tensor, copies: Tensor) -> tuple[Tensor, Tensor]:
+    """Opacity and scales of `copies` equal Gaussians in one place that together look like the one given.
+
+    opacities   [M] in 0..1
+    scales      [M,3] > 0, standard deviations
+    copies      [M] int64 >= 1; above 51 it counts as 51
+
+    Returns ([M], [M,3]), not clamped, in the dtype given: o' = 1 - (1 - o)^(1/n), so that n of them let as much light
+    through, and scale * o / sum_{i=1..n} sum_{k=0..i-1} C(i-1,k) (-1)^k o'^(k+1) / sqrt(k+1), so that what they blend
+    along a line through the centre stays. Summed over i first, C(i-1,k) becomes C(n,k+1). In float64: the signs
+    alternate. Source: arXiv 2404.09591.
+    """
+    n = copies.clamp(1, MAX_COPIES)
+    before = opacities.double()
+    after = -torch.expm1(torch.log1p(-before) / n)
+    table = _coefficients().to(opacities.device)
+    total = torch.zeros_like(after)
+    for j in range(MAX_COPIES, 0, -1):  # Horner; the sum has no term of power 0
+        total = (total + table[j].index_select(0, n)) * after
+    # Of a Gaussian without opacity nothing is seen: its scale may stay (0 / 0).
+    factor = torch.where(total > 0, before / total, 1.0)
+    return after.to(opacities), (scales.double() * factor[:, None]).to(scales)
+
+
+def draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    """[count] int64: rows drawn with replacement, with probabilities proportional to `weights` [N] >= 0.
+
+    The random numbers are drawn on the CPU, so that every device draws the same rows.
+    """
+    at = torch.rand(count, generator=generator, dtype=torch.float64).to(weights.device)
+    cumulated = weights.double().cumsum(0)
+    return torch.searchsorted(cumulated, at * cumulated[-1], right=True).clamp_max(len(weights) - 1)
+
+
+@torch.no_grad()
+def relocate(
+    model: GaussianModel, rows: SplatOptimizer, generator: torch.Generator, *, min_opacity: float = 0.005
+) -> int:
+    """Move every Gaussian with an opacity of at most `min_opacity` onto a live one; how many moved.
+
+    The live ones are drawn in proportion to their opacity, and each shares its opacity and scales with those that come
+    (`shared_among`). Adam moments of both become zero. If none is dead, or none is alive, nothing happens.
+    """
+    opacities = model.opacities
+    is_dead = opacities <= min_opacity
+    dead, alive = is_dead.nonzero().squeeze(1), (~is_dead).nonzero().squeeze(1)
+    if dead.numel() == 0 or alive.numel() == 0:
+        return 0
+    sources, arrivals = _shared(model, alive[draw(opacities[alive], dead.numel(), generator)], min_opacity)
+    index, values = sources
+    rows.set_rows(
+        model,
+        torch.cat([dead, index]),
+        {name: torch.cat([arrivals[name], values[name]]) for name in arrivals},
+    )
+    return dead.numel()
+
+
+@torch.no_grad()
+def grow(
+    model: GaussianModel,
+    rows: SplatOptimizer,
+    generator: torch.Generator,
+    *,
+    cap: int = 1_000_000,
+    growth: float = 0.05,
+    min_opacity: float = 0.005,
+) -> int:
+    """Add copies of Gaussians drawn in proportion to opacity, up to min(cap, floor((1 + growth) N)); how many.
+
+    Each copied one shares its opacity and scales with its copies, and its Adam moments become zero. A model that is
+    larger than the cap stays as it is.
+    """
+    count = min(cap, math.floor((1 + growth) * model.num_rows)) - model.num_rows
+    if count <= 0:
+        return 0
+    (index, values), arrivals = _shared(model, draw(model.opacities, count, generator), min_opacity)
+    rows.set_rows(model, index, values)
+    rows.append_rows(model, arrivals)
+    return count
+
+
+def _shared(
+    model: GaussianModel, picks: Tensor, min_opacity: float
+) -> tuple[tuple[Tensor, dict[str, Tensor]], dict[str, Tensor]]:
+    """((rows that were picked, their new values), the values of each pick): all parameters, by name."""
+    index, inverse, counts = torch.unique(picks, return_inverse=True, return_counts=True)
+    opacities, scales = shared_among(model.opacities[index], model.scales[index], counts + 1)
+    values = {
+        name: parameter.detach()[index]
+        for name, parameter in model.named_parameters(recurse=False)
+        if name in model.ROWS
+    }
+    most = 1 - torch.finfo(opacities.dtype).eps
+    values["opacity_logits"] = torch.logit(opacities.clamp(min_opacity, most))
+    values["log_scales"] = scales.log()
+    return (index, values), {name: value[inverse] for name, value in values.items()}
+
+
+@torch.no_grad()
+def add_noise(
+    model: GaussianModel,
+    generator: torch.Generator,
+    *,
+    lr: float,
+    strength: float = 5e5,
+    min_opacity: float = 0.005,
+) -> None:
+    """Shift every mean, in place, by lr * strength * sigmoid(-100 (opacity - min_opacity)) * Sigma z, z ~ N(0, I).
+
+    generator   on the model's device: a million normal numbers a step are not to travel
+    lr          step size of the means, world units
+
+    Sigma = R S^2 R^T, and R^T z is as normal as z: one rotation suffices.
+    """
+    scales = model.scales
+    noise = torch.randn(scales.shape, generator=generator, dtype=scales.dtype, device=scales.device)
+    amount = torch.sigmoid(STEEPNESS * (min_opacity - model.opacities)) * (lr * strength)  # [N]
+    model.means.add_(rotate(model.quats, scales.square().mul_(noise).mul_(amount[:, None])))

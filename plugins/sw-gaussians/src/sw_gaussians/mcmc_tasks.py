@@ -1,0 +1,64 @@
+"""Density control of 3DGS-MCMC as schedule tasks, for this method and, by name, for others.
+
+Every draw comes from a stream that is named after the step, so there is no state to save: a run that resumes at a step
+draws what the uninterrupted one drew there. At the last step nothing is moved: no update follows that could repair it.
+"""
+
+import logging
+
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.streams import stream
+from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.training.params import OptimizationParams
+from sw_gaussians import mcmc
+
+log = logging.getLogger(__name__)
+
+
+class Relocate:
+    """Moves dead Gaussians onto live ones (sw_gaussians.mcmc.relocate)."""
+
+    def __init__(self, *, min_opacity: float = 0.005) -> None:
+        self.min_opacity = min_opacity
+
+    def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
+        if step >= opt.iterations:
+            return
+        draws = stream(model.split_seed, f"relocate/{step}")
+        moved = mcmc.relocate(model, optimizer, draws, min_opacity=self.min_opacity)
+        log.debug("step %d: %d Gaussians relocated", step, moved)
+
+
+class Grow:
+    """Adds Gaussians up to a cap (sw_gaussians.mcmc.grow)."""
+
+    def __init__(self, *, cap: int = 1_000_000, growth: float = 0.05, min_opacity: float = 0.005) -> None:
+        self.cap, self.growth, self.min_opacity = cap, growth, min_opacity
+
+    def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
+        if step >= opt.iterations:
+            return
+        draws = stream(model.split_seed, f"grow/{step}")
+        added = mcmc.grow(
+            model, optimizer, draws, cap=self.cap, growth=self.growth, min_opacity=self.min_opacity
+        )  # fmt: skip
+        log.debug("step %d: %d Gaussians added, %d now", step, added, model.num_rows)
+
+
+class AddNoise:
+    """Shakes the means after each update (sw_gaussians.mcmc.add_noise).
+
+    A pre task: what follows the update of step s - 1 happens at the start of step s, and before the task that sets the
+    step size, so that it is still that of s - 1. Register it before "update lr".
+    """
+
+    def __init__(self, *, strength: float = 5e5, min_opacity: float = 0.005) -> None:
+        self.strength, self.min_opacity = strength, min_opacity
+
+    def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
+        if not 1 < step < opt.iterations:  # before step 1 there was no update
+            return
+        draws = stream(model.split_seed, f"noise/{step}", model.means.device)
+        mcmc.add_noise(
+            model, draws, lr=optimizer.lr("means"), strength=self.strength, min_opacity=self.min_opacity
+        )  # fmt: skip

@@ -1,0 +1,30 @@
+"""What this package provides: the tasks of 3DGS and of 3DGS-MCMC, and a pruner, for any method that wants them."""
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+
+@hookimpl
+def register_tasks(registry: Registry) -> None:
+    registry.add("update-lr", "sw_gaussians.tasks:UpdateLearningRate",
+                 summary="exponential decay of the means' step size, times the scene extent", factory=True)  # fmt: skip
+    registry.add("increase-sh-degree", "sw_gaussians.tasks:increase_sh_degree",
+                 summary="activate one more band of spherical harmonics", factory=False)  # fmt: skip
+    registry.add("collect-gradient-statistics", "sw_gaussians.tasks:collect_gradient_statistics",
+                 summary="add up screen-space gradients (needs grad2d)", factory=False)  # fmt: skip
+    registry.add("collect-absgrad-statistics", "sw_gaussians.tasks:collect_absgrad_statistics",
+                 summary="add up absolute screen-space gradients (needs absgrad)", factory=False)  # fmt: skip
+    registry.add("prune-and-densify", "sw_gaussians.tasks:PruneAndDensify",
+                 summary="clone, split and prune Gaussians by those statistics", factory=True)  # fmt: skip
+    registry.add("reset-opacity", "sw_gaussians.tasks:ResetOpacity",
+                 summary="lower every opacity to at most 0.01", factory=True)  # fmt: skip
+    registry.add("relocate-dead", "sw_gaussians.mcmc_tasks:Relocate",
+                 summary="move faint Gaussians onto opaque ones (3DGS-MCMC)", factory=True)  # fmt: skip
+    registry.add("grow-to-cap", "sw_gaussians.mcmc_tasks:Grow",
+                 summary="add Gaussians beside opaque ones, up to a cap (3DGS-MCMC)", factory=True)  # fmt: skip
+    registry.add("add-position-noise", "sw_gaussians.mcmc_tasks:AddNoise",
+                 summary="shake the means of faint Gaussians after each update (3DGS-MCMC)", factory=True)  # fmt: skip
+
+
+@hookimpl
+def register_pruners(registry: Registry) -> None:
+    registry.add("opacity", "sw_gaussians.pruners:Opacity", summary="keeps what is opaque; looks at no view")

@@ -1,0 +1,157 @@
+"""How 3DGS trains: the one stage that other methods start from, extend, or take over whole."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.training.losses import photometric_loss
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+from splatwizard_core.training.plan import When, scaled
+from splatwizard_core.training.stage import LossPack, Stage, StageContext
+from sw_gaussians import mcmc_tasks as mcmc
+from sw_gaussians import tasks
+from sw_gaussians.config import GaussianTraining
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from splatwizard_core.gaussians.splat_model import SplatModel
+    from splatwizard_core.rendering.rasterizer import RenderResult
+    from splatwizard_core.scene.scene import Scene, View
+    from splatwizard_core.training.params import OptimizationParams, PipelineParams
+    from splatwizard_core.training.scheduler import Scheduler
+
+
+class ThreeDGSStage(Stage):
+    """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
+
+    name = "3dgs"
+
+    def __init__(self, opt: GaussianTraining) -> None:
+        super().__init__(opt)
+        if opt.sparse_adam != "off" and opt.mcmc.enabled:
+            raise ConfigError(
+                "sparse_adam leaves hidden Gaussians as they are, which the regularisers of mcmc.enabled must reach: "
+                "set one of the two"
+            )
+        self.config = opt
+        self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
+        self.white = False  # known when the stage begins; a plan can be printed without a scene
+
+    def when(self, when: When) -> When:
+        """A plan of the full run, in steps of this one."""
+        return scaled(when, self.config.schedule_scale)
+
+    def steps(self, steps: int) -> int:
+        """A number of steps likewise, which a task keeps to itself."""
+        return max(1, round(steps * self.config.schedule_scale)) if steps > 0 else 0
+
+    def begin(self, context: StageContext) -> SplatModel:
+        self.white = context.scene.protocol.background == "white"
+        model = context.model
+        if hasattr(model, "split_seed"):
+            model.split_seed = context.generator("split").initial_seed()
+        return model
+
+    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        lr = self.config.lr
+        return SplatOptimizer(
+            model,
+            [
+                ParamGroup("means", lr=lr.position_init * scene.extent),
+                ParamGroup("sh_dc", lr=lr.sh_dc),
+                ParamGroup("sh_rest", lr=lr.sh_rest),
+                ParamGroup("opacity_logits", lr=lr.opacity),
+                ParamGroup("log_scales", lr=lr.scales),
+                ParamGroup("quats", lr=lr.quats),
+            ],
+            sparse=None if self.config.sparse_adam == "off" else self.config.sparse_adam,
+        )
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        lr, chain = self.config.lr, self.config.mcmc
+        if chain.enabled and chain.noise > 0:
+            noise = mcmc.AddNoise(strength=chain.noise, min_opacity=chain.min_opacity)
+            # First of all: it belongs to the update of the step before, and to that step's learning rate.
+            scheduler.register_task(self.when(range(lr.max_steps)), noise, name="add noise")
+        update_lr = tasks.UpdateLearningRate(
+            init=lr.position_init,
+            final=lr.position_final,
+            max_steps=self.steps(lr.max_steps),
+            delay_steps=self.steps(lr.position_delay_steps),
+            delay_mult=lr.position_delay_mult,
+        )
+        scheduler.register_task(self.when(range(lr.max_steps)), update_lr, name="update lr")
+        scheduler.register_task(
+            self.when(range(0, lr.max_steps, self.config.sh_interval)),
+            tasks.increase_sh_degree,
+            name="increase SH degree",
+        )
+
+    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        if self.config.mcmc.enabled:
+            self._register_mcmc(scheduler)
+            return
+        densify = self.config.densify
+        scheduler.register_task(
+            self.when(range(densify.stop)),
+            tasks.collect_absgrad_statistics if densify.absgrad else tasks.collect_gradient_statistics,
+            name="collect gradient statistics",
+        )
+        prune_and_densify = tasks.PruneAndDensify(
+            grad_threshold=densify.grad_threshold,
+            percent_dense=densify.percent_dense,
+            min_opacity=densify.min_opacity,
+            world_prune=densify.world_prune,
+            size_rules_after=self.steps(densify.reset_interval),
+            prune_screen_px=densify.prune_screen_px,
+            revised_opacity=densify.revised_opacity,
+            reset_interval=self.steps(densify.reset_interval),
+            pause_after_reset=self.steps(densify.pause_after_reset),
+        )
+        scheduler.register_task(
+            self.when(range(densify.start, densify.stop, densify.interval)),
+            prune_and_densify,
+            name="prune and densify",
+        )
+        reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
+        if self.white and densify.white_reset > 0:
+            # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
+            scheduler.register_task(
+                self.when(densify.white_reset), reset_opacity, name="reset opacity (white background)"
+            )
+        scheduler.register_task(
+            self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
+        )
+
+    def _register_mcmc(self, scheduler: Scheduler) -> None:
+        chain = self.config.mcmc
+        when = self.when(range(chain.start, chain.stop, chain.interval))
+        scheduler.register_task(when, mcmc.Relocate(min_opacity=chain.min_opacity), name="relocate")
+        grow = mcmc.Grow(cap=chain.cap, growth=chain.growth, min_opacity=chain.min_opacity)
+        scheduler.register_task(when, grow, name="grow")
+
+    def raster_options(self, step: int, background: Tensor) -> RasterOptions:
+        if self._options is None or self._options.background is not background:
+            statistics, absgrad = not self.config.mcmc.enabled, self.config.densify.absgrad
+            self._options = RasterOptions(
+                background=background, grad2d=statistics and not absgrad, absgrad=statistics and absgrad
+            )
+        return self._options
+
+    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
+        truth = view.image(background, result.image.device)
+        settings = self.config.loss
+        loss = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding)
+        return self._regularised(loss, result) if self.config.mcmc.enabled else loss
+
+    def _regularised(self, loss: LossPack, result: RenderResult) -> LossPack:
+        """Plus what makes Gaussians fade and shrink unless a picture needs them, so that they can be relocated."""
+        chain, inputs = self.config.mcmc, result.inputs
+        if inputs.scales is None:
+            raise TypeError("mcmc.enabled needs a model with scales: that of 3dgs has them")
+        parts = {"opacity": inputs.opacities.mean(), "scale": inputs.scales.mean()}
+        total = loss.total + chain.opacity_weight * parts["opacity"] + chain.scale_weight * parts["scale"]
+        return LossPack(total, loss.parts | {name: part.detach() for name, part in parts.items()})

@@ -1,0 +1,153 @@
+"""3DGS-MCMC on the small procedural scene: its plan, what it reaches, and that stopping changes nothing."""
+
+import math
+
+import pytest
+import torch
+from sw_gaussians.mcmc_tasks import AddNoise, Grow, Relocate
+from sw_gaussians.stage import ThreeDGSStage
+
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.runs.config import resolve
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.loading import load_scene
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.streams import stream
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.scheduler import build_schedulers, format_plan
+from sw_3dgs.method import ThreeDGS
+
+PLAN = """\
+Stage | Task               | Plan
+------+--------------------+-----------------------
+Pre   | add noise          | range(30000)
+Pre   | update lr          | range(30000)
+Pre   | increase SH degree | range(0, 30000, 1000)
+Post  | relocate           | range(600, 25000, 100)
+Post  | grow               | range(600, 25000, 100)"""
+SHORT = {
+    "iterations": 200, "lr.max_steps": 200, "sh_interval": 60, "mcmc.start": 40, "mcmc.stop": 180, "mcmc.interval": 20,
+    "mcmc.cap": 700,
+}  # fmt: skip
+
+
+def method(**sets) -> ThreeDGS:
+    return ThreeDGS(load_plugins(), resolve(ThreeDGS, "mcmc", sets={**SHORT, **sets}).config)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene("demo:tiny", SceneOptions(init_points=600), load_plugins())
+
+
+def train(scene: Scene, *, directory=None, stop_after=None, seed=0, **sets):
+    made = method(**sets)
+    return train_stages(
+        made.stages(),
+        lambda: made.create_model(scene, stream(seed, "init")),
+        scene,
+        PipelineParams(seed=seed, checkpoint_every=1000),
+        NegotiatedRasterizer(load_plugins(), device="cpu"),
+        directory=directory,
+        identity={},
+        trained=lambda name: pytest.fail(f"asked for '{name}'"),
+        stop_after=stop_after,
+    )
+
+
+@pytest.fixture(scope="module")
+def whole(scene):
+    return train(scene)
+
+
+def test_the_plan_is_the_published_one():
+    stage = ThreeDGSStage(resolve(ThreeDGS, "mcmc").config)
+    assert format_plan(*build_schedulers(stage, PipelineParams())) == PLAN
+
+
+def test_it_asks_for_no_statistics():
+    options = method().stages()[0].raster_options(1, torch.zeros(3))
+    assert not options.grad2d
+    assert not options.absgrad
+
+
+def test_the_start_is_half_opaque_and_small(scene):
+    start = method().create_model(scene, stream(0, "init"))
+    plain = ThreeDGS(load_plugins(), resolve(ThreeDGS, "paper").config).create_model(scene, stream(0, "init"))
+    torch.testing.assert_close(start.opacities, torch.full((600,), 0.5))
+    torch.testing.assert_close(start.scales, 0.1 * plain.scales)
+
+
+@torch.no_grad()
+def psnr(model, scene: Scene) -> float:
+    rasterizer = NegotiatedRasterizer(load_plugins(), device="cpu")
+    values = []
+    for view in scene.train:
+        options = RasterOptions(background=scene.background)
+        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
+        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
+    return float(torch.stack(values).mean())
+
+
+@pytest.mark.pipeline
+def test_it_learns_and_ends_at_the_cap(scene, whole):
+    start = method().create_model(scene, stream(0, "init"))
+    assert psnr(whole.model, scene) > psnr(start, scene) + 5
+    assert whole.model.num_rows == 700
+    assert all(torch.isfinite(p).all() for p in whole.model.parameters())
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("stop", [39, 40, 121])
+def test_stopped_and_resumed_equals_one_go(scene, whole, tmp_path, stop):
+    with pytest.raises(TrainingStopped):
+        train(scene, directory=tmp_path, stop_after=stop)
+    assert train(scene, directory=tmp_path).model.digest() == whole.model.digest()
+
+
+@pytest.mark.pipeline
+def test_another_seed_is_another_chain(scene, whole):
+    assert train(scene, seed=1).model.digest() != whole.model.digest()
+
+
+def test_the_regularisers_are_the_weighted_means_of_opacity_and_scale(scene):
+    stage = method().stages()[0]
+    plain = ThreeDGSStage(resolve(ThreeDGS, "paper").config)
+    model = method().create_model(scene, stream(0, "init"))
+    view, rasterizer = scene.train[0], NegotiatedRasterizer(load_plugins(), device="cpu")
+    result = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, RasterOptions())
+    added = (
+        stage.loss(model, view, result, torch.zeros(3), 1).total
+        - plain.loss(model, view, result, torch.zeros(3), 1).total
+    )
+    expected = 0.01 * 0.5 + 0.01 * float(model.scales.mean())
+    assert float(added.detach()) == pytest.approx(expected, rel=1e-4)
+
+
+def test_the_last_step_and_the_first_are_left_alone(scene):
+    made = method()
+    stage = made.stages()[0]
+    model = made.create_model(scene, stream(0, "init"))
+    optimizer = stage.create_optimizer(model, scene)
+    with torch.no_grad():
+        model.opacity_logits[:20] = math.log(0.001)
+    before = model.digest()
+    for step, tasks in ((200, (Relocate(), Grow(), AddNoise())), (1, (AddNoise(),))):
+        for task in tasks:
+            task(model, optimizer, stage.config, step)
+            assert model.digest() == before
+    for task in (AddNoise(), Relocate(), Grow(cap=900)):
+        task(model, optimizer, stage.config, 100)
+        assert model.digest() != before
+        before = model.digest()
+    assert model.num_rows == 630
+
+
+def test_tasks_are_there_for_other_methods_by_name():
+    plugins = load_plugins()
+    for name in ("relocate-dead", "grow-to-cap", "add-position-noise"):
+        assert plugins.tasks.entry(name).declared["factory"] is True
+        assert callable(plugins.tasks.load(name)())

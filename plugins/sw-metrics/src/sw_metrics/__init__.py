@@ -1,0 +1,1 @@
+"""LPIPS in the three forms that published tables use, for Splatwizard."""

@@ -1,0 +1,47 @@
+"""`python -m sw_metrics.check`: what LPIPS needs besides torch, in a process of its own."""
+
+from __future__ import annotations
+
+import importlib
+
+from sw_doctor.check import Check, one_line
+from sw_doctor.child import serve
+
+from splatwizard_core.errors import CapabilityError
+from splatwizard_core.files import file_sha256
+from sw_metrics.lpips_weights import BACKBONES, find_weights, hub_folder
+from sw_metrics.perceptual import EXTRA, package_version
+from sw_metrics.torchvision_import import import_torchvision
+
+GROUP = "metrics"
+
+
+def check_lpips() -> list[Check]:
+    """Import the package, and compare the checksums of the weights with those that their names promise."""
+    try:
+        version = package_version()
+        import_torchvision()
+        importlib.import_module("lpips")
+    except CapabilityError:
+        checks = [Check(GROUP, "LPIPS package", "missing", "lpips is not installed", f"pip install '{EXTRA}'")]
+    except Exception as error:
+        mend = f"pip install --force-reinstall --no-deps torchvision '{EXTRA}'"
+        checks = [Check(GROUP, "LPIPS package", "broken", one_line(f"{type(error).__name__}: {error}"), mend)]
+    else:
+        checks = [Check(GROUP, "LPIPS package", "ok", f"lpips {version}")]
+    for net, backbone in BACKBONES.items():
+        name = f"LPIPS weights, {net}"
+        get = f"curl -L --create-dirs -o {hub_folder() / backbone.file_name} {backbone.address}"
+        path = find_weights(net, None)
+        if path is None:
+            detail = f"{backbone.file_name} is not in {hub_folder()} (sw eval --lpips-weights DIR names another folder)"
+            checks.append(Check(GROUP, name, "missing", detail, get))
+        elif not file_sha256(path).startswith(backbone.sha256_prefix):
+            checks.append(Check(GROUP, name, "broken", f"{path} is not the published file: its checksum differs", get))
+        else:
+            checks.append(Check(GROUP, name, "ok", str(path)))
+    return checks
+
+
+if __name__ == "__main__":
+    serve([("LPIPS", check_lpips)])

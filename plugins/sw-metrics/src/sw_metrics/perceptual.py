@@ -1,0 +1,132 @@
+"""LPIPS in the three forms that published tables use, through the package `lpips` (version 0.1 of the linear heads).
+
+lpips_vgg_3dgs  VGG16, images in 0..1 as they are: what the 3DGS code does and most compression papers copy
+lpips_vgg       VGG16, images mapped to -1..1, as the network's input layer expects
+lpips_alex      AlexNet, images mapped to -1..1
+
+The first form feeds the network values from a range it was not made for and comes out lower; the three are different
+metrics and never share a name. Source: LPIPS (arXiv 1801.03924); specification of the evaluation protocol, LPIPS.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import CapabilityError, ShapeError
+from splatwizard_core.evaluation.metrics import MetricSetup, PreparedMetric
+from sw_metrics.lpips_weights import BACKBONES, Weights, find_weights, load_weights
+from sw_metrics.torchvision_import import import_torchvision
+
+EXTRA = "splatwizard-core[lpips]"
+SMALLEST = {"vgg": 16, "alex": 31}  # pixels; below, a pooling layer is left with nothing
+
+
+@dataclass(frozen=True)
+class Lpips:
+    """One form of LPIPS, as it is registered.
+
+    net         "vgg" or "alex"
+    to_signed   map images from 0..1 to -1..1 first
+    """
+
+    net: str
+    to_signed: bool
+
+    def prepare(self, setup: MetricSetup) -> PreparedMetric:
+        """The metric on the setup's device.
+
+        Raises CapabilityError if the package or the weights are missing, UserInputError for damaged weights.
+        """
+        version = package_version()
+        network, weights = setup.share(f"lpips {self.net}", lambda: _network(self.net, setup))
+
+        def compute(render: Tensor, truth: Tensor) -> float:
+            return self._distance(network, render, truth)
+
+        made_with = {"lpips": version, "weights": weights.file_name, "weights_sha256": weights.sha256}
+        return PreparedMetric(compute, made_with, weights.published)
+
+    def identity(self, setup: MetricSetup) -> str | None:
+        """The package's version and which file would be read; None if one is missing."""
+        path = find_weights(self.net, setup.lpips_weights)
+        try:
+            version = package_version()
+        except CapabilityError:
+            return None
+        if path is None:
+            return None
+        facts = path.stat()
+        return f"lpips {version}, {path.resolve()}, {facts.st_size}, {facts.st_mtime_ns}"
+
+    def _distance(self, network: torch.nn.Module, render: Tensor, truth: Tensor) -> float:
+        if render.dim() != 3 or render.shape[0] != 3 or render.shape != truth.shape:
+            raise ShapeError(
+                f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}",
+                actual=render.shape,
+                expected=(3, "H", "W"),
+            )
+        smallest = SMALLEST[self.net]
+        if min(render.shape[1:]) < smallest:
+            raise CapabilityError(f"too-small: LPIPS ({self.net}) needs pictures of at least {smallest} pixels a side")
+        with torch.no_grad():
+            return float(network(render.float()[None], truth.float()[None], normalize=self.to_signed))
+
+
+VGG_3DGS = Lpips("vgg", to_signed=False)
+VGG = Lpips("vgg", to_signed=True)
+ALEX = Lpips("alex", to_signed=True)
+
+
+def package_version() -> str:
+    """Version of the installed package `lpips`. Raises CapabilityError that names the extra."""
+    try:
+        return importlib.metadata.version("lpips")
+    except importlib.metadata.PackageNotFoundError:
+        raise CapabilityError(f"package-missing: LPIPS needs pip install '{EXTRA}'", missing=["lpips"]) from None
+
+
+def not_available(folder: Path | None) -> str | None:
+    """One line for the user if a form of LPIPS cannot be computed here, else None. Reads no weights."""
+    try:
+        package_version()
+    except CapabilityError as error:
+        return f"LPIPS is not available ({error}); its values will be null"
+    absent = [b.file_name for net, b in BACKBONES.items() if find_weights(net, folder) is None]
+    if not absent:
+        return None
+    return (
+        f"LPIPS is not available without its weights, its values will be null: bring {' and '.join(absent)} from "
+        f"{BACKBONES['vgg'].address.rpartition('/')[0]}/ and give --lpips-weights DIR"
+    )
+
+
+def _network(net: str, setup: MetricSetup) -> tuple[torch.nn.Module, Weights]:
+    """The network with the weights of a backbone, on the device, in eval mode."""
+    weights = load_weights(net, setup.lpips_weights)
+    lpips = _import_lpips()
+    # pnet_rand keeps the package from downloading; what it draws instead is replaced below, and no stream is moved.
+    with torch.random.fork_rng(devices=[]), warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # torchvision: an argument that lpips uses is deprecated
+        network: torch.nn.Module = lpips.LPIPS(net=net, version="0.1", pnet_rand=True, eval_mode=True, verbose=False)
+    # Its slices count layers as torchvision's `features` does: slice3.10.weight is features.10.weight.
+    own = {key: f"features.{key.partition('.')[2]}" for key in network.net.state_dict()}  # type: ignore[union-attr]
+    if set(own.values()) != set(weights.state):
+        raise CapabilityError(f"package-missing: lpips {package_version()} has another network than 0.1.4: {EXTRA}")
+    network.net.load_state_dict({key: weights.state[name] for key, name in own.items()})  # type: ignore[union-attr]
+    return network.to(setup.device).eval().requires_grad_(False), weights
+
+
+def _import_lpips() -> Any:
+    try:
+        import_torchvision()
+        import lpips
+    except ImportError as error:
+        raise CapabilityError(f"package-missing: LPIPS cannot be imported: {error}: pip install '{EXTRA}'") from error
+    return lpips

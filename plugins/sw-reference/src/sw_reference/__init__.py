@@ -1,0 +1,1 @@
+"""The pure-torch oracle of every Splatwizard rasterizer, and the checks that hold others against it."""

@@ -1,0 +1,160 @@
+"""Per-Gaussian sums over the pixels of a view: how much each one contributes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.rendering.rasterizer import ScoreSpec
+from sw_reference.compositing import (
+    T_MIN,
+    Batch,
+    Splats,
+    Terms,
+    TileLists,
+    batches,
+    evaluated,
+)
+
+
+def score_dtype(spec: ScoreSpec) -> torch.dtype:
+    """int32 for counts (also under a mask), float32 for everything else."""
+    whole = spec.pixel_weight is None or not spec.pixel_weight.is_floating_point()
+    return torch.int32 if spec.kind == "hits" and whole else torch.float32
+
+
+def merge_scores(spec: ScoreSpec, total: Tensor, view: Tensor) -> Tensor:
+    """Add one view's score to the running total (the maximum for "blend_max")."""
+    return torch.maximum(total, view) if spec.kind == "blend_max" else total + view
+
+
+def check_scores(specs: tuple[ScoreSpec, ...], height: int, width: int) -> None:
+    """Raise ConfigError for an unknown rule, a pixel weight of the wrong size, or two scores of one name."""
+    for spec in specs:
+        rules = ("blended",) if spec.kind == "grad_sq" else ("blended", "tested")
+        if spec.rule not in rules:
+            raise ConfigError(f"score '{spec.name}': rule is '{spec.rule}', must be {' or '.join(map(repr, rules))}")
+        if spec.pixel_weight is not None and spec.pixel_weight.shape != (height, width):
+            raise ConfigError(
+                f"score '{spec.name}': pixel_weight is {list(spec.pixel_weight.shape)}, must be [{height}, {width}]"
+            )
+    if len({s.name for s in specs}) < len(specs):
+        raise ConfigError(f"two scores have one name: {', '.join(s.name for s in specs)}")
+
+
+@torch.no_grad()
+def view_scores(
+    specs: tuple[ScoreSpec, ...], splats: Splats, lists: TileLists, num_colors: int, background: Tensor
+) -> dict[str, Tensor]:
+    """Scores of the splats of one view in depth order, ScoreSpec.name -> [V] float64.
+
+    num_colors   the first so many channels are the image's ("grad_sq" differentiates their sum)
+    background   [C,H,W]
+    Over blended pairs: hits 1; opacity o; opacity_T o T; blend alpha T; blend_max its maximum;
+    gamma alpha^(2g) T^(2-2g); dist |d| in pixels; grad_sq (o dL/dalpha)^2 for L = sum of all pixels and channels
+    (Speedy-Splat, arXiv 2412.00578). Rule "tested" also counts the splat that triggers the stop.
+    Raises ConfigError as `check_scores` does.
+    """
+    height, width = background.shape[1:]
+    check_scores(specs, height, width)
+    packed = splats.packed
+    totals = {s.name: torch.zeros(len(packed), dtype=torch.float64, device=packed.device) for s in specs}
+    if not len(packed):
+        return totals
+    flat_background = background.sum(dim=0)  # [H,W]
+
+    for batch in batches(lists, width, height, packed.dtype):
+        x = batch.pixels[..., 0].clamp(max=width - 1)
+        y = batch.pixels[..., 1].clamp(max=height - 1)
+        left = None
+        if any(s.kind == "grad_sq" for s in specs):
+            left = _total_light(splats, lists, batch, num_colors, flat_background[y, x])
+        for ids, terms in evaluated(splats, lists, batch):
+            derivative = None
+            if left is not None:
+                derivative, left = _value_gradient(splats, terms, num_colors, left)
+            for spec in specs:
+                counted = terms.weight > 0
+                if spec.rule == "tested":
+                    counted = counted | (~terms.alive & (terms.alpha > 0) & (terms.before >= T_MIN))
+                    counted = counted & ~terms.was_done[..., None]
+                pairs = torch.where(counted, _pair_value(spec, terms, derivative), 0).double()  # [B,P,L]
+                if spec.pixel_weight is not None:
+                    pairs = pairs * spec.pixel_weight.to(pairs)[y, x][..., None]
+                if spec.kind == "blend_max":
+                    totals[spec.name].scatter_reduce_(0, ids.reshape(-1), pairs.amax(dim=1).reshape(-1), "amax")
+                else:
+                    totals[spec.name].index_add_(0, ids.reshape(-1), pairs.sum(dim=1).reshape(-1))
+    return totals
+
+
+def _pair_value(spec: ScoreSpec, terms: Terms, derivative: Tensor | None) -> Tensor:
+    if spec.kind == "hits":
+        return torch.ones_like(terms.alpha)
+    if spec.kind == "opacity":
+        return terms.opacity.expand_as(terms.alpha)
+    if spec.kind == "opacity_T":
+        return terms.opacity * terms.before
+    if spec.kind in ("blend", "blend_max"):
+        return terms.alpha * terms.before
+    if spec.kind == "gamma":
+        return terms.alpha ** (2 * spec.gamma) * terms.before ** (2 - 2 * spec.gamma)
+    if spec.kind == "dist":
+        return torch.hypot(terms.dx, terms.dy)
+    assert spec.kind == "grad_sq"
+    assert derivative is not None
+    return derivative**2
+
+
+def _total_light(splats: Splats, lists: TileLists, batch: Batch, num_colors: int, background: Tensor) -> Tensor:
+    """[B,P]: the sum over channels of the finished image, background [B,P] included."""
+    light, T = torch.zeros_like(background), torch.ones_like(background)
+    for _, terms in evaluated(splats, lists, batch):
+        shade = terms.channels[..., :num_colors].sum(dim=-1)  # [B,L]
+        light = light + torch.bmm(terms.weight, shade[..., None]).squeeze(-1)
+        T = terms.T
+    return light + T * background
+
+
+def _value_gradient(splats: Splats, terms: Terms, num_colors: int, left: Tensor) -> tuple[Tensor, Tensor]:
+    """d(sum of channels)/d exp(-sigma), [B,P,L]; and the light that is left behind the chunk, [B,P]."""
+    shade = terms.channels[..., :num_colors].sum(dim=-1)[:, None]  # [B,1,L]
+    own = torch.cumsum(terms.weight * shade, dim=-1)
+    behind = left[..., None] - own
+    gradient = terms.opacity * (terms.before * shade - behind / (1 - terms.alpha))
+    if not splats.pass_clamp:
+        gradient = torch.where(terms.clamped, 0, gradient)
+    return gradient, left - own[..., -1] if own.shape[-1] else left
+
+
+def view_fisher(draw: Callable[[GaussianInputs], Tensor], g: GaussianInputs) -> Tensor:
+    """Fisher blocks of one view by brute force: autograd once per pixel and channel. For small images.
+
+    draw    inputs -> image [C,H,W], differentiable; `g` needs means, scales and quats (indexed ones are gathered)
+    Returns [N,21] float64, the upper triangle row by row of F = sum over pixels and channels of g g^T,
+    g = d image / d (mean, log scale): mean, projected covariance and viewing direction (PUP 3D-GS, arXiv 2406.10219).
+    """
+    assert g.scales is not None
+    assert g.quats is not None
+    scales, quats = g.scales.detach(), g.quats.detach()
+    if g.geom_indices is not None:
+        scales, quats = scales[g.geom_indices], quats[g.geom_indices]
+    if g.scale_factors is not None:
+        scales = scales * g.scale_factors.detach()[:, None]
+    first, second = torch.triu_indices(6, 6, device=g.means.device)
+    blocks = torch.zeros(len(g), len(first), dtype=torch.float64, device=g.means.device)
+    with torch.enable_grad():
+        means, scales = g.means.detach().requires_grad_(), scales.requires_grad_()
+        image = draw(replace(g, means=means, scales=scales, quats=quats, geom_indices=None, scale_factors=None))
+        if not image.requires_grad:
+            return blocks
+        for value in image.flatten():
+            of_means, of_scales = torch.autograd.grad(value, (means, scales), retain_graph=True)
+            slope = torch.cat([of_means, of_scales * scales.detach()], dim=1).double()  # [N,6]
+            blocks += slope[:, first] * slope[:, second]
+    return blocks

@@ -1,0 +1,151 @@
+"""From scenes to data sets: plain means, and nothing where a scene is missing.
+
+Source: evaluation protocol, aggregation. A mean over what happens to exist would compare different scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from sw_datasets.families import BENCHMARKS
+
+from sw_report.numbers import ordered_metrics
+from sw_report.runs import Run, natural
+
+# The scenes that tables of the field report; the family also names the two of the original BungeeNeRF release.
+TABLE_SCENES = {"bungee": ("amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome")}
+
+
+@dataclass(frozen=True)
+class MeanRow:
+    """A method at a rate point over the scenes of a data set.
+
+    scenes      that it was run on, of those that count
+    missing     those it lacks
+    metrics     by name; None: a scene is missing (or its value unknown), and partial means were not asked for
+    size        mean bytes, or None likewise
+    counts      mean primitives by unit, or None likewise
+    """
+
+    variant: str
+    rate: str | None
+    scenes: tuple[str, ...]
+    missing: tuple[str, ...]
+    metrics: dict[str, float | None]
+    size: float | None
+    counts: dict[str, float] | None
+
+
+@dataclass(frozen=True)
+class DatasetTable:
+    """One data set under one protocol.
+
+    published   whether `scenes` are the published ones (else: all that the runs are of)
+    protocols   ids; several only where they differ in nothing but the picture folder
+    """
+
+    dataset: str
+    title: str
+    scenes: tuple[str, ...]
+    published: bool
+    protocols: tuple[str, ...]
+    rows: list[MeanRow]
+
+
+def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[DatasetTable]:
+    """A table for each data set and protocol that has more than one scene.
+
+    partial     means over the scenes that are there, the missing ones named
+    """
+    tables = [_table(part, partial) for part in comparable(runs)]
+    return [table for table in tables if len(table.scenes) > 1]
+
+
+def comparable(runs: Sequence[Run]) -> list[list[Run]]:
+    """The runs that may share a mean over scenes: one data set, one set of rules.
+
+    Only the picture folder may differ between scenes, and then only within one named protocol: `survey` and `inria`
+    read the same scenes of Mip-NeRF 360 from different folders.
+    """
+    groups: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.facts.dataset, run.facts.protocol.without_folder()), []).append(run)
+    found = []
+    for group in groups.values():
+        several = len({run.facts.protocol.id for run in group}) > 1
+        named: dict[str, list[Run]] = {}
+        for run in group:
+            named.setdefault(str(run.facts.protocol.rules().get("name")) if several else "", []).append(run)
+        for part in named.values():
+            found += _one_protocol_a_scene(part)
+    return found
+
+
+def _one_protocol_a_scene(group: Sequence[Run]) -> list[list[Run]]:
+    """One part if every scene has one protocol; else the protocols apart."""
+    by_scene: dict[str, set[str]] = {}
+    for run in group:
+        by_scene.setdefault(run.facts.scene, set()).add(run.facts.protocol.id)
+    if all(len(ids) == 1 for ids in by_scene.values()):
+        return [list(group)]
+    apart: dict[str, list[Run]] = {}
+    for run in group:
+        apart.setdefault(run.facts.protocol.id, []).append(run)
+    return list(apart.values())
+
+
+def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
+    dataset = runs[0].facts.dataset
+    family = BENCHMARKS.get(dataset)
+    published = TABLE_SCENES.get(dataset, family.scenes) if family is not None else ()
+
+    def scene_of(run: Run) -> str:
+        known = family.scene_of(run.facts.scene) if family is not None else None
+        return known or run.facts.scene
+
+    scenes = published or tuple(sorted({scene_of(run) for run in runs}, key=natural))
+    rows: dict[tuple[str, str | None], dict[str, Run]] = {}
+    for run in runs:
+        if scene_of(run) in scenes:
+            rows.setdefault((run.variant, run.facts.rate), {})[scene_of(run)] = run
+    names = ordered_metrics(name for run in runs for name in run.facts.metrics)
+    return DatasetTable(
+        dataset,
+        family.title if family is not None else dataset,
+        scenes,
+        bool(published),
+        tuple(dict.fromkeys(run.facts.protocol.id for run in runs)),
+        sorted(
+            (_row(variant, rate, by_scene, scenes, names, partial) for (variant, rate), by_scene in rows.items()),
+            key=lambda row: (natural(row.variant), natural(row.rate or "")),
+        ),
+    )
+
+
+def _row(
+    variant: str, rate: str | None, runs: dict[str, Run], scenes: Sequence[str], metrics: Sequence[str], partial: bool
+) -> MeanRow:
+    missing = tuple(scene for scene in scenes if scene not in runs)
+    present = [runs[scene] for scene in scenes if scene in runs]
+    whole = not missing or partial
+    counts = None
+    if whole and present and all(run.facts.counts.keys() == present[0].facts.counts.keys() for run in present):
+        counts = {unit: mean([run.facts.counts[unit] for run in present]) or 0.0 for unit in present[0].facts.counts}
+    return MeanRow(
+        variant,
+        rate,
+        tuple(scene for scene in scenes if scene in runs),
+        missing,
+        {name: mean([run.mean(name) for run in present], partial=partial) if whole else None for name in metrics},
+        mean([run.facts.file.bytes for run in present]) if whole else None,
+        counts,
+    )
+
+
+def mean(values: Sequence[float | None], *, partial: bool = False) -> float | None:
+    """The plain mean; None if one is unknown (partial: those are left out) or there is none."""
+    known = [value for value in values if value is not None]
+    if not known or (len(known) < len(values) and not partial):
+        return None
+    return sum(known) / len(known)

@@ -1,0 +1,131 @@
+"""`sw report`: tables, curves, BD-rates and one HTML page about any run directories."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from splatwizard_core.cli import complete
+from splatwizard_core.cli.options import console, debug_option, options, print_json
+from splatwizard_core.cli.setup import output_file, output_folder, say
+
+if TYPE_CHECKING:
+    from splatwizard_core.scene.scene import Scene
+    from sw_report.blocks import Table
+    from sw_report.runs import Run
+
+FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
+
+
+@click.command(short_help="tables, curves, BD-rates, one HTML page")
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete.folders)
+@options(
+    click.option("--html", metavar="FILE", shell_complete=complete.files,
+                 help="Write one self-contained page there.  [default: none]"),
+    click.option("--survey", metavar="FOLDER", shell_complete=complete.folders,
+                 help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
+                 "[default: none]"),
+    click.option("--csv", "form", flag_value="csv",
+                 help="Print CSV: the survey's columns after what tells runs apart."),
+    click.option("--latex", "form", flag_value="latex", help="Print LaTeX tables (booktabs)."),
+    click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
+    click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
+    click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
+    click.option("--anchor", metavar="METHOD", shell_complete=complete.names("method"),
+                 help="What BD-rates compare against.  [default: hac, lightgaussian, "
+                 "3dgs, or the first]"),
+    click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),
+    click.option("--partial", is_flag=True, help="Means over the scenes that are there, the missing ones named; "
+                 "without it, one missing scene leaves no mean."),
+    click.option("--pictures/--no-pictures", default=True, show_default=True, help="Renders, ground truth and "
+                 "differences in the page; ground truth is what runs kept, else read from their scene."),
+    debug_option,
+)  # fmt: skip
+def report(
+    folders: tuple[str, ...],
+    html: str | None,
+    survey: str | None,
+    form: str | None,
+    anchor: str | None,
+    pareto: bool,
+    partial: bool,
+    pictures: bool,
+) -> None:
+    """Report on every run under DIR..., wherever they lie: run directories, or trees of them.
+
+    Results are comparable inside one protocol only; runs of different protocols stand in different tables. Without an
+    option that prints something else, tables are printed as text.
+    """
+    from splatwizard_core.errors import CapabilityError
+
+    try:
+        from sw_report import exports
+    except ModuleNotFoundError as error:
+        raise CapabilityError("sw report needs jinja2: pip install 'splatwizard-core[report]'") from error
+    from sw_report.distortion import choose_anchor
+    from sw_report.runs import collect
+
+    target = output_file(html) if html is not None else None
+    collection = collect([Path(folder) for folder in folders])
+    against = choose_anchor(collection.runs, anchor)
+    if target is not None:
+        from sw_report.page import PageOptions, write_page
+
+        write_page(collection, target, PageOptions(against, partial, pareto, open_scene, pictures))
+        say(f"wrote {target}")
+    if survey is not None:
+        for path in exports.write_survey(collection.runs, output_folder(survey)):
+            say(f"wrote {path}")
+    if form == "csv":
+        click.echo(exports.to_csv(collection.runs), nl=False)
+    elif form == "jsonl":
+        click.echo(exports.to_json_lines(collection.runs), nl=False)
+    elif form == "json":
+        print_json(exports.to_dict(collection, anchor=against, partial=partial, pareto=pareto))
+    elif form is not None or (target is None and survey is None):
+        tables = exports.tables_of(collection, anchor=against, partial=partial, pareto=pareto)
+        if form == "latex":
+            click.echo(exports.to_latex(tables, collection.notes), nl=False)
+        elif form == "markdown":
+            click.echo(exports.to_markdown(tables, collection.notes), nl=False)
+        else:
+            print_tables(tables, collection.notes)
+    elif collection.notes:
+        for note in collection.notes:
+            say(note)
+
+
+def open_scene(run: Run) -> Scene:
+    """The scene of a run, read as the run read it. Raises what reading a scene raises."""
+    from splatwizard_core.cli.setup import existing_file, resolve_run_options
+    from splatwizard_core.errors import SceneError
+    from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.scene.loading import load_scene
+
+    config = existing_file(str(run.directory / "config.toml"))
+    _, scene_options, spec = resolve_run_options(str(config), {})
+    if spec is None:
+        raise SceneError(f"{config} names no scene")
+    return load_scene(spec, scene_options, load_plugins())
+
+
+def print_tables(tables: list[tuple[str, Table]], notes: list[str]) -> None:
+    """As text on stdout."""
+    from rich.markup import escape
+    from rich.table import Table as Drawn
+
+    out = console()
+    for title, table in tables:
+        drawn = Drawn(title=escape(title), title_justify="left")
+        for i, column in enumerate(table.columns):
+            drawn.add_column(escape(column.name), justify="left" if column.text or not i else "right")
+        for row in table.rows:
+            drawn.add_row(*(escape(cell.text) for cell in row.cells), end_section=row.emphasis)
+        out.print(drawn)
+        for note in table.notes:
+            out.print(escape(note), soft_wrap=True)
+        out.print()
+    for note in notes:
+        out.print(escape(f"note: {note}"), soft_wrap=True)

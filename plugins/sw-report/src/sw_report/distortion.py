@@ -1,0 +1,135 @@
+"""BD-rates of a report: every method against the anchor, scene by scene, then the mean over scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from splatwizard_core.errors import UserInputError
+from sw_report.aggregate import comparable, mean
+from sw_report.numbers import main_lpips
+from sw_report.rate_distortion import BdResult, bd_quality, bd_rate
+from sw_report.runs import Run
+
+# The anchors of tables, most usual first; else whatever comes first.
+USUAL_ANCHORS = ("hac", "lightgaussian", "3dgs")
+FLAG_TEXTS = {
+    "low_overlap": "the curves share less than a quarter of their range",
+    "few_points": "fewer than 4 points, joined by straight lines",
+    "no_overlap": "the curves share no range",
+}
+
+
+@dataclass(frozen=True)
+class BdCell:
+    """A BD value, or None with a reason; `flags` as of BdResult."""
+
+    value: float | None
+    flags: tuple[str, ...] = ()
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class BdRow:
+    """One method on one scene (scene None: the mean over scenes)."""
+
+    variant: str
+    scene: str | None
+    rate: BdCell
+    quality: BdCell
+
+
+@dataclass(frozen=True)
+class BdTable:
+    """All methods against one anchor by one metric, in one protocol group."""
+
+    metric: str
+    anchor: str
+    protocol: str
+    rows: list[BdRow]
+
+
+def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
+    """The variant that is compared against; None if there is only one. Raises UserInputError for an unknown one."""
+    variants = list(dict.fromkeys(run.variant for run in runs))
+    if wanted is not None:
+        matches = [v for v in variants if v == wanted] or [r.variant for r in runs if r.facts.method == wanted]
+        if not matches:
+            raise UserInputError(f"--anchor {wanted}: no run is of it; there are {', '.join(variants)}")
+        if len(set(matches)) > 1:
+            raise UserInputError(f"--anchor {wanted} is not unique: choose one of {', '.join(dict.fromkeys(matches))}")
+        return matches[0]
+    if len(variants) < 2:
+        return None
+    methods = {run.facts.method: run.variant for run in reversed(runs)}
+    return next((methods[name] for name in USUAL_ANCHORS if name in methods), variants[0])
+
+
+def bd_metrics(runs: Sequence[Run]) -> list[str]:
+    """The metrics that curves are compared by: PSNR, SSIM and one LPIPS, as far as they are there."""
+    known = {name for run in runs for name, metric in run.facts.metrics.items() if metric.mean is not None}
+    lpips = main_lpips(known)
+    return [name for name in ("psnr", "ssim", lpips) if name in known]
+
+
+def bd_tables(runs: Sequence[Run], anchor: str | None, *, pareto: bool = False, partial: bool = False) -> list[BdTable]:
+    """One table for each protocol and metric that has something to compare.
+
+    partial     the mean over the scenes that have a value; else it needs all of them
+    """
+    if anchor is None:
+        return []
+    tables = []
+    for group in comparable(runs):
+        places = dict.fromkeys(run.place for run in group if run.variant == anchor)
+        others = [v for v in dict.fromkeys(run.variant for run in group) if v != anchor]
+        if not places or not others:
+            continue
+        ids = ", ".join(dict.fromkeys(run.facts.protocol.id for run in group))
+        for metric in bd_metrics(group):
+            rows = []
+            for variant in others:
+                cells = [_compare(group, place, anchor, variant, metric, pareto) for place in places]
+                rows += cells
+                if len(cells) > 1:
+                    rows.append(_mean_row(variant, cells, partial))
+            tables.append(BdTable(metric, anchor, ids, rows))
+    return tables
+
+
+def curve(runs: Sequence[Run], metric: str) -> tuple[list[float], list[float]]:
+    """(bytes, quality), quality turned so that higher is better."""
+    known = [(float(run.facts.file.bytes), run.facts.metrics[metric]) for run in runs if run.mean(metric) is not None]
+    return (
+        [size for size, _ in known],
+        [(m.mean or 0.0) * (-1 if m.direction == "lower" else 1) for _, m in known],
+    )
+
+
+def _compare(
+    runs: Sequence[Run], place: tuple[str, str], anchor: str, variant: str, metric: str, pareto: bool
+) -> BdRow:
+    here = [run for run in runs if run.place == place]
+    curves = [curve([run for run in here if run.variant == name], metric) for name in (anchor, variant)]
+    cells = []
+    for function in (bd_rate, bd_quality):
+        try:
+            cells.append(_cell(function(curves[0], curves[1], pareto=pareto)))
+        except UserInputError as error:
+            cells.append(BdCell(None, (), str(error).partition(": ")[2] or str(error)))
+    return BdRow(variant, place[0], *cells)
+
+
+def _cell(result: BdResult) -> BdCell:
+    reasons = [FLAG_TEXTS[flag] for flag in result.flags if flag in FLAG_TEXTS]
+    return BdCell(result.value, result.flags, "; ".join(reasons))
+
+
+def _mean_row(variant: str, cells: Sequence[BdRow], partial: bool) -> BdRow:
+    def over(values: Sequence[BdCell]) -> BdCell:
+        flags = tuple(dict.fromkeys(flag for cell in values for flag in cell.flags if cell.value is not None))
+        without = sum(cell.value is None for cell in values)
+        reason = f"{without} of {len(values)} scenes have no value" if without else ""
+        return BdCell(mean([cell.value for cell in values], partial=partial), flags, reason)
+
+    return BdRow(variant, None, over([row.rate for row in cells]), over([row.quality for row in cells]))

@@ -1,0 +1,193 @@
+"""Results for other programs and for papers: CSV, JSON, JSON lines, Markdown, LaTeX."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.files import write_atomic
+from sw_report import numbers
+from sw_report.aggregate import dataset_tables
+from sw_report.blocks import Table
+from sw_report.distortion import bd_tables
+from sw_report.results_tables import bd_table, means_table, metric_names, runs_table
+from sw_report.runs import Collection, Run
+
+# What the survey of 3DGS compression asks of a table of one method on one scene.
+SURVEY_COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
+
+
+def survey_row(run: Run, lpips: str | None = numbers.FIELD_LPIPS) -> list[str]:
+    """One run as the survey wants it; unknown values are empty.
+
+    lpips   the form that stands under "LPIPS"; the survey's own is the default, and nothing else may pass for it
+    """
+
+    def value(name: str | None, digits: int) -> str:
+        mean = run.mean(name) if name is not None else None
+        return "" if mean is None else f"{mean:.{digits}f}"
+
+    primitives = run.facts.counts.get("num_gaussians")
+    return [
+        _cell(run.facts.rate or run.facts.preset or ""), value("psnr", 4), value("ssim", 5), value(lpips, 5),
+        str(run.facts.file.bytes), "" if primitives is None else str(primitives),
+    ]  # fmt: skip
+
+
+def to_csv(runs: Sequence[Run]) -> str:
+    """One table of all runs: what tells them apart, then the survey's columns."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["Dataset", "Scene", "Protocol", "Method", *SURVEY_COLUMNS, "LPIPS variant"])
+    for run in runs:
+        facts = run.facts
+        where = [facts.dataset, facts.scene, facts.protocol.id, run.variant]
+        lpips = numbers.main_lpips(name for name in facts.metrics if run.mean(name) is not None)
+        writer.writerow([*map(_cell, where), *survey_row(run, lpips), lpips or ""])
+    return text.getvalue()
+
+
+def write_survey(runs: Sequence[Run], folder: Path) -> list[Path]:
+    """The survey's own layout: folder/<dataset>/<scene>/<method>.csv, rate points as submethods.
+
+    Runs of one scene under different protocols get folders of their own: <scene>@<number>. Returns the files.
+    """
+    files: dict[Path, list[Run]] = {}
+    places = list(dict.fromkeys(run.place for run in runs))
+    for run in runs:
+        same = [place for place in places if place[0] == run.facts.scene]
+        scene = _name(run.facts.scene) + (f"@{same.index(run.place) + 1}" if len(same) > 1 else "")
+        files.setdefault(folder / _name(run.facts.dataset) / scene / f"{_name(run.variant)}.csv", []).append(run)
+    for path, group in files.items():
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(SURVEY_COLUMNS)
+        writer.writerows(survey_row(run) for run in group)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_atomic(path, text.getvalue())
+    return list(files)
+
+
+def to_dict(collection: Collection, *, anchor: str | None, partial: bool, pareto: bool) -> dict[str, Any]:
+    """Everything that the tables hold, as plain values: what `sw report --json` prints."""
+    return {
+        "runs": [run_dict(run) for run in collection.runs],
+        "means": [asdict(table) for table in dataset_tables(collection.runs, partial=partial)],
+        "anchor": anchor,
+        "bd": [asdict(table) for table in bd_tables(collection.runs, anchor, pareto=pareto, partial=partial)],
+        "notes": collection.notes,
+    }
+
+
+def run_dict(run: Run) -> dict[str, Any]:
+    """One run as plain values."""
+    facts = run.facts
+    return {
+        "directory": str(run.directory),
+        "method": run.variant,
+        "rate": facts.rate,
+        "preset": facts.preset,
+        "dataset": facts.dataset,
+        "scene": facts.scene,
+        "protocol": facts.protocol.id,
+        "metrics": {name: run.mean(name) for name in metric_names([run], diagnostic=True)},
+        "bytes": facts.file.bytes,
+        "sections": facts.file.sections,
+        "counts": facts.counts,
+        "steps": facts.train.steps,
+        "train_s": facts.train.train_s,
+        "with_pretraining_s": facts.train.with_pretraining_s,
+        "encode_s": facts.codec.encode_s,
+        "decode_s": facts.codec.decode_s,
+        "fps": facts.speed.fps,
+        "flags": facts.flags,
+        "unknown": facts.unknown,
+        "date": facts.date,
+    }
+
+
+def to_json_lines(runs: Sequence[Run]) -> str:
+    """One JSON object a run and line."""
+    return "".join(json.dumps(run_dict(run), allow_nan=False) + "\n" for run in runs)
+
+
+def tables_of(collection: Collection, *, anchor: str | None, partial: bool, pareto: bool) -> list[tuple[str, Table]]:
+    """(title, table): the runs of each scene and protocol, means over data sets, BD values."""
+    runs = collection.runs
+    found = []
+    for place in dict.fromkeys(run.place for run in runs):
+        found.append((f"{place[0]}, protocol {place[1]}", runs_table([run for run in runs if run.place == place])))
+    for means in dataset_tables(runs, partial=partial):
+        found.append((f"{means.title}, protocol {', '.join(means.protocols)}", means_table(means)))
+    for bd in bd_tables(runs, anchor, pareto=pareto, partial=partial):
+        found.append((f"{numbers.heading(bd.metric)} against {bd.anchor}, protocol {bd.protocol}", bd_table(bd)))
+    return found
+
+
+def to_markdown(tables: Sequence[tuple[str, Table]], notes: Sequence[str]) -> str:
+    """Tables as GitHub reads them."""
+    blocks = []
+    for title, table in tables:
+        lines = [f"**{_markdown(title)}**", "", "| " + " | ".join(_markdown(c.name) for c in table.columns) + " |"]
+        lines.append("|" + "|".join("---" if c.text or not i else "---:" for i, c in enumerate(table.columns)) + "|")
+        lines += ["| " + " | ".join(_markdown(cell.text) for cell in row.cells) + " |" for row in table.rows]
+        lines += ["", *(f"{_markdown(note)}  " for note in [table.caption, *table.notes] if note)]
+        blocks.append("\n".join(lines).rstrip() + "\n")
+    if notes:
+        blocks.append("\n".join(f"- {_markdown(note)}" for note in notes) + "\n")
+    return "\n".join(blocks)
+
+
+def to_latex(tables: Sequence[tuple[str, Table]], notes: Sequence[str]) -> str:
+    """Tables for booktabs (\\usepackage{booktabs}); what must be known stands in comments and under the table."""
+    blocks = [f"% {_comment(note)}\n" for note in notes]
+    for title, table in tables:
+        align = "".join("l" if c.text or not i else "r" for i, c in enumerate(table.columns))
+        lines = [
+            r"\begin{table}", r"  \centering", f"  \\caption{{{_latex(title)}. {_latex(table.caption)}}}",
+            f"  \\begin{{tabular}}{{{align}}}", r"    \toprule",
+            "    " + " & ".join(_latex(c.name) for c in table.columns) + r" \\", r"    \midrule",
+        ]  # fmt: skip
+        for row in table.rows:
+            if row.emphasis:
+                lines.append(r"    \midrule")
+            lines.append("    " + " & ".join(_latex(cell.text) for cell in row.cells) + r" \\")
+        lines += [r"    \bottomrule", r"  \end{tabular}"]
+        lines += [f"  \\par\\smallskip\\footnotesize {_latex(note)}" for note in table.notes]
+        blocks.append("\n".join([*lines, r"\end{table}"]) + "\n")
+    return "\n".join(blocks)
+
+
+def _cell(text: str) -> str:
+    """Text that a spreadsheet does not take for a formula."""
+    return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
+
+
+def _name(text: str) -> str:
+    """A file name from whatever a record calls something."""
+    return re.sub(r"[^\w.+@()\[\]-]+", "_", text).strip(".") or "_"
+
+
+def _markdown(text: str) -> str:
+    return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text.replace("\n", " "))
+
+
+def _comment(text: str) -> str:
+    return " ".join(text.split())
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
+    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
+    "–": "--", "−": "$-$", "×": r"$\times$", "·": r"$\cdot$",
+}  # fmt: skip
+
+
+def _latex(text: str) -> str:
+    return "".join(_LATEX.get(character, character) for character in text)

@@ -1,0 +1,214 @@
+"""What a report reads of a result record: whatever release of this software, or other software, wrote it.
+
+`record.Record` is what is written, strictly. A report reads also what older and newer releases wrote, and files that
+strangers sent: it takes what it understands, says what it does not, and invents nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import unicodedata
+from pathlib import Path
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
+
+from splatwizard_core.errors import UserInputError
+from splatwizard_core.runs.record import SCHEMA
+from sw_report import numbers
+
+LONGEST_TEXT = 300
+LARGEST_RECORD = 64_000_000  # bytes; ten thousand views with ten metrics take a tenth of it
+
+
+def clean(text: str) -> str:
+    """Text that cannot reorder or hide what stands around it: control characters are replaced, length is bounded."""
+    kept = "".join("\N{REPLACEMENT CHARACTER}" if unicodedata.category(c) in ("Cc", "Cf", "Cs") else c for c in text)
+    return kept if len(kept) <= LONGEST_TEXT else kept[: LONGEST_TEXT - 1] + "…"
+
+
+Text = Annotated[str, AfterValidator(clean)]
+
+
+class Facts(BaseModel):
+    """Base of the blocks: what is not known here is passed over."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
+
+
+class ProtocolFacts(Facts):
+    """Only results of equal ids are comparable; the other rules stand beside it."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+
+    id: Text
+
+    def rules(self) -> dict[str, Any]:
+        """Every rule by name, without the id."""
+        return {clean(name): value for name, value in self.model_dump().items() if name != "id"}
+
+    def without_folder(self) -> str:
+        """The id of all rules but the picture folder, which may differ between the scenes of one data set."""
+        images = self.rules().get("images")
+        parts = self.id.split("/")
+        return "/".join("*" if part == images else part for part in parts) if isinstance(images, str) else self.id
+
+
+class MetricFacts(Facts):
+    """One image metric."""
+
+    mean: float | None = None
+    per_view: list[float | None] = []
+    direction: Text = "higher"
+    diagnostic: bool = False
+
+
+class FileFacts(Facts):
+    """The encoded file; `sections` is bytes by section."""
+
+    bytes: int = Field(gt=0)
+    sha256: Text | None = None
+    sections: dict[Text, Annotated[int, Field(ge=0)]] = {}
+
+
+class CodecFacts(Facts):
+    encode_s: float | None = None
+    decode_s: float | None = None
+    peak_decode_bytes: int | None = None
+
+
+class SpeedFacts(Facts):
+    fps: float | None = None
+    latency_ms_median: float | None = None
+    latency_ms_p95: float | None = None
+    prepare_s: float | None = None
+    image_size: tuple[int, int] | None = None
+
+
+class MemoryFacts(Facts):
+    kind: Text | None = None
+    model_bytes: int | None = None
+    peak_render_bytes: int | None = None
+
+
+class PretrainingFacts(Facts):
+    """A trained scene that a training started from; `file` is name and sha256 where it came from one."""
+
+    file: dict[Text, Text] = {}
+    preset: Text | None = None
+    steps: int | None = None
+    train_s: float | None = None
+
+
+class TrainFacts(Facts):
+    train_s: float | None = None
+    pretraining: dict[Text, PretrainingFacts] | None = None
+    with_pretraining_s: float | None = None
+    steps: int | None = None
+    peak_bytes: int | None = None
+    memory_kind: Text | None = None
+    breakdown_s: dict[Text, dict[Text, float]] | None = None
+    trained_in: Text | None = None
+
+    def started_from(self) -> str:
+        """What the training started from, in words; empty: nothing that was trained."""
+        found = []
+        for name, scene in (self.pretraining or {}).items():
+            steps = "" if scene.steps is None else f", {numbers.count(scene.steps)} steps"
+            seconds = "" if scene.train_s is None else f", {numbers.seconds(scene.train_s)} s"
+            preset = "" if scene.preset is None else f" ({scene.preset} preset{steps}{seconds})"
+            origin = f" from the file {scene.file['name']}" if "name" in scene.file else preset
+            found.append(f"a trained {name} scene{origin}")
+        return "; ".join(found)
+
+
+class PartFacts(Facts):
+    """One that served: a rasterizer, a stage, a coder, ..., and the distribution that it comes from."""
+
+    kind: Text
+    name: Text
+    distribution: Text = ""
+    version: Text = ""
+
+
+class PhaseFacts(Facts):
+    phase: Text
+    provided_by: list[PartFacts] = []
+
+    def by_distribution(self) -> dict[str, list[str]]:
+        """`sw-codecs 0.1` -> what of it served, such as `coder octree`."""
+        found: dict[str, list[str]] = {}
+        for part in self.provided_by:
+            owner = f"{part.distribution} {part.version}".strip() or "no distribution"
+            found.setdefault(owner, []).append(f"{part.kind} {part.name}")
+        return found
+
+
+class RunFacts(Facts):
+    """One record. Only method, scene, protocol, metrics and the size of the file are indispensable."""
+
+    schema_version: int = 0
+    method: Text = Field(min_length=1)
+    scene: Text = Field(min_length=1)
+    protocol: ProtocolFacts
+    file: FileFacts
+    metrics: dict[Text, MetricFacts]
+    distribution: Text | None = None
+    method_version: int | None = None
+    preset: Text | None = None
+    rate: Text | None = None
+    config: dict[str, Any] | None = None
+    dataset: Text = "unknown"
+    train_views: int | None = None
+    test_views: int | None = None
+    views: list[Text] = []
+    counts: dict[Text, int] = {}
+    visible_gaussians: float | None = None
+    codec: CodecFacts = CodecFacts()
+    speed: SpeedFacts = SpeedFacts()
+    memory: MemoryFacts = MemoryFacts()
+    train: TrainFacts = TrainFacts()
+    geometry: dict[Text, float] | None = None
+    rasterizers: dict[Text, dict[Text, Text]] = {}
+    phases: list[PhaseFacts] = []
+    environment: dict[Text, Any] = {}
+    flags: list[Text] = []
+    unknown: dict[Text, Text] = {}
+    date: Text | None = None
+
+
+OTHER_SCHEMA = f"record of schema {{}}, this release writes {SCHEMA}: a dash may stand for what only one has"
+INDISPENSABLE = ("schema_version", "method", "scene", "protocol", "file", "metrics")
+
+
+def read_facts(path: Path) -> tuple[RunFacts, list[str]]:
+    """What a record says, and notes on what of it could not be understood.
+
+    Raises UserInputError that names the first thing wrong, if an indispensable part is missing or makes no sense.
+    """
+    try:
+        if path.stat().st_size > LARGEST_RECORD:
+            raise UserInputError(f"{path}: {path.stat().st_size:,} bytes is too large for a result record")
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise UserInputError(f"{path}: not a result record: {error}") from None
+    if not isinstance(content, dict):
+        raise UserInputError(f"{path}: not a result record: it holds no object")
+    notes: list[str] = []
+    version = content.get("schema_version")
+    if version != SCHEMA:
+        notes.append(OTHER_SCHEMA.format(clean(repr(version))))
+    content = {name: value for name, value in content.items() if value is not None or name in INDISPENSABLE}
+    try:
+        return RunFacts.model_validate(content), notes
+    except ValidationError as error:
+        wrong = {str(e["loc"][0]): e for e in error.errors() if e["loc"]}
+    for name, problem in wrong.items():
+        if name in INDISPENSABLE:
+            where = ".".join(map(str, problem["loc"]))
+            raise UserInputError(f"{path}: not a result record: {clean(where)}: {problem['msg']}")
+        notes.append(f"'{name}' of its record is not understood and left out")
+    kept = {name: value for name, value in content.items() if name not in wrong}
+    return RunFacts.model_validate(kept), notes

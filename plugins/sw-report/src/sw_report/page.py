@@ -1,0 +1,282 @@
+"""The page: one self-contained HTML file about one run or many."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from pathlib import Path
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+import splatwizard_core
+from splatwizard_core.files import write_atomic
+from sw_report import numbers, plots
+from sw_report import results_tables as tables
+from sw_report.aggregate import dataset_tables
+from sw_report.blocks import Part, Section, Table
+from sw_report.distortion import bd_tables, choose_anchor
+from sw_report.pictures import (
+    GAIN,
+    LONGEST_SIDE,
+    LONGEST_SIDE_OF_MANY,
+    PictureBudget,
+    scene_gallery,
+    single_gallery,
+    views_per_scene,
+)
+from sw_report.runs import Collection, Run
+from sw_report.truth import EVEN_VIEWS, SceneOpener, Truth
+
+FILE_NAME = "report.html"
+PICTURES = "Renders beside the ground truth"
+BYTES = "Bytes by section"
+VIEWS = "Scores view by view"
+SHORT = {PICTURES: "Pictures", BYTES: "Bytes", VIEWS: "Views"}
+"""Headings, and what stands for them in the contents."""
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """What a page shows.
+
+    anchor      variant or method that BD-rates compare against; None: the usual one
+    partial     means also where scenes are missing
+    pareto      BD-rates after dropping points that a smaller file beats
+    opener      (run) -> its scene, for ground truth that a run did not keep; None: only what runs kept
+    pictures    whether there are any
+    """
+
+    anchor: str | None = None
+    partial: bool = False
+    pareto: bool = False
+    opener: SceneOpener | None = None
+    pictures: bool = True
+
+
+def write_page(collection: Collection, path: Path, options: PageOptions | None = None) -> None:
+    """Write the page about these runs, atomically."""
+    write_atomic(path, render_page(collection, options or PageOptions()))
+
+
+def render_page(collection: Collection, options: PageOptions) -> str:
+    """The HTML text. Raises UserInputError for an anchor that no run is of."""
+    runs = collection.runs
+    single = len(runs) == 1
+    sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
+    environment = Environment(
+        loader=PackageLoader("sw_report"), autoescape=True, undefined=StrictUndefined,
+        trim_blocks=True, lstrip_blocks=True,
+    )  # fmt: skip
+    environment.filters["capfirst"] = lambda text: text[:1].upper() + text[1:]
+    loader = environment.loader
+    assert loader is not None
+    style, script = (loader.get_source(environment, name)[0] for name in ("style.css", "script.js"))
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    return environment.get_template("page.html.j2").render(
+        title=_title(runs),
+        lede=_lede(runs),
+        date=datetime.now(timezone.utc).strftime("%d %B %Y").lstrip("0"),
+        version=splatwizard_core.__version__,
+        figures=_key_figures(runs[0]) if single else [],
+        notes=collection.notes,
+        contents=[(section.id, section.short or section.title) for section in sections],
+        sections=sections,
+        style=Markup(style),
+        script=Markup(script),
+        script_hash=f"sha256-{digest}",
+        gain=GAIN,
+        side=LONGEST_SIDE if single else LONGEST_SIDE_OF_MANY,
+    )
+
+
+def _unique(values: Sequence[str]) -> list[str]:
+    return list(dict.fromkeys(values))
+
+
+def _title(runs: Sequence[Run]) -> str:
+    methods, scenes = _unique([r.variant for r in runs]), _unique([r.facts.scene for r in runs])
+    if len(runs) == 1:
+        return f"{runs[0].label} on {scenes[0]}"
+    who = methods[0] if len(methods) == 1 else " and ".join(methods) if len(methods) == 2 else f"{len(methods)} methods"
+    where = scenes[0] if len(scenes) == 1 else " and ".join(scenes) if len(scenes) == 2 else f"{len(scenes)} scenes"
+    return f"{who} on {where}"
+
+
+def _lede(runs: Sequence[Run]) -> str:
+    facts = runs[0].facts
+    if len(runs) > 1:
+        methods, scenes = _unique([r.variant for r in runs]), _unique([r.facts.scene for r in runs])
+        protocols = _unique([r.facts.protocol.id for r in runs])
+        sizes = sorted(r.facts.file.bytes for r in runs)
+        return (
+            f"{len(runs)} runs: {_plural(len(methods), 'method')} on {_plural(len(scenes), 'scene')}, under "
+            f"{_plural(len(protocols), 'protocol')}. Files of {numbers.megabytes(sizes[0])} to "
+            f"{numbers.megabytes(sizes[-1])} MB; every score is of a model that was decoded from its file."
+        )
+    stored = numbers.counts(facts.counts) + (" Gaussians" if list(facts.counts) == ["num_gaussians"] else "")
+    views = facts.test_views or len(facts.views)
+    psnr = runs[0].mean("psnr")
+    reached = f" that reach {psnr:.2f} dB on {_plural(views, 'test view')}" if psnr is not None else ""
+    return f"{numbers.megabytes(facts.file.bytes)} MB hold {stored}{reached}; every score is of the decoded file."
+
+
+def _plural(n: int, word: str) -> str:
+    return f"{n} {word}" if n == 1 else f"{n} {word}s"
+
+
+def _key_figures(run: Run) -> list[dict[str, str]]:
+    facts = run.facts
+    found = []
+    for name in tables.metric_names([run]):
+        head = numbers.heading(name)
+        decibel = head.endswith(" dB")
+        found.append(
+            {"name": head.removesuffix(" dB"), "value": numbers.score(name, run.mean(name)), "unit": "dB" * decibel}
+        )
+    found.append({"name": "file size", "value": numbers.megabytes(facts.file.bytes), "unit": "MB"})
+    for name, n in facts.counts.items():
+        found.append({"name": numbers.unit(name), "value": f"{n:,}", "unit": ""})
+    found.append({"name": "rendering", "value": numbers.rate(facts.speed.fps), "unit": "FPS"})
+    return found
+
+
+def _single_sections(run: Run, options: PageOptions) -> list[Section]:
+    facts = run.facts
+    sections = []
+    if options.pictures:
+        gallery = single_gallery(run, Truth([run], options.opener), PictureBudget())
+        sections.append(Section("pictures", PICTURES, [Part(gallery=gallery)], short=SHORT[PICTURES]))
+    views = plots.view_charts([run])
+    parts = [Part(charts=views)] if views is not None else [Part(text="The record holds no scores of single views.")]
+    table = plots.views_table([run])
+    parts += [Part(table=table, folded="All scores")] if table is not None else []
+    missing = tables.missing_metrics([run])
+    parts += [Part(text="Not known: " + "; ".join(missing) + ".")] if missing else []
+    sections.append(Section("views", VIEWS, parts, short=SHORT[VIEWS]))
+    table = plots.single_sections_table(run)
+    part = Part(table=table) if table is not None else Part(text="The record lists no sections of the file.")
+    sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
+    sections.append(_training("training", "Training", [run], tables.breakdown_table(facts)))
+    sections.append(Section("cost", "Time and memory", [Part(table=tables.cost_table(facts))]))
+    if facts.geometry:
+        values = "; ".join(f"{name} {tables.plain(value)}" for name, value in facts.geometry.items())
+        sections.append(Section("geometry", "Geometry", [Part(text=f"{values}.")]))
+    sections.append(_provenance([run]))
+    return sections
+
+
+def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
+    anchor = choose_anchor(runs, options.anchor)
+    style_of = {variant: i for i, variant in enumerate(plots.variants_of(runs))}
+    sections = []
+    means = dataset_tables(runs, partial=options.partial)
+    if means:
+        parts = [Part(f"{t.title}: {', '.join(t.protocols)}", table=tables.means_table(t)) for t in means]
+        sections.append(Section("means", "Means over scenes", parts, short="Means"))
+    comparisons = bd_tables(runs, anchor, pareto=options.pareto, partial=options.partial)
+    if comparisons:
+        parts = [
+            Part(f"{numbers.heading(t.metric)} · {t.protocol}" if i else "", table=tables.bd_table(t))
+            for i, t in enumerate(comparisons)
+        ]
+        sections.append(
+            Section(
+                "bd", "Rate saved against the anchor", parts,
+                "Mean distance between rate-distortion curves, scene by scene (Bjøntegaard; monotone piecewise cubic).",
+                "BD-rate",
+            )
+        )  # fmt: skip
+    places: dict[tuple[str, str], list[Run]] = {}
+    for run in runs:
+        places.setdefault(run.place, []).append(run)
+    budget = PictureBudget()
+    views = views_per_scene([len(group) for group in places.values()], EVEN_VIEWS)
+    scenes = [scene for scene, _ in places]
+    for number, ((scene, protocol), group) in enumerate(places.items()):
+        title = scene if scenes.count(scene) == 1 else f"{scene}, {protocol}"
+        parts = _place_parts(group, style_of, views, budget, options)
+        if len(places) == 1:  # what would be sub-headings under a lonely heading
+            sections += _as_sections(parts, f"Results on {scene}", f"Protocol {protocol}.")
+        else:
+            sections.append(Section(f"scene-{number}", title, parts, f"Protocol {protocol}.", title))
+    sections.append(_provenance(runs))
+    return sections
+
+
+def _as_sections(parts: Sequence[Part], title: str, text: str) -> list[Section]:
+    """A section for every part with a heading; those without one belong to the section before them."""
+    sections = [Section("results", title, [], text, "Results")]
+    for part in parts:
+        if part.heading:
+            sections.append(Section(f"part-{len(sections)}", part.heading, [], short=SHORT.get(part.heading, "")))
+        sections[-1].parts.append(replace(part, heading=""))
+    return sections
+
+
+def _place_parts(
+    runs: Sequence[Run], style_of: dict[str, int], views: int, budget: PictureBudget, options: PageOptions
+) -> list[Part]:
+    """All about the runs of one scene under one protocol."""
+    parts = [Part(table=tables.runs_table(runs))]
+    charts = plots.distortion_charts(runs, style_of)
+    if charts is not None and len(runs) > 1:
+        parts.append(Part("Rate and distortion", charts=charts))
+    if options.pictures:
+        if budget.spent:
+            parts.append(Part(PICTURES, "Left out: the page holds as many pictures as it may."))
+        else:
+            gallery = scene_gallery(runs, views, Truth(runs, options.opener), budget)
+            parts.append(Part(PICTURES, gallery=gallery))
+    bars = plots.section_bars(runs)
+    if bars is not None:
+        parts.append(Part(BYTES, charts=bars))
+        parts.append(Part(table=plots.sections_table(runs), folded="Bytes as a table"))
+    curves, missing = plots.training_charts(runs)
+    parts.append(Part("Training", charts=curves, text=_sentence(missing)))
+    by_view = plots.view_charts(runs)
+    if by_view is not None:
+        parts.append(Part(VIEWS, charts=by_view))
+        parts.append(Part(table=plots.views_table(runs), folded="All scores"))
+    return parts
+
+
+def _training(anchor: str, title: str, runs: Sequence[Run], breakdown: Table | None) -> Section:
+    curves, missing = plots.training_charts(runs)
+    parts = [Part(charts=curves, text=_sentence(missing))]
+    if breakdown is not None:
+        parts.append(Part("Where the time went", table=breakdown))
+    return Section(anchor, title, parts)
+
+
+def _sentence(missing: Sequence[str]) -> str:
+    return f"Not shown: {'; '.join(missing)}." if missing else ""
+
+
+def _provenance(runs: Sequence[Run]) -> Section:
+    phases = tables.phases_table(runs)
+    parts = [
+        Part("Served by", table=tables.served_table(runs)),
+        *([Part("Phases", table=phases)] if phases is not None else []),
+        Part("Protocol", table=tables.protocol_table(runs)),
+        Part("Environment", table=tables.environment_table(runs)),
+    ]
+    if len(runs) == 1:
+        config = tables.config_table(runs[0].facts)
+        if config is not None:
+            parts.append(Part("Configuration", table=config, folded="Every value, and where it was set"))
+    text = _identity(runs[0]) if len(runs) == 1 else ""
+    return Section("provenance", "How it was measured", parts, text, "Protocol and environment")
+
+
+def _identity(run: Run) -> str:
+    facts = run.facts
+    known = [
+        f"Measured {facts.date}." if facts.date else "",
+        f"Flags: {', '.join(facts.flags)}." if facts.flags else "",
+        f"SHA-256 of the file: {facts.file.sha256}." if facts.file.sha256 else "",
+    ]
+    return " ".join(filter(None, known))

@@ -1,0 +1,240 @@
+"""The charts of a report: rate and distortion, bytes by section, training, scores view by view."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from sw_report import numbers
+from sw_report.blocks import Cell, Charts, Figure, Table, columns, row
+from sw_report.charts import STYLES, Bar, Chart, Point, Series, square, stacked_bars, swatch
+from sw_report.distortion import bd_metrics
+from sw_report.pictures import pick_evenly
+from sw_report.results_tables import metric_names
+from sw_report.runs import Run
+from sw_report.training_log import TrainingCurves, log_path, read_training
+
+MOST_SECTIONS = 2 * STYLES - 1  # with a colour of their own; smaller ones are joined
+MOST_LINES = 8
+MOST_VIEWS_IN_TABLE = 300
+MOST_BARS = 24
+
+
+def variants_of(runs: Sequence[Run]) -> list[str]:
+    return list(dict.fromkeys(run.variant for run in runs))
+
+
+def counts_anchors(run: Run) -> bool:
+    """Whether its primitives are anchors, whose number is not comparable: drawn dashed, as in the field."""
+    return "num_anchors" in run.facts.counts
+
+
+def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
+    """Quality against bytes, one chart a metric, one line a method."""
+    variants = variants_of(runs)
+    figures = []
+    for metric in bd_metrics(runs):
+        lines = []
+        for variant in variants:
+            own = sorted((r for r in runs if r.variant == variant), key=lambda r: r.facts.file.bytes)
+            points = [
+                Point(
+                    run.facts.file.bytes / 1e6,
+                    value,
+                    f"{run.label}: {numbers.score(metric, value)}{' dB' if metric == 'psnr' else ''} "
+                    f"at {numbers.megabytes(run.facts.file.bytes)} MB",
+                    run.facts.rate or "" if len(variants) <= 2 else "",
+                )
+                for run in own
+                if (value := run.mean(metric)) is not None
+            ]
+            dashed = any(counts_anchors(run) for run in own)
+            lines.append(Series(variant, points, style_of[variant], dashed))
+        name = numbers.heading(metric)
+        lower = any(run.facts.metrics[metric].direction == "lower" for run in runs if metric in run.facts.metrics)
+        title = f"{name} against file size for {', '.join(variants)}"
+        chart = Chart(title, lines, "file size, MB (logarithmic)", x_log=True)
+        figures.append(Figure(f"{name.replace(' dB', ', dB')}{' (lower is better)' if lower else ''}", chart.draw()))
+    if not figures:
+        return None
+    legend = [(swatch(style_of[v], dashed=any(counts_anchors(r) for r in runs if r.variant == v)), v) for v in variants]
+    notes = ["Dashed: anchors, not Gaussians, are stored."] if any(map(counts_anchors, runs)) else []
+    return Charts(figures, legend if len(variants) > 1 else [], notes)
+
+
+def section_styles(runs: Sequence[Run]) -> dict[str, int]:
+    """A colour for each section, the largest first."""
+    totals: dict[str, int] = {}
+    for run in runs:
+        for name, size in run.facts.file.sections.items():
+            totals[name] = totals.get(name, 0) + size
+    ordered = sorted(totals, key=lambda name: -totals[name])
+    return {name: min(i, MOST_SECTIONS) for i, name in enumerate(ordered)}
+
+
+def section_bars(runs: Sequence[Run]) -> Charts | None:
+    """Bytes by section as one stacked bar a run."""
+    with_sections = [run for run in runs if run.facts.file.sections]
+    if not with_sections:
+        return None
+    shown = pick_evenly(with_sections, MOST_BARS)
+    styles = section_styles(shown)
+    bars = []
+    for run in shown:
+        sections = sorted(run.facts.file.sections.items(), key=lambda item: styles[item[0]])
+        size = run.facts.file.bytes
+        parts = [(styles[n], b / size, f"{n}: {b:,} bytes, {b / size:.1%}") for n, b in sections]
+        bars.append(Bar(run.label, f"{numbers.megabytes(size)} MB", parts))
+    legend = [(square(style), name) for name, style in styles.items() if style < MOST_SECTIONS]
+    if len(styles) > MOST_SECTIONS:
+        legend.append((square(MOST_SECTIONS), f"{len(styles) - MOST_SECTIONS} smaller sections"))
+    svg = stacked_bars(f"Bytes by section for {len(shown)} runs", bars)
+    notes = [f"{len(shown)} of {len(with_sections)} runs, spread evenly."] if len(shown) < len(with_sections) else []
+    if len(with_sections) < len(runs):
+        notes.append(f"{len(runs) - len(with_sections)} records list no sections.")
+    return Charts(
+        [Figure("Share of the file that each section takes; the bytes of the file at the right", svg)], legend, notes
+    )
+
+
+def sections_table(runs: Sequence[Run]) -> Table | None:
+    """Bytes by section, one column a run."""
+    styles = section_styles(runs)
+    if not styles:
+        return None
+    heads = ["section", *(run.label for run in runs)]
+    rows = [
+        row([name, *(f"{run.facts.file.sections[name]:,}" if name in run.facts.file.sections else numbers.MISSING
+                     for run in runs)])
+        for name in styles
+    ]  # fmt: skip
+    rows.append(row(["file", *(f"{run.facts.file.bytes:,}" for run in runs)], emphasis=True))
+    return Table("Bytes by section", columns(heads), rows)
+
+
+def single_sections_table(run: Run) -> Table | None:
+    """Bytes by section of one file, with bars."""
+    styles, size = section_styles([run]), run.facts.file.bytes
+    if not styles:
+        return None
+    largest = max(run.facts.file.sections.values()) or 1
+    rows = [
+        row([name, f"{b:,}", f"{b / size:.1%}", Cell("", share=b / largest, style=0)])
+        for name, b in sorted(run.facts.file.sections.items(), key=lambda item: styles[item[0]])
+    ]
+    rows.append(row(["file", f"{size:,}", "100.0%", ""], emphasis=True))
+    notes = []
+    total = sum(run.facts.file.sections.values())
+    if total != size:
+        notes.append(f"The sections sum to {total:,} bytes, the file has {size:,}.")
+    return Table("Bytes by section", columns(["section", "bytes", "share", ""]), rows, notes=notes, wide=True)
+
+
+def training_charts(runs: Sequence[Run]) -> tuple[Charts | None, list[str]]:
+    """Loss and primitive counts over the steps, one line for each different training; and what is missing."""
+    trainings: dict[object, list[Run]] = {}
+    for run in runs:
+        trainings.setdefault(log_path(run), []).append(run)
+    curves: list[tuple[str, TrainingCurves]] = []
+    missing: dict[str, list[str]] = {}
+    for path, group in trainings.items():
+        found = read_training(path)  # type: ignore[arg-type]
+        if found.missing is not None:
+            missing.setdefault(found.missing, []).append(group[0].label)
+            continue
+        rates = [run.facts.rate for run in group if run.facts.rate]
+        name = group[0].variant + (f" ({', '.join(rates)})" if rates and len(runs) > 1 else "")
+        curves.append((name, found))
+    notes = [f"{', '.join(names)}: {why}" for why, names in missing.items()]
+    if len(curves) > MOST_LINES:
+        notes.append(f"{MOST_LINES} of {len(curves)} trainings are drawn")
+        curves = curves[:MOST_LINES]
+    if not curves:
+        return None, notes
+    figures = _training_figures(curves)
+    damaged = sum(c.damaged for _, c in curves)
+    if damaged:
+        notes.append(f"{damaged} damaged lines of logs were passed over")
+    legend = [(swatch(i, marks=False), name) for i, (name, _) in enumerate(curves)] if len(curves) > 1 else []
+    return Charts(figures, legend), notes
+
+
+def _training_figures(curves: Sequence[tuple[str, TrainingCurves]]) -> list[Figure]:
+    stages = curves[0][1].stages if len(curves) == 1 else []
+    borders = [(float(step), f"stage {index + 1}") for step, index in stages[1:]]
+    figures = []
+    losses = [
+        Series(name, [Point(x, y) for x, y in c.loss if y > 0], i, marks=False) for i, (name, c) in enumerate(curves)
+    ]
+    if any(len(s.points) > 1 for s in losses):
+        chart = Chart("Training loss over steps", losses, "step", y_log=True, borders=borders)
+        figures.append(Figure("Training loss (logarithmic, means of neighbouring steps)", chart.draw()))
+    for key in ("num_gaussians", "num_anchors"):
+        lines = [
+            Series(name, [Point(x, y) for x, y in c.counts.get(key, [])], i, marks=False)
+            for i, (name, c) in enumerate(curves)
+        ]
+        if any(len(s.points) > 1 for s in lines):
+            unit = numbers.unit(key)
+            chart = Chart(f"Number of {unit} over steps", lines, "step", borders=borders)
+            figures.append(Figure(f"Number of {unit}", chart.draw()))
+    return figures
+
+
+def view_charts(runs: Sequence[Run]) -> Charts | None:
+    """PSNR and SSIM of every test view; views in the order of the record."""
+    shown = pick_evenly(runs, MOST_LINES)
+    figures = []
+    for metric in bd_metrics(shown)[:2]:
+        lines = []
+        for i, run in enumerate(shown):
+            scores = run.facts.metrics[metric].per_view if metric in run.facts.metrics else []
+            points = [
+                Point(float(j + 1), value, f"{run.label}, {name}: {numbers.score(metric, value, digits=3)}")
+                for j, (name, value) in enumerate(zip(run.facts.views, scores, strict=False))
+                if value is not None
+            ]
+            lines.append(Series(run.label, points, i, joined=len(shown) > 1))
+        if not any(line.points for line in lines):
+            continue
+        average = shown[0].mean(metric) if len(shown) == 1 else None
+        levels = [(average, f"mean {numbers.score(metric, average)}")] if average is not None else []
+        name = numbers.heading(metric)
+        figures.append(
+            Figure(
+                name.replace(" dB", ", dB"),
+                Chart(f"{name} of every test view", lines, "test view", levels=levels).draw(),
+            )
+        )
+    if not figures:
+        return None
+    legend = [(swatch(i), run.label) for i, run in enumerate(shown)] if len(shown) > 1 else []
+    notes = [f"{len(shown)} of {len(runs)} runs, spread evenly."] if len(shown) < len(runs) else []
+    return Charts(figures, legend, notes)
+
+
+def views_table(runs: Sequence[Run]) -> Table | None:
+    """Scores view by view: all metrics of one run, or the PSNR of several."""
+    first = runs[0]
+    if not first.facts.views:
+        return None
+    shown = pick_evenly(runs, MOST_BARS)
+    if len(runs) == 1:
+        names = [n for n in metric_names(runs) if first.facts.metrics[n].per_view]
+        parts = [(numbers.heading(n), n, first) for n in names]
+    else:
+        parts = [(run.label, "psnr", run) for run in shown if "psnr" in run.facts.metrics]
+    rows = []
+    for view in first.facts.views[:MOST_VIEWS_IN_TABLE]:
+        values = []
+        for _, metric, run in parts:
+            scores = run.facts.metrics[metric].per_view
+            j = run.facts.views.index(view) if view in run.facts.views else len(scores)
+            values.append(numbers.score(metric, scores[j] if j < len(scores) else None, digits=None))
+        rows.append(row([view, *values]))
+    notes = []
+    if len(first.facts.views) > MOST_VIEWS_IN_TABLE:
+        notes.append(f"The first {MOST_VIEWS_IN_TABLE} of {len(first.facts.views)} views.")
+    if any(v is None for _, m, run in parts for v in run.facts.metrics[m].per_view[: len(run.facts.views)]):
+        notes.append("A dash: the value is infinite, since render and photograph are identical.")
+    caption = "" if len(runs) == 1 else "PSNR in dB."
+    return Table("Scores of every view", columns(["view", *(name for name, _, _ in parts)]), rows, caption, notes)

@@ -1,0 +1,22 @@
+"""What this package provides: the command `sw report`, and the tables and pages that `sw run` ends with."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from splatwizard_core.plugins import Registry, hookimpl
+
+if TYPE_CHECKING:
+    from splatwizard_core.runs.observers import FinishedRuns
+
+
+@hookimpl
+def register_commands(registry: Registry) -> None:
+    registry.add("report", "sw_report.command:report", position=5.5, summary="tables, curves, BD-rates, one HTML page")
+
+
+@hookimpl
+def run_finished(runs: FinishedRuns) -> None:
+    from sw_report.after_run import report_finished
+
+    report_finished(runs)

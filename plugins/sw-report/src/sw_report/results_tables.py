@@ -1,0 +1,306 @@
+"""The tables of numbers: runs of one scene, means over data sets, BD values, settings."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from sw_report import numbers
+from sw_report.aggregate import DatasetTable
+from sw_report.blocks import Cell, Row, Table, columns, row
+from sw_report.distortion import BdCell, BdTable
+from sw_report.facts import RunFacts, clean
+from sw_report.runs import Run, machine
+
+
+def metric_names(runs: Iterable[Run], *, diagnostic: bool = False) -> list[str]:
+    """The metrics that some run has values of; those that only tell conventions apart if asked for."""
+    return numbers.ordered_metrics(
+        name
+        for run in runs
+        for name, metric in run.facts.metrics.items()
+        if (diagnostic or not metric.diagnostic) and (metric.mean is not None or metric.per_view)
+    )
+
+
+def missing_metrics(runs: Iterable[Run]) -> list[str]:
+    """Why metrics have no value, one line for each reason."""
+    reasons: dict[str, dict[str, None]] = {}
+    for run in runs:
+        for name in numbers.ordered_metrics(run.facts.metrics):
+            if run.mean(name) is None:
+                why = run.facts.unknown.get(f"metrics.{name}.mean", "the record gives no reason")
+                reasons.setdefault(why, {})[numbers.heading(name)] = None
+    return [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
+
+
+def runs_table(runs: Sequence[Run]) -> Table:
+    """One row a run: quality, size, times."""
+    names = metric_names(runs)
+    heads = [
+        "method", "rate", *map(numbers.heading, names), "MB", "primitives", "steps", "train s", "encode s", "decode s",
+        "FPS",
+    ]  # fmt: skip
+    rows = []
+    for run in runs:
+        facts = run.facts
+        cells: list[str | Cell] = [run.variant, facts.rate or numbers.MISSING]
+        for name in names:
+            value = run.mean(name)
+            why = facts.unknown.get(f"metrics.{name}.mean", "") if value is None else f"{value:.6f}"
+            cells.append(Cell(numbers.score(name, value), why))
+        train = facts.train
+        cells += [
+            Cell(numbers.megabytes(facts.file.bytes), f"{facts.file.bytes:,} bytes"),
+            numbers.counts(facts.counts),
+            numbers.count(train.steps),
+            Cell(numbers.seconds(train.with_pretraining_s), "with the training of scenes that it starts from"),
+            numbers.seconds(facts.codec.encode_s),
+            numbers.seconds(facts.codec.decode_s),
+            numbers.rate(facts.speed.fps),
+        ]
+        rows.append(row(cells))
+    views = {run.facts.test_views or len(run.facts.views) for run in runs}
+    caption = f"Means over {', '.join(map(str, sorted(views)))} test views."
+    notes = missing_metrics(runs)
+    if any("fit" in run.facts.flags for run in runs):
+        notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
+    if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
+        notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
+    return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes)
+
+
+def means_table(table: DatasetTable) -> Table:
+    """The data set's plain means over scenes."""
+    names = list(dict.fromkeys(name for r in table.rows for name in r.metrics))
+    heads = ["method", "rate", "scenes", *map(numbers.heading, names), "MB", "primitives"]
+    rows = []
+    for r in table.rows:
+        of = f"{len(r.scenes)} of {len(table.scenes)}"
+        where = f"missing: {', '.join(r.missing)}" if r.missing else "all scenes"
+        rows.append(
+            row(
+                [
+                    r.variant, r.rate or numbers.MISSING, Cell(of, where),
+                    *(numbers.score(name, r.metrics[name]) for name in names),
+                    numbers.megabytes(r.size), numbers.counts({k: round(v) for k, v in (r.counts or {}).items()}),
+                ]
+            )
+        )  # fmt: skip
+    return Table(
+        f"Means over {table.title}", columns(heads, text=("method", "rate")), rows,
+        f"Plain means over {', '.join(table.scenes)}.", means_notes(table),
+    )  # fmt: skip
+
+
+def means_notes(table: DatasetTable) -> list[str]:
+    """What a reader of the means must know: what is missing, and which protocols they come from."""
+    lacking: dict[tuple[str, tuple[str, ...], bool], list[str]] = {}
+    for r in table.rows:
+        if r.missing:
+            lacking.setdefault((r.variant, r.missing, r.size is None), []).append(r.rate or "")
+    notes = []
+    for (variant, missing, unknown), rates in lacking.items():
+        kind = "no mean" if unknown else "mean of what is there"
+        name = f"{variant} {', '.join(filter(None, rates))}".strip()
+        notes.append(f"{name}: {kind}, {_some(missing)} missing.")
+    if len(table.protocols) > 1:
+        notes.append(f"The scenes use different picture folders: {'; '.join(table.protocols)}.")
+    return notes
+
+
+def _some(names: Sequence[str], most: int = 6) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def bd_table(table: BdTable) -> Table:
+    """BD-rate and BD-quality of every method against the anchor."""
+    unit = "dB" if table.metric == "psnr" else numbers.heading(table.metric)
+    digits = 2 if table.metric == "psnr" else 4
+    rows = []
+    for r in table.rows:
+        rows.append(
+            row(
+                [r.variant, r.scene or "mean", _bd(r.rate, numbers.percent(r.rate.value)),
+                 _bd(r.quality, numbers.signed(r.quality.value, digits))],
+                emphasis=r.scene is None,
+            )
+        )  # fmt: skip
+    heads = ["method", "scene", f"BD-rate ({numbers.heading(table.metric).replace(' dB', '')}) %", f"BD gain, {unit}"]
+    marks = dict.fromkeys(
+        f"* {c.reason}" if c.value is not None else f"{numbers.MISSING} {r.variant}, {r.scene or 'mean'}: {c.reason}"
+        for r in table.rows for c in (r.rate, r.quality) if c.reason
+    )  # fmt: skip
+    return Table(
+        f"Against {table.anchor} by {numbers.heading(table.metric)}", columns(heads, text=("method", "scene")), rows,
+        f"Against {table.anchor}: rate at equal quality (negative saves), quality at equal rate (positive is better).",
+        list(marks),
+    )  # fmt: skip
+
+
+def _bd(cell: BdCell, text: str) -> Cell:
+    return Cell(text + (" *" if cell.value is not None and cell.reason else ""), cell.reason)
+
+
+def protocol_table(runs: Sequence[Run]) -> Table:
+    """The rules of each protocol, one column a protocol; rows in which they differ are marked."""
+    protocols = {run.facts.protocol.id: run.facts.protocol.rules() for run in runs}
+    names = list(dict.fromkeys(name for rules in protocols.values() for name in rules))
+    several = len(protocols) > 1
+    heads = ["rule", *protocols] + ["" for _ in range(several)]
+    rows = []
+    for name in names:
+        values = [plain(rules.get(name)) for rules in protocols.values()]
+        differ = len(set(values)) > 1
+        rows.append(
+            row([name.replace("_", " "), *values, *(["differs" if differ else ""] if several else [])], emphasis=differ)
+        )
+    return Table("Protocol", columns(heads, text=heads, long=list(protocols)), rows)
+
+
+def plain(value: Any) -> str:
+    """A value of a record as text."""
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, dict):
+        return clean(", ".join(f"{k} {plain(v)}" for k, v in value.items()))
+    if isinstance(value, (list, tuple)):
+        return clean(", ".join(plain(v) for v in value) or "none")
+    return clean(str(value))
+
+
+def environment_table(runs: Sequence[Run]) -> Table:
+    """Where it was measured: one column for each different environment."""
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(plain(dict(sorted(run.facts.environment.items(), key=lambda i: str(i[0])))), []).append(run)
+    chosen = [group[0].facts for group in groups.values()]
+    heads = ["", *(_who(group, len(runs)) for group in groups.values())]
+    names = list(dict.fromkeys(name for facts in chosen for name in facts.environment))
+    rows = [row(["machine", *map(machine, chosen)])]
+    for name in names:
+        if name == "packages":
+            packages = [facts.environment.get(name) for facts in chosen]
+            known = [p if isinstance(p, dict) else {} for p in packages]
+            for package in dict.fromkeys(str(key) for p in known for key in p):
+                rows.append(row([clean(package), *(plain(p.get(package)) for p in known)]))
+        else:
+            rows.append(row([name.replace("_", " "), *(plain(facts.environment.get(name)) for facts in chosen)]))
+    return Table("Environment", columns(heads, text=heads, long=heads[1:]), rows)
+
+
+def _who(group: Sequence[Run], total: int) -> str:
+    if len(group) == total:
+        return "all runs" if total > 1 else "this run"
+    return ", ".join(f"{run.facts.scene} {run.label}" for run in group[:3]) + (
+        f" and {len(group) - 3} more" if len(group) > 3 else ""
+    )
+
+
+def served_table(runs: Sequence[Run]) -> Table:
+    """Which rasterizer served which phase, and which distribution the method came from."""
+    groups: dict[tuple[str, ...], list[Run]] = {}
+    for run in runs:
+        facts = run.facts
+        phases = ["; ".join(f"{name} ({asked})" for asked, name in facts.rasterizers.get(phase, {}).items())
+                  for phase in ("train", "render")]  # fmt: skip
+        version = f", layout {facts.method_version}" if facts.method_version is not None else ""
+        source = f"{facts.distribution or 'unknown'}{version}"
+        groups.setdefault((run.variant, source, *(p or numbers.MISSING for p in phases)), []).append(run)
+    rows = []
+    for (variant, source, train, render), group in groups.items():
+        rows.append(row([variant, _who(group, len(runs)), source, train, render]))
+    heads = ["method", "runs", "distribution", "training drawn by", "evaluation drawn by"]
+    return Table("Served by", columns(heads, text=heads, long=heads[1:]), rows)
+
+
+def phases_table(runs: Sequence[Run]) -> Table | None:
+    """Who served each phase, by distribution; None if no record says so."""
+    groups: dict[tuple[str, str, str], list[Run]] = {}
+    for run in runs:
+        for phase in run.facts.phases:
+            served = "; ".join(f"{owner}: {', '.join(parts)}" for owner, parts in phase.by_distribution().items())
+            groups.setdefault((run.variant, phase.phase, served or numbers.MISSING), []).append(run)
+    if not groups:
+        return None
+    # The phases of one method stand together, however its runs differ.
+    ordered = sorted(groups.items(), key=lambda item: list(dict.fromkeys(r.variant for r in runs)).index(item[0][0]))
+    rows = [row([variant, _who(group, len(runs)), phase, served]) for (variant, phase, served), group in ordered]
+    heads = ["method", "runs", "phase", "provided by"]
+    return Table("Phases", columns(heads, text=heads, long=(heads[1], heads[3])), rows)
+
+
+def cost_table(facts: RunFacts) -> Table:
+    """Times and memory of one run."""
+    kind = {"rss": "growth of the resident set", "cuda": "CUDA allocator"}
+
+    def size(value: int | None, what: str | None) -> tuple[str, str]:
+        return (numbers.MISSING if value is None else f"{value / 1e6:,.0f} MB"), kind.get(what or "", "")
+
+    def time(value: float | None) -> str:
+        return numbers.MISSING if value is None else f"{numbers.seconds(value)} s"
+
+    speed, memory = facts.speed, facts.memory
+    latency = [numbers.MISSING if v is None else f"{v:.2f} ms" for v in (speed.latency_ms_median, speed.latency_ms_p95)]
+    drawn = "" if speed.image_size is None else f"at {speed.image_size[0]} × {speed.image_size[1]} px"
+    entries = [
+        ("training", time(facts.train.train_s), f"{numbers.count(facts.train.steps)} steps"),
+        ("training, with what it starts from", time(facts.train.with_pretraining_s), facts.train.started_from()),
+        ("training memory", *size(facts.train.peak_bytes, facts.train.memory_kind)),
+        ("encoding", time(facts.codec.encode_s), ""),
+        ("decoding", time(facts.codec.decode_s), "median, fresh process"),
+        ("rendering", f"{numbers.rate(speed.fps)} FPS", drawn),
+        ("latency", f"{latency[0]}", f"median; 95 % of frames under {latency[1]}"),
+        ("rendering memory", *size(memory.peak_render_bytes, memory.kind)),
+        ("model memory", *size(memory.model_bytes, memory.kind)),
+        ("visible primitives", numbers.count(facts.visible_gaussians), "mean over the test views"),
+    ]
+    shared = facts.train.trained_in
+    notes = [f"Training is shared with rate point {shared}."] if shared and shared != facts.rate else []
+    if any(value.startswith(numbers.MISSING) for _, value, _ in entries):
+        notes += [f"{name}: {why}" for name, why in facts.unknown.items() if not name.startswith("metrics.")]
+    heads = ["what", "measured", "how"]
+    return Table("Time and memory", columns(heads, text=("what", "how")), [row(e) for e in entries], notes=notes)
+
+
+def breakdown_table(facts: RunFacts) -> Table | None:
+    """Where the training time went, if it was profiled."""
+    parts = facts.train.breakdown_s
+    if not parts:
+        return None
+    total = sum(sum(stage.values()) for stage in parts.values()) or 1.0
+    rows: list[Row] = []
+    for stage, seconds in parts.items():
+        for name, value in seconds.items():
+            label = name if len(parts) == 1 else f"{stage}: {name}"
+            rows.append(row([label, numbers.seconds(value), f"{value / total:.1%}", Cell("", share=value / total)]))
+    return Table("Training time by part", columns(["part of a step", "s", "share", ""], text=[""]), rows, wide=True)
+
+
+def config_table(facts: RunFacts) -> Table | None:
+    """Every configured value of one run, and where it was set."""
+    if not facts.config:
+        return None
+    provenance = facts.config.get("provenance")
+    known = provenance if isinstance(provenance, dict) else {}
+    rows: list[Row] = []
+    for block, values in facts.config.items():
+        if block == "provenance":
+            continue
+        for key, value in _flat(values) if isinstance(values, dict) else [("", values)]:
+            name = f"{block}.{key}" if key and block != "config" else key or block
+            own = key if block in ("config", "pipeline", "scene") else name
+            rows.append(row([clean(name), plain(value), plain(known.get(own, "default"))]))
+    return Table("Configuration", columns(["key", "value", "set by"], text=["value", "set by"], long=["value"]), rows)
+
+
+def _flat(values: dict[str, Any], prefix: str = "", depth: int = 0) -> list[tuple[str, Any]]:
+    found: list[tuple[str, Any]] = []
+    for key, value in values.items():
+        name = f"{prefix}{key}"
+        found += _flat(value, f"{name}.", depth + 1) if isinstance(value, dict) and depth < 8 else [(name, value)]
+    return found

@@ -1,0 +1,90 @@
+"""What is read of records: of this release, of others, and of none."""
+
+import json
+from pathlib import Path
+
+import pytest
+from sw_report.facts import LONGEST_TEXT, clean, read_facts
+
+from splatwizard_core.errors import UserInputError
+
+
+def written(path: Path, content: object) -> Path:
+    path.write_text(json.dumps(content))
+    return path
+
+
+def test_a_record_of_today_is_read_without_remark(make_run):
+    facts, notes = read_facts(make_run("r3", size=5000) / "metrics.json")
+    assert notes == []
+    assert (facts.method, facts.rate, facts.scene, facts.file.bytes) == ("toy", "r3", "garden", 5000)
+    assert facts.train.steps == 300
+    assert facts.speed.fps == 12.5
+    assert facts.protocol.rules()["resolution"] == -1
+
+
+def test_an_older_record_is_read_and_its_schema_told(make_run):
+    def age(content):
+        content["schema_version"] = 1
+        for block, names in {"speed": ("jit_s", "load_s", "spread", "repeats"), "memory": ("peak_load_bytes",)}.items():
+            for name in names:
+                del content[block][name]
+
+    facts, notes = read_facts(make_run(change=age) / "metrics.json")
+    assert facts.speed.fps == 12.5
+    assert len(notes) == 1
+    assert notes[0].startswith("record of schema 1,")
+
+
+def test_a_newer_record_is_read_as_far_as_it_is_understood(make_run):
+    def renew(content):
+        content["schema_version"] = 99
+        content["hologram"] = {"depth": 3}
+        content["speed"] = {"fps": {"median": 12.0}}
+
+    facts, notes = read_facts(make_run(change=renew) / "metrics.json")
+    assert facts.speed.fps is None
+    assert facts.metrics["psnr"].mean > 20
+    assert notes[0].startswith("record of schema 99,")
+    assert notes[1] == "'speed' of its record is not understood and left out"
+
+
+@pytest.mark.parametrize("name", ["method", "scene", "protocol", "file", "metrics"])
+def test_what_is_indispensable_is_named_when_missing(make_run, name):
+    directory = make_run(change=lambda content: content.pop(name))
+    with pytest.raises(UserInputError, match=rf"metrics\.json: not a result record: {name}: Field required"):
+        read_facts(directory / "metrics.json")
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{", "not a result record"),
+        ("[1]", "it holds no object"),
+        ("[" * 200_000, "not a result record"),
+        ('{"method": NaN}', "not a result record: method"),
+        ("\ud800".encode("utf-8", "surrogatepass"), "not a result record"),
+    ],
+)
+def test_what_is_no_record_is_said_in_one_line(tmp_path, text, complaint):
+    path = tmp_path / "metrics.json"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    with pytest.raises(UserInputError, match=complaint) as error:
+        read_facts(path)
+    assert str(path) in str(error.value)
+    assert len(str(error.value).splitlines()) == 1
+
+
+def test_a_size_of_nothing_and_infinite_numbers_are_refused(make_run):
+    directory = make_run(change=lambda content: content["file"].update(bytes=0))
+    with pytest.raises(UserInputError, match=r"file\.bytes"):
+        read_facts(directory / "metrics.json")
+    directory = make_run("r2", change=lambda content: content["metrics"]["psnr"].update(mean=float("inf")))
+    with pytest.raises(UserInputError, match=r"metrics\.psnr\.mean"):
+        read_facts(directory / "metrics.json")
+
+
+def test_text_cannot_reorder_or_hide_what_stands_around_it():
+    assert clean("a\u202eb\x1b[2Jc\u200bd\n") == "a\ufffdb\ufffd[2Jc\ufffdd\ufffd"
+    assert clean("Gärten & <b>") == "Gärten & <b>"
+    assert len(clean("x" * 10_000)) == LONGEST_TEXT

@@ -1,0 +1,106 @@
+"""What `sw run` prints at its end."""
+
+import io
+
+import pytest
+from rich.console import Console
+from sw_report import results
+
+from splatwizard_core.runs.record import read_record
+
+
+def printed(done, width: int, monkeypatch: pytest.MonkeyPatch, *, terminal: bool = False, written=()) -> str:
+    out = Console(file=io.StringIO(), width=width, highlight=False, force_terminal=terminal, color_system=None)
+    monkeypatch.setattr(results, "console", lambda: out)
+    results.print_results(done, written)
+    return out.file.getvalue()
+
+
+@pytest.fixture
+def done(make_curve):
+    """Three methods at four rate points."""
+    directories = [*make_curve("toy"), *make_curve("lightgaussian", saving=0.5), *make_curve("other", saving=2.0)]
+    return [(read_record(directory / "metrics.json"), directory) for directory in directories]
+
+
+def rows(text: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.strip("│").split("│")] for line in text.splitlines() if line.startswith("│")]
+
+
+def test_one_table_with_a_section_for_each_method_and_the_best_marked(done, monkeypatch):
+    text = printed(done, 160, monkeypatch)
+    table = rows(text)
+    assert [row[0] for row in table] == ["toy", "", "", "", "lightgaussian", "", "", "", "other", "", "", ""]
+    assert [row[1] for row in table] == ["r1", "r2", "r3", "r4"] * 3
+    assert text.count("├") == 2
+    sizes = [row[4] for row in table]
+    assert [i for i, size in enumerate(sizes) if size.startswith("*")] == [4]
+    # The same quality thrice: all three of the best are marked.
+    assert [i for i, row in enumerate(table) if row[2].startswith("*")] == [3, 7, 11]
+    assert not any(row[-1].startswith("*") for row in table)  # equally fast: nothing is best
+    assert "* best of its column" in text
+
+
+def test_rate_points_of_one_method_are_not_marked(make_curve, monkeypatch):
+    done = [(read_record(d / "metrics.json"), d) for d in make_curve()]
+    text = printed(done, 160, monkeypatch)
+    assert "*" not in text
+    assert "BD-rate" not in text
+
+
+def test_bd_rates_against_the_usual_anchor(done, monkeypatch):
+    text = printed(done, 160, monkeypatch)
+    assert "BD-rate against lightgaussian by PSNR (negative saves): other +300.0 %, toy +100.0 %" in text
+
+
+@pytest.mark.parametrize("width", [60, 80, 100, 120])
+def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(done, monkeypatch, width):
+    text = printed(done, width, monkeypatch)
+    assert all(len(line) <= width for line in text.splitlines() if line[:1] in "┏┃│├└")
+    assert "…" not in text
+    assert all(len(row[0]) in (0, 3, 5, 13) for row in rows(text))
+    assert ("no room for" in text) == (width < 100)
+    heads = text.partition("┡")[0]
+    assert "PSNR" in heads
+    assert "MB" in heads
+
+
+def test_the_curves_are_drawn_on_a_terminal_alone(done, monkeypatch):
+    assert "●" not in printed(done, 100, monkeypatch)
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
+    text = printed(done, 100, monkeypatch, terminal=True)
+    assert "● lightgaussian   ■ other   ▲ toy" in text
+    assert "file size, MB (logarithmic)" in text
+    monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
+    assert "o lightgaussian   x other   v toy" in printed(done, 100, monkeypatch, terminal=True)
+
+
+def test_many_records_are_told_in_one_line(done, monkeypatch, tmp_path):
+    text = printed(done, 160, monkeypatch, written=[tmp_path / "out/garden/rd.svg"])
+    assert f"12 records: {tmp_path}/out/garden/<method>/<rate>/metrics.json" in text
+    assert text.rstrip().endswith("rd.svg")
+    few = printed(done[:2], 160, monkeypatch)
+    assert few.count("/metrics.json") == 2
+
+
+def test_the_seconds_of_what_a_method_starts_from_count_and_are_said(make_run, monkeypatch):
+    scene = {"file": {}, "preset": "quick", "config": {}, "steps": 9, "train_s": 1800.0, "made_by": {}}
+
+    def pruned(content):
+        content["train"] = {**content["train"], "pretraining": {"3dgs": scene}, "with_pretraining_s": 1860.0}
+
+    def given(content):
+        unknown = dict.fromkeys(("preset", "config", "steps", "train_s"))
+        given_scene = {**scene, **unknown, "file": {"name": "a.ply", "sha256": "00"}}
+        content["train"] = {**content["train"], "pretraining": {"3dgs": given_scene}, "with_pretraining_s": None}
+        content["unknown"] = {**content["unknown"], "train.with_pretraining_s": "the 3dgs scene came from a file"}
+
+    done = []
+    for method, change in (("pruned", pruned), ("given", given)):
+        directory = make_run(method=method, change=change)
+        done.append((read_record(directory / "metrics.json"), directory))
+    text = printed(done, 160, monkeypatch)
+    assert "1860.0" in text
+    assert "train s of pruned: with that of the 3dgs scene that it starts from" in text
+    assert "train s of given is not known: the 3dgs scene came from a file" in text
+    assert "train s of given: with" not in text

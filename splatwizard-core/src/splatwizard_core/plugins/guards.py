@@ -1,0 +1,66 @@
+"""Hook implementations of a plugin, each wrapped so that one that fails harms nobody but its own plugin."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Generator, Iterable
+from contextlib import AbstractContextManager
+from types import SimpleNamespace
+from typing import Any
+
+import pluggy
+
+from splatwizard_core.errors import PluginError
+
+Guard = Callable[[str, Iterable[Any]], AbstractContextManager[None]]
+"""(hook, arguments) -> a context that takes any exception of the implementation."""
+
+
+def guarded_hooks(module: Any, manager: pluggy.PluginManager, guard: Guard) -> SimpleNamespace:
+    """What pluggy finds in `module`, under the same names and with the same options, each call inside `guard`."""
+    found = SimpleNamespace()
+    for name in dir(module):
+        options = manager.parse_hookimpl_opts(module, name)
+        if options is None:
+            continue
+        wraps = options.get("wrapper") or options.get("hookwrapper")
+        protect = _guarded_wrapper if wraps else _guarded
+        setattr(found, name, protect(getattr(module, name), options.get("specname") or name, guard))
+    return found
+
+
+def _guarded(function: Callable[..., Any], hook: str, guard: Guard) -> Callable[..., Any]:
+    @functools.wraps(function)  # pluggy reads options and argument names off it
+    def call(*arguments: Any, **keywords: Any) -> Any:
+        with guard(hook, [*arguments, *keywords.values()]):
+            return function(*arguments, **keywords)
+
+    return call
+
+
+def _guarded_wrapper(function: Callable[..., Any], hook: str, guard: Guard) -> Callable[..., Any]:
+    @functools.wraps(function)
+    def call(*arguments: Any, **keywords: Any) -> Generator[None, Any, Any]:
+        inner = None
+        with guard(hook, [*arguments, *keywords.values()]):
+            inner = function(*arguments, **keywords)
+            next(inner)
+        failed = inner is None or inspect.getgeneratorstate(inner) != inspect.GEN_SUSPENDED
+        result = yield  # what the other implementations return
+        if failed:
+            return result
+        with guard(hook, ()):
+            try:
+                inner.send(result)
+            except StopIteration as end:
+                return end.value
+        return result
+
+    return call
+
+
+def one_line(error: BaseException) -> str:
+    """An exception as one line: its own text for an error that is meant for users, else with its type before it."""
+    reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
+    return " ".join(reason.split())

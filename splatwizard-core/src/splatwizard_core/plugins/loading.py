@@ -1,0 +1,57 @@
+"""From entry points to plugin modules: which are installed, and whether what they need is there."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from dataclasses import dataclass
+
+from packaging.requirements import InvalidRequirement, Requirement
+
+from splatwizard_core.plugins.catalogue import normal_name
+
+
+@dataclass
+class PluginInfo:
+    """One installed distribution that has a `splatwizard` entry point.
+
+    key     name of its entry point
+    error   why it could not be loaded, or None
+    """
+
+    key: str
+    distribution: str
+    version: str
+    module: str
+    error: str | None = None
+
+
+def plugin_info(entry_point: importlib.metadata.EntryPoint) -> PluginInfo:
+    """What is known of a plugin before it is imported."""
+    dist = entry_point.dist
+    name, version = (dist.metadata["Name"], dist.version) if dist else (entry_point.name, "")
+    return PluginInfo(entry_point.name, name, version, entry_point.value)
+
+
+def names_of(entry_point: importlib.metadata.EntryPoint) -> set[str]:
+    """What a user may call a plugin: its entry point, its distribution; normalised."""
+    dist = entry_point.dist
+    return {normal_name(name) for name in (entry_point.name, dist.metadata["Name"] if dist else None) if name}
+
+
+def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | None:
+    """The first dependency of `dist` that is not installed, or not in a version that it takes, with the cure."""
+    for text in (dist.requires if dist else None) or []:
+        try:
+            requirement = Requirement(text)
+        except InvalidRequirement:
+            continue
+        if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
+            continue
+        try:
+            version = importlib.metadata.version(requirement.name)
+        except importlib.metadata.PackageNotFoundError:
+            return f"needs {requirement.name}, which is not installed: pip install {requirement.name}"
+        if not requirement.specifier.contains(version, prereleases=True):
+            wanted = f"{requirement.name}{requirement.specifier}"
+            return f"needs {wanted}, but {version} is installed: pip install '{wanted}'"
+    return None

@@ -1,0 +1,235 @@
+"""The result record, metrics.json: what every table is made from. A versioned schema; unknown values are null.
+
+A value that is null has its reason in `unknown`, by dotted name; no value is ever 0 for "not measured".
+Source: evaluation protocol, result record.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from splatwizard_core.errors import UserInputError
+from splatwizard_core.files import write_atomic
+from splatwizard_core.runs.record_versions import upgraded
+
+SCHEMA: Literal[3] = 3
+FILE_NAME = "metrics.json"
+
+
+class Part(BaseModel):
+    """Base of the record's blocks: nothing unknown, nothing that is not a number."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class ProtocolBlock(Part):
+    """What makes results comparable: only equal ids may stand in one table. Rules that came later may stand beside."""
+
+    model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
+
+    id: str
+    dataset: str
+    images: str = Field(description="picture folder")
+    resolution: int = Field(description="-1 (1600 px rule), 1, 2, 4, 8, or a width in pixels")
+    split: str
+    background: str
+    principal_point: str
+    quantize8: bool = Field(description="renders were rounded to 8 bit before comparing")
+
+
+class MetricBlock(Part):
+    """One image metric over the test views."""
+
+    mean: float | None
+    per_view: list[float | None] = Field(description="in the order of `views`; null: not finite, as `unknown` says")
+    direction: Literal["higher", "lower"]
+    diagnostic: bool = Field(False, description="computed to tell conventions apart, not for tables")
+    made_with: dict[str, str] = Field({}, description="what else the values depend on: versions, weights, checksums")
+
+
+class SpreadBlock(Part):
+    """How much repeated measurements of one thing differ."""
+
+    n: int = Field(ge=2, description="measurements")
+    mean: float
+    std: float = Field(description="of the sample (n - 1)")
+    min: float
+    max: float
+
+
+class SpeedBlock(Part):
+    """Rendering, by the FPS protocol, of the model decoded from the file."""
+
+    fps: float
+    latency_ms_median: float
+    latency_ms_p95: float
+    jit_s: float | None = Field(description="loading or compiling native modules, before everything else")
+    prepare_s: float = Field(description="view-independent caches, built once, not in `fps`")
+    load_s: float | None = Field(description="from opening the file to the first frame; without `jit_s`")
+    frames: int = Field(description="measured, over all repeats")
+    rounds: int = Field(description="over all views, in each repeat")
+    repeats: int
+    views: int
+    warmup_frames: int
+    spread: dict[str, SpreadBlock] | None = Field(description="of fps and the latencies over the repeats")
+    image_size: tuple[int, int] = Field(description="width, height of the first view drawn")
+
+
+class MemoryBlock(Part):
+    """Bytes; `kind` says what was measured: "cuda" (torch's allocator) or "rss" (growth of the resident set)."""
+
+    kind: Literal["cuda", "rss"]
+    model_bytes: int = Field(description="held after the model was decoded and prepared")
+    peak_load_bytes: int | None = Field(description="peak from opening the file to the decoded model")
+    peak_render_bytes: int = Field(description="peak over the measured frames, the model included")
+    peak_reserved_bytes: int | None = None
+
+
+class StageBlock(Part):
+    """One training stage, or what a stage started from."""
+
+    name: str
+    seconds: float
+
+
+class PretrainingBlock(Part):
+    """The trained scene of another method that a training started from, or was taught by."""
+
+    file: dict[str, str] = Field(description="name and sha256 of the .ply that it came from; empty: trained here")
+    preset: str | None
+    config: dict[str, Any] | None = Field(description="every value of the method that trained it")
+    steps: int | None
+    train_s: float | None = Field(description="with what it started from itself")
+    made_by: dict[str, str] = Field(description="distribution -> version")
+
+
+class TrainBlock(Part):
+    """Training: wall clock of the loop without evaluation, checkpoints and loading."""
+
+    train_s: float | None
+    stages: list[StageBlock]
+    with_pretraining_s: float | None = Field(description="with the training of the scenes it starts from")
+    pretraining: dict[str, PretrainingBlock] | None = Field(description="method -> its scene that this one used")
+    steps: int | None
+    peak_bytes: int | None = Field(description="over the loop; without evaluation and checkpoints since schema 2")
+    memory_kind: Literal["cuda", "rss"] | None
+    pictures_in: str | None = Field(description="where the training pictures lay: host, cuda")
+    breakdown_s: dict[str, dict[str, float]] | None = Field(
+        description="stage -> part of a step -> seconds, if profiled"
+    )
+    trained_in: str | None = Field(description="rate point whose training this one shares (its own, as a rule)")
+
+
+class CodecBlock(Part):
+    """Encoding and decoding, wall clock, device synchronised."""
+
+    encode_s: float | None
+    decode_s: float = Field(description="median of the timed decodes")
+    decode_runs_s: list[float]
+    decode_spread: SpreadBlock | None
+    first_decode_s: float = Field(description="the untimed decode before them: late imports included")
+    jit_s: float | None = Field(description="loading or compiling native modules, before all decodes")
+    peak_decode_bytes: int
+    memory_kind: Literal["cuda", "rss"]
+
+
+class RecordFile(Part):
+    """The encoded file."""
+
+    bytes: int = Field(gt=0, description="size of the single file")
+    sha256: str
+    sections: dict[str, int] = Field(description="bytes by section, header included; they sum to `bytes`")
+    digest: str = Field(description="SHA-256 of the decoded model, equal in the decoding and the evaluating process")
+
+
+class ProvidedBlock(Part):
+    """Who served: a registered thing by its kind and name, a training `stage`, or a `task` of another package."""
+
+    kind: str
+    name: str
+    distribution: str = Field(description="pip distribution; empty: of none that is installed")
+    version: str
+
+
+class PhaseBlock(Part):
+    """One phase of a run."""
+
+    phase: str = Field(description='"train: NAME" (a stage), "train" (asked for before the first), "encode", "render"')
+    provided_by: list[ProvidedBlock]
+
+
+class Record(Part):
+    """One scene, one method, one rate point, one file."""
+
+    schema_version: Literal[3] = SCHEMA
+    method: str
+    method_version: int
+    distribution: str = Field(description="pip distribution and version that the method comes from")
+    preset: str | None
+    rate: str | None
+    config: dict[str, Any] | None = Field(description="every value, by block, and where each was set")
+    config_hash: str | None
+    dataset: str
+    scene: str
+    protocol: ProtocolBlock
+    train_views: int
+    test_views: int
+    views: list[str] = Field(description="names of the test views")
+    metrics: dict[str, MetricBlock]
+    file: RecordFile
+    counts: dict[str, int] = Field(description="num_gaussians, num_anchors, ... after decoding")
+    visible_gaussians: float = Field(description="mean over the test views of those with radius > 0")
+    codec: CodecBlock
+    speed: SpeedBlock
+    memory: MemoryBlock
+    train: TrainBlock
+    geometry: dict[str, float] | None = None
+    plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
+    rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
+    phases: list[PhaseBlock] | None = Field(description="who served each phase, with distribution and version")
+    environment: dict[str, Any]
+    flags: list[str] = Field(description="fit, rss, ...")
+    unknown: dict[str, str] = Field(description="dotted name of each null -> why")
+    date: str = Field(description="ISO 8601, UTC")
+
+    def write(self, path: Path) -> None:
+        """Write it, atomically."""
+        write_atomic(path, self.model_dump_json(indent=2) + "\n")
+
+
+def read_record(path: Path) -> Record:
+    """A record from its file, of this schema or an older one. Raises UserInputError that names what is wrong first."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise UserInputError(f"{path}: cannot be read: {error}") from error
+    try:
+        return Record.model_validate_json(upgraded(text))
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(map(str, first["loc"])) or "the file"
+        raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {where}: {first['msg']}") from None
+
+
+def missing_reasons(record: Record) -> list[str]:
+    """Dotted names of values that are null without a reason; a valid record has none."""
+    found: list[str] = []
+
+    def walk(value: Any, name: str) -> None:
+        if value is None and name not in record.unknown:
+            found.append(name)
+        elif isinstance(value, dict):
+            for key, inner in value.items():
+                walk(inner, f"{name}.{key}" if name else key)
+
+    content = record.model_dump()
+    for free in ("config", "environment", "unknown", "flags", "plan"):  # what they hold is described elsewhere
+        if content.get(free) is not None:
+            content.pop(free)
+    for scene in (content["train"]["pretraining"] or {}).values():
+        scene.update(config={} if scene["config"] is not None else None)
+    walk(content, "")
+    return found

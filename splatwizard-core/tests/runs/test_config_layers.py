@@ -1,0 +1,303 @@
+"""Configuration: the order of its layers, the parsing of text, and what is said of typos."""
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field
+
+from splatwizard_core.errors import ConfigError, PluginError
+from splatwizard_core.method import Method, create_method
+from splatwizard_core.runs.config import apply_overrides, parse_set, rate_points, resolve
+from splatwizard_core.runs.values import parse_text
+from splatwizard_core.training.params import OptimizationParams, Params
+
+
+class Densify(Params):
+    grad_threshold: float = Field(2e-4, gt=0, description="NDC units")
+    screen_px: float | None = 20.0
+
+
+class Codec(Params):
+    mode: Literal["exact", "quantized"] = "exact"
+    bits: dict[str, int] = {"means": 16}
+
+
+class Config(OptimizationParams):
+    steps: list[int] = [1, 2]
+    densify: Densify = Densify()
+    codec: Codec = Codec()
+
+
+class Toy(Method):
+    name = "toy"
+    Config = Config
+    PRESETS = {"paper": {}, "quick": {"iterations": 100, "clamp_render": True}}
+    RATES = {
+        "r1": {"codec.mode": "quantized", "codec.bits.means": 8},
+        "r2": {"codec.mode": "quantized"},
+        "r3": {},
+    }
+    DEFAULT_RATE = "r3"
+
+
+def resolved(*sets: str, **options: Any):
+    return resolve(
+        Toy,
+        options.pop("preset", None),
+        options.pop("rate", None),
+        options.pop("file", None),
+        parse_set(sets),
+        **options,
+    )
+
+
+def test_each_layer_wins_over_the_one_before(tmp_path: Path):
+    file = tmp_path / "c.toml"
+    file.write_text("iterations = 200\n[densify]\ngrad_threshold = 0.5\n")
+    assert resolved(scene="x").config.iterations == 30_000
+    assert resolved(scene="x", preset="quick").config.iterations == 100
+    assert resolved(scene="x", preset="quick", file=file).config.iterations == 200
+    both = resolved("iterations=300", scene="x", preset="quick", rate="r1", file=file)
+    assert both.config.iterations == 300
+    assert both.config.densify.grad_threshold == 0.5
+    assert both.config.codec.bits == {"means": 8}
+    assert both.provenance["iterations"] == "--set"
+    assert both.provenance["densify.grad_threshold"] == str(file)
+    assert both.provenance["codec.mode"] == "rate 'r1'"
+    assert both.provenance["clamp_render"] == "preset 'quick'"
+
+
+def test_the_demo_scene_means_the_quick_preset_and_any_other_the_paper():
+    assert resolved().preset == "quick"
+    assert resolved(scene="demo:tiny").preset == "quick"
+    assert resolved(scene="garden").preset == "paper"
+    assert resolved(preset="paper").preset == "paper"
+
+
+def test_keys_go_to_method_run_and_scene_options():
+    found = resolved(
+        "densify.screen_px=none", "raster.prefer=a,b", "seed=7", "resolution=4", "test_every=5", "split=all"
+    )
+    assert found.config.densify.screen_px is None
+    assert found.ppl.raster.prefer == ["a", "b"]
+    assert found.ppl.seed == found.scene.seed == 7
+    assert (found.scene.resolution, found.scene.test_every, found.scene.split) == (4, 5, "all")
+
+
+def test_the_written_file_makes_the_same_configuration(tmp_path: Path):
+    first = resolved(
+        "densify.screen_px=none", "steps=3,4,5", "background=white", rate="r1", preset="quick", scene="demo:tiny"
+    )
+    file = tmp_path / "config.toml"
+    file.write_text(first.toml())
+    again = resolve(Toy, config_file=file)
+    assert {**again.as_dict(), "provenance": None} == {**first.as_dict(), "provenance": None}
+    assert again.scene_spec == first.scene_spec
+    assert again.config_hash() == first.config_hash()
+    assert again.training_hash() == first.training_hash()
+
+
+class Rate(Params):
+    weight: float = 0.001
+
+
+class HidesTheRate(OptimizationParams):
+    rate: Rate = Rate()
+
+
+class HidesMore(OptimizationParams):
+    seed: int = 0
+    images: str = ""
+    pretrained: Rate = Rate()
+    init: str = ""  # this one a method may have: it means its own
+
+
+@pytest.mark.parametrize(
+    ("config", "names"), [(HidesTheRate, "'rate'"), (HidesMore, "'seed' and 'images' and 'pretrained'")]
+)
+def test_a_method_whose_keys_hide_those_of_a_run_is_refused_by_name(config: type[OptimizationParams], names: str):
+    class TheirMethod(Method):
+        name = "theirs"
+        Config = config
+
+    with pytest.raises(PluginError) as caught:
+        resolve(TheirMethod)
+    assert str(caught.value) == (
+        f"method 'theirs' cannot be used: its {config.__name__} ({__name__}) has a key {names}, as every run has; "
+        "its author must choose another name"
+    )
+
+
+def test_a_written_file_refuses_another_rate_point_instead_of_ignoring_it(tmp_path: Path):
+    file = tmp_path / "config.toml"
+    file.write_text(resolved(rate="r1").toml())
+    with pytest.raises(ConfigError, match=r"written for rate 'r1', not 'r2'"):
+        resolved(rate="r2", file=file)
+
+
+def test_rate_points_that_differ_only_in_the_codec_train_alike():
+    hashes = {resolved(rate=r).training_hash() for r in ("r1", "r2", "r3")}
+    assert len(hashes) == 1
+    assert len({resolved(rate=r).config_hash() for r in ("r1", "r2", "r3")}) == 3
+    assert resolved("iterations=5").training_hash() not in hashes
+    assert resolved("seed=1").training_hash() not in hashes
+    assert resolved("background=white").training_hash() not in hashes
+
+
+def test_rate_aliases():
+    assert rate_points(Toy, "low") == ["r1"]
+    assert rate_points(Toy, "high") == ["r3"]
+    assert rate_points(Toy, "default") == ["r3"]
+    assert rate_points(Toy, "all") == ["r1", "r2", "r3"]
+    assert rate_points(Toy, "r3, r1,low") == ["r1", "r3"]
+    with pytest.raises(ConfigError, match="no rate point 'r9': one of r1, r2, r3, or low"):
+        rate_points(Toy, "r9")
+
+
+@pytest.mark.parametrize(
+    ("setting", "message"),
+    [
+        (
+            "densify.grad_treshold=1",
+            "unknown key 'densify.grad_treshold' in --set: did you mean 'densify.grad_threshold'?",
+        ),
+        ("grad_threshold=1", "did you mean 'densify.grad_threshold'"),
+        ("iteration=1", "did you mean 'iterations'"),
+        ("resolutoin=1", "did you mean 'resolution'"),
+        ("seeed=1", "did you mean 'seed'"),
+        ("qqq=1", r"unknown key 'qqq' in --set: the keys are .*densify"),
+        ("densify.grad_threshold=-1", r"bad value '-1' for 'densify.grad_threshold' in --set: must be greater than 0"),
+        ("densify.grad_threshold=x", r"bad value 'x' for 'densify.grad_threshold' in --set: expected a number"),
+        ("densify.grad_threshold=inf", "must be a finite number"),
+        ("densify.grad_threshold=nan", "bad value 'nan' for 'densify.grad_threshold' in --set"),
+        ("iterations=0", r"bad value '0' for 'iterations' in --set: must be greater than or equal to 1"),
+        ("iterations=1.5", "expected a whole number"),
+        ("codec.mode=lossy", "expected one of exact, quantized"),
+        ("densify=1", "this is a block"),
+        ("device=gpu", "expected one of auto, cpu, cuda"),
+        ("resolution=big", "expected a whole number"),
+    ],
+)
+def test_wrong_input_is_named_with_what_to_do(setting: str, message: str):
+    with pytest.raises(ConfigError, match=message) as caught:
+        resolved(setting)
+    assert caught.value.exit_status == 2
+    assert "\n" not in str(caught.value)
+
+
+def test_set_needs_an_equals_sign():
+    with pytest.raises(ConfigError, match="--set needs key=value, got 'iterations'"):
+        parse_set(["iterations"])
+
+
+def test_an_unknown_preset_lists_those_there_are():
+    with pytest.raises(ConfigError, match="no preset 'fast': one of paper, quick"):
+        resolved(preset="fast")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("iterations = ", "not valid TOML"),
+        ("iteration = 3", r"unknown key 'iteration' in .*c.toml: did you mean 'iterations'"),
+        ("[densify]\ngrad_treshold = 1", r"unknown key 'densify.grad_treshold' in .*c.toml"),
+        ("iterations = 'many'", r"bad value 'many' for 'iterations' in .*c.toml"),
+        ("method = 5", r"bad value 5 for 'method' in .*c.toml: expected a name"),
+        ("rate = ['r1']", r"bad value \['r1'\] for 'rate' in .*c.toml: expected a name"),
+        ("scene = ''", r"bad value '' for 'scene' in .*c.toml: expected a name"),
+        ("method = 'other'", r"written for method 'other', not 'toy'"),
+    ],
+)
+def test_a_wrong_file_is_named(tmp_path: Path, content: str, message: str):
+    file = tmp_path / "c.toml"
+    file.write_text(content)
+    with pytest.raises(ConfigError, match=message):
+        resolved(file=file)
+
+
+def test_a_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(ConfigError, match=r"nothing\.toml"):
+        resolved(file=tmp_path / "nothing.toml")
+
+
+class Colour(Enum):
+    RED = "red"
+
+
+@pytest.mark.parametrize(
+    ("annotation", "text", "value"),
+    [
+        (bool, "yes", True), (bool, "0", False), (int, "30_000", 30_000), (int, "3e4", 30_000), (float, "1e-3", 1e-3),
+        (float | None, "none", None), (float | None, "2", 2.0), (str | None, "none", None), (str, "none", "none"),
+        (list[int], "1,2", [1, 2]), (list[int], "[1, 2]", [1, 2]), (list[str], "", []),
+        (list[str], "['a', b]", ["a", "b"]),
+        (tuple[int, str], "1,a", [1, "a"]), (tuple[float, ...], "1,2,3", [1.0, 2.0, 3.0]),
+        (list[tuple[int, int]], "(1,2),(3,4)", [[1, 2], [3, 4]]),
+        (Literal["a", 3], "3", 3), (Colour, "red", Colour.RED), (Colour, "RED", Colour.RED),
+        (Annotated[int | str, "x"], "5", 5), (int | str, "five", "five"), (dict[str, int], '{"a": 1}', {"a": 1}),
+        (Any, "[1]", [1]), (Any, "word", "word"),
+    ],
+)  # fmt: skip
+def test_text_is_parsed_by_the_fields_type(annotation: Any, text: str, value: Any):
+    assert parse_text(annotation, text) == value
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False), st.integers(), st.lists(st.integers(), max_size=5))
+def test_what_python_prints_is_parsed_back(x: float, n: int, numbers: list[int]):
+    assert parse_text(float, repr(x)) == x
+    assert parse_text(int, str(n)) == n
+    assert parse_text(list[int], str(numbers)) == numbers
+
+
+def test_overrides_leave_the_original_alone():
+    config = Config()
+    changed = apply_overrides(config, {"densify.grad_threshold": 1.0, "codec.bits.sh": 4}, source="test")
+    assert changed.densify.grad_threshold == 1.0
+    assert changed.codec.bits == {"means": 16, "sh": 4}
+    assert config == Config()
+
+
+def test_a_borrowed_preset_leaves_the_keys_of_the_run_to_the_run():
+    class Registry:
+        def load(self, name: str) -> type[Method]:
+            return Borrowed
+
+    class Manager:
+        methods = Registry()
+
+    class Borrowed(Toy):
+        PRESETS = {"paper": {}, "quick": {}, "old": {"clamp_render": True, "test_every": 4, "iterations": 77}}
+
+    assert create_method(Manager(), "toy", preset="old").config.iterations == 77  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="clamp_render"):
+        create_method(Manager(), "toy", {"clamp_render": True})  # type: ignore[arg-type]
+
+
+class Borrowing(OptimizationParams):
+    ENCODING = ("file", "order")
+    base: dict[str, Any] = {}
+    file: Codec = Codec()
+    order: str = "morton"
+
+
+class Borrower(Method):
+    name = "borrower"
+    Config = Borrowing
+
+
+def test_keys_of_a_borrowed_method_go_as_deep_as_it_has_blocks():
+    sets = {"base.densify.start": "600", "base.preset": "inria", "base.lr.means.init": "1.5e-4"}
+    assert resolve(Borrower, sets=sets).config.base == {
+        "densify": {"start": 600}, "preset": "inria", "lr": {"means": {"init": 1.5e-4}},
+    }  # fmt: skip
+
+
+def test_a_method_says_which_fields_only_its_encoder_reads():
+    plain = resolve(Borrower)
+    for sets in ({"file.mode": "quantized"}, {"order": "hilbert"}):
+        assert resolve(Borrower, sets=sets).training_hash() == plain.training_hash()
+    assert resolve(Borrower, sets={"base.densify.start": "600"}).training_hash() != plain.training_hash()

@@ -1,0 +1,93 @@
+"""What a method of Gaussians need not say itself: its file, by a codec that is asked for in time, and its start."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from pydantic import Field
+
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.plugins.registry import Registry
+from splatwizard_core.runs.gaussian_method import GaussianMethod
+from splatwizard_core.training.params import OptimizationParams
+
+SHAPES = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (0, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
+
+
+class ToyCodec:
+    """A codec of Gaussians: one array for each tensor."""
+
+    def __init__(self, plugins):
+        pass
+
+    def encode(self, model, writer):
+        for name in SHAPES:
+            writer.add_array(name, getattr(model, name).detach().numpy())
+
+    def decode(self, reader):
+        arrays = {name: reader.array(name, dtype="<f4").astype(np.float32) for name in SHAPES}
+        return GaussianModel.from_tensors(**{name: torch.from_numpy(array) for name, array in arrays.items()})
+
+
+class ToyConfig(OptimizationParams):
+    codec: str = Field("toy-codec", description="codec of the file")
+
+
+class Toy(GaussianMethod):
+    name = "toy"
+    Config = ToyConfig
+
+
+@pytest.fixture
+def plugins():
+    coders = Registry("coder")
+    coders.add("toy-codec", f"{__name__}:ToyCodec", summary="", codes="gaussians")
+    coders.add("range", f"{__name__}:NoSuchClass", summary="an entropy coder")
+    return SimpleNamespace(coders=coders)
+
+
+@pytest.fixture
+def model():
+    g = torch.Generator().manual_seed(0)
+    return GaussianModel(*(torch.randn(5, *shape, generator=g) for shape in SHAPES.values()))
+
+
+def written(plugins, model) -> ContainerReader:
+    writer = ContainerWriter(Toy.name, Toy.version)
+    Toy(plugins, ToyConfig()).encode(model, writer)
+    return ContainerReader(writer.to_bytes(), "file.swz")
+
+
+def test_the_codec_of_the_config_writes_the_file_which_says_so(plugins, model):
+    reader = written(plugins, model)
+    assert reader.static["codec"] == "toy-codec"
+    decoded = Toy(plugins, None).decode(reader)
+    for (name, ours), (_, theirs) in zip(model.named_parameters(), decoded.named_parameters(), strict=True):
+        assert torch.equal(ours, theirs), name
+
+
+@pytest.mark.parametrize("codec", ["zip", "range"])
+def test_a_codec_that_is_not_one_of_gaussians_is_told_before_anything_is_trained(plugins, codec):
+    with pytest.raises(ConfigError, match=f"'{codec}'; installed: toy-codec") as told:
+        Toy(plugins, ToyConfig(codec=codec))
+    assert told.value.key == "codec"
+
+
+def test_another_layout_version_is_refused(plugins, model):
+    reader = written(plugins, model)
+    reader.version = 7
+    with pytest.raises(BitstreamError, match=r"version 7.*upgrade sw-toy"):
+        Toy(plugins, None).decode(reader)
+
+
+def test_what_is_no_set_of_gaussians_is_no_file(plugins):
+    with pytest.raises(TypeError, match="toy encodes a GaussianModel"):
+        written(plugins, torch.nn.Linear(1, 1))
+
+
+def test_a_method_without_a_start_of_its_own_refuses_points(plugins):
+    with pytest.raises(SceneError, match="toy starts from a trained 3dgs scene"):
+        Toy(plugins, ToyConfig()).create_model(SimpleNamespace(path="somewhere"), None)

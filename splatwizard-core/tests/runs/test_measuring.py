@@ -1,0 +1,118 @@
+"""What a run measures beside quality: speed with its spread, loading, LPIPS once its weights are there."""
+
+import importlib.util
+from types import SimpleNamespace
+
+import pytest
+import torch
+from lpips_backbones import write_backbones
+
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.runs.asked import Asked
+from splatwizard_core.runs.config import parse_set, resolve
+from splatwizard_core.runs.record import Record, missing_reasons
+from splatwizard_core.runs.run import RunRequest, run
+from splatwizard_core.runs.session import Session
+
+pytestmark = pytest.mark.pipeline
+
+LPIPS = ("lpips_vgg_3dgs", "lpips_vgg", "lpips_alex")
+
+
+@pytest.fixture(scope="module")
+def runs(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
+    """One run, given three times: plain, with weights and repeats, plain again."""
+    if importlib.util.find_spec("lpips") is None:
+        pytest.skip("LPIPS is the extra splatwizard-core[lpips]")
+    root = tmp_path_factory.mktemp("measured")
+    weights = write_backbones(tmp_path_factory.mktemp("weights"), "alex")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch-home")))
+
+        def once(**options: object) -> tuple[Record, list[str]]:
+            said: list[str] = []
+            session = Session(toy_plugins, torch.device("cpu"), said.append)
+            method = toy_plugins.methods.load("toy")
+            resolved = resolve(method, rate="r1", sets=parse_set(["eval_every=3"]), scene="demo:tiny")
+            return run(session, RunRequest(resolved, root, **options))[0], said
+
+        yield SimpleNamespace(plain=once(), asked=once(lpips_weights=weights, repeats=4), again=once())
+
+
+def test_without_weights_lpips_is_null_with_its_reason(runs):
+    record, _ = runs.plain
+    for name in LPIPS:
+        assert (record.metrics[name].mean, record.metrics[name].per_view) == (None, [])
+        assert record.unknown[f"metrics.{name}.mean"].startswith("weights-missing")
+    assert "unverified-weights" not in record.flags
+    assert missing_reasons(record) == []
+
+
+def test_weights_that_are_brought_fill_the_record_without_training_again(runs):
+    record, said = runs.asked
+    assert not any(line.startswith(("training", "encoded")) for line in said)
+    alex = record.metrics["lpips_alex"]
+    assert alex.mean == pytest.approx(sum(alex.per_view) / 2)
+    assert 0 < alex.mean < 2
+    assert alex.made_with["weights"] == "alexnet-owt-7be5be79.pth"
+    assert "unverified-weights" in record.flags  # made for this test, not the published ones
+    assert record.metrics["lpips_vgg"].mean is None  # only the other net's were brought
+    for name in ("psnr", "ssim", "l1"):
+        assert record.metrics[name] == runs.plain[0].metrics[name]
+    assert record.train == runs.plain[0].train
+
+
+def test_repeats_leave_their_spread_in_the_record(runs):
+    (plain, _), (asked, _) = runs.plain, runs.asked
+    assert (plain.speed.repeats, plain.speed.spread) == (1, None)
+    assert "--repeats" in plain.unknown["speed.spread"]
+    assert asked.speed.repeats == asked.speed.spread["fps"].n == 4
+    assert asked.speed.frames == 4 * asked.speed.rounds * asked.speed.views
+    fps = asked.speed.spread["fps"]
+    assert fps.min <= fps.mean <= fps.max
+    assert fps.min <= asked.speed.fps <= fps.max
+    # More than the three of the first decode: it was done again too.
+    assert asked.codec.decode_spread.n == len(asked.codec.decode_runs_s) == 4
+
+
+def test_what_was_measured_is_not_lost_to_a_command_that_asks_for_less(runs):
+    record, said = runs.again
+    assert record == runs.asked[0]
+    assert any("is finished" in line for line in said)
+
+
+def test_loading_and_compiling_are_told_apart(runs):
+    record, _ = runs.asked
+    assert record.speed.load_s > record.speed.prepare_s >= 0
+    assert record.speed.jit_s >= 0
+    assert record.codec.jit_s >= 0
+    assert record.memory.peak_load_bytes >= 0
+    assert record.train.pictures_in == "host"
+
+
+def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):
+    import json
+
+    log = next(tmp_path_factory.getbasetemp().glob("measured*/demo-tiny/toy/r1/log.jsonl"))
+    lines = [json.loads(line) for line in log.read_text().splitlines()]
+    evaluated = [line["metrics"] for line in lines if "metrics" in line]
+    assert len(evaluated) == 2
+    assert set(evaluated[0]) == {"psnr", "ssim", "l1", "toy-error"}
+
+
+def test_an_earlier_measurement_counts_if_it_holds_all_that_is_asked():
+    asked = Asked(2, {"psnr": "core 1", "lpips_vgg": None})
+    held = {"repeats": 3, "metrics": {"psnr": "core 1", "lpips_vgg": "weights a"}}
+    assert asked.is_held_by(held)
+    assert asked.is_held_by(asked.as_dict())
+    assert not asked.is_held_by({**held, "repeats": 1})
+    assert not asked.is_held_by({**held, "metrics": {"psnr": "core 0"}})
+    assert not Asked(1, {"lpips_vgg": "weights b"}).is_held_by(held)
+    for damaged in (None, [], {}, {"repeats": "3", "metrics": {}}, {"repeats": 3, "metrics": None}):
+        assert not asked.is_held_by(damaged)
+
+
+def test_the_record_names_no_folder_of_this_machine(runs):
+    made_with = runs.asked[0].metrics["lpips_alex"].made_with
+    assert not any("/" in value for value in made_with.values())
+    assert not any("torch-home" in reason or "/tmp" in reason for reason in runs.asked[0].unknown.values())

@@ -1,0 +1,162 @@
+"""The result record: its schema, its nulls, and what is said of a damaged one."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pydantic import ValidationError
+
+from splatwizard_core.errors import UserInputError
+from splatwizard_core.runs.record import Record, missing_reasons, read_record
+
+
+def content(**changes: Any) -> dict[str, Any]:
+    """A complete record as plain values."""
+    found: dict[str, Any] = {
+        "method": "toy", "method_version": 1, "distribution": "sw-toy 0.1", "preset": "paper", "rate": "r1",
+        "config": {"config": {"iterations": 3}}, "config_hash": "00", "dataset": "demo", "scene": "demo",
+        "protocol": {
+            "id": "demo/i/r-1/every8/black/pp-center/q8", "dataset": "demo", "images": "i", "resolution": -1,
+            "split": "every8", "background": "black", "principal_point": "center", "quantize8": True, "masked": False,
+        },
+        "train_views": 7, "test_views": 1, "views": ["a.png"],
+        "metrics": {"psnr": {"mean": 30.0, "per_view": [30.0], "direction": "higher"}},
+        "file": {"bytes": 12, "sha256": "00", "sections": {"header": 12}, "digest": "00"},
+        "counts": {"num_gaussians": 1}, "visible_gaussians": 0.5,
+        "codec": {
+            "encode_s": 0.1, "decode_s": 0.2, "decode_runs_s": [0.1, 0.2, 0.3], "first_decode_s": 0.3, "jit_s": 0.01,
+            "decode_spread": {"n": 3, "mean": 0.2, "std": 0.1, "min": 0.1, "max": 0.3}, "peak_decode_bytes": 1,
+            "memory_kind": "rss",
+        },
+        "speed": {
+            "fps": 10.0, "latency_ms_median": 100.0, "latency_ms_p95": 120.0, "prepare_s": 0.0, "frames": 1,
+            "rounds": 1, "views": 1, "warmup_frames": 10, "image_size": [4, 3], "jit_s": 0.01, "load_s": 0.3,
+            "repeats": 1, "spread": None,
+        },
+        "memory": {
+            "kind": "rss", "model_bytes": 1, "peak_load_bytes": 2, "peak_render_bytes": 2, "peak_reserved_bytes": None,
+        },
+        "train": {
+            "train_s": 1.0, "stages": [{"name": "toy", "seconds": 1.0}], "with_pretraining_s": 1.0, "steps": 3,
+            "peak_bytes": 5, "memory_kind": "rss", "breakdown_s": None, "trained_in": "r1",
+            "pictures_in": "host", "pretraining": {},
+        },
+        "phases": [{"phase": "train: toy", "provided_by": [
+            {"kind": "stage", "name": "toy", "distribution": "sw-toy", "version": "0.1"}]}],
+        "plan": [], "rasterizers": {"train": {"BACKWARD": "reference"}}, "environment": {"python": "3"},
+        "flags": ["rss"],
+        "unknown": {
+            "memory.peak_reserved_bytes": "a CPU has none", "train.breakdown_s": "not profiled",
+            "geometry": "not asked for", "speed.spread": "measured once",
+        },
+        "date": "2026-01-01T00:00:00+00:00",
+    }  # fmt: skip
+    return {**found, **changes}
+
+
+def test_a_record_survives_its_file(tmp_path: Path):
+    record = Record.model_validate(content())
+    record.write(tmp_path / "metrics.json")
+    assert read_record(tmp_path / "metrics.json") == record
+    assert json.loads((tmp_path / "metrics.json").read_text())["schema_version"] == 3
+
+
+def test_every_null_has_its_reason():
+    assert missing_reasons(Record.model_validate(content())) == []
+    without = Record.model_validate(content(unknown={"train.breakdown_s": "not profiled"}))
+    assert missing_reasons(without) == ["speed.spread", "memory.peak_reserved_bytes", "geometry"]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"unheard_of": 1},
+        {"schema_version": 4},
+        {"visible_gaussians": float("nan")},
+        {"file": {"bytes": 0, "sha256": "", "sections": {}, "digest": ""}},
+        {"metrics": {"psnr": {"mean": 1.0, "per_view": [], "direction": "up"}}},
+    ],
+)
+def test_what_is_not_in_the_schema_is_refused(change: dict[str, Any]):
+    with pytest.raises(ValidationError):
+        Record.model_validate(content(**change))
+
+
+def test_a_damaged_record_is_named_with_its_field(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    damaged = content()
+    del damaged["file"]["bytes"]
+    path.write_text(json.dumps(damaged))
+    with pytest.raises(UserInputError, match=r"not a result record of schema 3: file\.bytes: Field required"):
+        read_record(path)
+    path.write_text("{")
+    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
+        read_record(path)
+
+
+def as_schema_2(content: dict[str, Any]) -> dict[str, Any]:
+    """What a release wrote of the same run that did not say who served what."""
+    found: dict[str, Any] = json.loads(json.dumps({**content, "schema_version": 2}))
+    del found["phases"], found["train"]["pretraining"]
+    return found
+
+
+def as_schema_1(content: dict[str, Any]) -> dict[str, Any]:
+    """What the first release wrote of the same run."""
+    found = {**as_schema_2(content), "schema_version": 1}
+    for block, names in {
+        "speed": ("jit_s", "load_s", "repeats", "spread"), "memory": ("peak_load_bytes",),
+        "codec": ("decode_spread", "jit_s"), "train": ("pictures_in",),
+    }.items():  # fmt: skip
+        for name in names:
+            del found[block][name]
+    del found["unknown"]["speed.spread"]
+    return found
+
+
+def test_a_record_of_schema_1_is_read_and_says_what_it_does_not_hold(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(as_schema_1(content())))
+    record = read_record(path)
+    assert record.schema_version == 3
+    assert (record.speed.fps, record.speed.repeats, record.speed.load_s) == (10.0, 1, None)
+    assert "schema 1" in record.unknown["speed.load_s"]
+    assert missing_reasons(record) == []
+    assert read_record(path).model_dump() == record.model_dump()
+    assert json.loads(path.read_text())["schema_version"] == 1  # reading changes no file
+
+
+@pytest.mark.parametrize(
+    "damage", [{"unknown": None}, {"speed": None}, {"schema_version": True}, {"schema_version": 0}]
+)
+def test_a_damaged_record_of_schema_1_is_refused(tmp_path: Path, damage: dict[str, Any]):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps({**as_schema_1(content()), **damage}))
+    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
+        read_record(path)
+
+
+def test_a_record_of_schema_2_is_read_and_says_what_it_does_not_hold(tmp_path: Path):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps(as_schema_2(content())))
+    record = read_record(path)
+    assert (record.schema_version, record.phases, record.train.pretraining) == (3, None, None)
+    assert "schema 2" in record.unknown["phases"]
+    assert (record.speed.load_s, record.train.train_s) == (0.3, 1.0)
+    assert missing_reasons(record) == []
+
+
+def test_what_a_scene_was_trained_with_may_hold_null_and_what_is_unknown_of_it_needs_a_reason():
+    scene = {"file": {}, "preset": None, "config": {"cap": None}, "steps": 3, "train_s": 1.0, "made_by": {}}
+    found = content()
+    found["train"] = {**found["train"], "pretraining": {"3dgs": scene}}
+    assert missing_reasons(Record.model_validate(found)) == ["train.pretraining.3dgs.preset"]
+
+
+@pytest.mark.parametrize("damage", [{"unknown": None}, {"train": None}])
+def test_a_damaged_record_of_schema_2_is_refused(tmp_path: Path, damage: dict[str, Any]):
+    path = tmp_path / "metrics.json"
+    path.write_text(json.dumps({**as_schema_2(content()), **damage}))
+    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
+        read_record(path)
