@@ -6,10 +6,10 @@ import torch
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.coding.gaussian_codec import gaussian_codecs
 from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
-from splatwizard_core.runs.gaussian_method import GaussianMethod
 
 PLUGINS = load_plugins()
 METHODS = [e.name for e in PLUGINS.methods if issubclass(e.load(), GaussianMethod)]

@@ -9,9 +9,9 @@ from pydantic import Field
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
+from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.registry import Registry
-from splatwizard_core.runs.gaussian_method import GaussianMethod
 from splatwizard_core.training.params import OptimizationParams
 
 SHAPES = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (0, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}

@@ -7,14 +7,20 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.method import Method, create_method
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams, PipelineParams
-from splatwizard_core.training.scheduler import Scheduler
-from splatwizard_core.training.stage import Stage
+from splatwizard_core.api import (
+    ContainerReader,
+    ContainerWriter,
+    GaussianModel,
+    Method,
+    OptimizationParams,
+    ParamGroup,
+    PipelineParams,
+    Scene,
+    Scheduler,
+    SplatOptimizer,
+    Stage,
+    create_method,
+)
 
 TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 

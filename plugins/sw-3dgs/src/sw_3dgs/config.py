@@ -3,7 +3,7 @@
 from pydantic import Field
 from sw_gaussians.config import GaussianTraining
 
-from splatwizard_core.training.params import InputFile
+from splatwizard_core.api import InputFile
 from sw_codecs.models.settings import Codec
 
 

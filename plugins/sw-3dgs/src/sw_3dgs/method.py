@@ -7,10 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from sw_gaussians.stage import ThreeDGSStage
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import load_ply
-from splatwizard_core.method import Method
+from splatwizard_core.api import GaussianModel, Method, SceneError, load_ply
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
 from sw_codecs.models import exact, quantized
@@ -18,10 +15,7 @@ from sw_codecs.models import exact, quantized
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
 class ThreeDGS(Method):

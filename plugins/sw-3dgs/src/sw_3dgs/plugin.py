@@ -1,6 +1,6 @@
 """What this package provides: the method 3dgs."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

@@ -12,16 +12,19 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.errors import SceneError, ShapeError
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
-from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.scene import PointCloud
+from splatwizard_core.api import (
+    Camera,
+    GaussianInputs,
+    PointCloud,
+    SceneError,
+    ShapeError,
+    SplatModel,
+    mean_squared_neighbor_distance,
+)
 from sw_anchors.decoding import GEOMETRY, spawn
 
 if TYPE_CHECKING:
-    from splatwizard_core.rendering.rasterizer import Rasterizer
+    from splatwizard_core.api import Rasterizer
 
 MIN_SQUARED_DISTANCE = 1e-7
 """Floor of the squared neighbour distance that sets an anchor's first scales, world units squared."""

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader
+    from splatwizard_core.api import ContainerReader
 
 
 def this_machine() -> dict[str, str]:

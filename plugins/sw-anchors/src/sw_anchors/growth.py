@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import EmptyModel
-from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.api import EmptyModel, SplatOptimizer
 from sw_anchors.anchors import AnchorModel, AnchorSelection
 
 MAX_LOG_BASE_SCALE = 0.05

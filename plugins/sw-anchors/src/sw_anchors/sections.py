@@ -16,12 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_anchors.lattice import BITS, TOP, coded_positions
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
 
 WeightType = Literal["float32", "float16"]
 WEIGHT_TYPES: tuple[WeightType, ...] = ("float32", "float16")

@@ -9,12 +9,19 @@ import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
-from splatwizard_core.training.learning_rate import exponential_lr
-from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.plan import When, scaled
-from splatwizard_core.training.stage import LossPack, Stage, StageContext
+from splatwizard_core.api import (
+    LossPack,
+    ParamGroup,
+    RasterOptions,
+    RenderResult,
+    SplatOptimizer,
+    Stage,
+    StageContext,
+    When,
+    exponential_lr,
+    photometric_loss,
+)
+from splatwizard_core.training.plan import scaled
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams
@@ -23,10 +30,7 @@ from sw_anchors.values import mean_product
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.scene.scene import Scene, View
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.api import OptimizationParams, PipelineParams, Scene, Scheduler, SplatModel, View
 
 log = logging.getLogger(__name__)
 

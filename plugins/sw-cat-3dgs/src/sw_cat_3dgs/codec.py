@@ -27,15 +27,14 @@ from sw_anchors.sections import (
 )
 from torch import Tensor, nn
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
 from sw_cat_3dgs.predictors import PREDICTORS
 from sw_cat_3dgs.stage import base_resolution
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_cat_3dgs.config import CatConfig
 
 LIMITS = {

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field
 from sw_anchors.params import AnchorLearningRates, AnchorParams
 
-from splatwizard_core.training.params import Params
+from splatwizard_core.api import Params
 
 FULL_RUN = 40_000
 """Steps of the published plan."""

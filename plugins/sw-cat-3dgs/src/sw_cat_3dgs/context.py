@@ -16,7 +16,7 @@ from sw_anchors.coded_anchors import AnchorContext, AnchorForecast
 from torch import Tensor, nn
 
 if TYPE_CHECKING:
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import PluginManager
 
 STEP_OFFSET = 1.1
 """A step is its base times (1.1 + tanh t): never zero."""

@@ -8,7 +8,7 @@ import torch
 from sw_anchors.coded_anchors import rounded_indices
 
 if TYPE_CHECKING:
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import PluginManager
     from sw_cat_3dgs.model import CatAnchors
 
 SECTIONS = ("features", "scalings", "offsets")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import ConfigError, SceneError
-from splatwizard_core.method import Method
+from splatwizard_core.api import ConfigError, Method, SceneError
 from sw_cat_3dgs import codec
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.context import CatContext, ContextShape
@@ -17,10 +16,7 @@ from sw_cat_3dgs.stage import CatStage
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
 class Cat3DGS(Method):

@@ -9,8 +9,7 @@ import torch
 from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from torch import Tensor
 
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]

@@ -15,7 +15,7 @@ from sw_anchors.coded_anchors import GROUPS
 from torch import Tensor
 
 if TYPE_CHECKING:
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import PluginManager
     from sw_cat_3dgs.context import CatContext
 
 Prediction = dict[str, tuple[Tensor, Tensor, Tensor]]

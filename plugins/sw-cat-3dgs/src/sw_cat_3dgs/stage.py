@@ -11,23 +11,23 @@ import torch
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
 from sw_anchors.stage import AnchorStage
 
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.scheduler import PhaseSwitch
-from splatwizard_core.training.stage import CameraIterator, LossPack
+from splatwizard_core.api import CameraIterator, LossPack, PhaseSwitch, Rasterizer, SplatOptimizer
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.model import CatAnchors, Trained
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import RenderResult
-    from splatwizard_core.scene.camera import Camera
-    from splatwizard_core.scene.scene import View
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
-    from splatwizard_core.training.stage import StageContext
+    from splatwizard_core.api import (
+        Camera,
+        OptimizationParams,
+        PipelineParams,
+        RenderResult,
+        Scheduler,
+        SplatModel,
+        StageContext,
+        View,
+    )
 
 log = logging.getLogger(__name__)
 

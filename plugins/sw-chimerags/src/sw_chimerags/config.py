@@ -9,7 +9,7 @@ from pydantic import Field
 from sw_finetuning.distillation import DistillLoss
 from sw_finetuning.fine_tuning import FineTuningRates
 
-from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params
 
 
 class Train(Params):

@@ -18,13 +18,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, ConfigError, SplatwizardError
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import BitstreamError, ConfigError, GaussianModel, SplatwizardError
 from sw_chimerags.model import DEGREE, LOWER, TENSORS, MaskedGaussians
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_chimerags.config import Steps
 
 GROUPS = {"sh2": LOWER, "sh3": (DEGREE + 1) ** 2 - 1}

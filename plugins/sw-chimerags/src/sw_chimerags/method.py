@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.method import Method, create_method
+from splatwizard_core.api import ConfigError, Method, create_method, load_pruner
 from splatwizard_core.runs.keys import dotted
-from splatwizard_core.training.pruner import load_pruner
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
 from sw_chimerags.model import MaskedGaussians
@@ -18,10 +16,7 @@ from sw_chimerags.stage import MaskedDistillation
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
 class ChimeraGS(Method):

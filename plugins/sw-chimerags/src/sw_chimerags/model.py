@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import SH, GaussianInputs, GaussianModel
 
 if TYPE_CHECKING:
-    from splatwizard_core.rendering.rasterizer import Rasterizer
-    from splatwizard_core.scene.camera import Camera
+    from splatwizard_core.api import Camera, Rasterizer
 
 LOWER = 8
 """Coefficients of SH degrees 1 and 2 in `sh_rest`; the 7 behind them are degree 3."""

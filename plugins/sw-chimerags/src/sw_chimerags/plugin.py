@@ -1,6 +1,6 @@
 """What this package provides: the method chimerags. Its parts are asked for by name, from whoever has them."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

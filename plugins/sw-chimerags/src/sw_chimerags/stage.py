@@ -8,25 +8,33 @@ from typing import TYPE_CHECKING
 from sw_finetuning.distillation import DistillationStage, PseudoViewSampler
 from sw_finetuning.pruning import scores_of
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.pruner import Pruner
-from splatwizard_core.training.stage import CameraIterator, LossPack
+from splatwizard_core.api import (
+    CameraIterator,
+    ConfigError,
+    GaussianModel,
+    LossPack,
+    ParamGroup,
+    Pruner,
+    Rasterizer,
+    Scene,
+    SplatOptimizer,
+)
 from sw_chimerags.model import MaskedGaussians, MaskQuantizer
 
 if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import RenderResult
-    from splatwizard_core.scene.scene import View
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
-    from splatwizard_core.training.stage import CameraSampler, StageContext
+    from splatwizard_core.api import (
+        CameraSampler,
+        OptimizationParams,
+        PipelineParams,
+        RenderResult,
+        Scheduler,
+        SplatModel,
+        StageContext,
+        View,
+    )
     from sw_chimerags.config import ChimeraConfig
 
 STUDENT = "student_initial"

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.coders import RangeCoder
 from sw_codecs.model_spec import Bernoulli as BernoulliSpec

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 
 MAX_VARINT_BYTES = 10
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import ByteReader
 from sw_codecs.coders import RangeCoder
 from sw_codecs.count_tables import pack_tables, rounded_counts, unpack_tables

@@ -20,7 +20,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from splatwizard_core.progress import track
+from splatwizard_core.api import track
 from sw_codecs.nearest import nearest
 from sw_codecs.relocation import relocate
 from sw_codecs.weighted_rows import draw, gather

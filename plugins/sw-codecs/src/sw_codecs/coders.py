@@ -13,7 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum, model_spec
 from sw_codecs.bits import ByteReader
 from sw_codecs.model_spec import Gaussian, Laplace, ModelSpec, as_symbols, changed, check_length, domain

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import (
     ByteReader,
     class_bits,

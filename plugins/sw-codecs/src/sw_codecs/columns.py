@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum
 from sw_codecs.bits import ByteReader, class_bits, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.column_plan import CONSTANT, MAGNITUDES, MAX_VALUE, ColumnPlan, choose_plan

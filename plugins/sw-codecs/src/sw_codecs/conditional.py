@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.coders import RangeCoder
 from sw_codecs.gaussian_exact import GaussianExact, IntegerContext

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import ByteReader, class_floor, split_classes, unzigzag, write_varint, zigzag
 from sw_codecs.model_spec import Table
 from sw_codecs.symbol_stream import SymbolReader, SymbolWriter

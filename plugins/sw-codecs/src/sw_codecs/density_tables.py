@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, write_signed, write_varint
 from sw_codecs.column_plan import MAX_TABLE

@@ -20,7 +20,7 @@ from types import ModuleType
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.errors import BitstreamError, CapabilityError
+from splatwizard_core.api import BitstreamError, CapabilityError
 from sw_codecs import checksum, morton
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.duplicates import decode_duplicates, encode_duplicates, without_duplicates

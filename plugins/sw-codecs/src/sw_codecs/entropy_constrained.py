@@ -8,8 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.errors import BitstreamError, ShapeError
-from splatwizard_core.progress import track
+from splatwizard_core.api import BitstreamError, ShapeError, track
 from sw_codecs.kmeans import kmeans
 from sw_codecs.nearest import nearest
 from sw_codecs.side_information import within

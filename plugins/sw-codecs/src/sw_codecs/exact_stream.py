@@ -18,7 +18,7 @@ from typing import Any
 import constriction
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.exact_tables import FRACTIONS, Family, exact_tables

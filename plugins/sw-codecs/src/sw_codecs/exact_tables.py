@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.model_spec import Table
 
 LEVELS, FRACTIONS, STEPS = 64, 8, 128

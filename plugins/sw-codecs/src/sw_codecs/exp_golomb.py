@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import bit_length
 
 MAX_PREFIX = 40

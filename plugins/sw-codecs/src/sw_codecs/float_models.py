@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum, exp_golomb
 from sw_codecs.bits import ByteReader, bit_length, write_varint
 from sw_codecs.coders import RangeCoder

@@ -8,7 +8,7 @@ import constriction
 import numpy as np
 import torch
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.coders import ChunkedCoder
 from sw_codecs.model_spec import Gaussian, Laplace, ModelSpec, Table, Tables
 from sw_codecs.symbol_stream import guarded

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 
 FRACTION = 12
 ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1

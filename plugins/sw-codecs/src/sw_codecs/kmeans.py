@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatwizard_core.progress import track
+from splatwizard_core.api import track
 from sw_codecs.nearest import nearest
 from sw_codecs.relocation import relocate
 from sw_codecs.weighted_rows import draw, gather

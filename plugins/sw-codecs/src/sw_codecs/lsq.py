@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.errors import BitstreamError, ShapeError
+from splatwizard_core.api import BitstreamError, ShapeError
 from sw_codecs.side_information import finite_values, floats, integers, within
 
 MAX_BITS = 16

@@ -15,7 +15,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum, morton
 from sw_codecs.bits import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatwizard_core.errors import SplatwizardError
+from splatwizard_core.api import SplatwizardError
 
 MAX_POINTS = 1 << 26
 ALWAYS_ALLOWED = 1 << 16

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum, morton, zstd_frame
 from sw_codecs.bits import ByteReader, write_varint
 from sw_codecs.columns import Columns

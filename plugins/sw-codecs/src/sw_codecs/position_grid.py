@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, ShapeError
+from splatwizard_core.api import BitstreamError, ShapeError
 from sw_codecs.side_information import finite_values, floats, integers, within
 from sw_codecs.straight_through import straight_through
 

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.outliers import inliers
 
 UNIT = 1 << 20

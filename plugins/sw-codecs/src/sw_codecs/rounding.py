@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.side_information import finite_values, fits, within
 
 INDEX_CLAMP = 15_000  # index ranges then fit int16 (HAC)

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import wavefront
 from sw_codecs.exact_tables import LEVELS
 from sw_codecs.integer_mlp import FRACTION, IntegerMlp

@@ -13,7 +13,7 @@ from typing import Any
 import constriction
 import numpy as np
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs import checksum
 from sw_codecs.model_spec import (
     Bernoulli,

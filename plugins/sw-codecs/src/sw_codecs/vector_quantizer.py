@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, ShapeError
+from splatwizard_core.api import BitstreamError, ShapeError
 from sw_codecs.codebook_training import RULES, smoothed, train_codebook
 from sw_codecs.kmeans import kmeans
 from sw_codecs.nearest import nearest

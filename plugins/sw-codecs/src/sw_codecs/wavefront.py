@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_codecs.exact_stream import ExactReader, ExactWriter, exact_bits
 from sw_codecs.exact_tables import FRACTIONS
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ShapeError
+from splatwizard_core.api import ShapeError
 
 ROWS = {"cpu": 1 << 12, "cuda": 1 << 18}  # rows whose float64 copies are held at a time
 

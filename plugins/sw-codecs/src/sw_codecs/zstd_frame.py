@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import zstandard
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 
 LEVEL = 19
 

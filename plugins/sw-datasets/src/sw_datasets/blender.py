@@ -15,10 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.assemble import assemble_scene
-from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
 from splatwizard_core.scene.images import (
     find_pictures,
     fitted_size,
@@ -27,8 +24,6 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from splatwizard_core.scene.scene import PointCloud, Scene, View
-from splatwizard_core.streams import stream
 from sw_datasets.families import BLENDER
 from sw_datasets.rules import Rules, of_no_use, settle
 

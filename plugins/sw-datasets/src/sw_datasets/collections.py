@@ -7,9 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.scene import Scene
+from splatwizard_core.api import Scene, SceneError, SceneOptions
 from sw_datasets.blender import has_blender_layout, load_blender
 from sw_datasets.colmap import load_colmap, model_folder
 from sw_datasets.dtu import has_dtu_layout, load_dtu

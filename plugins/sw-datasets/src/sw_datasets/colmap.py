@@ -10,10 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.assemble import assemble_scene
-from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene
 from splatwizard_core.scene.images import (
     find_pictures,
     fitted_size,
@@ -23,7 +20,6 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from splatwizard_core.scene.scene import PointCloud, Scene, View
 from sw_datasets.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
 from sw_datasets.families import COLMAP
 from sw_datasets.rules import Rules, of_no_use, settle

@@ -16,10 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.api import Scene, SceneError, SceneOptions
 from splatwizard_core.scene.images import list_pictures
-from splatwizard_core.scene.scene import Scene
 from sw_datasets.colmap import load_colmap, mask_files, model_folder
 from sw_datasets.rules import Rules
 

@@ -17,13 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.assemble import assemble_scene
-from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
 from splatwizard_core.scene.images import fitted_size, list_pictures, load_picture, picture_header
-from splatwizard_core.scene.scene import PointCloud, Scene, View
-from splatwizard_core.streams import stream
 from sw_datasets.rules import Rules, of_no_use
 
 POSES = "poses_enu.json"

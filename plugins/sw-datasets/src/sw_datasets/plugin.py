@@ -1,6 +1,6 @@
 """What this package provides: loaders, the six published data sets, the demo scene, and the command `sw data`."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

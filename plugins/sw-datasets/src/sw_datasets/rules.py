@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, fields
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.scene import Protocol
+from splatwizard_core.api import ConfigError, Protocol, SceneOptions
 from sw_datasets.families import PROTOCOLS, Family
 
 

@@ -17,10 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatwizard_core.errors import CapabilityError, SceneError
-from splatwizard_core.files import new_folder
-from splatwizard_core.progress import track
+from splatwizard_core.api import CapabilityError, SceneError, track
 from splatwizard_core.scene.images import FORMATS, find_pictures, load_mask, load_picture, picture_header
+from splatwizard_core.tooling import new_folder
 from sw_datasets.colmap import MAX_SIDE, PLAIN_FOCALS, RADIAL_FOCALS, mask_files, model_folder
 from sw_datasets.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model, write_model
 

@@ -8,14 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.errors import SceneError, SplatwizardError
-from splatwizard_core.files import file_sha256
-from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_core.progress import track
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.api import PluginManager, Scene, SceneError, SceneOptions, SplatwizardError, View, track
 from splatwizard_core.scene.images import find_pictures, is_inside, picture_header
-from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.scene.scene import Scene, View
+from splatwizard_core.tooling import file_sha256, load_scene
 
 MAX_PROBLEMS = 5
 """Of one kind; more are counted."""

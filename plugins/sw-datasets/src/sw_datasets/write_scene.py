@@ -12,12 +12,9 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatwizard_core.errors import ConfigError, SceneError
-from splatwizard_core.files import write_atomic
-from splatwizard_core.progress import track
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, ConfigError, PointCloud, Scene, SceneError, View, track
 from splatwizard_core.scene.images import is_inside
-from splatwizard_core.scene.scene import PointCloud, Scene, View
+from splatwizard_core.tooling import write_atomic
 from sw_datasets.colmap_model import (
     ColmapCamera,
     ColmapImage,

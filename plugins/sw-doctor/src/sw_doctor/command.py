@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.cli.options import debug_option, json_option, options, print_json
 from splatwizard_core.cli.setup import DEFAULT_METHOD
+from splatwizard_core.tooling import debug_option, json_option, options, print_json
 
 if TYPE_CHECKING:
     from sw_doctor import Diagnosis

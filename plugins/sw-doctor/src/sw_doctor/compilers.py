@@ -12,8 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.native.toolchain import find_compiler, find_nvcc, nvcc_version
+from splatwizard_core.tooling import NativeBuildError, find_compiler, find_nvcc, nvcc_version
 from sw_doctor.check import Check, one_line
 
 GROUP = "compilers"

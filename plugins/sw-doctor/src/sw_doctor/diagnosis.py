@@ -9,7 +9,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-from splatwizard_core.errors import PluginError
+from splatwizard_core.tooling import PluginError
 from sw_doctor import child, compilers, packages, system
 from sw_doctor.check import SLOWLY, Check, one_line
 
@@ -89,7 +89,7 @@ def probed(answer: child.Answer, *, needed: bool = True) -> list[Check]:
 
 def plugin_checks() -> tuple[list[Check], list[str]]:
     """(one check a plugin and one a clash of names, names of the distributions)."""
-    from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.tooling import load_plugins
 
     try:
         plugins = load_plugins()

@@ -1,6 +1,6 @@
 """What this package provides: the command `sw doctor`."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

@@ -15,10 +15,15 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from splatwizard_core.errors import NativeBuildError, PluginError, SplatwizardError
-from splatwizard_core.native.build import declared_modules, resolve_module
-from splatwizard_core.plugins import PluginManager, load_plugins
-from splatwizard_core.plugins.registry import Entry
+from splatwizard_core.api import PluginManager, SplatwizardError
+from splatwizard_core.tooling import (
+    Entry,
+    NativeBuildError,
+    PluginError,
+    declared_modules,
+    load_plugins,
+    resolve_module,
+)
 from sw_doctor.check import SLOWLY, Check, State, one_line
 from sw_doctor.child import Step, serve
 
@@ -172,7 +177,7 @@ def check_rasterizers(plugins: PluginManager) -> list[Check]:
 def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
     import torch
 
-    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry, obstacle
+    from splatwizard_core.tooling import NegotiatedRasterizer, info_from_entry, obstacle
 
     device = "cpu" if "cpu" in entry.declared.get("devices", ("cpu",)) else "cuda"
     where = ", ".join(entry.declared.get("devices", ("cpu",)))
@@ -215,9 +220,7 @@ def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> 
     """Sixteen splats (two axes: surfels) on 32 x 24 pixels. Raises if the picture is empty, a gradient not finite."""
     import torch
 
-    from splatwizard_core.gaussians.inputs import GaussianInputs
-    from splatwizard_core.rendering.rasterizer import RasterOptions
-    from splatwizard_core.scene.camera import Camera
+    from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
 
     generator = torch.Generator().manual_seed(0)
     means = torch.rand(16, 3, generator=generator) - 0.5
@@ -271,10 +274,7 @@ def check_scenes(plugins: PluginManager) -> Check:
 
 def check_main_job(plugins: PluginManager, method: str) -> Check:
     """Resolve `sw run` on the demo scene, and draw as its trainer would with what is built."""
-    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-    from splatwizard_core.runs.config import resolve
-    from splatwizard_core.runs.device import choose_device
-    from splatwizard_core.runs.run import run  # noqa: F401 (its imports are what `sw run` needs)
+    from splatwizard_core.tooling import NegotiatedRasterizer, choose_device, resolve
 
     name = f"sw run --method {method} --scene demo"
     try:

@@ -11,8 +11,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.cores import available_cores
-from splatwizard_core.native import cache_root
+from splatwizard_core.tooling import available_cores, cache_root
 from sw_doctor.check import Check, gigabytes, one_line
 
 GROUP = "system"

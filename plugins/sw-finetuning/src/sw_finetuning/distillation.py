@@ -11,12 +11,18 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
-from splatwizard_core.scene.scene import Scene, View
-from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.params import OptimizationParams
-from splatwizard_core.training.stage import CameraSampler, LossPack, StageContext
+from splatwizard_core.api import (
+    CameraSampler,
+    LossPack,
+    OptimizationParams,
+    RasterOptions,
+    RenderResult,
+    Scene,
+    SplatModel,
+    StageContext,
+    View,
+    photometric_loss,
+)
 from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
 
 DistillLoss = Literal["l1_ssim", "l2"]

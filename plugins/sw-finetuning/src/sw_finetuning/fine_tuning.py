@@ -8,17 +8,27 @@ from pydantic import Field
 from sw_gaussians.statistics import accumulate_statistics
 from torch import Tensor
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
-from splatwizard_core.scene.scene import Scene, View
-from splatwizard_core.training.learning_rate import exponential_lr
-from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams
-from splatwizard_core.training.plan import When, scaled
-from splatwizard_core.training.scheduler import Scheduler
-from splatwizard_core.training.stage import LossPack, Stage, StageContext
+from splatwizard_core.api import (
+    GaussianModel,
+    LossPack,
+    OptimizationParams,
+    ParamGroup,
+    Params,
+    PipelineParams,
+    RasterOptions,
+    RenderResult,
+    Scene,
+    Scheduler,
+    SplatModel,
+    SplatOptimizer,
+    Stage,
+    StageContext,
+    View,
+    When,
+    exponential_lr,
+    photometric_loss,
+)
+from splatwizard_core.training.plan import scaled
 
 GRADIENT_STATISTICS = ("grad_accum", "denom")
 CLEAR = -1  # before the same step's statistics are added

@@ -10,13 +10,16 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import EmptyModel, ShapeError
-from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.pruner import Pruner
-from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.api import (
+    CameraIterator,
+    EmptyModel,
+    Pruner,
+    Rasterizer,
+    Scene,
+    ShapeError,
+    SplatModel,
+    SplatOptimizer,
+)
 
 log = logging.getLogger(__name__)
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params
 
 
 class LearningRates(Params):

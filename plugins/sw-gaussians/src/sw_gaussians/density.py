@@ -11,9 +11,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import EmptyModel
-from splatwizard_core.gaussians.model import GaussianModel, logit
-from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.api import EmptyModel, GaussianModel, SplatOptimizer
+from splatwizard_core.gaussians.model import logit
 
 SPLIT_CHILDREN = 2
 SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN

@@ -12,8 +12,7 @@ import math
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.training.optimizer import SplatOptimizer
+from splatwizard_core.api import GaussianModel, SplatOptimizer
 from sw_gaussians.density import rotate
 
 MAX_COPIES = 51

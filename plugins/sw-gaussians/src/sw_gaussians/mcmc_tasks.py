@@ -6,10 +6,7 @@ draws what the uninterrupted one drew there. At the last step nothing is moved: 
 
 import logging
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.streams import stream
-from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams
+from splatwizard_core.api import GaussianModel, OptimizationParams, SplatOptimizer, stream
 from sw_gaussians import mcmc
 
 log = logging.getLogger(__name__)

@@ -1,6 +1,6 @@
 """What this package provides: the tasks of 3DGS and of 3DGS-MCMC, and a pruner, for any method that wants them."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import GaussianModel
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import Rasterizer
-    from splatwizard_core.scene.camera import Camera
+    from splatwizard_core.api import Camera, Rasterizer, SplatModel
 
 
 class Opacity:

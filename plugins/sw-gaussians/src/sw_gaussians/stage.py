@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.plan import When, scaled
-from splatwizard_core.training.stage import LossPack, Stage, StageContext
+from splatwizard_core.api import (
+    ConfigError,
+    LossPack,
+    ParamGroup,
+    RasterOptions,
+    SplatOptimizer,
+    Stage,
+    StageContext,
+    When,
+    photometric_loss,
+)
+from splatwizard_core.training.plan import scaled
 from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians import tasks
 from sw_gaussians.config import GaussianTraining
@@ -17,11 +23,15 @@ from sw_gaussians.config import GaussianTraining
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import RenderResult
-    from splatwizard_core.scene.scene import Scene, View
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.api import (
+        OptimizationParams,
+        PipelineParams,
+        RenderResult,
+        Scene,
+        Scheduler,
+        SplatModel,
+        View,
+    )
 
 
 class ThreeDGSStage(Stage):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import GaussianModel
 from splatwizard_core.training.native import TRAINING
 from sw_gaussians import density
 

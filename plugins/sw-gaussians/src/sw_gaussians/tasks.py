@@ -11,12 +11,7 @@ short runs are taken before the densification of their last step, too.
 
 import logging
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import RenderResult
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.learning_rate import exponential_lr
-from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams
+from splatwizard_core.api import GaussianModel, OptimizationParams, RenderResult, Scene, SplatOptimizer, exponential_lr
 from sw_gaussians import density
 from sw_gaussians.statistics import accumulate_statistics
 

@@ -14,21 +14,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ConfigError, PluginError
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.checks import check_placement, check_request, checked_background
-from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import (
+from splatwizard_core.api import (
     AccumOutput,
+    Camera,
+    ConfigError,
     Feature,
+    GaussianInputs,
     GradBuffer,
     RasterizerInfo,
     RasterOptions,
     RenderResult,
-    check_offered,
-    option_features,
+    check_request,
+    checked_background,
 )
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.rendering.checks import check_placement
+from splatwizard_core.rendering.negotiation import declared_info
+from splatwizard_core.rendering.rasterizer import check_offered, option_features
+from splatwizard_core.tooling import PluginError
 from sw_gsplat import plugin
 
 

@@ -31,12 +31,11 @@ from sw_anchors.sections import (
 )
 from torch import Tensor, nn
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 from sw_hac.model import HACAnchors, context_of, group_widths, output_widths
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_hac.config import Codec
 
 log = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 from sw_anchors.params import AnchorLearningRates, AnchorParams
 
-from splatwizard_core.training.params import Params
+from splatwizard_core.api import Params
 
 Resolution = Annotated[int, Field(ge=3, le=4096)]
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.method import Method
+from splatwizard_core.api import Method, SceneError
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors
@@ -16,10 +15,7 @@ from sw_hac.stage import HACStage
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
 class HAC(Method):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED, AnchorRate
 from sw_anchors.stage import AnchorStage
 
-from splatwizard_core.training.scheduler import PhaseSwitch
+from splatwizard_core.api import PhaseSwitch
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors
 
@@ -16,9 +16,7 @@ if TYPE_CHECKING:
 
     from torch import Tensor
 
-    from splatwizard_core.rendering.rasterizer import RenderResult
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.api import OptimizationParams, PipelineParams, RenderResult, Scheduler
 
 
 class HACStage(AnchorStage):

@@ -7,7 +7,7 @@ from sw_finetuning.distillation import DistillLoss
 from sw_finetuning.fine_tuning import FineTuningRates
 from sw_finetuning.pruning import CountRule
 
-from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params
 from sw_lightgaussian.importance_vq import Training
 from sw_lightgaussian.significance import Kind, VolumeNorm
 

@@ -25,10 +25,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.api import BitstreamError
 
 if TYPE_CHECKING:
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import PluginManager
 
 VERSION = 1
 PACKED, RANGE_CODED = 0, 1

@@ -1,6 +1,6 @@
 """What this package provides: the method lightgaussian, its score as a pruner, and its two coders for anybody."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

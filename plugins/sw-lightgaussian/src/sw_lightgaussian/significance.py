@@ -10,15 +10,12 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import Rasterizer
-    from splatwizard_core.scene.camera import Camera
+    from splatwizard_core.api import Camera, Rasterizer, SplatModel
 
 Kind = Literal["v_important_score", "important_score", "max_v_important_score", "count", "opacity"]
 VolumeNorm = Literal["unclamped", "paper_clamp"]

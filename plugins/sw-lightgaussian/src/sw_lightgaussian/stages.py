@@ -11,19 +11,11 @@ from sw_finetuning.fine_tuning import FineTuningStage, collect_statistics
 from sw_finetuning.pruning import PruneByScore, scores_of
 from torch import Tensor
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.pruner import Pruner
-from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.api import CameraIterator, ConfigError, GaussianModel, Pruner, Rasterizer, Scene
 from sw_lightgaussian.config import LightGaussianConfig
 
 if TYPE_CHECKING:
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
-    from splatwizard_core.training.stage import StageContext
+    from splatwizard_core.api import OptimizationParams, PipelineParams, Scheduler, SplatModel, StageContext
 
 log = logging.getLogger(__name__)
 

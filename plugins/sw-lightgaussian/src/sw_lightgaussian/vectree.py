@@ -13,14 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, SplatwizardError
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
 from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError
 from sw_lightgaussian.significance import volume_factor
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
 
 log = logging.getLogger(__name__)
 

@@ -7,8 +7,8 @@ import importlib
 from sw_doctor.check import Check, one_line
 from sw_doctor.child import serve
 
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.files import file_sha256
+from splatwizard_core.api import CapabilityError
+from splatwizard_core.tooling import file_sha256
 from sw_metrics.lpips_weights import BACKBONES, find_weights, hub_folder
 from sw_metrics.perceptual import EXTRA, package_version
 from sw_metrics.torchvision_import import import_torchvision

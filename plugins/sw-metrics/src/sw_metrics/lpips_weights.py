@@ -16,8 +16,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, UserInputError
-from splatwizard_core.files import file_sha256
+from splatwizard_core.api import CapabilityError, UserInputError
+from splatwizard_core.tooling import file_sha256
 
 MOST_BYTES = 1 << 30  # the largest published one, VGG16 with its classifier, has 553 MB
 

@@ -19,8 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.evaluation.metrics import MetricSetup, PreparedMetric
+from splatwizard_core.api import CapabilityError, MetricSetup, PreparedMetric, ShapeError
 from sw_metrics.lpips_weights import BACKBONES, Weights, find_weights, load_weights
 from sw_metrics.torchvision_import import import_torchvision
 

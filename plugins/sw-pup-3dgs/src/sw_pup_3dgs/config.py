@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from sw_finetuning.fine_tuning import FineTuningRates
 from sw_finetuning.pruning import CountRule
 
-from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params
 
 
 class Prune(Params):

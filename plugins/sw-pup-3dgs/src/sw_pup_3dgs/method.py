@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.runs.gaussian_method import GaussianMethod
+from splatwizard_core.api import GaussianMethod
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.presets import PRESETS, RATES
 from sw_pup_3dgs.stage import PupStage
 
 if TYPE_CHECKING:
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import Stage
 
 
 class Pup3DGS(GaussianMethod):

@@ -1,6 +1,6 @@
 """What this package provides: the method pup-3dgs, and its score as a pruner for any method."""
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl

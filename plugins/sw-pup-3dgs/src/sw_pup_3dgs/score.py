@@ -16,14 +16,10 @@ from typing import TYPE_CHECKING
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import ConfigError, GaussianModel, RasterOptions
 
 if TYPE_CHECKING:
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import Rasterizer
-    from splatwizard_core.scene.camera import Camera
+    from splatwizard_core.api import Camera, Rasterizer, SplatModel
 
 RESOLUTIONS = (1, 2, 4, 8)
 FLOOR = 1e-30

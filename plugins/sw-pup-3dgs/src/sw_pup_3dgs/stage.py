@@ -7,16 +7,12 @@ from typing import TYPE_CHECKING
 from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
 from sw_finetuning.pruning import PruneByScore
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.pruner import load_pruner
+from splatwizard_core.api import ConfigError, SplatOptimizer, load_pruner
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from splatwizard_core.plugins import PluginManager
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
+    from splatwizard_core.api import OptimizationParams, PipelineParams, PluginManager, Scheduler
     from sw_pup_3dgs.config import Pup3DGSConfig
 
 OWN = "pup-3dgs"

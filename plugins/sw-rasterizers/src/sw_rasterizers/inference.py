@@ -8,11 +8,8 @@ from __future__ import annotations
 
 import torch
 
-from splatwizard_core.errors import CapabilityError, ConfigError
-from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.api import Camera, CapabilityError, ConfigError, GaussianInputs, RasterizerInfo, RasterOptions
 from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import RasterizerInfo, RasterOptions
-from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag
 from sw_rasterizers.standard import StandardRasterizer

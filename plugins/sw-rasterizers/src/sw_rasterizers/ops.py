@@ -9,8 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.rendering.rasterizer import GradBuffer
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GradBuffer
 from sw_rasterizers.native import MODULE
 
 INPUTS = (

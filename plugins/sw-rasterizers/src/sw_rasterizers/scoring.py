@@ -9,12 +9,19 @@ import torch
 from sw_reference.scores import check_scores, score_dtype
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.checks import check_placement, check_request
+from splatwizard_core.api import (
+    AccumOutput,
+    Camera,
+    CapabilityError,
+    GaussianInputs,
+    RasterOptions,
+    RenderResult,
+    ScoreSpec,
+    ShapeError,
+    check_request,
+)
+from splatwizard_core.rendering.checks import check_placement
 from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import AccumOutput, RasterOptions, RenderResult, ScoreSpec
-from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.standard import StandardRasterizer

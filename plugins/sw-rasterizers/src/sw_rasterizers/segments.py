@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.utils.weak import WeakIdKeyDictionary
 
-from splatwizard_core.errors import ShapeError
+from splatwizard_core.api import ShapeError
 
 
 class Segments:

@@ -8,21 +8,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.checks import check_placement, check_request, checked_background
-from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import (
+from splatwizard_core.api import (
     AccumOutput,
+    Camera,
     Feature,
+    GaussianInputs,
     GradBuffer,
     RasterizerInfo,
     RasterOptions,
     RasterStats,
     RenderResult,
-    check_offered,
-    option_features,
+    check_request,
+    checked_background,
 )
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.rendering.checks import check_placement
+from splatwizard_core.rendering.negotiation import declared_info
+from splatwizard_core.rendering.rasterizer import check_offered, option_features
 from sw_rasterizers import plugin
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, camera_numbers

@@ -7,11 +7,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.rendering.checks import check_request
+from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions, RenderResult, check_request
 from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
-from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import plugin
 from sw_rasterizers.segments import Tables
 from sw_rasterizers.standard import StandardRasterizer

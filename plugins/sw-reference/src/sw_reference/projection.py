@@ -7,9 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
 
 JAC_CLAMP_MARGIN = 0.3
 """Slopes in the Jacobian are clamped this share of tan(fov/2) outside the image (1.3 tan(fov/2) when centred)."""

@@ -11,18 +11,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.checks import check_request
-from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import (
+from splatwizard_core.api import (
     AccumOutput,
+    Camera,
+    GaussianInputs,
     GradBuffer,
     RasterizerInfo,
     RasterOptions,
     RasterStats,
     RenderResult,
+    check_request,
 )
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.rendering.negotiation import declared_info
 from sw_reference import plugin
 from sw_reference.compositing import Splats, composite, support_rectangles, tile_lists
 from sw_reference.projection import CLASSIC_TILE, Projection, project, visible_radii

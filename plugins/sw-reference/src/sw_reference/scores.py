@@ -8,9 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ConfigError
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import ScoreSpec
+from splatwizard_core.api import ConfigError, GaussianInputs, ScoreSpec
 from sw_reference.compositing import (
     T_MIN,
     Batch,

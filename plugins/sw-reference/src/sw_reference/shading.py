@@ -4,11 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.gaussians.spherical_harmonics import view_colors
-from splatwizard_core.rendering.checks import checked_background
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, checked_background, view_colors
 
 
 def splat_colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) -> Tensor:

@@ -14,10 +14,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import GradBuffer, RasterOptions, RasterStats, RenderResult
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import (
+    Camera,
+    CapabilityError,
+    GaussianInputs,
+    GradBuffer,
+    RasterOptions,
+    RasterStats,
+    RenderResult,
+)
 from sw_reference.compositing import (
     ALPHA_MAX,
     ALPHA_MIN,

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING
 import click
 
 from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import console, debug_option, options, print_json
-from splatwizard_core.cli.setup import output_file, output_folder, say
+from splatwizard_core.tooling import console, debug_option, options, output_file, output_folder, print_json, say
 
 if TYPE_CHECKING:
-    from splatwizard_core.scene.scene import Scene
+    from splatwizard_core.api import Scene
     from sw_report.blocks import Table
     from sw_report.runs import Run
 
@@ -58,7 +57,7 @@ def report(
     Results are comparable inside one protocol only; runs of different protocols stand in different tables. Without an
     option that prints something else, tables are printed as text.
     """
-    from splatwizard_core.errors import CapabilityError
+    from splatwizard_core.api import CapabilityError
 
     try:
         from sw_report import exports
@@ -99,10 +98,8 @@ def report(
 
 def open_scene(run: Run) -> Scene:
     """The scene of a run, read as the run read it. Raises what reading a scene raises."""
-    from splatwizard_core.cli.setup import existing_file, resolve_run_options
-    from splatwizard_core.errors import SceneError
-    from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.loading import load_scene
+    from splatwizard_core.api import SceneError
+    from splatwizard_core.tooling import existing_file, load_plugins, load_scene, resolve_run_options
 
     config = existing_file(str(run.directory / "config.toml"))
     _, scene_options, spec = resolve_run_options(str(config), {})

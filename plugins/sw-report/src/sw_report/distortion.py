@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from splatwizard_core.errors import UserInputError
+from splatwizard_core.api import UserInputError
 from sw_report.aggregate import comparable, mean
 from sw_report.numbers import main_lpips
 from sw_report.rate_distortion import BdResult, bd_quality, bd_rate

@@ -11,7 +11,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.files import write_atomic
+from splatwizard_core.tooling import write_atomic
 from sw_report import numbers
 from sw_report.aggregate import dataset_tables
 from sw_report.blocks import Table

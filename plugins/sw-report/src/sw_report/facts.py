@@ -13,8 +13,8 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
-from splatwizard_core.errors import UserInputError
-from splatwizard_core.runs.record import SCHEMA
+from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import SCHEMA
 from sw_report import numbers
 
 LONGEST_TEXT = 300

@@ -13,7 +13,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 import splatwizard_core
-from splatwizard_core.files import write_atomic
+from splatwizard_core.tooling import write_atomic
 from sw_report import numbers, plots
 from sw_report import results_tables as tables
 from sw_report.aggregate import dataset_tables

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splatwizard_core.plugins import Registry, hookimpl
+from splatwizard_core.api import Registry, hookimpl
 
 if TYPE_CHECKING:
-    from splatwizard_core.runs.observers import FinishedRuns
+    from splatwizard_core.tooling import FinishedRuns
 
 
 @hookimpl

@@ -14,7 +14,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from splatwizard_core.errors import UserInputError
+from splatwizard_core.api import UserInputError
 
 Floats = NDArray[np.float64]
 Method = Literal["pchip", "cubic"]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from splatwizard_core.runs.record import Record
+    from splatwizard_core.tooling import Record
 
 FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
 """Metrics that stand first in the table, in this order."""

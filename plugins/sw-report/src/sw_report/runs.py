@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from splatwizard_core.errors import UserInputError
-from splatwizard_core.runs.record import FILE_NAME
+from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import FILE_NAME
 from sw_report.facts import RunFacts, clean, read_facts
 
 

@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatwizard_core.errors import SplatwizardError
+from splatwizard_core.api import SplatwizardError
 from sw_report.facts import RunFacts, clean
 from sw_report.runs import Run
 
 if TYPE_CHECKING:
-    from splatwizard_core.scene.scene import Scene, View
+    from splatwizard_core.api import Scene, View
 
 Pixels = NDArray[np.uint8]  # [H,W,3]
 SceneOpener = Callable[[Run], "Scene"]
@@ -152,7 +152,7 @@ def is_what_was_scored(render: Pixels, truth: Pixels, recorded: float | None) ->
 
 
 def _save(pixels: Pixels, path: Path) -> None:
-    from splatwizard_core.files import replacing
+    from splatwizard_core.tooling import replacing
 
     with replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.method import Method, create_method
-from splatwizard_core.runs.gaussian_method import GaussianMethod
+from splatwizard_core.api import GaussianMethod, Method, create_method
 from splatwizard_core.runs.keys import dotted
 from sw_speedy_splat.config import SpeedySplatConfig
 from sw_speedy_splat.presets import PRESETS, RATES
@@ -15,9 +14,7 @@ from sw_speedy_splat.stage import SpeedySplatStage
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import Scene, SplatModel, Stage
 
 
 class SpeedySplat(GaussianMethod):

@@ -16,15 +16,10 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.spherical_harmonics import view_colors
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec, view_colors
 
 if TYPE_CHECKING:
-    from splatwizard_core.gaussians.inputs import GaussianInputs
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import Rasterizer
-    from splatwizard_core.scene.camera import Camera
+    from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, SplatModel
 
 SPECS = (ScoreSpec("grad_sq", "grad_sq"), ScoreSpec("hits", "hits"))
 

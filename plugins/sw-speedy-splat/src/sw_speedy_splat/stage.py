@@ -7,12 +7,8 @@ from typing import TYPE_CHECKING, Any
 from sw_finetuning.pruning import PruneByScore
 from sw_gaussians.statistics import accumulate_statistics
 
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import RenderResult
-from splatwizard_core.training.plan import When, scaled
-from splatwizard_core.training.pruner import load_pruner
-from splatwizard_core.training.scheduler import Scheduler
-from splatwizard_core.training.stage import Stage
+from splatwizard_core.api import GaussianModel, RenderResult, Scheduler, Stage, When, load_pruner
+from splatwizard_core.training.plan import scaled
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -20,14 +16,20 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.method import Method
-    from splatwizard_core.plugins import PluginManager
-    from splatwizard_core.rendering.rasterizer import RasterOptions
-    from splatwizard_core.scene.scene import Scene, View
-    from splatwizard_core.training.optimizer import SplatOptimizer
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.stage import CameraSampler, LossPack, StageContext
+    from splatwizard_core.api import (
+        CameraSampler,
+        LossPack,
+        Method,
+        OptimizationParams,
+        PipelineParams,
+        PluginManager,
+        RasterOptions,
+        Scene,
+        SplatModel,
+        SplatOptimizer,
+        StageContext,
+        View,
+    )
     from sw_speedy_splat.config import SpeedySplatConfig
 
 OWN = "speedy-splat"

@@ -7,7 +7,7 @@ from typing import ClassVar, Literal
 from pydantic import Field, model_validator
 from sw_finetuning.fine_tuning import FineTuningRates
 
-from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params
 
 
 class Prune(Params):

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.runs.gaussian_method import GaussianMethod
+from splatwizard_core.api import GaussianMethod
 from sw_trimming_the_fat.config import TrimmingTheFatConfig
 from sw_trimming_the_fat.presets import PRESETS, RATES
 from sw_trimming_the_fat.stage import TrimmingStage
 
 if TYPE_CHECKING:
-    from splatwizard_core.training.stage import Stage
+    from splatwizard_core.api import Stage
 
 
 class TrimmingTheFat(GaussianMethod):

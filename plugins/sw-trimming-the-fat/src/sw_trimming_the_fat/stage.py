@@ -15,21 +15,27 @@ from sw_finetuning.fine_tuning import (
 )
 from sw_finetuning.pruning import PruneByScore, scores_of
 
-from splatwizard_core.errors import EmptyModel
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import Rasterizer
-from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.optimizer import SplatOptimizer
-from splatwizard_core.training.pruner import Pruner, load_pruner
-from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.api import (
+    CameraIterator,
+    EmptyModel,
+    GaussianModel,
+    Pruner,
+    Rasterizer,
+    Scene,
+    SplatOptimizer,
+    load_pruner,
+)
 from sw_trimming_the_fat.score import doomed, mean_gradients
 
 if TYPE_CHECKING:
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.plugins import PluginManager
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
-    from splatwizard_core.training.stage import StageContext
+    from splatwizard_core.api import (
+        OptimizationParams,
+        PipelineParams,
+        PluginManager,
+        Scheduler,
+        SplatModel,
+        StageContext,
+    )
     from sw_trimming_the_fat.config import TrimmingTheFatConfig
 
 log = logging.getLogger(__name__)

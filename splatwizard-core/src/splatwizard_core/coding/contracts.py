@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from torch import Tensor
+
+if TYPE_CHECKING:
+    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.gaussians.model import GaussianModel
 
 
 class Quantizer(Protocol):
@@ -58,4 +62,32 @@ class PositionCodec(Protocol):
 
     def decode(self, data: bytes) -> np.ndarray:
         """[N,3] int64, in Morton order. Raises BitstreamError."""
+        ...
+
+
+class ContextModel(Protocol):
+    """Predicts parameters of entropy models from what is already decoded: a module that trains with its method."""
+
+    def __call__(self, *inputs: Any) -> Tensor:
+        """Differentiable features or parameters, one row for each row of the inputs."""
+        ...
+
+
+class ArrayCoder(Protocol):
+    """Arrays of numbers without loss, shape and dtype included."""
+
+    def encode(self, array: np.ndarray) -> bytes: ...
+
+    def decode(self, data: bytes) -> np.ndarray: ...
+
+
+class GaussianCodec(Protocol):
+    """Turns a GaussianModel into sections of a file and back. The class takes (plugins, **settings), all with defaults."""
+
+    def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
+        """Write everything that `decode` needs; leaves the model as it is."""
+        ...
+
+    def decode(self, reader: ContainerReader) -> GaussianModel:
+        """The inverse. Raises BitstreamError."""
         ...

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatwizard_core.errors import UserInputError
+from splatwizard_core.api import UserInputError
 from sw_codecs.models import gauge
 
 BASE_COLUMNS = 10

@@ -8,9 +8,7 @@ from sw_codecs.models import exact, lossless, ply_section, quantized
 from sw_codecs.models.settings import Codec
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel, PluginManager
 
 
 class Exact:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import GaussianModel
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter
 
 TAILS = {"means": (3,), "sh_dc": (1, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
 """Shape of one row of each tensor, but for sh_rest [K-1,3]."""

@@ -13,11 +13,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.api import GaussianModel
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
 
 TAILS = {"sh_dc": (1, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
 """Shape of one row of what is stored as byte planes, but for sh_rest [K-1,3]; means [3] are stored as steps."""

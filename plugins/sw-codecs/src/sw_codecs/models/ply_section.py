@@ -7,12 +7,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splatwizard_core.errors import BitstreamError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import from_ply, ply_header, property_names, to_ply
+from splatwizard_core.api import BitstreamError, GaussianModel, from_ply, to_ply
+from splatwizard_core.gaussians.ply import ply_header, property_names
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+    from splatwizard_core.api import ContainerReader, ContainerWriter
 
 
 def encode(model: GaussianModel, writer: ContainerWriter) -> None:

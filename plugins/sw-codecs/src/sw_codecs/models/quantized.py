@@ -15,10 +15,9 @@ import torch
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
+from splatwizard_core.api import BitstreamError, GaussianModel, Params
 from splatwizard_core.coding.gaussian_codec import BORROWED
-from splatwizard_core.errors import BitstreamError
-from splatwizard_core.gaussians.model import GaussianModel, logit
-from splatwizard_core.training.params import Params
+from splatwizard_core.gaussians.model import logit
 from sw_codecs.models.attributes import BASE_COLUMNS, Steps, Values, dequantize, quantize
 from sw_codecs.models.band_context import (
     MAX_CLASSES,
@@ -31,8 +30,7 @@ from sw_codecs.models.band_context import (
 from sw_codecs.models.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
     from sw_codecs.models.settings import Codec
 
 log = logging.getLogger(__name__)

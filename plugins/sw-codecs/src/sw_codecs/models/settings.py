@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import Field
 
-from splatwizard_core.training.params import Params
+from splatwizard_core.api import Params
 
 
 class Codec(Params):

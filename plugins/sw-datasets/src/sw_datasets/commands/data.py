@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import (
+from splatwizard_core.tooling import (
     assignments,
     console,
     debug_option,
     json_option,
     options,
+    output_folder,
     print_json,
+    resolve_run_options,
+    say,
     set_option,
 )
-from splatwizard_core.cli.setup import output_folder, resolve_run_options, say
 from sw_datasets.commands.fetch import fetch, registry_option
 
 if TYPE_CHECKING:
@@ -171,7 +173,7 @@ def verify(targets: tuple[str, ...], checksums: bool, decode: bool, registry: st
     Without a name: every scene of the known data sets that lies under $SPLATWIZARD_DATA. Exit status 1 if anything is
     wrong, or if there is nothing to check.
     """
-    from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.tooling import load_plugins
     from sw_datasets.downloads.registry import load_registry
 
     jobs = _verify_jobs(targets, load_registry(registry))
@@ -189,7 +191,7 @@ def verify(targets: tuple[str, ...], checksums: bool, decode: bool, registry: st
 
 def _verify_jobs(targets: tuple[str, ...], known: Registry) -> list[tuple[str, Path, DataSet | None, bool]]:
     """(name, folder, data set or None, whether it is there at all) of every scene to check."""
-    from splatwizard_core.errors import UserInputError
+    from splatwizard_core.api import UserInputError
     from sw_datasets.downloads.presence import data_root, scene_presence
 
     jobs: list[tuple[str, Path, DataSet | None, bool]] = []
@@ -308,9 +310,8 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
 
     --set takes scene keys: resolution, test_every, background, split.
     """
-    from splatwizard_core.errors import UserInputError
-    from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.loading import load_scene
+    from splatwizard_core.api import UserInputError
+    from splatwizard_core.tooling import load_plugins, load_scene
     from sw_datasets.write_scene import write_scene
 
     target = Path(out)

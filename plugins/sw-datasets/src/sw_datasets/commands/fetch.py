@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import debug_option, json_option, options, print_json
-from splatwizard_core.cli.setup import say
+from splatwizard_core.tooling import debug_option, json_option, options, print_json, say
 
 if TYPE_CHECKING:
     from sw_datasets.downloads.download import Fetched
@@ -85,7 +84,7 @@ def fetch(
 
 def _pinned(jobs: list[Job], pins: Sequence[str]) -> list[Job]:
     """The jobs with the user's checksums in place of the registry's. Raises UserInputError for what does not fit."""
-    from splatwizard_core.errors import UserInputError
+    from splatwizard_core.api import UserInputError
 
     by_name: dict[str, str] = {}
     names = list(dict.fromkeys(job.file.name for job in jobs))
@@ -108,7 +107,7 @@ def _pinned(jobs: list[Job], pins: Sequence[str]) -> list[Job]:
 
 def _local_archives(jobs: list[Job], archives: Sequence[str]) -> dict[str, Path]:
     """Address -> the file that is here instead. Raises UserInputError where it is not clear which is which."""
-    from splatwizard_core.errors import UserInputError
+    from splatwizard_core.api import UserInputError
 
     files: dict[str, DataFile] = {job.file.url: job.file for job in jobs}
     names = [file.name for file in files.values()]
@@ -128,7 +127,7 @@ def _local_archives(jobs: list[Job], archives: Sequence[str]) -> dict[str, Path]
 
 def _ask(root: Path, jobs: list[Job], local: dict[str, Path], yes: bool) -> None:
     """Say what will happen, and ask. Raises UserInputError if nobody can answer, Exit for a no."""
-    from splatwizard_core.errors import UserInputError
+    from splatwizard_core.api import UserInputError
     from sw_datasets.downloads.download import require_pooch
 
     if any(job.file.url not in local for job in jobs):
@@ -159,8 +158,7 @@ def _ask(root: Path, jobs: list[Job], local: dict[str, Path], yes: bool) -> None
 @contextlib.contextmanager
 def _alone(root: Path) -> Iterator[None]:
     """Nobody else fetches into the same root meanwhile."""
-    from splatwizard_core.errors import RunLockedError
-    from splatwizard_core.runs.lock import directory_lock
+    from splatwizard_core.tooling import RunLockedError, directory_lock
     from sw_datasets.downloads.fetch import DOWNLOADS
 
     with contextlib.ExitStack() as stack:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.api import Scene, SceneError, SceneOptions
 from splatwizard_core.scene.images import fitted_size
-from splatwizard_core.scene.scene import Scene
 from sw_datasets.demo.synthetic import SIZES, make_scene
 from sw_datasets.families import DEMO
 from sw_datasets.rules import of_no_use, settle

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera
 from sw_datasets.demo.shapes import Shape, Vec, dot, normalize
 from sw_datasets.demo.textures import Material
 

@@ -11,10 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.scene.assemble import assemble_scene
-from splatwizard_core.scene.camera import Camera, look_at
-from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
-from splatwizard_core.streams import stream
+from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, assemble_scene, stream
+from splatwizard_core.scene.camera import look_at
 from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks

@@ -18,9 +18,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from splatwizard_core.errors import CapabilityError, FetchError
-from splatwizard_core.files import full_disk_code, write_json
-from splatwizard_core.progress import Bar, track
+from splatwizard_core.api import CapabilityError, track
+from splatwizard_core.errors import FetchError
+from splatwizard_core.tooling import Bar, full_disk_code, write_json
 
 CHUNK_BYTES = 1 << 15  # what a broken connection costs at most
 ATTEMPTS = 6  # in a row without one new byte; with the pauses below that is half a minute of silence

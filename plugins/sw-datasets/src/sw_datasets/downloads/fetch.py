@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 
-from splatwizard_core.errors import UserInputError
-from splatwizard_core.files import write_json
+from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import write_json
 from sw_datasets.downloads.download import Fetched
 from sw_datasets.downloads.presence import RECEIPTS, ScenePresence, scene_presence
 from sw_datasets.downloads.registry import DataFile, DataSet

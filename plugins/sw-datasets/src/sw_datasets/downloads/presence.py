@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from splatwizard_core.errors import UserInputError
+from splatwizard_core.api import UserInputError
 from sw_datasets.downloads.registry import DataSet
 from sw_datasets.families import BENCHMARKS
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
 
-from splatwizard_core.errors import ConfigError, UserInputError
+from splatwizard_core.api import ConfigError, UserInputError
 
 if sys.version_info >= (3, 11):
     import tomllib

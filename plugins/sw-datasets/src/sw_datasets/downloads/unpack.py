@@ -20,10 +20,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
+from splatwizard_core.api import track
 from splatwizard_core.errors import ArchiveError, FetchError
-from splatwizard_core.files import new_folder
-from splatwizard_core.progress import track
 from splatwizard_core.scene.images import is_inside
+from splatwizard_core.tooling import new_folder
 from sw_datasets.downloads.download import byte_progress
 
 MAX_MEMBERS = 200_000

@@ -10,10 +10,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.gaussians.spherical_harmonics import eval_sh
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, eval_sh
 
 Note = Callable[["Tensor | float", float], None]
 MaskedNote = Callable[..., None]

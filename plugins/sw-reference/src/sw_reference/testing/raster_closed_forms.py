@@ -6,9 +6,8 @@ import math
 
 import torch
 
-from splatwizard_core.gaussians.inputs import SH
+from splatwizard_core.api import SH, Rasterizer, RasterOptions
 from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions
 from sw_reference.testing.raster_scenes import permute_inputs
 from sw_reference.testing.rasterizer_checks import check, close, draw, front_camera, splats
 

@@ -8,16 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import (
-    Rasterizer,
-    RasterizerInfo,
-    RasterOptions,
-    RenderResult,
-    feature_names,
-    required_features,
-)
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterizerInfo, RasterOptions, RenderResult
+from splatwizard_core.rendering.rasterizer import feature_names, required_features
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, margin_scene, with_tensors
 
 DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})

@@ -8,9 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterOptions
 from sw_reference.projection import rotation_matrices
 from sw_reference.testing.raster_scenes import (
     RasterCase,

@@ -8,10 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
+from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
 from splatwizard_core.gaussians.spherical_harmonics import num_coefficients
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import Camera, look_at
+from splatwizard_core.scene.camera import look_at
 from sw_reference.projection import covariances
 from sw_reference.testing.naive_rasterizer import naive_render
 

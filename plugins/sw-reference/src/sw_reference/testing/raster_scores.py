@@ -5,8 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, ScoreSpec
+from splatwizard_core.api import GaussianInputs, Rasterizer, RasterOptions, ScoreSpec
 from sw_reference.scores import view_fisher
 from sw_reference.testing.naive_rasterizer import Pair, naive_render
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, margin_scene

@@ -9,15 +9,15 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import (
+from splatwizard_core.api import (
     AccumOutput,
+    Camera,
+    GaussianInputs,
     Rasterizer,
     RasterizerInfo,
     RasterOptions,
     RenderResult,
 )
-from splatwizard_core.scene.camera import Camera
 from sw_reference.testing import raster_closed_forms, raster_robustness
 from sw_reference.testing.rasterizer_checks import CheckFunction, check, close, draw, front_camera, splats
 

@@ -19,9 +19,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterizerInfo, RasterOptions, RenderResult
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterizerInfo, RasterOptions, RenderResult
 from sw_reference.testing.raster_scenes import with_tensors
 
 CheckFunction = Callable[[Rasterizer, str], None]

@@ -10,16 +10,25 @@ from sw_anchors.anchors import AnchorModel
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from torch import Tensor
 
-from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import SceneError
-from splatwizard_core.method import Method
-from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
-from splatwizard_core.scene.scene import Scene, View
-from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams, PipelineParams
-from splatwizard_core.training.scheduler import Scheduler
-from splatwizard_core.training.stage import LossPack, Stage, StageContext
+from splatwizard_core.api import (
+    ContainerReader,
+    ContainerWriter,
+    LossPack,
+    Method,
+    OptimizationParams,
+    ParamGroup,
+    PipelineParams,
+    RasterOptions,
+    RenderResult,
+    Scene,
+    SceneError,
+    Scheduler,
+    SplatOptimizer,
+    Stage,
+    StageContext,
+    View,
+    photometric_loss,
+)
 from sw_test_anchors.model import POSITION_BITS, ContextAnchors, context_inputs
 
 NETWORKS = ("mlp_opacity", "mlp_cov", "mlp_color")

@@ -6,7 +6,7 @@ import torch
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from torch import Tensor, nn
 
-from splatwizard_core.plugins import PluginManager
+from splatwizard_core.api import PluginManager
 
 POSITION_BITS = 16
 OCTAVES = 5

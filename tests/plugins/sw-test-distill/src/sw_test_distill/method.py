@@ -9,17 +9,29 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.method import Method, create_method
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
-from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.scene import Scene, View
-from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams
-from splatwizard_core.training.stage import CameraSampler, LossPack, Stage, StageContext
+from splatwizard_core.api import (
+    SH,
+    Camera,
+    CameraSampler,
+    ContainerReader,
+    ContainerWriter,
+    GaussianInputs,
+    GaussianModel,
+    LossPack,
+    Method,
+    OptimizationParams,
+    ParamGroup,
+    Rasterizer,
+    RasterOptions,
+    RenderResult,
+    Scene,
+    SplatOptimizer,
+    Stage,
+    StageContext,
+    View,
+    create_method,
+    photometric_loss,
+)
 
 OWN = ("means", "opacity_logits", "log_scales", "quats")
 

@@ -1,0 +1,61 @@
+"""What a method, rasterizer, codec, metric or data set imports of the core: at most 80 names, stable since 0.2.
+
+docs/plugins.md describes each. Everything else in `splatwizard_core` may change with any release.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+MODULES = {
+    "plugins.hookspecs": "hookimpl",
+    "plugins.registry": "Registry",
+    "plugins.manager": "PluginManager",
+    "errors": "SplatwizardError BitstreamError CapabilityError ConfigError EmptyModel SceneError ShapeError UserInputError",
+    "method": "Method create_method",
+    "gaussian_method": "GaussianMethod",
+    "scene.camera": "Camera",
+    "scene.scene": "View Scene PointCloud Protocol",
+    "scene.dataset": "SceneOptions Dataset",
+    "scene.assemble": "assemble_scene",
+    "gaussians.splat_model": "SplatModel",
+    "gaussians.model": "GaussianModel",
+    "gaussians.inputs": "GaussianInputs SH",
+    "gaussians.ply": "load_ply to_ply from_ply",
+    "gaussians.spherical_harmonics": "eval_sh view_colors",
+    "gaussians.knn": "mean_squared_neighbor_distance",
+    "rendering.rasterizer": "Rasterizer RasterizerInfo RasterOptions RenderResult RasterStats AccumOutput GradBuffer Feature ScoreSpec",
+    "rendering.checks": "check_request checked_background",
+    "training.stage": "Stage StageContext LossPack CameraSampler CameraIterator",
+    "training.scheduler": "Scheduler PhaseSwitch",
+    "training.plan": "When",
+    "training.params": "OptimizationParams PipelineParams Params InputFile",
+    "training.optimizer": "SplatOptimizer ParamGroup",
+    "training.losses": "photometric_loss",
+    "training.learning_rate": "exponential_lr",
+    "training.pruner": "Pruner load_pruner",
+    "streams": "stream",
+    "coding.container": "ContainerReader ContainerWriter",
+    "coding.contracts": "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder GaussianCodec",
+    "evaluation.metrics": "Metric MetricSetup PreparedMetric",
+    "native": "NativeModule",
+    "progress": "track",
+}
+"""Module of the core -> the names that it lends, in the order of the documentation. `api.pyi` repeats it for type checkers."""
+
+_HOMES = {name: f"splatwizard_core.{module}" for module, names in MODULES.items() for name in names.split()}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, once: a plugin that only registers itself imports no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    found = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -1,0 +1,49 @@
+"""What packages about runs (reports, sweeps, diagnoses, viewers) import of the core besides `api`.
+
+Documented in docs/plugins.md; unlike `api` it is not promised to stay as it is.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+MODULES = {
+    "plugins.manager": "load_plugins",
+    "plugins.registry": "Entry",
+    "plugins.loading": "PluginInfo",
+    "runs.record": "Record read_record SCHEMA FILE_NAME",
+    "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
+    "runs.lock": "directory_lock",
+    "runs.config": "resolve",
+    "runs.run": "run",
+    "runs.device": "choose_device",
+    "scene.loading": "load_scene",
+    "files": "file_sha256 full_disk_code new_folder replacing write_atomic write_json",
+    "progress": "Bar",
+    "cores": "available_cores",
+    "errors": "NativeBuildError PluginError RunLockedError",
+    "native": "cache_root",
+    "native.build": "declared_modules resolve_module",
+    "native.toolchain": "find_compiler find_nvcc nvcc_version",
+    "rendering.negotiation": "NegotiatedRasterizer info_from_entry obstacle",
+    "cli.options": "assignments console debug_option json_option options print_json set_option",
+    "cli.setup": "existing_file output_file output_folder resolve_run_options say",
+}
+"""Module of the core -> the names that it lends, in the order of the documentation. `tooling.pyi` repeats it for type checkers."""
+
+_HOMES = {name: f"splatwizard_core.{module}" for module, names in MODULES.items() for name in names.split()}
+__all__ = list(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    """Import what is asked for, once: a plugin that only registers itself imports no torch."""
+    if name not in _HOMES:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    found = getattr(importlib.import_module(_HOMES[name]), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
