@@ -12,7 +12,9 @@ MODULES = {
     "plugins.hookspecs": "hookimpl",
     "plugins.registry": "Registry",
     "plugins.manager": "PluginManager",
-    "errors": "SplatwizardError BitstreamError CapabilityError ConfigError EmptyModel SceneError ShapeError UserInputError",
+    "errors": (
+        "SplatwizardError BitstreamError CapabilityError ConfigError EmptyModel SceneError ShapeError UserInputError"
+    ),
     "method": "Method create_method",
     "gaussian_method": "GaussianMethod",
     "scene.camera": "Camera",
@@ -25,7 +27,9 @@ MODULES = {
     "gaussians.ply": "load_ply to_ply from_ply",
     "gaussians.spherical_harmonics": "eval_sh view_colors",
     "gaussians.knn": "mean_squared_neighbor_distance",
-    "rendering.rasterizer": "Rasterizer RasterizerInfo RasterOptions RenderResult RasterStats AccumOutput GradBuffer Feature ScoreSpec",
+    "rendering.rasterizer": (
+        "Rasterizer RasterizerInfo RasterOptions RenderResult RasterStats AccumOutput GradBuffer Feature ScoreSpec"
+    ),
     "rendering.checks": "check_request checked_background",
     "training.stage": "Stage StageContext LossPack CameraSampler CameraIterator",
     "training.scheduler": "Scheduler PhaseSwitch",
@@ -42,7 +46,7 @@ MODULES = {
     "native": "NativeModule",
     "progress": "track",
 }
-"""Module of the core -> the names that it lends, in the order of the documentation. `api.pyi` repeats it for type checkers."""
+"""Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""
 
 _HOMES = {name: f"splatwizard_core.{module}" for module, names in MODULES.items() for name in names.split()}
 __all__ = list(_HOMES)

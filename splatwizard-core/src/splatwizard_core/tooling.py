@@ -30,7 +30,7 @@ MODULES = {
     "cli.options": "assignments console debug_option json_option options print_json set_option",
     "cli.setup": "existing_file output_file output_folder resolve_run_options say",
 }
-"""Module of the core -> the names that it lends, in the order of the documentation. `tooling.pyi` repeats it for type checkers."""
+"""Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 
 _HOMES = {name: f"splatwizard_core.{module}" for module, names in MODULES.items() for name in names.split()}
 __all__ = list(_HOMES)

@@ -1,4 +1,4 @@
-"""Hyper-parameters of training explicit Gaussians. Defaults are those of 3DGS (the Splatwizard paper where they differ)."""
+"""Hyper-parameters of training explicit Gaussians. Defaults are those of the Splatwizard paper."""
 
 from typing import Literal
 

@@ -82,7 +82,7 @@ class ArrayCoder(Protocol):
 
 
 class GaussianCodec(Protocol):
-    """Turns a GaussianModel into sections of a file and back. The class takes (plugins, **settings), all with defaults."""
+    """Turns a GaussianModel into sections of a file and back. The class takes (plugins, **settings)."""
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         """Write everything that `decode` needs; leaves the model as it is."""

@@ -1,7 +1,7 @@
 """The whole plugin surface: every hook that an installed distribution may implement.
 
 A `register_*` hook gets a registry and adds light entries to it: a name, a lazy "module:attribute" target, a one-line
-summary, and the fields that its kind declares. Nothing heavy is imported by a hook. The hooks are called through pluggy,
+summary, and the fields that its kind declares. Nothing heavy is imported by a hook. Hooks are called through pluggy,
 so `specname`, `tryfirst`, `trylast` and wrappers work as its documentation says.
 """
 

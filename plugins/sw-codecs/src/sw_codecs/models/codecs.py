@@ -25,7 +25,7 @@ class Exact:
 
 
 class Quantized:
-    """Octree positions, all else on a lattice and range coded; settings: `sw_codecs.models.settings.Codec` (defaults: rate r5)."""
+    """Octree positions, all else on a lattice and range coded; settings: `Codec` (defaults: rate r5)."""
 
     def __init__(self, plugins: PluginManager, **settings: Any) -> None:
         self.plugins, self.codec = plugins, Codec(mode="quantized", **settings)
