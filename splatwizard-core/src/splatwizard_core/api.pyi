@@ -19,8 +19,8 @@ from splatwizard_core.evaluation.metrics import Metric as Metric
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.gaussian_method import GaussianMethod as GaussianMethod
-from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
 from splatwizard_core.gaussians.inputs import SH as SH
+from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance as mean_squared_neighbor_distance
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel
 from splatwizard_core.gaussians.ply import from_ply as from_ply
@@ -41,10 +41,10 @@ from splatwizard_core.rendering.checks import checked_background as checked_back
 from splatwizard_core.rendering.rasterizer import AccumOutput as AccumOutput
 from splatwizard_core.rendering.rasterizer import Feature as Feature
 from splatwizard_core.rendering.rasterizer import GradBuffer as GradBuffer
-from splatwizard_core.rendering.rasterizer import RasterOptions as RasterOptions
-from splatwizard_core.rendering.rasterizer import RasterStats as RasterStats
 from splatwizard_core.rendering.rasterizer import Rasterizer as Rasterizer
 from splatwizard_core.rendering.rasterizer import RasterizerInfo as RasterizerInfo
+from splatwizard_core.rendering.rasterizer import RasterOptions as RasterOptions
+from splatwizard_core.rendering.rasterizer import RasterStats as RasterStats
 from splatwizard_core.rendering.rasterizer import RenderResult as RenderResult
 from splatwizard_core.rendering.rasterizer import ScoreSpec as ScoreSpec
 from splatwizard_core.scene.assemble import assemble_scene as assemble_scene

@@ -41,8 +41,8 @@ from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
 from splatwizard_core.runs.observers import StartedTraining as StartedTraining
 from splatwizard_core.runs.observers import TrainingObserver as TrainingObserver
 from splatwizard_core.runs.record import FILE_NAME as FILE_NAME
-from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import SCHEMA as SCHEMA
+from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import read_record as read_record
 from splatwizard_core.runs.run import run as run
 from splatwizard_core.scene.loading import load_scene as load_scene
