@@ -22,7 +22,7 @@ from sw_datasets.colmap_model import (
 )
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.loading import colmap_model
+from sw_datasets import colmap_model
 
 READERS = {
     "cameras": colmap_model.read_cameras,
