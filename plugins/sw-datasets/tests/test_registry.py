@@ -149,12 +149,13 @@ def test_the_two_archives_of_bungee_fill_one_folder(tmp_path: Path):
 @pytest.mark.parametrize("where", ["dtu/scan24", "dtu/24", "DTU/scan24"])
 def test_scenes_are_found_where_the_loader_finds_them(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from splatwizard_core.scene.locate import locate
+    from splatwizard_core.tooling import load_plugins
 
     (tmp_path / where / "images").mkdir(parents=True)
     found = scene_presence(tmp_path, load_registry()["dtu"], "24")
     assert (found.path, found.state) == (tmp_path / where, "partly")
     monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
-    assert locate("dtu/24")[0] == found.path
+    assert locate("dtu/24", load_plugins().datasets)[0] == found.path
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"{}", b'{"archive": 1, "files": {}}', b"\xff", b"[" * 100_000])
