@@ -284,7 +284,7 @@ def test_progress_and_time_left_are_shown(
 
 def test_without_pooch_it_names_what_to_install(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pooch", None)
-    with pytest.raises(CapabilityError, match=r"pip install 'splatwizard-core\[download\]'"):
+    with pytest.raises(CapabilityError, match=r"pip install 'sw-datasets\[download\]'"):
         download(site.url(PATH), target)
     assert site.asked == []
 
