@@ -22,7 +22,7 @@ INDOOR = ("room", "counter", "kitchen", "bonsai")
 
 @dataclass(frozen=True)
 class Pictures:
-    """Which pictures of a scene are used, and how large.
+    """The picture folder and the size at which a scene is used.
 
     folder      picture folder; None: the layout has none to choose
     resolution  -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
@@ -40,7 +40,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Family:
-    """One dataset family: what a folder of it is read with unless the user says otherwise.
+    """One dataset family and the rules its scenes are read by unless the user says otherwise.
 
     name            registry name, and the dataset in protocol ids
     title           as papers write it

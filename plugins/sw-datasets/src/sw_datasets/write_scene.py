@@ -1,4 +1,4 @@
-"""Writes a scene as a folder that the loaders, and other programs, read."""
+"""Writes a scene as a folder in a layout that the loaders and other programs read."""
 
 from __future__ import annotations
 

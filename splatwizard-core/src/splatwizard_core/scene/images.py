@@ -1,4 +1,4 @@
-"""Decoding of many pictures at once, and where they are kept."""
+"""Decodes the pictures of many views at once, and keeps them in memory."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From the name of a scene to the Scene: the family that reads it is chosen among those installed, and loads it."""
+"""Loads the scene that a user names, with the installed family that reads it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ PICTURES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scene:
-    """The scene that `spec` names.
+    """Load the scene that `spec` names.
 
     NAME, NAME:VARIANT  a scene that the procedural family NAME makes, and one of its variants
     a path              a scene folder; the registered family that recognises it best reads it
@@ -62,7 +62,7 @@ def _family(families: Families, name: str) -> Dataset:
 
 
 def _recognise(path: Path, families: Families) -> str:
-    """The family with the highest detection score. Raises SceneError if none or several claim the path."""
+    """Name of the family with the highest detection score. Raises SceneError if none or several claim the path."""
     scores: dict[str, float] = {}
     for entry in families:
         try:

@@ -1,4 +1,4 @@
-"""Where a scene is: a path as it stands, or `dataset/scene` below $SPLATWIZARD_DATA."""
+"""Finds the folder of a scene: a path as it stands, or `dataset/scene` below $SPLATWIZARD_DATA."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def is_procedural(families: Families, name: str) -> bool:
 
 
 def locate(spec: str, families: Families) -> tuple[Path, str | None]:
-    """(folder, the dataset it was asked for under, None for a path).
+    """Find (folder of a scene, name of the data set it was asked by; None for a path).
 
     `dataset/scene` is $SPLATWIZARD_DATA/dataset/scene, or lies in one of the other `folders` that the family of that
     name declares, with or without its `prefix` before the scene's name.

@@ -22,7 +22,7 @@ FOV_X = math.radians(46)
 
 @dataclass(frozen=True)
 class DemoSize:
-    """How much of the demo scene there is.
+    """Size of the demo scene.
 
     views           cameras on the hemisphere; every `test_every`-th by name is a test view
     width, height   pixels
@@ -171,7 +171,7 @@ def sample_surfaces(world: World, count: int, generator: torch.Generator) -> tup
 
 
 def start_points(world: World, cameras: list[Camera], count: int, generator: torch.Generator) -> PointCloud:
-    """What structure from motion would find: noisy, coloured points that at least two of the cameras see."""
+    """Start points as structure from motion finds them: noisy, coloured, each seen by at least two of the cameras."""
     xyz, _, which = sample_surfaces(world, 2 * count, generator)
     seen = np.zeros(xyz.shape[1], dtype=int)
     rgb = np.zeros_like(xyz)

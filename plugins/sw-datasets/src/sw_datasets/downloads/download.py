@@ -48,7 +48,7 @@ class Fetched:
 
 @dataclass
 class _Part:
-    """What FILE.part is a part of: address, length in all (None: unknown), and what tells versions apart."""
+    """The file that FILE.part is a part of: address, length in all (None: unknown), and the marks of its version."""
 
     url: str
     total: int | None = None
@@ -57,7 +57,7 @@ class _Part:
 
 
 def require_pooch() -> Any:
-    """The module. Raises CapabilityError that says how to install it."""
+    """Import pooch. Raises CapabilityError that says how to install it."""
     try:
         return importlib.import_module("pooch")
     except ImportError as error:
@@ -124,7 +124,7 @@ def sha256_with_progress(path: Path) -> str:
 
 @contextlib.contextmanager
 def byte_progress(label: str, total: int | None, start: int = 0) -> Iterator[Callable[[int], None]]:
-    """A progress display in MB; what it yields is called with numbers of bytes."""
+    """Show progress in MB; yields a function that is called with numbers of bytes."""
     whole = None if total is None else -(-total // MEGABYTE)
     with track(label, total=whole, start=start // MEGABYTE, unit="MB") as bar:
         yield _Counter(bar, start)
@@ -161,7 +161,7 @@ class _Transfer:
         self.part = self._read_note()
 
     def run(self) -> None:
-        """Until the file is whole. Raises FetchError."""
+        """Connect until the file is whole. Raises FetchError."""
         failures = 0
         while True:
             before = self._have()
@@ -232,7 +232,7 @@ class _Transfer:
         return self.path.stat().st_size if self.path.exists() else 0
 
     def _read_note(self) -> _Part:
-        """What the part is of; another address, or no readable note: the part is of no use and deleted."""
+        """Read the note beside the part. Another address, or no readable note: the part is deleted."""
         try:
             part = _Part(**json.loads(self.note.read_bytes()))
         except (OSError, ValueError, TypeError):
@@ -244,7 +244,7 @@ class _Transfer:
         return part
 
     def begin(self, response: Any, start: int) -> int:
-        """What the first lines of an answer mean: the byte of the file at which its body begins."""
+        """Return the byte of the file at which the body of an answer begins."""
         if response.status_code == 416:
             total = _total(response.headers.get("Content-Range", ""))
             if total is not None and total == start:
@@ -298,7 +298,7 @@ class _Transfer:
 
 
 class _Sink(contextlib.ExitStack):
-    """What pooch writes to: the part file, opened when the answer says where its bytes belong."""
+    """The file object that pooch writes to: the part file, opened when the answer says where its bytes belong."""
 
     def __init__(self, transfer: _Transfer, start: int) -> None:
         super().__init__()
@@ -317,7 +317,7 @@ class _Sink(contextlib.ExitStack):
         self.count = self.enter_context(byte_progress(label, self.transfer.part.total, start))
 
     def write(self, block: bytes) -> int:
-        """The next bytes of the body."""
+        """Write the next bytes of the body."""
         if self.file is None:
             raise _Broken("the server answered nothing that can be kept")
         total = self.transfer.part.total
@@ -327,7 +327,7 @@ class _Sink(contextlib.ExitStack):
         return self.file.write(block)
 
     def flush(self) -> None:
-        """Nothing: the file is written when it is closed, and blocks are large."""
+        """Do nothing: the file is written when it is closed, and blocks are large."""
 
 
 class _Broken(Exception):  # noqa: N818 (not an error for the user)

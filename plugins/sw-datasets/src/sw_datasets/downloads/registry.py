@@ -129,7 +129,7 @@ class DataSet(BaseModel):
         return file.scenes or self.scenes
 
     def check_scene(self, scene: str) -> None:
-        """Raises UserInputError for a scene that the data set does not have."""
+        """Raise UserInputError for a scene that the data set does not have."""
         if scene not in self.scenes:
             there = ", ".join(self.scenes) or "it holds no scenes"
             raise UserInputError(f"data set '{self.id}' has no scene '{scene}': {there}")
@@ -146,7 +146,7 @@ class DataSets(Mapping[str, DataSet]):
         self._datasets = {dataset.id: dataset for dataset in datasets}
 
     def __getitem__(self, name: str) -> DataSet:
-        """Raises UserInputError with the nearest id."""
+        """The data set of this id. Raises UserInputError with the nearest id."""
         if name not in self._datasets:
             near = difflib.get_close_matches(name, self._datasets, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(self._datasets)}"
@@ -203,7 +203,7 @@ def public_data() -> bytes:
 
 
 def parse_registry(content: bytes, name: str) -> list[DataSet]:
-    """The data sets of a TOML text. Raises ConfigError that names `name`, the data set and the key."""
+    """Parse the data sets of a TOML text. Raises ConfigError that names `name`, the data set and the key."""
     try:
         tables: dict[str, Any] = tomllib.loads(content.decode())
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:

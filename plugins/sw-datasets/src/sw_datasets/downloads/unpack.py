@@ -38,7 +38,7 @@ JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db")
 """What systems leave in archives; passed over."""
 
 Files = dict[str, tuple[int, str]]
-"""What was unpacked: path -> (bytes, SHA-256)."""
+"""Unpacked files: path -> (bytes, SHA-256)."""
 
 
 @dataclass(frozen=True)

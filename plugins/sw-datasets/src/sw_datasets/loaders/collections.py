@@ -1,4 +1,4 @@
-"""The six published collections as dataset families: recognised by what lies where, read by their own rules."""
+"""The six published collections: how their scenes are recognised on disk, and read by their own rules."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sw_datasets.loaders.blender import has_blender_layout, load_blender
 from sw_datasets.loaders.colmap import load_colmap, model_folder
 from sw_datasets.loaders.dtu import has_dtu_layout, load_dtu
 from sw_datasets.loaders.enu import has_enu_layout, load_enu
-from sw_datasets.rules import Rules, settle
+from sw_datasets.rules import Rules, rules_for
 
 AT_HOME, BY_SIGNS, BY_OWN_FILE = 0.9, 0.8, 0.9
 
@@ -52,7 +52,7 @@ class Collection:
         self.family, self.layouts = family, tuple(layouts)
 
     def detect(self, path: Path) -> float:
-        """How surely a folder is a scene of the collection.
+        """Score how surely a folder is a scene of the collection.
 
         0.9     a layout that only this family has, with its prefix where it has one ("scan"); or a published scene's
                 name in a folder with the collection's name
@@ -81,7 +81,7 @@ class Collection:
             nothing = "neither " if len(self.layouts) > 1 else "no "
             raise SceneError(f"{path}: {nothing}{wanted}: not a scene of {self.family.title}", path=str(path))
         folder = path.resolve().name if self.family.scene_of(path.name) is None else path.name
-        rules = settle(self.family, folder, options)
+        rules = rules_for(self.family, folder, options)
         scene = layout.load(path, rules, options)
         scene.name = folder  # a link goes by its own name where that is the published one
         if rules.scene is None:
