@@ -88,7 +88,7 @@ def dataset_state(root: Path, dataset: DataSet, scenes: list[ScenePresence]) -> 
 
 
 def read_receipt(home: Path, folder: str) -> dict[str, Any] | None:
-    """Read a receipt of a fetched scene: {"archive": {...}, "files": {path: [bytes, sha256]}}; None if there is none."""
+    """Read the receipt of a scene: {"archive": {...}, "files": {path: [bytes, sha256]}}; None if there is none."""
     try:
         receipt = json.loads((home / RECEIPTS / f"{folder}.json").read_bytes())
     except (OSError, ValueError, RecursionError):
