@@ -1,4 +1,4 @@
-"""The six published collections as dataset families: recognised by what lies where, read by their own rules."""
+"""The six published collections: how their scenes are recognised on disk, and read by their own rules."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
-from sw_datasets.blender import has_blender_layout, load_blender
-from sw_datasets.colmap import load_colmap, model_folder
-from sw_datasets.dtu import has_dtu_layout, load_dtu
-from sw_datasets.enu import has_enu_layout, load_enu
 from sw_datasets.families import BENCHMARKS, Family
-from sw_datasets.rules import Rules, settle
+from sw_datasets.loaders.blender import has_blender_layout, load_blender
+from sw_datasets.loaders.colmap import load_colmap, model_folder
+from sw_datasets.loaders.dtu import has_dtu_layout, load_dtu
+from sw_datasets.loaders.enu import has_enu_layout, load_enu
+from sw_datasets.rules import Rules, rules_for
 
 AT_HOME, BY_SIGNS, BY_OWN_FILE = 0.9, 0.8, 0.9
 
@@ -22,8 +22,10 @@ AT_HOME, BY_SIGNS, BY_OWN_FILE = 0.9, 0.8, 0.9
 class Layout:
     """One way in which a family's scenes lie on disk.
 
-    looks_for   for messages
-    own         no other family of the core has this layout
+    is_there    whether a folder has this layout
+    load        reads such a folder
+    looks_for   the file by which it is known, for messages
+    own         no other family of this package has this layout
     """
 
     is_there: Callable[[Path], bool]
@@ -32,10 +34,12 @@ class Layout:
     own: bool = False
 
 
-COLMAP = Layout(lambda path: model_folder(path) is not None, load_colmap, "sparse/0/cameras.bin or .txt (run COLMAP)")
-BLENDER = Layout(has_blender_layout, load_blender, "transforms_train.json")
-ENU = Layout(has_enu_layout, load_enu, "poses_enu.json", own=True)
-DTU = Layout(has_dtu_layout, load_dtu, "sparse/0/cameras.bin beside cameras.npz", own=True)
+COLMAP_LAYOUT = Layout(
+    lambda path: model_folder(path) is not None, load_colmap, "sparse/0/cameras.bin or .txt (run COLMAP)"
+)
+BLENDER_LAYOUT = Layout(has_blender_layout, load_blender, "transforms_train.json")
+ENU_LAYOUT = Layout(has_enu_layout, load_enu, "poses_enu.json", own=True)
+DTU_LAYOUT = Layout(has_dtu_layout, load_dtu, "sparse/0/cameras.bin beside cameras.npz", own=True)
 
 
 class Collection:
@@ -48,7 +52,7 @@ class Collection:
         self.family, self.layouts = family, tuple(layouts)
 
     def detect(self, path: Path) -> float:
-        """How surely a folder is a scene of the collection.
+        """Score how surely a folder is a scene of the collection.
 
         0.9     a layout that only this family has, with its prefix where it has one ("scan"); or a published scene's
                 name in a folder with the collection's name
@@ -77,7 +81,7 @@ class Collection:
             nothing = "neither " if len(self.layouts) > 1 else "no "
             raise SceneError(f"{path}: {nothing}{wanted}: not a scene of {self.family.title}", path=str(path))
         folder = path.resolve().name if self.family.scene_of(path.name) is None else path.name
-        rules = settle(self.family, folder, options)
+        rules = rules_for(self.family, folder, options)
         scene = layout.load(path, rules, options)
         scene.name = folder  # a link goes by its own name where that is the published one
         if rules.scene is None:
@@ -90,9 +94,11 @@ class Collection:
         return next((layout for layout in self.layouts if layout.is_there(path)), None)
 
 
-MIPNERF360 = Collection(BENCHMARKS["mipnerf360"], [COLMAP])
-TANDT = Collection(BENCHMARKS["tandt"], [COLMAP])
-DB = Collection(BENCHMARKS["db"], [COLMAP])
-BUNGEE = Collection(BENCHMARKS["bungee"], [COLMAP, ENU])  # the archive with SfM points is what published tables use
-NERF_SYNTHETIC = Collection(BENCHMARKS["nerf_synthetic"], [BLENDER])
-DTU_SCANS = Collection(BENCHMARKS["dtu"], [DTU])
+MIPNERF360 = Collection(BENCHMARKS["mipnerf360"], [COLMAP_LAYOUT])
+TANDT = Collection(BENCHMARKS["tandt"], [COLMAP_LAYOUT])
+DB = Collection(BENCHMARKS["db"], [COLMAP_LAYOUT])
+BUNGEE = Collection(
+    BENCHMARKS["bungee"], [COLMAP_LAYOUT, ENU_LAYOUT]
+)  # the archive with SfM points is what published tables use
+NERF_SYNTHETIC = Collection(BENCHMARKS["nerf_synthetic"], [BLENDER_LAYOUT])
+DTU = Collection(BENCHMARKS["dtu"], [DTU_LAYOUT])

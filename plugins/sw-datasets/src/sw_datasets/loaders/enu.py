@@ -18,8 +18,8 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
-from splatwizard_core.scene.images import fitted_size, list_pictures, load_picture, picture_header
-from sw_datasets.rules import Rules, of_no_use
+from sw_datasets.pictures import fitted_size, list_pictures, load_picture, picture_header
+from sw_datasets.rules import Rules, unused_option_warnings
 
 POSES = "poses_enu.json"
 DEPTHS = (0.8, 1.2)  # start points lie about the distance at which the cameras' axes meet
@@ -62,7 +62,9 @@ def load_enu(path: Path, rules: Rules, options: SceneOptions) -> Scene:
         f"{POSES} brings no points: {options.init_points:,} random ones are laid where the cameras look, "
         "figures are not comparable with those of the COLMAP layout"
     ]
-    warnings += of_no_use(options, ("principal_point", "mask_background", "legacy_8bit_composite"), rules.family)
+    warnings += unused_option_warnings(
+        options, ("principal_point", "mask_background", "legacy_8bit_composite"), rules.family
+    )
     return assemble_scene(
         path.resolve().name,
         views,

@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
-from splatwizard_core.scene.images import (
+from sw_datasets.families import BLENDER
+from sw_datasets.pictures import (
     find_pictures,
     fitted_size,
     load_composited,
@@ -24,8 +25,7 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from sw_datasets.families import BLENDER
-from sw_datasets.rules import Rules, of_no_use, settle
+from sw_datasets.rules import Rules, rules_for, unused_option_warnings
 
 HALF_CUBE = 1.3  # start points fill [-1.3, 1.3]^3 (3DGS)
 SH_C0 = 0.28209479177387814
@@ -34,7 +34,7 @@ DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
 
 class BlenderDataset:
-    """Camera-to-world matrices in OpenGL axes, split by file, white background unless told otherwise."""
+    """Blender scenes: camera-to-world matrices in OpenGL axes, split by file, white background by default."""
 
     def detect(self, path: Path) -> float:
         """0.5 with transforms_train.json, else 0."""
@@ -42,7 +42,7 @@ class BlenderDataset:
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read poses and the sizes of the pictures; no pixel is decoded. Raises SceneError in one line."""
-        return load_blender(path, settle(BLENDER, path.resolve().name, options), options)
+        return load_blender(path, rules_for(BLENDER, path.resolve().name, options), options)
 
 
 def has_blender_layout(path: Path) -> bool:
@@ -66,7 +66,9 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
             f"{rules.family.title} has {published[0]} training and {published[1]} test views a scene, this folder "
             f"{len(train)} and {len(test)}: figures are not comparable with published ones"
         )
-    warnings += of_no_use(options, ("mask_background",), rules.family)  # alpha always cuts these pictures out
+    warnings += unused_option_warnings(
+        options, ("mask_background",), rules.family
+    )  # alpha always cuts these pictures out
     return assemble_scene(
         path.resolve().name,
         train + test,

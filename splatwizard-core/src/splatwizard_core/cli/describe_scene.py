@@ -1,4 +1,4 @@
-"""What was found in a scene, as plain values for `sw info SCENE`."""
+"""Facts of a scene as plain values, for `sw info SCENE`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from splatwizard_core.scene.scene import Scene
 
 
 def describe(scene: Scene) -> dict[str, Any]:
-    """JSON-able facts; no picture is decoded.
+    """Collect facts of a scene that can be printed as JSON; no picture is decoded.
 
     name, path, dataset, protocol (its id), named_protocol ("survey", "inria", "custom"), background, split     text
     views           {"train": n, "test": n}

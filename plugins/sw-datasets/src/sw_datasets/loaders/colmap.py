@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene
-from splatwizard_core.scene.images import (
+from sw_datasets.families import COLMAP
+from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
+from sw_datasets.pictures import (
     find_pictures,
     fitted_size,
     list_pictures,
@@ -20,9 +22,7 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from sw_datasets.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
-from sw_datasets.families import COLMAP
-from sw_datasets.rules import Rules, of_no_use, settle
+from sw_datasets.rules import Rules, rules_for, unused_option_warnings
 
 PLAIN_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
 RADIAL_FOCALS = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2, "FOV": 2}
@@ -40,7 +40,7 @@ MaskFinder = Callable[[Path, Sequence[str]], "list[Path | None]"]
 
 
 class ColmapDataset:
-    """A COLMAP sparse model with its pictures; pinhole cameras."""
+    """COLMAP scenes: a sparse model with its pictures; pinhole cameras."""
 
     def detect(self, path: Path) -> float:
         """0.5 with cameras and images files in sparse/0 or sparse, 0.45 with the cameras alone, else 0."""
@@ -51,7 +51,7 @@ class ColmapDataset:
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
         """Read poses, points and the sizes of the pictures; no pixel is decoded. Raises SceneError in one line."""
-        return load_colmap(path, settle(COLMAP, path.resolve().name, options), options)
+        return load_colmap(path, rules_for(COLMAP, path.resolve().name, options), options)
 
 
 def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskFinder | None = None) -> Scene:
@@ -114,7 +114,7 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
             f"the principal point is up to {off_centre:.1f} px off the image centre and is taken as the centre, "
             "as the 3DGS code does (principal_point = file uses it)"
         )
-    warnings += of_no_use(options, ("legacy_8bit_composite", "init_points"), rules.family)
+    warnings += unused_option_warnings(options, ("legacy_8bit_composite", "init_points"), rules.family)
     return assemble_scene(
         path.resolve().name,
         views,
@@ -168,7 +168,7 @@ def pose(image: ColmapImage) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def point_cloud(points: ColmapPoints) -> PointCloud:
-    """xyz and colours as float32."""
+    """Points and colours of a model as float32."""
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is dropped as such
         xyz = points.xyz.astype(np.float32)
     return PointCloud(torch.from_numpy(xyz), torch.from_numpy(points.rgb.astype(np.float32) / 255))
