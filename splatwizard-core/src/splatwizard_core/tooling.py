@@ -22,6 +22,8 @@ MODULES = {
     "files": "file_sha256 full_disk_code new_folder replacing write_atomic write_json",
     "progress": "Bar",
     "cores": "available_cores",
+    "evaluation.evaluate": "png_names",
+    "evaluation.metrics": "short_reason",
     "errors": "NativeBuildError PluginError RunLockedError",
     "native": "cache_root",
     "native.build": "declared_modules resolve_module",

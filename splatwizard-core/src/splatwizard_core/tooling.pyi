@@ -14,6 +14,8 @@ from splatwizard_core.cores import available_cores as available_cores
 from splatwizard_core.errors import NativeBuildError as NativeBuildError
 from splatwizard_core.errors import PluginError as PluginError
 from splatwizard_core.errors import RunLockedError as RunLockedError
+from splatwizard_core.evaluation.evaluate import png_names as png_names
+from splatwizard_core.evaluation.metrics import short_reason as short_reason
 from splatwizard_core.files import file_sha256 as file_sha256
 from splatwizard_core.files import full_disk_code as full_disk_code
 from splatwizard_core.files import new_folder as new_folder

@@ -27,6 +27,9 @@ def report_finished(runs: FinishedRuns) -> None:
         runs.written.extend(page for page in pages if page is not None)
         return
     above = [report_above(directories, runs.say), plot_above(directories, runs.say)]
+    if any(above):  # the pages of single runs lie beside their records
+        own = {directory / FILE_NAME for directory in directories}
+        runs.written[:] = [path for path in runs.written if path not in own]
     runs.written.extend(path for path in above if path is not None)
     if runs.console is not None:
         print_results([(run.record, run.directory) for run in runs.runs], runs.written, runs.console)
