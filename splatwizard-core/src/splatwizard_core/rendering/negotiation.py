@@ -88,6 +88,15 @@ def obstacle(info: RasterizerInfo, device: torch.device) -> str | None:
     return probe()
 
 
+def why_not(entry: Entry, device: torch.device | str) -> str | None:
+    """Why the rasterizer of a registry entry cannot run on `device`, or None; compiles nothing.
+
+    Raises PluginError for an entry that makes no sense, and what the rasterizer's own probe raises.
+    """
+    device = torch.device(device)
+    return obstacle(info_from_entry(entry).on(device.type), device)
+
+
 @dataclass(frozen=True)
 class _Candidate:
     """A rasterizer that can serve a request if `adapted` features are composed for it."""
