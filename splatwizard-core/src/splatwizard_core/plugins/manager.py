@@ -94,10 +94,16 @@ class PluginManager:
         self.registries: dict[str, Registry[Any]] = {r.kind: r for r in self._filled_by.values()}
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
+        self._loaded: list[tuple[PluginInfo, object]] = []
         for entry_point in _chosen(entry_points, only):
             self._load(entry_point)
         for hook, registry in self._filled_by.items():
             getattr(self._pluggy.hook, hook)(registry=registry)
+        for info, hooks in self._loaded:
+            if info.error is not None:  # nothing is left of a plugin that failed half way
+                self._pluggy.unregister(hooks)
+                for registry in self.registries.values():
+                    registry._withdraw(info.distribution)
 
     def _load(self, entry_point: importlib.metadata.EntryPoint) -> None:
         info = plugin_info(entry_point)
@@ -108,12 +114,16 @@ class PluginManager:
                 raise PluginError(unmet)
             hooks = guarded_hooks(entry_point.load(), self._pluggy, functools.partial(self._guard, info))
             self._pluggy.register(hooks, name=entry_point.name)
-            self._pluggy.check_pending()
+            try:
+                self._pluggy.check_pending()
+            except pluggy.PluginValidationError:
+                self._pluggy.unregister(hooks)
+                raise
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
             info.error = one_line(error)
-            if self._pluggy.has_plugin(entry_point.name):
-                self._pluggy.unregister(name=entry_point.name)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
+        else:
+            self._loaded.append((info, hooks))
 
     @contextlib.contextmanager
     def _guard(self, info: PluginInfo, hook: str, arguments: Iterable[Any]) -> Iterator[None]:
@@ -133,8 +143,6 @@ class PluginManager:
                 log.warning("%s %s: %s failed: %s", info.distribution, info.version, hook, one_line(error))
                 return
             info.error = f"{hook}: {one_line(error)}"
-            for each in self.registries.values():
-                each._withdraw(info.distribution)
 
     @property
     def hook(self) -> pluggy.HookRelay:
