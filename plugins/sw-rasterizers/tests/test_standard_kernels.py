@@ -15,7 +15,8 @@ from sw_reference.testing.rasterizer_checks import front_camera, splats
 from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.rasterizer import Feature, RasterOptions, ScoreSpec
+from splatwizard_core.rendering.features import Feature
+from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import visible_radii
 from sw_rasterizers.standard import StandardRasterizer

@@ -24,8 +24,9 @@ from sw_reference.testing.rasterizer_checks import checks_for, front_camera
 from splatwizard_core.errors import CapabilityError, ShapeError
 from splatwizard_core.gaussians.inputs import SH
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import Feature, RasterOptions, ScoreSpec
+from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.surfel import SurfelRasterizer
 

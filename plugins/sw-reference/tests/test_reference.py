@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from sw_reference import compositing
+from sw_reference import compositing, plugin
 from sw_reference.projection import rotation_matrices
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.naive_rasterizer import naive_render
@@ -17,7 +17,6 @@ from sw_reference.testing.raster_gradients import (
 from sw_reference.testing.raster_scenes import RasterCase, draw_scene, margin_scene, with_tensors
 from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
 
-from splatwizard_core import builtin
 from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
 from splatwizard_core.plugins.registry import Registry
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
@@ -217,5 +216,5 @@ def test_screen_gradient_without_other_gradients():
 
 def test_declared_features_are_those_of_the_registry():
     registry = Registry("rasterizer")
-    builtin.register_rasterizers(registry)
+    plugin.register_rasterizers(registry)
     assert registry.entry("reference").load().info.features == set(registry.entry("reference").declared["features"])

@@ -26,7 +26,7 @@ MODULES = {
     "native": "cache_root",
     "native.build": "declared_modules resolve_module",
     "native.toolchain": "find_compiler find_nvcc nvcc_version",
-    "rendering.negotiation": "NegotiatedRasterizer info_from_entry obstacle",
+    "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": "assignments console debug_option json_option options print_json set_option",
     "cli.setup": "existing_file output_file output_folder resolve_run_options say",
 }

@@ -16,6 +16,7 @@ def register_rasterizers(registry: Registry) -> None:
             "TIGHT_TILES",
         ],
         available="sw_gsplat.availability:unavailable",
+        profiles=["3dgs"],
         exactness="tight",
         speed=40,
     )  # fmt: skip

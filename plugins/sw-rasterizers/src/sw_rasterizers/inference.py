@@ -9,7 +9,6 @@ from __future__ import annotations
 import torch
 
 from splatwizard_core.api import Camera, CapabilityError, ConfigError, GaussianInputs, RasterizerInfo, RasterOptions
-from splatwizard_core.rendering.negotiation import declared_info
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag
 from sw_rasterizers.standard import StandardRasterizer
@@ -41,7 +40,7 @@ class InferenceRasterizer(StandardRasterizer):
 class FlashRasterizer(InferenceRasterizer):
     """FlashGS-style: a base-2 exponent with the opacity folded in, a polynomial about the tile's middle."""
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "flash")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "flash")
     method = Flag.FLASH
 
 
@@ -51,7 +50,7 @@ class TensorCoreRasterizer(InferenceRasterizer):
     Raises ConfigError for a low-pass below 0.1 px^2: the exponents of sharper splats leave the range of a half.
     """
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "tcgs")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "tcgs")
     method = Flag.TENSOR_CORES
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:

@@ -10,7 +10,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, eval_sh
+from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
 
 Note = Callable[["Tensor | float", float], None]
 MaskedNote = Callable[..., None]
@@ -226,8 +226,7 @@ def _color(g: GaussianInputs, i: int, R: Tensor, tau: Tensor, opt: RasterOptions
     if g.colors is not None:
         return g.colors[i]
     assert g.sh is not None
-    toward = g.means[i] + R.T @ tau
-    raw = eval_sh(g.sh.to_dense()[i : i + 1], (toward / toward.norm())[None], g.sh.active_degree)[0] + 0.5
+    raw = g.sh.colors_from(-R.T @ tau, g.means, rows=torch.tensor([i]), clamp=False)[0]
     if not opt.clamp_color:
         return raw
     note(raw + 1, 1.0)  # absolute distance to zero
