@@ -21,12 +21,8 @@ from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_sce
 from sw_reference.testing.raster_surfels import surfels
 from sw_reference.testing.rasterizer_checks import checks_for, front_camera
 
-from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.features import Feature
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, ScoreSpec, ShapeError
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.surfel import SurfelRasterizer
 

@@ -11,12 +11,8 @@ from sw_reference.testing.raster_gradients import GRADIENT_CASES, applies, check
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.features import Feature
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, ShapeError
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.segments import Segments, Tables
 from sw_rasterizers.variants import AccelRasterizer, DepthRasterizer, IndexedRasterizer

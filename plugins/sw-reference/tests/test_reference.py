@@ -17,9 +17,7 @@ from sw_reference.testing.raster_gradients import (
 from sw_reference.testing.raster_scenes import RasterCase, draw_scene, margin_scene, with_tensors
 from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
 
-from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
-from splatwizard_core.plugins.registry import Registry
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import CapabilityError, ConfigError, RasterOptions, Registry, ScoreSpec, ShapeError
 
 REFERENCE = ReferenceRasterizer()
 DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})

@@ -234,6 +234,21 @@ def test_a_failed_build_falls_back_with_one_warning(plugins, scene, caplog, base
     assert "'reference'" in warnings(caplog)[0]
 
 
+def test_a_rasterizer_that_cannot_be_made_harms_no_other(plugins, scene, caplog, monkeypatch):
+    class Broken(Fake):
+        def __init__(self):
+            raise OSError(f"libfoo.so ({REASON})")
+
+    plugins.install("broken", base=Broken)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "reference"}
+    assert [w for w in warnings(caplog) if "OSError: libfoo.so" in w]
+    monkeypatch.setenv("SW_RASTERIZER", "broken")
+    with pytest.raises(OSError, match="libfoo"):
+        NegotiatedRasterizer(plugins, device="cpu").render(*scene, RasterOptions())
+
+
 def test_a_failed_build_is_told_even_if_another_fast_one_serves(plugins, scene, caplog):
     plugins.install("native", base=FailsToBuild, speed=9)
     plugins.install("other", speed=1)

@@ -17,6 +17,7 @@ from torch import Tensor
 from splatwizard_core.api import (
     AccumOutput,
     Camera,
+    CapabilityError,
     ConfigError,
     Feature,
     GaussianInputs,
@@ -25,7 +26,6 @@ from splatwizard_core.api import (
     RasterOptions,
     RenderResult,
 )
-from splatwizard_core.tooling import PluginError
 from sw_gsplat import plugin
 
 
@@ -38,7 +38,7 @@ class GsplatRasterizer:
         try:
             from gsplat import rasterization
         except ImportError as error:
-            raise PluginError(
+            raise CapabilityError(
                 f"rasterizer 'gsplat' needs the package gsplat ({error}): pip install 'sw-gsplat[gsplat]'"
             ) from error
         self._rasterization = rasterization

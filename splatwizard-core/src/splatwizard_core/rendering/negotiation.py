@@ -12,7 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError
+from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError, SplatwizardError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
 from splatwizard_core.plugins.manager import PluginManager
@@ -118,7 +118,7 @@ class NegotiatedRasterizer:
             try:
                 rasterizer: Rasterizer = self._registry.entry(name).load()()
                 break
-            except (NativeBuildError, PluginError) as error:
+            except Exception as error:  # a package that is broken harms no other rasterizer
                 self._fail(name, error)
         if best.adapted:
             rasterizer = AdaptedRasterizer(rasterizer, best.adapted)
@@ -148,7 +148,8 @@ class NegotiatedRasterizer:
         module = self._registry.entry(name).declared.get("native", name)
         # Whoever shares the kernel module is spared the same attempt.
         failed = {e.name for e in self._registry if e.declared.get("native", e.name) == module}
-        self._failed |= dict.fromkeys(failed, str(error))
+        reason = str(error) if isinstance(error, SplatwizardError) else f"{type(error).__name__}: {error}"
+        self._failed |= dict.fromkeys(failed, reason)
         self._chosen = {k: r for k, r in self._chosen.items() if r.info.name not in failed}
 
     def _read(self, entry: Entry) -> RasterizerInfo | None:
