@@ -7,8 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
-from sw_reference.testing.rasterizer_checks import front_camera, splats
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, splats
 
 from splatwizard_core.api import SH, CapabilityError, ConfigError, RasterOptions
 from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins

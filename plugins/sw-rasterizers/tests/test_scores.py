@@ -7,8 +7,16 @@ from dataclasses import replace
 import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, margin_scene, with_tensors
-from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
+from sw_reference.testing.raster_scenes import (
+    RasterCase,
+    cast_inputs,
+    draw_scene,
+    front_camera,
+    margin_scene,
+    splats,
+    with_tensors,
+)
+from sw_reference.testing.rasterizer_checks import checks_for
 
 from splatwizard_core.api import SH, Camera, CapabilityError, ConfigError, RasterOptions, ScoreSpec
 from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins

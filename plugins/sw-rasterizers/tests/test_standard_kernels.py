@@ -9,8 +9,7 @@ import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_gradients import run
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, with_tensors
-from sw_reference.testing.rasterizer_checks import front_camera, splats
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, splats, with_tensors
 
 from splatwizard_core.api import (
     SH,

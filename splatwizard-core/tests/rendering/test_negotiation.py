@@ -245,7 +245,7 @@ def test_a_rasterizer_that_cannot_be_made_harms_no_other(plugins, scene, caplog,
     assert rasterizer.choices == {"plain": "reference"}
     assert [w for w in warnings(caplog) if "OSError: libfoo.so" in w]
     monkeypatch.setenv("SW_RASTERIZER", "broken")
-    with pytest.raises(OSError, match="libfoo"):
+    with pytest.raises(PluginError, match=r"'broken' of .* cannot be made: OSError: libfoo"):
         NegotiatedRasterizer(plugins, device="cpu").render(*scene, RasterOptions())
 
 

@@ -1,4 +1,4 @@
-"""What this package provides."""
+"""Registration of the rasterizer `gsplat`."""
 
 from splatwizard_core.api import Registry, hookimpl
 

@@ -41,7 +41,7 @@ class _Totals:
         self.fisher = like.new_zeros(len(g), FISHER, dtype=torch.float64) if opt.fisher else None
 
     def result(self) -> AccumOutput:
-        """What the contract returns: counts as int32, all else as float32."""
+        """The sums in the dtypes of the contract: counts as int32, all else as float32."""
         limit = torch.iinfo(torch.int32).max
         scores = {
             spec.name: (row.clamp(max=limit) if spec.dtype == torch.int32 else row).to(spec.dtype)

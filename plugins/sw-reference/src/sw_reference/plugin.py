@@ -1,4 +1,4 @@
-"""What this package provides: the rasterizer `reference`."""
+"""Registration of the rasterizer `reference`."""
 
 from splatwizard_core.api import Registry, hookimpl
 

@@ -1,4 +1,4 @@
-"""What a rasterizer declares of itself in its registry entry, and whether a request keeps to it."""
+"""The declaration of a rasterizer in its registry entry, and the checks that hold a request against it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """How a rasterizer differs on one device: features it lacks there, another probe, another speed."""
+    """Differences of a rasterizer on one device: features it lacks there, another probe, another speed."""
 
     lacks: frozenset[str] = frozenset()
     available: str | None = None
@@ -30,7 +30,7 @@ class DeviceInfo:
 
 @dataclass(frozen=True)
 class RasterizerInfo:
-    """What a rasterizer declares of itself.
+    """Declaration of one rasterizer: where it runs, which features it offers, how exact and how fast it is.
 
     available       "module:function" of a cheap probe () -> str | None, the reason why it cannot run here;
                     it must not compile anything. None: always available
@@ -111,7 +111,7 @@ class RasterizerInfo:
         return known[device]
 
     def obstacle(self, device: torch.device | str) -> str | None:
-        """Why it cannot run on `device`, as its own probe says, or None; compiles nothing.
+        """The reason why it cannot run on `device`, as its own probe says, or None; compiles nothing.
 
         Raises what the probe raises.
         """
@@ -128,7 +128,7 @@ class RasterizerInfo:
         return probe()
 
     def check_request(self, g: GaussianInputs, opt: RasterOptions) -> None:
-        """Check all that is declared, before drawing `g` with `opt`; every rasterizer calls it first.
+        """Hold a request to draw `g` with `opt` against the declaration; every rasterizer calls it first.
 
         Raises ShapeError for inputs that do not fit together, CapabilityError for a feature or a device, ConfigError
         for a profile or another option.
@@ -146,7 +146,7 @@ class RasterizerInfo:
         self._check_placement(g)
 
     def check_geometry(self, g: GaussianInputs) -> None:
-        """Check what a `visible_filter` needs: as `check_request`, of shapes alone."""
+        """Hold a request for `visible_filter` against the declaration: as `check_request`, of shapes alone."""
         g.validate()
         self.on(g.means.device.type).check_offered(Feature.VISIBLE_FILTER | Feature.geometry_of(g))
         self._check_placement(g)

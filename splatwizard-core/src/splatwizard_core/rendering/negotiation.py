@@ -1,4 +1,4 @@
-"""Which rasterizer serves a request: read off what is asked for, matched with what each one declares."""
+"""The choice of a rasterizer for each request: features that it needs, matched with those that each one declares."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class NegotiatedRasterizer:
         )
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
-        """Draw one view with whatever serves it best. Raises CapabilityError if nothing does."""
+        """Draw one view with the rasterizer that serves it best. Raises CapabilityError if none does."""
         return self._delegate(Feature.asked_by(opt, g), lambda r: r.render(g, cam, opt))
 
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
@@ -116,9 +116,9 @@ class NegotiatedRasterizer:
             best, passed_over = self._best(wanted)
             name = best.info.name
             try:
-                rasterizer: Rasterizer = self._registry.entry(name).load()()
+                rasterizer = self._make(name)
                 break
-            except Exception as error:  # a package that is broken harms no other rasterizer
+            except SplatwizardError as error:
                 self._fail(name, error)
         if best.adapted:
             rasterizer = AdaptedRasterizer(rasterizer, best.adapted)
@@ -142,14 +142,25 @@ class NegotiatedRasterizer:
                 self.served.add(rasterizer.info.name)
                 return result
 
-    def _fail(self, name: str, error: Exception) -> None:
+    def _make(self, name: str) -> Rasterizer:
+        """Import and construct one; whatever a broken package raises becomes a PluginError."""
+        entry = self._registry.entry(name)
+        try:
+            made: Rasterizer = entry.load()()
+        except SplatwizardError:
+            raise
+        except Exception as error:
+            reason = f"{type(error).__name__}: {error}"
+            raise PluginError(f"rasterizer '{name}' of {entry.distribution} cannot be made: {reason}") from error
+        return made
+
+    def _fail(self, name: str, error: SplatwizardError) -> None:
         if self._forced is not None:
             raise error
         module = self._registry.entry(name).declared.get("native", name)
         # Whoever shares the kernel module is spared the same attempt.
         failed = {e.name for e in self._registry if e.declared.get("native", e.name) == module}
-        reason = str(error) if isinstance(error, SplatwizardError) else f"{type(error).__name__}: {error}"
-        self._failed |= dict.fromkeys(failed, reason)
+        self._failed |= dict.fromkeys(failed, str(error))
         self._chosen = {k: r for k, r in self._chosen.items() if r.info.name not in failed}
 
     def _read(self, entry: Entry) -> RasterizerInfo | None:
@@ -193,7 +204,7 @@ class NegotiatedRasterizer:
         return _Candidate(info, missing, (preferred, int(info.speed > 0), -len(missing), info.speed))
 
     def _unavailable(self, info: RasterizerInfo) -> str | None:
-        """Why it cannot run here, or None; compiles nothing."""
+        """The reason why it cannot run here, or None; compiles nothing."""
         if info.name in self._failed:
             return self._failed[info.name]
         try:

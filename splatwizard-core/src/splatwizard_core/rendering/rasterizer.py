@@ -1,4 +1,4 @@
-"""The rasterizer contract: how to draw, what comes back, and the protocol of whoever draws."""
+"""The rasterizer contract: options of a drawing, its result, and the protocol of rasterizers."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class ScoreSpec:
 
 @dataclass(frozen=True, eq=False)
 class RasterOptions:
-    """How to draw. Whatever is asked for is in the result; whatever is not is None.
+    """Options of one drawing. A map or sum that they ask for is in the result; any other is None.
 
     background      [C] or [C,H,W]; None is 0
     scale_modifier  multiplies the scales (1 in training)
@@ -119,7 +119,7 @@ class GradBuffer:
         return self._value
 
     def set(self, value: Tensor) -> None:
-        """Called once by the rasterizer's backward pass."""
+        """Store the gradient; the rasterizer's backward pass calls it once."""
         self._value = value.detach()
 
 
@@ -138,7 +138,7 @@ class RasterStats:
 
 @dataclass
 class RenderResult:
-    """One rendered view, the inputs that were drawn, and what the model said about them.
+    """One rendered view, with the inputs that were drawn and the model's additions to them.
 
     image       [C,H,W]
     radii       [N] int32, pixels, 0 = culled (the classic definition in every family)
@@ -171,12 +171,12 @@ class RenderResult:
 
     @property
     def visible(self) -> Tensor:
-        """[N] bool: what was not culled."""
+        """[N] bool: False for Gaussians that were culled."""
         return self.radii > 0
 
     @property
     def extras(self) -> dict[str, Any]:
-        """What the model attached to the inputs it made."""
+        """The model's own additions to the inputs: `GaussianInputs.extras`."""
         return self.inputs.extras
 
 

@@ -18,7 +18,7 @@ MaskedNote = Callable[..., None]
 
 @dataclass
 class Pair:
-    """What one Gaussian does to every pixel, each [H,W]; `raw` is alpha before the clamp and the cuts."""
+    """The effect of one Gaussian on every pixel, each [H,W]; `raw` is alpha before the clamp and the cuts."""
 
     index: int
     offset: Tensor  # [H,W,2] centre minus pixel

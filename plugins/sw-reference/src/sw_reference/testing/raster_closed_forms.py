@@ -7,8 +7,8 @@ import math
 import torch
 
 from splatwizard_core.api import SH, Rasterizer, RasterOptions
-from sw_reference.testing.raster_scenes import permute_inputs
-from sw_reference.testing.rasterizer_checks import check, close, draw, front_camera, splats
+from sw_reference.testing.facts import check, close, draw
+from sw_reference.testing.raster_scenes import front_camera, permute_inputs, splats
 
 VARIANCE = (64 * 0.2 / 4) ** 2 + 0.3
 """Of the standard splat (scale 0.2 at depth 4, focal length 64) on the screen, px^2."""
