@@ -29,7 +29,7 @@ MODULES = {
     "native": "cache_root",
     "native.build": "declared_modules",
     "native.toolchain": "installed_compilers",
-    "rendering.negotiation": "NegotiatedRasterizer why_not",
+    "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": "assignments console debug_option json_option options print_json set_option",
     "cli.setup": "existing_file output_file output_folder resolve_run_options say",
 }

@@ -32,7 +32,6 @@ from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
 from splatwizard_core.progress import Bar as Bar
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
-from splatwizard_core.rendering.negotiation import why_not as why_not
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.lock import directory_lock as directory_lock

@@ -189,7 +189,8 @@ def check_rasterizers(plugins: PluginManager) -> list[Check]:
 def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
     import torch
 
-    from splatwizard_core.tooling import NegotiatedRasterizer, why_not
+    from splatwizard_core.api import RasterizerInfo
+    from splatwizard_core.tooling import NegotiatedRasterizer
 
     device = "cpu" if "cpu" in entry.declared.get("devices", ("cpu",)) else "cuda"
     where = ", ".join(entry.declared.get("devices", ("cpu",)))
@@ -200,7 +201,7 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         detail = f"its kernels '{lacking.name}' are not loaded"
         return Check("rasterizers", entry.name, lacking.state, detail, lacking.mend)
     try:
-        why = why_not(entry, device)
+        why = RasterizerInfo.from_entry(entry).obstacle(device)
         if why is not None:
             what, mend = _with_command_apart(why)
             return Check("rasterizers", entry.name, "missing", one_line(what), mend)

@@ -54,7 +54,7 @@ class Job:
 
 
 def cores() -> int:
-    """How many compilers may run at once: $MAX_JOBS, else the cores that this process may use."""
+    """Number of compilers that may run at once: $MAX_JOBS, else the cores that this process may use."""
     limit = os.environ.get("MAX_JOBS", "")
     if limit.isdigit() and int(limit) > 0:
         return int(limit)
@@ -128,7 +128,7 @@ def installed_compilers() -> Compilers:
 
 
 def cuda_mismatch() -> str | None:
-    """Why CUDA kernels for this torch cannot be compiled here, or None."""
+    """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
     import torch
 
     wanted = torch.version.cuda
@@ -182,7 +182,7 @@ def gpus() -> list[tuple[int, int]]:
 
 
 def cpu_identity() -> str:
-    """What -march=native depends on: the CPU's feature list."""
+    """The CPU's feature list and model, on which -march=native depends."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:

@@ -46,6 +46,23 @@ class Camera:
                 expected=(3, 3),
             )
 
+    @classmethod
+    def look_at(
+        cls, eye: Tensor, target: Tensor, up: Tensor, *, width: int, height: int, fov_x: float, near: float = 0.2
+    ) -> Camera:
+        """A camera at `eye` that looks at `target`, principal point in the image centre, square pixels.
+
+        eye, target     [3] world units
+        up              [3] the world direction that points up in the picture
+        fov_x           horizontal field of view, radians
+        """
+        forward = torch.nn.functional.normalize(target - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+        down = torch.linalg.cross(forward, right)
+        R = torch.stack([right, down, forward])
+        focal = width / (2 * math.tan(fov_x / 2))
+        return cls(width, height, focal, focal, width / 2, height / 2, R, -R @ eye, near=near)
+
     @cached_property
     def center(self) -> Tensor:
         """Camera centre in the world, [3]."""
