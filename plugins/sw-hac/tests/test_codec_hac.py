@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import this_machine
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError

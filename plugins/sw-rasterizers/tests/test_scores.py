@@ -7,15 +7,19 @@ from dataclasses import replace
 import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, margin_scene, with_tensors
-from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
+from sw_reference.testing.raster_scenes import (
+    RasterCase,
+    cast_inputs,
+    draw_scene,
+    front_camera,
+    margin_scene,
+    splats,
+    with_tensors,
+)
+from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError, ConfigError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import SH, Camera, CapabilityError, ConfigError, RasterOptions, ScoreSpec
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers import scoring
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.scoring import CountRasterizer, PupRasterizer

@@ -10,6 +10,7 @@ from typing import Any
 
 MODULES = {
     "plugins.manager": "load_plugins",
+    "plugins.check": "Check State",
     "plugins.registry": "Entry",
     "plugins.loading": "PluginInfo",
     "runs.record": "Record read_record SCHEMA FILE_NAME",
@@ -23,11 +24,13 @@ MODULES = {
     "files": "file_sha256 new_folder replacing write_atomic write_json",
     "progress": "Bar",
     "cores": "available_cores",
+    "evaluation.evaluate": "png_names",
+    "evaluation.metrics": "short_reason",
     "errors": "NativeBuildError PluginError RunLockedError",
     "native": "cache_root",
-    "native.build": "declared_modules resolve_module",
-    "native.toolchain": "find_compiler find_nvcc nvcc_version",
-    "rendering.negotiation": "NegotiatedRasterizer info_from_entry obstacle",
+    "native.build": "declared_modules",
+    "native.toolchain": "installed_compilers",
+    "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": "assignments console debug_option json_option options print_json set_option",
     "cli.setup": "existing_file output_file output_folder resolve_run_options say",
 }

@@ -9,7 +9,8 @@ import torch
 from sw_gaussians import density
 
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import GradBuffer, RasterizerInfo, RasterOptions, RenderResult
+from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_core.rendering.rasterizer import GradBuffer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer, exponential_lr

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from splatwizard_core.evaluation.metrics import AnyMetric
     from splatwizard_core.gaussians.model import GaussianModel
     from splatwizard_core.method import Method
+    from splatwizard_core.plugins.check import Check
     from splatwizard_core.rendering.rasterizer import Rasterizer
     from splatwizard_core.scene.dataset import Dataset
     from splatwizard_core.training.pruner import Pruner
@@ -69,7 +70,7 @@ class PluginManager:
         self.exporters: Registry[Callable[..., None]] = Registry("exporter")
         self.importers: Registry[Callable[..., GaussianModel]] = Registry("importer")
         self.executors: Registry[Any] = Registry("executor")
-        self.checks: Registry[Callable[..., Any]] = Registry("check")
+        self.checks: Registry[Callable[[], list[Check]]] = Registry("check")
         self.downloads: Registry[Callable[[], bytes]] = Registry("download")
         self.commands: Registry[click.Command] = Registry("command")
         self._filled_by: dict[str, Registry[Any]] = {
