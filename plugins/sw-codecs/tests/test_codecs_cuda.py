@@ -12,7 +12,7 @@ from sw_codecs.float_models import GaussianFloat
 from sw_codecs.gaussian_exact import FloatContext
 from sw_codecs.hash_grid import MixedHashGrid
 from sw_codecs.mixture import Mixture, MixtureContext
-from sw_codecs.ordering import CURVES, spatial_order
+from sw_codecs.ordering import spatial_order
 from sw_codecs.spatial_ar import SpatialAr
 from sw_codecs.triplane import Triplane
 
@@ -22,12 +22,11 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("curve", CURVES)
-def test_points_have_one_order(curve):
+def test_points_have_one_order():
     points = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0))
-    order = spatial_order(points.cuda(), curve=curve)
+    order = spatial_order(points.cuda())
     assert order.is_cuda
-    assert torch.equal(order.cpu(), spatial_order(points, curve=curve))
+    assert torch.equal(order.cpu(), spatial_order(points))
 
 
 def test_rates_and_their_gradients_agree():

@@ -1,4 +1,4 @@
-"""Morton and Hilbert order of points: the curves' own properties, arrays and tensors alike, floats on a grid."""
+"""Morton order of points: that of the position codecs, arrays and tensors alike, floats on a grid."""
 
 import numpy as np
 import pytest
@@ -8,19 +8,11 @@ from hypothesis import strategies as st
 
 from splatwizard_core.plugins import load_plugins
 from sw_codecs import morton
-from sw_codecs.ordering import CURVES, spatial_order
+from sw_codecs.ordering import spatial_order
 
 
 def grid(bits):
     return np.stack(np.meshgrid(*[np.arange(1 << bits)] * 3, indexing="ij"), -1).reshape(-1, 3)
-
-
-@pytest.mark.parametrize("bits", [1, 2, 3, 4])
-def test_the_hilbert_curve_visits_every_cell_by_steps_to_a_neighbour(bits):
-    cells = np.random.default_rng(bits).permutation(grid(bits))
-    path = cells[spatial_order(cells, curve="hilbert", bits=bits)]
-    assert (np.abs(np.diff(path, axis=0)).sum(1) == 1).all()
-    assert path[0].tolist() == [0, 0, 0]
 
 
 @pytest.mark.parametrize("bits", [3, 21])
@@ -38,25 +30,24 @@ def test_a_method_asks_a_codec_for_the_order(name):
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.sampled_from(CURVES), st.integers(1, 21), st.data())
-def test_a_tensor_is_ordered_as_the_array_is_and_nothing_is_lost(curve, bits, data):
+@given(st.integers(1, 21), st.data())
+def test_a_tensor_is_ordered_as_the_array_is_and_nothing_is_lost(bits, data):
     rows = data.draw(st.lists(st.tuples(*[st.integers(0, 2**bits - 1)] * 3), max_size=20))
     cells = np.array(rows, np.int64).reshape(-1, 3)
-    order = spatial_order(cells, curve=curve, bits=bits)
+    order = spatial_order(cells, bits=bits)
     assert sorted(order.tolist()) == list(range(len(rows)))
-    tensor = spatial_order(torch.from_numpy(cells), curve=curve, bits=bits)
+    tensor = spatial_order(torch.from_numpy(cells), bits=bits)
     assert (tensor.dtype, tensor.tolist()) == (torch.int64, order.tolist())
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64, np.float16])
-@pytest.mark.parametrize("curve", CURVES)
-def test_floats_follow_the_cells_of_their_bounding_box(dtype, curve):
+def test_floats_follow_the_cells_of_their_bounding_box(dtype):
     cells = grid(3)
     points = (cells * 0.25 - 7).astype(dtype)  # the grid of 3 bits, moved and scaled
     shuffled = np.random.default_rng(1).permutation(len(points))
-    order = spatial_order(points[shuffled], curve=curve, bits=3)
-    assert np.array_equal(shuffled[order], spatial_order(cells, curve=curve, bits=3))
-    tensor = spatial_order(torch.from_numpy(points[shuffled]).requires_grad_(), curve=curve, bits=3)
+    order = spatial_order(points[shuffled], bits=3)
+    assert np.array_equal(shuffled[order], spatial_order(cells, bits=3))
+    tensor = spatial_order(torch.from_numpy(points[shuffled]).requires_grad_(), bits=3)
     assert tensor.tolist() == order.tolist()
 
 
@@ -66,8 +57,7 @@ def test_an_ordered_cloud_has_short_steps():
     def step(order):
         return float(np.linalg.norm(np.diff(points[order], axis=0), axis=1).mean())
 
-    morton_step, hilbert_step = step(spatial_order(points)), step(spatial_order(points, curve="hilbert"))
-    assert hilbert_step < morton_step < 0.1 * step(np.arange(len(points)))
+    assert step(spatial_order(points)) < 0.1 * step(np.arange(len(points)))
 
 
 def test_odd_clouds_are_ordered_too():
@@ -86,7 +76,7 @@ def test_what_has_no_order_is_refused(points):
         spatial_order(points)
 
 
-def test_unknown_curves_and_widths_are_refused():
-    for options in ({"curve": "peano"}, {"bits": 0}, {"bits": 22}):
-        with pytest.raises(ValueError, match="not known"):
-            spatial_order(np.zeros((1, 3)), **options)
+@pytest.mark.parametrize("bits", [0, 22])
+def test_widths_out_of_range_are_refused(bits):
+    with pytest.raises(ValueError, match=r"1\.\.21"):
+        spatial_order(np.zeros((1, 3)), bits=bits)

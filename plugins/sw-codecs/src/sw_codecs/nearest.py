@@ -15,14 +15,11 @@ def block_rows(size: int, device: torch.device, block: int | None = None) -> int
 
 
 @torch.no_grad()
-def nearest(
-    x: Tensor, entries: Tensor, *, bias: Tensor | None = None, block: int | None = None, others: bool = False
-) -> tuple[Tensor, Tensor]:
-    """For each row of x the entry with the least |x - c|^2 + bias: index [N] int64, and |x - c|^2 [N].
+def nearest(x: Tensor, entries: Tensor, *, block: int | None = None, others: bool = False) -> tuple[Tensor, Tensor]:
+    """Index [N] int64 of the nearest entry of each row of x, and the squared distance [N] to it.
 
     x        [N, d] float32 or float64
     entries  [K, d], same type
-    bias     [K], added to the squared distances; None: nothing
     block    rows at a time; None: as many as make 64 MB of scores (CPU) or 512 MB (CUDA)
     others   x is `entries` itself: look for the nearest other one (K >= 2)
 
@@ -37,7 +34,7 @@ def nearest(
     table = torch.zeros(width + 1, size + (-size % GROUP if grouped else 0), dtype=x.dtype, device=x.device)
     table[:width, :size] = -2 * centred.T
     table[width] = torch.inf  # what fills the last group is never chosen
-    table[width, :size] = centred.square().sum(1) if bias is None else centred.square().sum(1) + bias
+    table[width, :size] = centred.square().sum(1)
     rows_at_once = min(block_rows(size, x.device, block), max(len(x), 1))
     scores = torch.empty(rows_at_once, table.shape[1], dtype=x.dtype, device=x.device)  # one for all tiles
     padded = torch.ones(rows_at_once, width + 1, dtype=x.dtype, device=x.device)

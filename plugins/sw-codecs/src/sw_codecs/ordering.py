@@ -1,8 +1,7 @@
-"""The order in which points are stored: along a Morton or a Hilbert curve, so that neighbours in space are neighbours.
+"""The order in which points are stored: along a Morton curve, so that neighbours in space are neighbours.
 
 The order of a set of points carries log2(n!) bits that nobody needs (15 bits a point at n = 1e5), and what differs
-little from row to row codes shorter. Sources: specification of the codec library, point positions; J. Skilling,
-Programming the Hilbert curve, AIP Conf. Proc. 707 (2004).
+little from row to row codes shorter. Source: specification of the codec library, point positions.
 """
 
 from __future__ import annotations
@@ -16,29 +15,24 @@ from torch import Tensor
 from sw_codecs import morton
 
 Points = TypeVar("Points", np.ndarray, Tensor)
-CURVES = ("morton", "hilbert")
 
 
-def spatial_order(points: Points, *, curve: str = "morton", bits: int = morton.MAX_BITS) -> Points:
-    """Indices int64 [N] that bring `points` into spatial order; equal cells keep their order.
+def spatial_order(points: Points, *, bits: int = morton.MAX_BITS) -> Points:
+    """Indices int64 [N] that bring `points` into Morton order; equal cells keep their order.
 
     points  [N, 3], array or tensor on any device. Integers are cells, 0 <= p < 2^bits. Floats are put on a grid of
             2^bits cells along the longest side of their bounding box
-    curve   "morton" (the order of the position codecs), or "hilbert", which never jumps: any two cells that follow one
-            another on it touch
     bits    1..21 an axis
 
     The result is of the kind and on the device of `points`. Raises ValueError for other shapes, integers out of range
     and floats that are not finite.
     """
-    if curve not in CURVES or not 1 <= bits <= morton.MAX_BITS:
-        raise ValueError(f"curve '{curve}' with {bits} bits is not known: 'morton' or 'hilbert' with 1..21 bits")
+    if not 1 <= bits <= morton.MAX_BITS:
+        raise ValueError(f"{bits} bits an axis, must be 1..{morton.MAX_BITS}")
     given = points.detach() if isinstance(points, Tensor) else np.asarray(points)
     if given.ndim != 2 or given.shape[1] != 3:
         raise ValueError(f"points must be [N, 3], not {list(given.shape)}")
     cells = _cells(given, bits)
-    if curve == "hilbert":
-        cells = _hilbert_axes(cells, bits)
     order = torch.argsort(morton.interleave(cells), stable=True)
     return order if isinstance(points, Tensor) else order.numpy()
 
@@ -64,22 +58,3 @@ def _cells(points: np.ndarray | Tensor, bits: int) -> Tensor:
     width = float((tensor.amax(0) - low).max())
     top = (1 << bits) - 1
     return ((tensor - low) * (top / width) if width > 0 else torch.zeros_like(tensor)).long().clamp(0, top)
-
-
-def _hilbert_axes(cells: Tensor, bits: int) -> Tensor:
-    """[N, 3] whose interleaved bits are the index along the Hilbert curve (Skilling's transpose, reversed)."""
-    x = list(cells.unbind(1))
-    for level in range(bits - 1, 0, -1):  # undo the rotations and reflections of each level
-        low = (1 << level) - 1
-        for axis in range(3):
-            is_set = (x[axis] >> level) & 1 == 1
-            swapped = (x[0] ^ x[axis]) & low
-            first = torch.where(is_set, x[0] ^ low, x[0] ^ swapped)
-            x[axis] = torch.where(is_set, x[axis], x[axis] ^ swapped) if axis else first
-            x[0] = first
-    x[1] = x[1] ^ x[0]  # Gray code
-    x[2] = x[2] ^ x[1]
-    flips = torch.zeros_like(x[0])
-    for level in range(bits - 1, 0, -1):
-        flips = torch.where((x[2] >> level) & 1 == 1, flips ^ ((1 << level) - 1), flips)
-    return torch.stack([axis ^ flips for axis in reversed(x)], 1)  # the first axis is the most significant

@@ -13,14 +13,10 @@ def register_quantizers(registry: Registry) -> None:
     registry.add("ste-mask", "sw_codecs.binary:SteMask", summary="a learned mask with a threshold")
     registry.add("fake-quant", "sw_codecs.fake_quant:FakeQuantAffine",
                  summary="affine with a zero point, range observed in training")  # fmt: skip
-    registry.add("lsq", "sw_codecs.lsq:Lsq", summary="a step learned by gradient")
-    registry.add("position-grid", "sw_codecs.position_grid:PositionQuantizer", summary="positions on a grid over a box")
     registry.add("vq", "sw_codecs.vector_quantizer:VectorQuantizer",
                  summary="nearest codebook entry; k-means or weighted batches, bounded memory")  # fmt: skip
     registry.add("residual-vq", "sw_codecs.residual_quantizer:ResidualVectorQuantizer",
                  summary="a sum of entries, a codebook for each stage")  # fmt: skip
-    registry.add("ecvq", "sw_codecs.entropy_constrained:EntropyConstrainedQuantizer",
-                 summary="nearest entry with a price on its bits")  # fmt: skip
 
 
 @hookimpl
