@@ -20,7 +20,7 @@ import torch
 import zstandard
 
 from splatwizard_core.plugins import load_plugins
-from sw_codecs import checksum
+from sw_codecs.bits import checksum
 
 models = constriction.stream.model
 queue, stack = constriction.stream.queue, constriction.stream.stack
