@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians, gaussian_codecs
+from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
 from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import save_ply
@@ -36,8 +36,8 @@ def written(plugins, name, model, **settings):
 
 
 def test_each_codec_that_says_it_codes_gaussians_decodes_what_it_encodes(plugins, model):
-    assert {"gaussians-exact", "gaussians-quantized"} <= set(gaussian_codecs(plugins))
-    for name in gaussian_codecs(plugins):
+    assert {"gaussians-exact", "gaussians-quantized"} <= set(plugins.gaussian_codecs.names)
+    for name in plugins.gaussian_codecs.names:
         reader = ContainerReader(written(plugins, name, model).to_bytes(), "file.swz")
         decoded = decode_gaussians(plugins, reader)
         assert isinstance(decoded, GaussianModel)
