@@ -98,8 +98,16 @@ CASES = {
         lambda d: BytePlanes().decode(d, hashes.dtype, hashes.shape),
         hashes,
     ),
-    "float_delta_v1": (lambda: FloatDelta().encode(floats), lambda d: FloatDelta().decode(d, floats.shape), floats),
-    "packed_bits_v1": (lambda: PackedBits().encode(mixed, 12), lambda d: PackedBits().decode(d, 300, 12), mixed),
+    "float_delta_v1": (
+        lambda: FloatDelta().encode(floats),
+        lambda d: FloatDelta().decode(d, np.float32, floats.shape),
+        floats,
+    ),
+    "packed_bits_v1": (
+        lambda: PackedBits(4096).encode(mixed),
+        lambda d: PackedBits(4096).decode(d, np.int64, (300,)),
+        mixed,
+    ),
     "range": (lambda: RangeCoder().encode(symbols, tables), lambda d: RangeCoder().decode(d, 300, tables), symbols),
     "rans": (lambda: RansCoder().encode(symbols, tables), lambda d: RansCoder().decode(d, 300, tables), symbols),
     "huffman": (

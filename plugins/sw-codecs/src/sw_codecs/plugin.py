@@ -76,7 +76,7 @@ def register_coders(registry: Registry) -> None:
                  summary="float or integer arrays without loss: byte planes, zstd")  # fmt: skip
     registry.add("float-delta", "sw_codecs.arrays.byte_planes:FloatDelta", codes="arrays",
                  summary="float32 positions without loss: steps as byte planes, zstd")  # fmt: skip
-    registry.add("packed-bits", "sw_codecs.arrays.packed_bits:PackedBits", codes="indices",
+    registry.add("packed-bits", "sw_codecs.arrays.packed_bits:PackedBits", codes="arrays",
                  summary="indices of 1 to 16 bits, packed")  # fmt: skip
     registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip

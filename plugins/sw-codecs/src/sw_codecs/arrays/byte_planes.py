@@ -102,8 +102,13 @@ class FloatDelta:
         steps[1:] -= ranks[:-1]  # modulo 2^32
         return BytePlanes().encode((steps << np.uint32(1)) ^ -(steps >> np.uint32(31)))
 
-    def decode(self, data: bytes, shape: Sequence[int]) -> np.ndarray:
-        """float32 of `shape` (N, C) or (N,), writable. Raises BitstreamError; memory as `byte-planes`."""
+    def decode(self, data: bytes, dtype: npt.DTypeLike, shape: Sequence[int]) -> np.ndarray:
+        """float32 of `shape` (N, C) or (N,), writable. Raises BitstreamError; memory as `byte-planes`.
+
+        Raises ValueError for another dtype.
+        """
+        if np.dtype(dtype) != np.float32:
+            raise ValueError(f"float-delta is of float32, not {np.dtype(dtype)}")
         zigzag = BytePlanes().decode(data, np.uint32, shape)
         steps = (zigzag >> np.uint32(1)) ^ -(zigzag & np.uint32(1))
         ranks = np.cumsum(steps, axis=0, dtype=np.uint32)

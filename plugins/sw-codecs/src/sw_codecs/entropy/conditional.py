@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError
@@ -20,9 +21,11 @@ from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
 from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
+from sw_codecs.entropy.rates import gaussian_bits
 
 BLOCK_SYMBOLS = 1 << 20
 FLOAT_LATTICE = 16  # means and deviations in steps are rounded to 1/16
+Numbers = np.ndarray | Tensor
 FLOAT_DOMAIN = 1 << 22  # symbols of a block lie within this of one another
 
 
@@ -34,9 +37,9 @@ class RowContext:
     step            [n,1]. exact: multipliers 64..16384, the step is base step * multiplier / 4096; float: the step
     """
 
-    mean: Any
-    scale: Any
-    step: Any
+    mean: Numbers
+    scale: Numbers
+    step: Numbers
 
 
 class ConditionalGaussian:
@@ -51,7 +54,7 @@ class ConditionalGaussian:
         self.mode = mode
         self._exact, self._range = GaussianExact(), RangeCoder()
 
-    def encode(self, symbols: Any, context: RowContext, present: Any = None) -> bytes:
+    def encode(self, symbols: Numbers, context: RowContext, present: Numbers | None = None) -> bytes:
         """Bytes of one block.
 
         symbols     [n,C] integers
@@ -69,7 +72,7 @@ class ConditionalGaussian:
         head = write_varint(low + K_LIMIT) + write_varint(high - low)
         return head + self._range.encode(coded, _floats(context, where, values.shape, low, high))
 
-    def decode(self, data: bytes, context: RowContext, present: Any = None) -> np.ndarray:
+    def decode(self, data: bytes, context: RowContext, present: Numbers | None = None) -> np.ndarray:
         """int64 [n,C], 0 where `present` is False. Raises BitstreamError."""
         shape, where = np.shape(_array(context.mean)), _where(present)
         found = np.zeros(shape, np.int64)
@@ -83,10 +86,24 @@ class ConditionalGaussian:
         found[where] = coded if where is not Ellipsis else coded.reshape(shape)
         return found
 
-    def bits(self, symbols: Any, context: RowContext, present: Any = None) -> float:
-        """Bits that `encode` spends on the symbols in mode `exact`, from the tables it uses; framing not counted."""
+    def bits(self, symbols: Numbers, context: RowContext, present: Numbers | None = None) -> Tensor:
+        """Bits that `encode` spends on each symbol, float64 [n,C] on the CPU, 0 where `present` is False; no gradient.
+
+        In mode `exact` from the very tables that it uses. Framing is not counted.
+        """
         values, where = _array(symbols), _where(present)
-        return float(self._exact.table_bits(values[where].reshape(-1), _integers(context, where, values.shape)).sum())
+        found = np.zeros(values.shape)
+        coded = values[where].reshape(-1)
+        if self.mode == "exact":
+            bits = self._exact.table_bits(coded, _integers(context, where, values.shape))
+        else:
+            low, high = int(coded.min(initial=0)), int(coded.max(initial=0))
+            spec = _floats(context, where, values.shape, low, high)
+            bits = gaussian_bits(
+                *(torch.from_numpy(each) for each in (coded.astype(np.float64), spec.mu, spec.sigma)), 1.0
+            ).numpy()
+        found[where] = bits if where is not Ellipsis else bits.reshape(values.shape)
+        return torch.from_numpy(found)
 
     def _decode_floats(self, data: bytes, context: RowContext, where: Any, shape: tuple[int, ...]) -> np.ndarray:
         count = int(np.count_nonzero(where)) if where is not Ellipsis else int(np.prod(shape))
@@ -100,7 +117,7 @@ class ConditionalGaussian:
         return self._range.decode(bytes(reader.take(reader.left)), count, spec).astype(np.int64)
 
     @staticmethod
-    def step_multipliers(outputs: Any, offset: int = 0) -> np.ndarray:
+    def step_multipliers(outputs: Numbers, offset: int = 0) -> np.ndarray:
         """Multipliers for step outputs t (integers, 12 fractional bits): round(4096 (1 + tanh t)), at least 64, plus
         `offset`."""
         return GaussianExact.step_multipliers(_array(outputs)) + offset

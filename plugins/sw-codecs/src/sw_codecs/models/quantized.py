@@ -77,7 +77,7 @@ class Layout(Params):
 
 def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> None:
     """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
-    octree = plugins.coders.load("octree")()
+    octree = plugins.position_codecs.load("octree")()
     layout, cells, symbols = lattice(model, codec, octree.sort)
     writer.raster["sh_degree"] = layout.max_sh_degree
     writer.static.update(layout.model_dump(mode="json"))
@@ -97,7 +97,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     n = layout.num_gaussians
     reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
     with reader.decoding("positions") as data:
-        cells = plugins.coders.load("octree")(max_points=n).decode(data)
+        cells = plugins.position_codecs.load("octree")(max_points=n).decode(data)
         if cells.shape != (n, 3):
             raise BitstreamError(f"holds {len(cells):,} points, header says {n:,}")
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
