@@ -126,7 +126,7 @@ def check_entropy_model(
         _hold(found.shape == each.symbols.shape, f"decode gives {list(found.shape)} for {list(each.symbols.shape)}")
         _hold(np.array_equal(found, each.symbols), f"{n:,} symbols do not come back")
         if n == 30:
-            _refuses_less(data, lambda part, each=each: factory().decode(part, each.decoding))
+            _refuses_less(factory().decode, data, each.decoding)
         if n == MANY:
             _agrees(model, each, 8 * len(data))
 
@@ -160,11 +160,11 @@ def check_entropy_coder(factory: Callable[..., EntropyCoder], counts: np.ndarray
     found = factory().decode(data, len(symbols), model)
     _hold(found.dtype == np.int32, f"decode gives {found.dtype}, must be int32")
     _hold(np.array_equal(found, symbols), "symbols do not come back")
-    _refuses_less(data, lambda part: factory().decode(part, len(symbols), model))
+    _refuses_less(factory().decode, data, len(symbols), model)
     _hold(coder.encode(symbols[:0], model) == b"", "no symbols take bytes")
     _hold(len(coder.decode(b"", 0, model)) == 0, "no bytes decode to symbols")
     outside = np.full(3, len(counts), symbols.dtype)
-    _raises(ValueError, lambda: coder.encode(outside, model), "a symbol outside the model is coded")
+    _refuses(ValueError, "a symbol outside the model is coded", coder.encode, outside, model)
 
 
 def check_position_codec(factory: Callable[..., PositionCodec], points: np.ndarray, bits: int) -> None:
@@ -184,10 +184,10 @@ def check_position_codec(factory: Callable[..., PositionCodec], points: np.ndarr
         found = factory().decode(data)
         _hold(found.dtype == np.int64, f"decode gives {found.dtype}, must be int64")
         _hold(found.shape == some.shape and np.array_equal(found, some), f"{len(some):,} points do not come back")
-        _refuses_less(data, lambda part: factory().decode(part))
-    _raises(ValueError, lambda: codec.encode(points[order][::-1], bits), "points out of order are coded")
+        _refuses_less(factory().decode, data)
+    _refuses(ValueError, "points out of order are coded", codec.encode, points[order][::-1], bits)
     limited = factory(max_points=len(points) - 1)
-    _raises(BitstreamError, lambda: limited.decode(data), "more points than max_points are decoded")
+    _refuses(BitstreamError, "more points than max_points are decoded", limited.decode, data)
 
 
 def check_array_coder(factory: Callable[..., ArrayCoder], array: np.ndarray) -> None:
@@ -203,7 +203,7 @@ def check_array_coder(factory: Callable[..., ArrayCoder], array: np.ndarray) -> 
         _hold(found.shape == some.shape, f"decode gives {list(found.shape)} for {list(some.shape)}")
         _hold(found.tobytes() == some.astype(found.dtype).tobytes(), "the array does not come back bit for bit")
         _hold(bool(found.flags.writeable), "the decoded array cannot be written")
-        _refuses_less(data, lambda part, some=some: factory().decode(part, some.dtype, some.shape))
+        _refuses_less(factory().decode, data, some.dtype, some.shape)
 
 
 def check_vector_coder(
@@ -226,13 +226,9 @@ def check_vector_coder(
     nothing = coder.encode(vectors[:0], importance[:0])
     _hold(factory(plugins).decode(nothing, 0, d).shape == (0, d), "no vectors do not come back")
     for name, data in parts.items():
-        _refuses_less(data, lambda part, name=name: factory(plugins).decode({**parts, name: part}, n, d))
-        without = {key: value for key, value in parts.items() if key != name}
-        _raises(
-            BitstreamError,
-            lambda without=without: factory(plugins).decode(without, n, d),
-            f"part '{name}' is not needed",
-        )
+        for less in ({key: part for key, part in parts.items() if key != name}, {**parts, name: data[:-1]}):
+            if less != parts:
+                _refuses(BitstreamError, f"part '{name}' decodes when cut", factory(plugins).decode, less, n, d)
 
 
 def check_gaussian_codec(
@@ -263,9 +259,7 @@ def check_gaussian_codec(
             for name in reader.sections:
                 damaged.add(name, reader.section(name)[: -1 if name == cut else None])
             less = ContainerReader(damaged.to_bytes(), "file")
-            _raises(
-                BitstreamError, lambda less=less: factory(plugins).decode(less), f"section '{cut}' decodes when cut"
-            )
+            _refuses(BitstreamError, f"section '{cut}' decodes when cut", factory(plugins).decode, less)
     return decoded
 
 
@@ -290,20 +284,19 @@ def _hold(condition: bool, text: str) -> None:
         raise AssertionError(text)
 
 
-def _raises(kind: type[Exception], act: Callable[[], object], text: str) -> None:
+def _refuses(kind: type[Exception], text: str, act: Callable[..., object], *arguments: Any) -> None:
     try:
-        act()
+        act(*arguments)
     except kind:
         return
     raise AssertionError(text)
 
 
-def _refuses_less(data: bytes, decode: Callable[[bytes], object]) -> None:
-    """Hold `decode` to raise BitstreamError for what is left of `data` when it is cut, at up to 60 places."""
-    for length in sorted({len(data) - 1, *range(0, len(data), max(len(data) // 60, 1))} - {len(data)}):
-        if length >= 0:
-            text = f"{length:,} of {len(data):,} bytes are decoded"
-            _raises(BitstreamError, lambda length=length: decode(data[:length]), text)
+def _refuses_less(decode: Callable[..., object], data: bytes, *arguments: Any) -> None:
+    """Hold `decode(part, *arguments)` to raise BitstreamError for `data` that is cut, at up to 60 places."""
+    for length in sorted({len(data) - 1, *range(0, len(data), max(len(data) // 60, 1))} - {-1, len(data)}):
+        text = f"{length:,} of {len(data):,} bytes are decoded"
+        _refuses(BitstreamError, text, decode, data[:length], *arguments)
 
 
 def _same(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
