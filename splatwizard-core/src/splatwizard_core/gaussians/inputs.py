@@ -90,6 +90,16 @@ class SH:
         return 0
 
 
+def check_shape(name: str, tensor: Tensor, expected: tuple[int | str, ...]) -> None:
+    """Raise ShapeError unless `tensor` has the sizes `expected`; a string there stands for any size."""
+    shape = tensor.shape
+    if shape == expected:
+        return
+    if len(shape) != len(expected) or any(a != e for a, e in zip(shape, expected, strict=True) if isinstance(e, int)):
+        wanted = ", ".join(str(e) for e in expected)
+        raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}", actual=shape, expected=expected)
+
+
 _TENSORS = (
     "means", "opacities", "scales", "quats", "cov3d", "geom_indices", "scale_factors", "colors", "features", "visible",
 )  # fmt: skip
@@ -175,18 +185,8 @@ class GaussianInputs:
         n = self.means.shape[0]
 
         def need(name: str, tensor: Tensor | None, *expected: int | str) -> None:
-            if tensor is None or tensor.shape == expected:
-                return
-            ok = tensor.dim() == len(expected) and all(
-                isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
-            )
-            if not ok:
-                wanted = ", ".join(str(e) for e in expected)
-                raise ShapeError(
-                    f"GaussianInputs.{name} must be [{wanted}], got {list(tensor.shape)}",
-                    actual=tensor.shape,
-                    expected=expected,
-                )
+            if tensor is not None:
+                check_shape(f"GaussianInputs.{name}", tensor, expected)
 
         rows: int | str = n if self.geom_indices is None else "M"
         need("means", self.means, n, 3)
