@@ -15,7 +15,8 @@ import pytest
 from sw_doctor import child, compilers, diagnosis, metrics, packages, probe, system
 from sw_doctor.check import Check, gigabytes, one_line
 
-from splatwizard_core.native import NativeModule, toolchain
+from splatwizard_core.api import NativeModule
+from splatwizard_core.native import toolchain
 from splatwizard_core.plugins import PluginManager, load_plugins
 
 needs_compiler = pytest.mark.skipif(
@@ -388,7 +389,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
     package = tmp_path / "src" / "doctored_kernels"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(
-        "from splatwizard_core.native import NativeModule\n"
+        "from splatwizard_core.api import NativeModule\n"
         "MODULE = NativeModule(name='doctored', package='doctored_kernels', sources=('a.cpp',), seconds=7,"
         " without='it is slow')\n"
     )

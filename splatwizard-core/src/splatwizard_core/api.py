@@ -41,7 +41,7 @@ MODULES = {
     "coding.container": "ContainerReader ContainerWriter",
     "coding.contracts": "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder GaussianCodec",
     "evaluation.metrics": "Metric MetricSetup PreparedMetric",
-    "native": "NativeModule",
+    "native.loader": "NativeModule",
     "progress": "track",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""

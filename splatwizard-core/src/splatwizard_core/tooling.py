@@ -23,7 +23,7 @@ MODULES = {
     "progress": "Bar",
     "cores": "available_cores",
     "errors": "NativeBuildError PluginError RunLockedError",
-    "native": "cache_root",
+    "native.loader": "cache_root",
     "native.build": "declared_modules resolve_module",
     "native.toolchain": "find_compiler find_nvcc nvcc_version",
     "rendering.negotiation": "NegotiatedRasterizer",

@@ -20,9 +20,9 @@ from splatwizard_core.files import new_folder as new_folder
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
 from splatwizard_core.files import write_json as write_json
-from splatwizard_core.native import cache_root as cache_root
 from splatwizard_core.native.build import declared_modules as declared_modules
 from splatwizard_core.native.build import resolve_module as resolve_module
+from splatwizard_core.native.loader import cache_root as cache_root
 from splatwizard_core.native.toolchain import find_compiler as find_compiler
 from splatwizard_core.native.toolchain import find_nvcc as find_nvcc
 from splatwizard_core.native.toolchain import nvcc_version as nvcc_version
