@@ -101,6 +101,32 @@ def nvcc_version(nvcc: str) -> tuple[int, int] | None:
     return None if found is None else (int(found[1]), int(found[2]))
 
 
+@dataclass(frozen=True)
+class Compilers:
+    """The compilers that builds would use on this machine.
+
+    cxx             command of the C++ compiler; None: there is none, and `problem` says why
+    nvcc            path of the CUDA compiler, None if there is none
+    nvcc_release    (major, minor) of it, None if it does not say
+    """
+
+    cxx: list[str] | None
+    problem: str | None
+    nvcc: str | None
+    nvcc_release: tuple[int, int] | None
+
+
+def installed_compilers() -> Compilers:
+    """Look for the C++ and the CUDA compiler; neither is run on anything."""
+    cxx, problem = None, None
+    try:
+        cxx = find_compiler()
+    except CompilerMissingError as error:
+        problem = str(error)
+    nvcc = find_nvcc()
+    return Compilers(cxx, problem, nvcc, None if nvcc is None else nvcc_version(nvcc))
+
+
 def cuda_mismatch() -> str | None:
     """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
     import torch
