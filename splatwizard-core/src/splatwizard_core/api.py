@@ -43,7 +43,7 @@ MODULES = {
         "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
     ),
     "evaluation.metrics": "Metric MetricSetup PreparedMetric",
-    "native": "NativeModule",
+    "native.loader": "NativeModule",
     "progress": "track",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""

@@ -37,7 +37,7 @@ def build_kernels(
     from rich.markup import escape
     from rich.table import Table
 
-    from splatwizard_core.native import build_all
+    from splatwizard_core.native.build import build_all
     from splatwizard_core.plugins import load_plugins
 
     march = "portable" if portable else "native"
