@@ -108,7 +108,7 @@ def report(
 
 
 def open_scene(run: Run) -> Scene:
-    """The scene of a run, read as the run read it. Raises what reading a scene raises."""
+    """Read the scene of a run as the run read it. Raises what reading a scene raises."""
     from splatwizard_core.api import SceneError
     from splatwizard_core.tooling import existing_file, load_plugins, load_scene, resolve_run_options
 
@@ -120,7 +120,7 @@ def open_scene(run: Run) -> Scene:
 
 
 def print_tables(tables: list[tuple[str, Table]], notes: list[str]) -> None:
-    """As text on stdout."""
+    """Print tables as text on stdout."""
     from rich.markup import escape
     from rich.table import Table as Drawn
 
