@@ -39,7 +39,9 @@ MODULES = {
     "training.pruner": "Pruner load_pruner",
     "streams": "stream",
     "coding.container": "ContainerReader ContainerWriter",
-    "coding.contracts": "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder GaussianCodec",
+    "coding.contracts": (
+        "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
+    ),
     "evaluation.metrics": "Metric MetricSetup PreparedMetric",
     "native": "NativeModule",
     "progress": "track",

@@ -17,7 +17,6 @@ from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
 from splatwizard_core.files import file_sha256 as file_sha256
-from splatwizard_core.files import full_disk_code as full_disk_code
 from splatwizard_core.files import new_folder as new_folder
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
@@ -45,3 +44,4 @@ from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import read_record as read_record
 from splatwizard_core.runs.run import run as run
 from splatwizard_core.scene.loading import load_scene as load_scene
+from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE

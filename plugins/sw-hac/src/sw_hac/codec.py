@@ -148,7 +148,7 @@ def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec, plugins: Pl
             integers = index.to(torch.int64).numpy() * (1 if present is None else present)
             coded[g].append(coder.encode(integers, contexts[g], present))
             symbols[g].append(integers)
-            bits += coder.bits(integers, contexts[g], present) if codec.mode == "exact" else 0.0
+            bits += float(coder.bits(integers, contexts[g], present).sum()) if codec.mode == "exact" else 0.0
     for name, blocks in zip(SECTIONS, coded, strict=True):
         writer.add(name, coder.join(blocks))
     writer.allow(len(rows) * bytes_per_anchor(feature_dim, k), f"a model of {len(rows):,} anchors")

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         GaussianCodec,
         PositionCodec,
         Quantizer,
+        VectorCoder,
     )
     from splatwizard_core.evaluation.metrics import AnyMetric
     from splatwizard_core.gaussians.model import GaussianModel
@@ -62,6 +63,7 @@ class PluginManager:
         self.entropy_coders: Coders[EntropyCoder] = Coders(self.coders, "symbols")
         self.position_codecs: Coders[PositionCodec] = Coders(self.coders, "positions")
         self.array_coders: Coders[ArrayCoder] = Coders(self.coders, "arrays")
+        self.vector_coders: Coders[VectorCoder] = Coders(self.coders, "vectors")
         self.gaussian_codecs: Coders[GaussianCodec] = Coders(self.coders, "gaussians")
         self.tasks: Registry[Callable[..., Any]] = Registry("task")
         self.methods: Registry[type[Method]] = Registry("method")
