@@ -1,6 +1,6 @@
 """What a measurement is asked for beyond the file and the scene, and whether an earlier one already holds it.
 
-An earlier one that holds more is kept: a run that was measured with LPIPS, or five times over, does not lose that
+An earlier one that holds more is kept: a run that was measured with weights, or five times over, does not lose that
 because a later command does not ask for it.
 """
 
@@ -8,10 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
-from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
+from splatwizard_core.evaluation.metrics import MetricSettings, MetricSetup, metric_identities
 from splatwizard_core.runs.session import Session
 
 
@@ -40,7 +39,7 @@ class Asked:
         return all(now is None or metrics.get(name) == now for name, now in self.metrics.items())
 
 
-def what_is_asked(session: Session, *, repeats: int, lpips_weights: Path | None) -> Asked:
+def what_is_asked(session: Session, *, repeats: int, metric_settings: MetricSettings) -> Asked:
     """What a run asks of its evaluation, with the packages and weights that are there now."""
-    setup = MetricSetup(session.device, lpips_weights)
+    setup = MetricSetup(session.device, metric_settings)
     return Asked(repeats, metric_identities(session.plugins.metrics, setup))

@@ -17,7 +17,7 @@ from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardErro
 from splatwizard_core.evaluation.speed import Spread, spread
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
 from splatwizard_core.runs.file_needs import (
@@ -129,10 +129,10 @@ def timed_decode(
     """
 
     def once() -> tuple[SplatModel, ContainerReader, float]:
-        _synchronize(device)
+        synchronize(device)
         began = time.perf_counter()
         model, reader = open_model(path, plugins, device)
-        _synchronize(device)
+        synchronize(device)
         return model, reader, time.perf_counter() - began
 
     import_method(path, plugins)
@@ -207,8 +207,3 @@ def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: st
             raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
     plugins.exporters.load(name)(model, path)
     return name
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

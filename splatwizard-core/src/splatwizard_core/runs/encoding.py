@@ -17,6 +17,7 @@ from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import synchronize
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
 from splatwizard_core.runs.cache import cached_directory, trained_scene
@@ -43,7 +44,7 @@ def encode(
     The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
     """
     before = model.digest()
-    _synchronize(device)
+    synchronize(device)
     began = time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad(), method.plugins.recording() as loaded:
@@ -52,7 +53,7 @@ def encode(
         loaded.insert(0, method.plugins.methods.entry(method.name))
     writer.requires = requirements(loaded)
     size = writer.write(path)
-    _synchronize(device)
+    synchronize(device)
     seconds = time.perf_counter() - began
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
@@ -129,8 +130,3 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
         return encode(method, model, raster, target, session.device)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

@@ -22,9 +22,10 @@ from splatwizard_core.evaluation.evaluate import (
     save_png,
     suggested_rasterizers,
 )
+from splatwizard_core.evaluation.metrics import MetricSettings
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -56,7 +57,7 @@ def measure(
     ppl: PipelineParams,
     *,
     metrics: Sequence[str] | None = None,
-    lpips_weights: Path | None = None,
+    metric_settings: MetricSettings | None = None,
     speed: bool = True,
     repeats: int = 1,
     renders: Path | None = None,
@@ -67,7 +68,7 @@ def measure(
     open_model  () -> the model on `device`; called first, before any picture is read
     load_scene  () -> the scene
     metrics     names; None: all that are installed
-    lpips_weights   folder that LPIPS' backbones are looked for in first
+    metric_settings     of metrics, group -> key -> value
     speed       also measure speed and memory
     repeats     how often speed is measured
     renders     folder for the test views as PNG; None: not kept
@@ -82,7 +83,7 @@ def measure(
     meter.start()
     began = time.perf_counter()
     model, raster, device_bound = open_model()
-    _synchronize(device)
+    synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
     scene = load_scene()
@@ -95,7 +96,7 @@ def measure(
     began = time.perf_counter()
     with torch.no_grad():
         model.prepare()
-    _synchronize(device)
+    synchronize(device)
     prepare_s = time.perf_counter() - began
     # CUDA's allocator knows all that is held; a resident set only grows by what was measured piece by piece.
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
@@ -110,7 +111,7 @@ def measure(
     quality = evaluate(
         model, views, rasterizer, plugins,
         device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
-        lpips_weights=lpips_weights, save_to=renders,
+        metric_settings=metric_settings, save_to=renders,
         label=f"evaluate on {scene.name}",
     )  # fmt: skip
     found = _describe_scene(scene, quality)
@@ -156,11 +157,6 @@ def _flags(scene: Scene, quality: EvaluationResult, meter: MemoryMeter, device_b
         "device-bound": device_bound,
     }
     return [name for name, holds in told.items() if holds]
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 def _all_views(scene: Scene) -> list[View]:

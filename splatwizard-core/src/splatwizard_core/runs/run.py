@@ -7,12 +7,13 @@ a finished one is not done again.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SceneError, SplatwizardError, UserInputError
+from splatwizard_core.evaluation.metrics import MetricSettings
 from splatwizard_core.files import file_sha256, remove_folder, sweep, write_atomic
 from splatwizard_core.runs.asked import Asked, what_is_asked
 from splatwizard_core.runs.cache import cached_directory, trained_scene
@@ -44,7 +45,7 @@ class RunRequest:
 
     out         root of all run directories
     resume      use what is there; False: discard it
-    lpips_weights   folder that LPIPS' backbones are looked for in first
+    metric_settings     of metrics, group -> key -> value
     repeats     how often rendering speed is measured; decoding is timed as often, and at least three times
     """
 
@@ -52,7 +53,7 @@ class RunRequest:
     out: Path
     resume: bool = True
     allow_changed_plan: bool = False
-    lpips_weights: Path | None = None
+    metric_settings: MetricSettings = field(default_factory=dict)
     repeats: int = 1
 
 
@@ -260,15 +261,16 @@ def _evaluate_step(
         arguments = ["eval", str(directory / ENCODED), "--scene", absolute_spec(request.resolved.scene_spec)]
         arguments += eval_options(resolved, str(session.device))
         arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
-        if request.lpips_weights is not None:
-            arguments += ["--lpips-weights", str(request.lpips_weights)]
+        for group, settings in request.metric_settings.items():
+            for key, value in settings.items():
+                arguments += ["--set", f"metrics.{group}.{key}={value}"]
         facts = {**run_fresh(arguments), "asked": asked.as_dict()}
         steps.finish("evaluate", key, facts)
     return facts
 
 
 def _asked(session: Session, request: RunRequest) -> Asked:
-    return what_is_asked(session, repeats=request.repeats, lpips_weights=request.lpips_weights)
+    return what_is_asked(session, repeats=request.repeats, metric_settings=request.metric_settings)
 
 
 def eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
