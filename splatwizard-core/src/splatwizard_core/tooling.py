@@ -27,8 +27,11 @@ MODULES = {
     "native.build": "declared_modules resolve_module",
     "native.toolchain": "find_compiler find_nvcc nvcc_version",
     "rendering.negotiation": "NegotiatedRasterizer info_from_entry obstacle",
-    "cli.options": "assignments console debug_option json_option options print_json set_option",
-    "cli.setup": "existing_file output_file output_folder resolve_run_options say",
+    "evaluation.metrics": "MetricInfo short_reason",
+    "cli.options": "console debug_option json_option options print_json say set_option",
+    "cli.complete": "complete_files complete_folders complete_image_folders complete_names complete_nothing",
+    "cli.paths": "existing_file output_file output_folder",
+    "cli.setup": "assignments resolve_run_options",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 

@@ -318,7 +318,7 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UserInputError(f"{out} is not an empty folder: choose another one")
     output_folder(target)
-    _, scene_options, _ = resolve_run_options(None, assignments(sets))
+    scene_options = resolve_run_options(None, assignments(sets)).scene
     scene = load_scene("demo" if size == "demo" else f"demo:{size}", scene_options, load_plugins())
     say(f"drawing {len(scene.train) + len(scene.test)} views")
     write_scene(scene, target, layout, text=text)
