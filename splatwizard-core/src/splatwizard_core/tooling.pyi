@@ -22,7 +22,6 @@ from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
 from splatwizard_core.files import file_sha256 as file_sha256
-from splatwizard_core.files import full_disk_code as full_disk_code
 from splatwizard_core.files import new_folder as new_folder
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
@@ -48,8 +47,9 @@ from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
 from splatwizard_core.runs.observers import StartedTraining as StartedTraining
 from splatwizard_core.runs.observers import TrainingObserver as TrainingObserver
 from splatwizard_core.runs.record import FILE_NAME as FILE_NAME
-from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import SCHEMA as SCHEMA
+from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import read_record as read_record
 from splatwizard_core.runs.run import run as run
 from splatwizard_core.scene.loading import load_scene as load_scene
+from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE

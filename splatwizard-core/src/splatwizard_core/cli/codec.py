@@ -81,5 +81,7 @@ def decode(file: str, out: str | None, repeats: int, as_json: bool, chosen: Choi
     if as_json:
         shared.print_json(facts)
         return
-    click.echo(f"{report.method}: {shared.counted(report.counts)}, decoded in {report.decode_s:.3f} s on {report.device}")
+    click.echo(
+        f"{report.method}: {shared.counted(report.counts)}, decoded in {report.decode_s:.3f} s on {report.device}"
+    )
     click.echo(f"model digest {report.digest}")

@@ -66,7 +66,8 @@ def complete_presets(context: click.Context, _parameter: click.Parameter, incomp
 
 def complete_scenes(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Offer the default scene, dataset/scene below $SPLATWIZARD_DATA, and folders by the shell."""
-    found: list[tuple[str, str | None]] = [(e.name, e.summary) for e in _registered("dataset") if e.declared.get("default")]
+    default = [entry for entry in _registered("dataset") if entry.declared.get("default")]
+    found: list[tuple[str, str | None]] = [(entry.name, entry.summary) for entry in default]
     if root := os.environ.get(DATA):
         places = [(data, scene) for data in _folders_in(Path(root).expanduser()) for scene in _folders_in(data)]
         found += [(f"{data.name}/{scene.name}", None) for data, scene in places[:MOST]]
@@ -78,14 +79,16 @@ def complete_scene_or_file(context: click.Context, parameter: click.Parameter, i
     return [CompletionItem(incomplete, type="file"), *complete_scenes(context, parameter, incomplete)[1:]]
 
 
-def complete_image_folders(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+def complete_image_folders(
+    context: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
     """Offer the `images*` folders of the scene on the line."""
     scene = context.params.get("scene")
     if not isinstance(scene, str):
         return []
     roots = [Path(root).expanduser() for root in (".", os.environ.get(DATA)) if root]
-    place = next((root / Path(scene).expanduser() for root in roots if (root / Path(scene).expanduser()).is_dir()), None)
-    names = [] if place is None else [path.name for path in _folders_in(place)]
+    places = [root / Path(scene).expanduser() for root in roots]
+    names = next(([path.name for path in _folders_in(place)] for place in places if place.is_dir()), [])
     return _starting(incomplete, [(name, None) for name in names if name.startswith("images")])
 
 

@@ -107,8 +107,8 @@ def _ply_facts(path: Path) -> dict[str, Any]:
 
 
 def _scene_facts(spec: str, chosen: Choices) -> dict[str, Any]:
+    from splatwizard_core.cli.describe_scene import describe
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.describe import describe
     from splatwizard_core.scene.loading import load_scene
 
     return describe(load_scene(spec, chosen.resolve_without_method().scene, load_plugins()))
