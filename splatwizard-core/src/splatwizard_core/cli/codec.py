@@ -58,7 +58,7 @@ def encode(
     codec), or a .ply of explicit Gaussians, for methods that encode such.
     """
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.encoding import encode_directory, encode_ply
+    from splatwizard_core.runs.encode import encode_directory, encode_ply
 
     path = existing(source)
     plugins = load_plugins()
@@ -97,7 +97,7 @@ def encode(
 def decode(file: str, out: str | None, repeats: int, device: str | None, as_json: bool) -> None:
     """Decode FILE.swz from nothing but itself; report time, counts and the digest of the model."""
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.decoding import save_decoded, timed_decode
+    from splatwizard_core.runs.decode import save_decoded, timed_decode
 
     path = existing_file(file)
     if out is not None:

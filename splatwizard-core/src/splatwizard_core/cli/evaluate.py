@@ -86,7 +86,7 @@ def evaluate(
     of the run (raster.prefer, threads, ...).
     """
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.measuring import Opened, measure, opener
+    from splatwizard_core.runs.measure import Opened, measure, opener
     from splatwizard_core.scene.loading import load_scene
 
     path = existing(file)
@@ -119,7 +119,7 @@ def evaluate(
         if not stored:
             open_model = opener(path, plugins, session.device)
         elif roundtrip:
-            from splatwizard_core.runs.encoding import encode_directory
+            from splatwizard_core.runs.encode import encode_directory
             from splatwizard_core.runs.fresh import decode_fresh
 
             path = stack.enter_context(scratch_folder("roundtrip")) / "scene.swz"
@@ -127,7 +127,7 @@ def evaluate(
             digest = decode_fresh(path, str(session.device))["digest"]
             open_model = opener(path, plugins, session.device)
         else:
-            from splatwizard_core.runs.encoding import load_finished
+            from splatwizard_core.runs.encode import load_finished
 
             def open_model() -> Opened:
                 trained = load_finished(session, resolved, path)

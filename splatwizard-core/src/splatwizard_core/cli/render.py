@@ -49,7 +49,7 @@ def render(
 ) -> None:
     """Draw FILE (.swz or .ply) from the cameras of a scene, as 8-bit PNG."""
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.measuring import opener, render_views
+    from splatwizard_core.runs.measure import opener, render_views
     from splatwizard_core.scene.loading import load_scene
 
     path = existing_file(file)

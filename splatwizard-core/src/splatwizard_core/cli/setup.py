@@ -63,19 +63,19 @@ def resolve_all(
 ) -> list[ResolvedConfig]:
     """One configuration for every method and rate point that was asked for; wrong input fails before anything runs."""
     from splatwizard_core.runs.config import rate_points, resolve
-    from splatwizard_core.runs.start import settled
+    from splatwizard_core.runs.pretrained import checked_start
 
     found = []
     for name in methods:
         cls = load_method(plugins, name)
         for rate in rate_points(cls, rates) if rates is not None else [None]:
             found.append(resolve(cls, preset, rate, config_file, values, scene=scene))
-    return [settled(plugins, each) for each in _left_to_those_with_a_use(plugins, found)]
+    return [checked_start(plugins, each) for each in _left_to_those_with_a_use(plugins, found)]
 
 
 def _left_to_those_with_a_use(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
     """Of several methods, those that start from nothing trained leave --init and `pretrained.KEY` to the others."""
-    from splatwizard_core.runs.start import of_no_use
+    from splatwizard_core.runs.pretrained import unused_start
 
     alone: dict[str, dict[str, Any]] = {"init": {"pretrained": {}}, "pretrained": {"init": ""}}
     without: dict[str, dict[str, Any]] = {"init": {"init": ""}, "pretrained": {"pretrained": {}}}
@@ -83,7 +83,7 @@ def _left_to_those_with_a_use(plugins: PluginManager, found: list[ResolvedConfig
         useless = {
             each.method: error
             for each in found
-            if (error := of_no_use(plugins, replace(each, **alone[what]))) is not None
+            if (error := unused_start(plugins, replace(each, **alone[what]))) is not None
         }
         if len(useless) < len({each.method for each in found}):  # else it is wrong, and told so
             for name, error in useless.items():
@@ -116,7 +116,7 @@ def rate_values(plugins: PluginManager, method: str | None, rate: str, config_fi
     Raises ConfigError for an unknown rate point.
     """
     from splatwizard_core.runs.config import read_config_file, resolve
-    from splatwizard_core.runs.keys import value_at
+    from splatwizard_core.training.keys import value_at
 
     (name,) = method_names([] if method is None else [method], config_file)
     cls = load_method(plugins, name)
@@ -128,7 +128,7 @@ def rate_values(plugins: PluginManager, method: str | None, rate: str, config_fi
 
 def field_in_config(method: type[Method], key: str) -> bool:
     """Whether a dotted key is one of the method's own config."""
-    from splatwizard_core.runs.keys import field_at
+    from splatwizard_core.training.keys import field_at
 
     return field_at(method.Config, key) is not None
 
@@ -143,7 +143,7 @@ def resolve_run_options(
     from splatwizard_core.errors import ConfigError
     from splatwizard_core.method import Method
     from splatwizard_core.runs.config import RESERVED, SCENE_KEYS, read_config_file, resolve
-    from splatwizard_core.runs.keys import block_keys, field_at, flatten
+    from splatwizard_core.training.keys import block_keys, field_at, flatten
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
 
     class NoMethod(Method):

@@ -57,7 +57,7 @@ def train(
     """Train one method on one scene; checkpoints and log go into its run directory."""
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.run import RunRequest, train_only
-    from splatwizard_core.runs.training_run import pretraining
+    from splatwizard_core.runs.training import pretraining
 
     plugins = load_plugins()
     values = assignments(sets, images=images, device=device, seed=seed, init=init)
