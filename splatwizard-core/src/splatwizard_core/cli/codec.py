@@ -31,7 +31,7 @@ def encode(source: str, out: str | None, as_json: bool, chosen: Choices) -> None
     codec), or a .ply of explicit Gaussians, for methods that encode such.
     """
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.encoding import encode_directory, encode_ply
+    from splatwizard_core.runs.encode import encode_directory, encode_ply
 
     path = existing(source)
     plugins = load_plugins()
@@ -66,7 +66,7 @@ def encode(source: str, out: str | None, as_json: bool, chosen: Choices) -> None
 def decode(file: str, out: str | None, repeats: int, as_json: bool, chosen: Choices) -> None:
     """Decode FILE.swz from nothing but itself; report time, counts and the digest of the model."""
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.decoding import save_decoded, timed_decode
+    from splatwizard_core.runs.decode import save_decoded, timed_decode
 
     path = existing_file(file)
     if out is not None:

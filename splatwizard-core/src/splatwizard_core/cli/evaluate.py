@@ -57,9 +57,9 @@ def evaluate(
     the run (raster.prefer, threads, ...) and settings of metrics (metrics.GROUP.KEY).
     """
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.encoding import encode_directory, load_finished
+    from splatwizard_core.runs.encode import encode_directory, load_finished
     from splatwizard_core.runs.fresh import decode_fresh
-    from splatwizard_core.runs.measuring import Opened, measure, opener
+    from splatwizard_core.runs.measure import Opened, measure, opener
     from splatwizard_core.scene.loading import load_scene
 
     path = existing(file)

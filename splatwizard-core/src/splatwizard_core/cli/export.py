@@ -26,8 +26,8 @@ from splatwizard_core.cli.setup import Choices, open_session, takes_choices
 def export(file: str, out: str, exporter: str | None, as_json: bool, chosen: Choices) -> None:
     """Decode FILE (.swz or .ply) and write it to OUT in another format, such as .ply."""
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.decoding import export_model
-    from splatwizard_core.runs.measuring import opener
+    from splatwizard_core.runs.decode import export_model
+    from splatwizard_core.runs.measure import opener
 
     path = existing_file(file)
     output_file(out)

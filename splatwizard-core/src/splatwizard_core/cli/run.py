@@ -32,8 +32,8 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     tables and pages of the finished runs; those about several runs go into the folder above theirs.
     """
     from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
-    from splatwizard_core.runs.run import RunRequest
     from splatwizard_core.runs.run import run as run_one
 
     plugins = load_plugins()
@@ -48,8 +48,7 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     console = None if as_json else shared.console()
     for each in resolved:
         request = RunRequest(
-            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, metric_settings=each.metrics,
-            repeats=repeats,
+            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, repeats=repeats,
         )  # fmt: skip
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))

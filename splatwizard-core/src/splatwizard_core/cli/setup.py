@@ -65,13 +65,15 @@ class Choices:
     def resolve(self, plugins: PluginManager) -> list[ResolvedConfig]:
         """One configuration for every method and rate point; wrong input fails before anything runs."""
         from splatwizard_core.runs.config import rate_points, resolve
-        from splatwizard_core.runs.start import settled
+        from splatwizard_core.runs.pretrained import checked_start
 
         values, found = self.values(), []
         for method in map(plugins.methods.load, self.method_names(plugins)):
             for rate in [None] if self.rate is None else rate_points(method, self.rate):
-                found.append(resolve(method, self.preset, rate, self.config_file, values, scene=self.scene))
-        return [settled(plugins, each) for each in _without_unused_starts(plugins, found)]
+                found.append(
+                    resolve(method, self.preset, rate, self.config_file, values, scene=self.scene, plugins=plugins)
+                )
+        return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
         """The configuration of a command that makes one thing."""
@@ -87,7 +89,7 @@ class Choices:
     def with_rate_of(self, directory: Path, plugins: PluginManager) -> Choices:
         """The same for a run directory: its config.toml, with what another rate point would change in it."""
         from splatwizard_core.runs.config import read_config_file, resolve
-        from splatwizard_core.runs.keys import field_at, value_at
+        from splatwizard_core.training.keys import field_at, value_at
 
         chosen = replace(self, config_file=str(directory / "config.toml"))
         if self.rate is None:
@@ -127,7 +129,7 @@ def assignments(sets: Sequence[str], **named: Any) -> dict[str, Any]:
 
 def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
     """Of several methods, take --init and `pretrained.KEY` from those that start from nothing trained."""
-    from splatwizard_core.runs.start import of_no_use
+    from splatwizard_core.runs.pretrained import unused_start
 
     alone: dict[str, dict[str, Any]] = {"init": {"pretrained": {}}, "pretrained": {"init": ""}}
     without: dict[str, dict[str, Any]] = {"init": {"init": ""}, "pretrained": {"pretrained": {}}}
@@ -135,7 +137,7 @@ def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) 
         useless = {
             each.method: error
             for each in found
-            if (error := of_no_use(plugins, replace(each, **alone[what]))) is not None
+            if (error := unused_start(plugins, replace(each, **alone[what]))) is not None
         }
         if len(useless) < len({each.method for each in found}):  # else it is wrong, and told so
             for name, error in useless.items():
@@ -151,7 +153,7 @@ def resolve_run_options(config_file: str | None, values: dict[str, Any], *, scen
     """
     from splatwizard_core.method import Method
     from splatwizard_core.runs.config import RESERVED, SCENE_KEYS, read_config_file, resolve
-    from splatwizard_core.runs.keys import block_keys, dotted, field_at, flatten
+    from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten
     from splatwizard_core.training.params import OptimizationParams, PipelineParams
 
     class NoMethod(Method):

@@ -21,8 +21,9 @@ from splatwizard_core.cli.setup import Choices, open_training_session, takes_cho
 def train(out: str, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
     """Train one method on one scene; checkpoints and log go into its run directory."""
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.run import RunRequest, train_only
-    from splatwizard_core.runs.training_run import pretraining
+    from splatwizard_core.runs.directory import RunRequest
+    from splatwizard_core.runs.run import train_only
+    from splatwizard_core.runs.training import pretraining
 
     plugins = load_plugins()
     resolved = chosen.resolve_one(plugins)
