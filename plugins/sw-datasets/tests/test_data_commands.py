@@ -455,3 +455,19 @@ def test_completion_says_nothing_of_a_registry_that_cannot_be_read(monkeypatch):
 
     monkeypatch.setenv("SPLATWIZARD_DATA_REGISTRY", "/nowhere/at/all.toml")
     assert datasets(click.Context(click.Command("fetch")), click.Argument(["targets"]), "dt") == []
+
+
+def test_synth_writes_a_scene_that_info_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["data", "synth", str(tmp_path / "s"), "--size", "tiny", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert main(["info", str(tmp_path / "s"), "--set", "test_every=4", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["dataset"] == "colmap"
+    assert found["views"] == {"train": written["train_views"], "test": written["test_views"]}
+    assert found["points"]["count"] == written["points"]
+
+
+def test_synth_leaves_a_folder_alone_that_holds_something(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "notes.txt").touch()
+    assert main(["data", "synth", str(tmp_path)]) == 2
+    assert "not an empty folder" in capsys.readouterr().err

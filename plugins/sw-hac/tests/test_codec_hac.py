@@ -100,7 +100,7 @@ def test_another_process_decodes_the_same(tmp_path):
     code = (
         "import sys, torch\n"
         "from splatwizard_core.coding.container import ContainerReader\n"
-        "from splatwizard_core.runs.decoding import decode_model\n"
+        "from splatwizard_core.runs.decode import decode_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "torch.set_num_threads(2)\n"
         "for path in sys.argv[1:]:\n"

@@ -42,7 +42,8 @@ MODULES = {
     "coding.contracts": (
         "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
     ),
-    "evaluation.metrics": "Metric MetricSetup PreparedMetric",
+    "evaluation.image": "ssim_map",
+    "evaluation.metrics": "MetricSetup PreparedMetric",
     "native.loader": "NativeModule",
     "progress": "track",
 }

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.keys import flatten, is_beside_method
+from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import OptimizationParams
 
 if TYPE_CHECKING:
@@ -69,27 +71,28 @@ class Method:
         if reader.version != self.version:
             raise BitstreamError(
                 f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-{self.name}"
+                f"{self.version}: upgrade {self._distribution()}"
             )
+
+    def _distribution(self) -> str:
+        methods = self.plugins.methods
+        return methods.entry(self.name).distribution if self.name in methods else f"the package of {self.name}"
 
 
 def create_method(
     plugins: PluginManager, name: str, config: Mapping[str, Any] | None = None, *, preset: str = "paper"
 ) -> Method:
-    """Another method by name, with values for its config by dotted key: how one method borrows from another.
+    """Make another method by name, with values for its config: how one method borrows from another.
 
+    config  by dotted key, or in nested tables
     preset  values that it sets beyond the method's config (of the run or the scene, such as clamp_render) are left to
             the run: they are the user's, and one run has one of each
 
     Raises PluginError if it is not installed, ConfigError for an unknown preset, key or value.
     """
-    from splatwizard_core.errors import ConfigError
-    from splatwizard_core.runs.config import apply_overrides
-    from splatwizard_core.runs.keys import is_beside_method
-
     cls: type[Method] = plugins.methods.load(name)
     if preset not in cls.PRESETS:
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
     borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
-    values = {**borrowed, **(config or {})}
+    values = {**borrowed, **flatten(cls.Config, config or {})}
     return cls(plugins, apply_overrides(cls.Config(), values, source=f"config of '{name}'"))

@@ -25,14 +25,16 @@ MODULES = {
     "progress": "Bar",
     "cores": "available_cores",
     "evaluation.evaluate": "png_names",
-    "evaluation.metrics": "short_reason",
+    "evaluation.metrics": "MetricInfo short_reason",
     "errors": "NativeBuildError PluginError RunLockedError",
     "native.loader": "cache_root",
     "native.build": "declared_modules",
     "native.toolchain": "installed_compilers",
     "rendering.negotiation": "NegotiatedRasterizer",
-    "cli.options": "assignments console debug_option json_option options print_json set_option",
-    "cli.setup": "existing_file output_file output_folder resolve_run_options say",
+    "cli.options": "console debug_option json_option options print_json say set_option",
+    "cli.complete": "complete_files complete_folders complete_image_folders complete_names complete_nothing",
+    "cli.paths": "existing_file output_file output_folder",
+    "cli.setup": "assignments resolve_run_options",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 

@@ -8,7 +8,7 @@ import torch
 from lpips_backbones import write_backbones
 
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.asked import Asked
+from splatwizard_core.runs.measure import Asked
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import RunRequest, run
@@ -23,7 +23,7 @@ LPIPS = ("lpips_vgg_3dgs", "lpips_vgg", "lpips_alex")
 def runs(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
     """One run, given three times: plain, with weights and repeats, plain again."""
     if importlib.util.find_spec("lpips") is None:
-        pytest.skip("LPIPS is the extra splatwizard-core[lpips]")
+        pytest.skip("LPIPS is the extra sw-metrics[lpips]")
     root = tmp_path_factory.mktemp("measured")
     weights = write_backbones(tmp_path_factory.mktemp("weights"), "alex")
     with pytest.MonkeyPatch.context() as patch:

@@ -14,7 +14,7 @@ from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.run import RunRequest, run, run_directory, train_in
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.steps import StepLog
+from splatwizard_core.runs.directory import StepLog
 from splatwizard_core.training.stage import Stage
 
 pytestmark = pytest.mark.pipeline

@@ -134,7 +134,7 @@ def test_resuming_in_any_stage_equals_one_go(make, tmp_path, stop):
 def test_a_finished_run_of_several_stages_is_only_loaded(make, tmp_path):
     first = make(directory=tmp_path)
     steps = []
-    again = make(directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    again = make(directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert again.model.digest() == first.model.digest()
 
@@ -142,7 +142,7 @@ def test_a_finished_run_of_several_stages_is_only_loaded(make, tmp_path):
 def test_a_later_stage_does_not_repeat_the_draws_of_the_first(toy):
     views = []
     stages = [toy.Stage(OptimizationParams(iterations=12)) for _ in range(2)]
-    toy.train(stages, on_step=lambda r: views.append(r.view))
+    toy.train(stages, on_step=lambda _, r: views.append(r.view))
     assert views[:12] != views[12:]
 
 

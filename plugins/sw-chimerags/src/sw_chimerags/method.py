@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.api import ConfigError, Method, create_method, load_pruner
-from splatwizard_core.runs.keys import dotted
+from splatwizard_core.training.keys import dotted
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
 from sw_chimerags.model import MaskedGaussians

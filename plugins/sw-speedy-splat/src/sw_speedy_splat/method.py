@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.api import GaussianMethod, Method, create_method
-from splatwizard_core.runs.keys import dotted
+from splatwizard_core.training.keys import dotted
 from sw_speedy_splat.config import SpeedySplatConfig
 from sw_speedy_splat.presets import PRESETS, RATES
 from sw_speedy_splat.stage import SpeedySplatStage

@@ -12,18 +12,19 @@ from typing import Any
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.progress import track
 from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scalars import read_scalars
-from splatwizard_core.training.timing import LoopClock, synchronize
+from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
 
 log = logging.getLogger(__name__)
 
 Evaluate = Callable[[SplatModel, int], Mapping[str, Any] | None]
+OnStep = Callable[[SplatModel, StepRecord], None]
 
 UNREAD_LINES = 8  # log lines whose losses stay on a GPU until they are read together: each reading waits for it
 
@@ -74,7 +75,7 @@ class Housekeeping:
         meter: MemoryMeter,
         *,
         label: str,
-        on_step: Callable[[StepRecord], None] | None = None,
+        on_step: OnStep | None = None,
         evaluate: Evaluate | None = None,
     ) -> None:
         self.trainer, self.name, self.progress, self.run_log = trainer, name, progress, run_log
@@ -115,7 +116,8 @@ class Housekeeping:
             try:
                 self._bar.advance(1, loss=record.total, **{self._rows_are: record.num_rows})
                 if self.on_step is not None:
-                    self.on_step(record)
+                    with rng.preserved():
+                        self.on_step(self.trainer.model, record)
                 self._log_step(record)
                 every = self.trainer.ppl.eval_every
                 if self.evaluate is not None and every and record.step % every == 0:

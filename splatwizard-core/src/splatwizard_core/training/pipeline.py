@@ -17,7 +17,7 @@ from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences, normalised
-from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, Progress
+from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows, row_facts
 from splatwizard_core.training.rng import Streams
@@ -25,7 +25,7 @@ from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.timing import StageClock
-from splatwizard_core.training.trainer import StepRecord, Trainer
+from splatwizard_core.training.trainer import Trainer
 
 __all__ = ["TrainOutcome", "TrainingStopped", "train_stages"]
 
@@ -189,7 +189,7 @@ def train_stages(
     stop_after: int | None = None,
     resume: bool = True,
     allow_changed_plan: bool = False,
-    on_step: Callable[[StepRecord], None] | None = None,
+    on_step: OnStep | None = None,
     evaluate: Evaluate | None = None,
     log_path: Path | None = None,
     provided: Callable[[], list[dict[str, str]]] = list,
@@ -204,7 +204,7 @@ def train_stages(
     stop_after      stop after this step, counted over all stages: a checkpoint is written and TrainingStopped raised
     resume          go on from the newest checkpoint; False: remove what the directory holds and start again
     allow_changed_plan  go on although plan or identity differ; the differences are logged
-    on_step         called after each step; not part of the training time
+    on_step         (model, record), called after each step; its time and its random draws are not the training's
     evaluate        (model, step of the stage) -> metrics for the log, every `ppl.eval_every` steps, without gradient,
                     in eval mode, with the process-wide random states kept
     log_path        of log.jsonl; default: in `directory`
@@ -277,7 +277,7 @@ def _run_stage(
     run_log: RunLog,
     meter: MemoryMeter,
     stop_after: int | None,
-    on_step: Callable[[StepRecord], None] | None,
+    on_step: OnStep | None,
     evaluate: Evaluate | None,
 ) -> None:
     """One stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
