@@ -6,6 +6,7 @@ from sw_anchors.coded_anchors import ENTROPY
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
+from sw_codecs.hash_grid import MixedHashGrid
 from sw_hac.config import HACConfig
 from sw_hac.method import HAC
 from sw_hac.model import HACAnchors
@@ -27,11 +28,10 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
     """n anchors in front of the test camera; a fifth of the offsets, and anchors 0 to 4, are masked."""
     g = generator(seed)
     anchors = torch.rand(n, 3, generator=g) * 2 - torch.tensor([1.0, 1.0, -3.0])
-    grid = PLUGINS.context_models.load("hash-grid")((6, 10, 18), (10, 34), **SMALL_GRID, generator=g)
+    grid = MixedHashGrid((6, 10, 18), (10, 34), **SMALL_GRID, generator=g)
     model = HACAnchors(
         anchors, torch.zeros(n, feature_dim), torch.zeros(n, k, 3), torch.zeros(n, 6), voxel_size=0.01, hidden=8,
-        generator=g, entropy=PLUGINS.entropy_models.load("gaussian-exact")(), grid=grid, grid_hidden=16,
-        margin="extent", **kwargs,
+        generator=g, grid=grid, grid_hidden=16, margin="extent", **kwargs,
     )  # fmt: skip
     with torch.no_grad():
         for part in model.grid.grids:

@@ -77,6 +77,7 @@ class ContainerWriter:
         self.raster: dict[str, Any] = dict(raster or {})
         self.static: dict[str, Any] = {}
         self.requires: list[Requirement] = []
+        self.required: list[tuple[str, str]] = []
         self._sections: dict[str, bytes] = {}
 
     def add(self, name: str, data: bytes | bytearray | memoryview) -> None:
@@ -92,6 +93,13 @@ class ContainerWriter:
     def add_array(self, name: str, array: npt.ArrayLike) -> None:
         """Append a section that states dtype and shape: bool, (u)int8-64 or float16-64, at most 8 axes."""
         self.add(name, pack_array(array))
+
+    def require(self, kind: str, name: str) -> None:
+        """Name a part that decoding needs, such as ("coder", "octree"), for the header's list of requirements.
+
+        For fixed parts of a format that a method imports; what is asked for in a registry is listed by itself.
+        """
+        self.required.append((kind, name))
 
     @property
     def sections(self) -> dict[str, int]:

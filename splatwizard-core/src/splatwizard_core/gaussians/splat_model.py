@@ -26,6 +26,8 @@ class SplatModel(nn.Module):
 
     ROWS: tuple[str, ...] = ()
     """Names of the parameters and buffers whose first dimension is the primitive; attributes of the model."""
+    ROW_LABEL: str = "Gaussians"
+    """Name of the rows in progress and messages: the primitive's plural."""
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
@@ -46,7 +48,7 @@ class SplatModel(nn.Module):
         return next(self.parameters()).device
 
     def counts(self) -> dict[str, int]:
-        """What is reported: {"num_gaussians": ...}, and {"num_anchors": ...} for anchor methods."""
+        """Numbers of primitives for logs and records: {"num_gaussians": ...}, and more if a model stores others."""
         return {"num_gaussians": self.num_rows}
 
     def prepare(self) -> None:

@@ -50,6 +50,8 @@ def encode(
         method.encode(model, writer)
     if method.name in method.plugins.methods:
         loaded.insert(0, method.plugins.methods.entry(method.name))
+    registries = method.plugins.registries
+    loaded += [registries[kind].entry(name) for kind, name in writer.required if name in registries[kind]]
     writer.requires = requirements(loaded)
     size = writer.write(path)
     _synchronize(device)
