@@ -8,13 +8,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from hac_models import PLUGINS, decoded, encoded, generator, make, method
+from hac_models import PLUGINS, decoded, encoded, generator, lattice_of, make, method, predictor
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sw_anchors.attribute_sections import AttributeEncoder
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import this_machine
-from sw_anchors.sections import kept_geometry, morton_order
+from sw_anchors.sections import morton_order
 from sw_anchors.shape import GROUPS
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.rasterizer_checks import front_camera
@@ -26,46 +25,9 @@ from splatwizard_core.runs import measuring
 from splatwizard_core.scene.scene import Protocol
 from sw_hac import codec
 from sw_hac.method import HAC
-from sw_hac.predictors import PREDICTORS
 
 RASTERIZER = ReferenceRasterizer()
 SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "offsets"]
-
-
-class Recorder(AttributeEncoder):
-    """An encoder that keeps integers and steps, and counts the bits of the tables."""
-
-    def __init__(self, *args):
-        super().__init__(*args)
-        self.symbols, self.steps, self.bits = {g: [] for g in GROUPS}, {g: [] for g in GROUPS}, 0.0
-
-    def code(self, section, group, rows, columns, context, step, present=None):
-        symbols = super().code(section, group, rows, columns, context, step, present)
-        self.symbols[group].append(symbols)
-        self.steps[group].append(step)
-        self.bits += self.coder.bits(symbols, context, present) if self.coder.mode == "exact" else 0.0
-        return symbols
-
-
-def predictor(model, mode="exact"):
-    return PREDICTORS[mode](model.grid, model.mlp_grid, model.shape, model.base_steps)
-
-
-def lattice_of(model, *, mode="exact"):
-    """Geometry, integers and steps of a file by group, the values they stand for, its bits by the tables; the file."""
-    writer, again = ContainerWriter("hac", 1), ContainerWriter("hac", 1)
-    with torch.no_grad():
-        codec.encode(model, writer, method(codec__mode=mode).config.codec)
-        geometry, rows = kept_geometry(model)
-        recorder = Recorder(model, rows, list(codec.SECTIONS.values()), mode)
-        codec.walk(recorder, predictor(model, mode), geometry)
-        recorder.write(again)
-    stored = ContainerReader(writer.to_bytes()), ContainerReader(again.to_bytes())
-    assert all(stored[0].section(name) == stored[1].section(name) for name in codec.SECTIONS.values())
-    symbols, steps = ([torch.cat(each[g]) for g in GROUPS] for each in (recorder.symbols, recorder.steps))
-    return SimpleNamespace(
-        places=geometry, symbols=symbols, steps=steps, values=model.raw(rows), bits=recorder.bits
-    ), writer
 
 
 def test_the_header_lists_what_decoding_needs():

@@ -312,3 +312,11 @@ def two_layers(inputs: int, hidden: int, outputs: int, generator: torch.Generato
             with torch.no_grad():
                 parameter.copy_(torch.rand(parameter.shape, generator=generator) * 2 * bound - bound)
     return nn.Sequential(layers[0], nn.ReLU(), layers[1])
+
+
+def linear_layers(network: nn.Sequential) -> tuple[nn.Linear, nn.Linear]:
+    """Both layers of a network Linear, ReLU, Linear."""
+    first, _, last = network
+    assert isinstance(first, nn.Linear)
+    assert isinstance(last, nn.Linear)
+    return first, last

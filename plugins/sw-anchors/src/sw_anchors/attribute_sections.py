@@ -151,7 +151,7 @@ class ExactNetwork:
 
     def __call__(self, features: Tensor) -> dict[str, RowContext]:
         """Distributions by group for anchors with features int64 [n, inputs], 12 fractional bits."""
-        parts = self._network(features).split(self._shape.outputs, dim=1)
+        parts = torch.split(self._network(features), self._shape.outputs, dim=1)
         multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
         return {
             group: RowContext(parts[2 * i], parts[2 * i + 1], multipliers[:, i : i + 1])

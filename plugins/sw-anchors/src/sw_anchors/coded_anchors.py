@@ -217,7 +217,7 @@ class CodedAnchors(AnchorModel):
         )
         extras: dict[str, Any] = {}
         if self.phase != FULL and not self.training:
-            groups = triple(torch.split(values, self.shape.widths, dim=1))
+            groups = triple(torch.split(values, list(self.shape.widths), dim=1))
             steps = self.base_steps_like(values) if self.phase == QUANTIZED else self.predict(rows).steps
             values = torch.cat(self._rounded(groups, steps), dim=1)
         elif self.phase == QUANTIZED:
@@ -229,7 +229,7 @@ class CodedAnchors(AnchorModel):
             wide = widen(forecast.steps, *self._columns(values))
             values = add_noise(values, wide, self.uniform(*values.shape))
             extras["rate"] = self.rate(values, wide, forecast, masks)
-        features, scales, offsets = torch.split(values, self.shape.widths, dim=1)
+        features, scales, offsets = torch.split(values, list(self.shape.widths), dim=1)
         return AnchorAttributes(
             self.positions().index_select(0, rows),
             features,

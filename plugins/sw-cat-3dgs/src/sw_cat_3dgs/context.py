@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from sw_anchors.anchors import linear_layers
 from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, Triple, triple
 from sw_anchors.lattice import low_and_step
 from sw_anchors.shape import AnchorShape
@@ -106,9 +107,7 @@ class CatContext(nn.Module):
         """Let the network predict mean and deviation of each column of the groups, wherever an anchor is."""
         if not len(values[0]):
             return
-        last = self.network[-1]
-        assert isinstance(last, nn.Linear)
-        bias = last.bias
+        bias = linear_layers(self.network)[1].bias
         start = 0
         for value, base, unit in zip(values, self.shape.base_steps, self.units, strict=True):
             for column in (value.mean(dim=0), value.std(dim=0, unbiased=False).clamp(min=base)):
@@ -124,8 +123,7 @@ class CatContext(nn.Module):
     @torch.no_grad()
     def fold_units(self) -> None:
         """Let the network predict in the units of the values, which is what the file has."""
-        last, start = self.network[-1], 0
-        assert isinstance(last, nn.Linear)
+        (_, last), start = linear_layers(self.network), 0
         for width, unit in zip(self.shape.widths, self.units, strict=True):
             rows = slice(start, start + 2 * width)
             last.weight[rows] *= unit
@@ -147,18 +145,16 @@ class CatContext(nn.Module):
 
         All anchors have noise of their own steps; means and scales are computed for the sample alone.
         """
-        first, last = self.network[0], self.network[2]
-        assert isinstance(first, nn.Linear)
-        assert isinstance(last, nn.Linear)
+        first, last = linear_layers(self.network)
         hidden = torch.relu(first(self.triplane.at_sites(sites, rounded=self.rounded)))
         widths = self.shape.outputs[:-1]
-        weights = last.weight.split([sum(widths), PLANES])
-        biases = last.bias.split([sum(widths), PLANES])
+        weights = torch.split(last.weight, [sum(widths), PLANES])
+        biases = torch.split(last.bias, [sum(widths), PLANES])
         steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
-            out = nn.functional.linear(hidden, weights[0], biases[0]).split(widths, dim=1)
+            out = torch.split(nn.functional.linear(hidden, weights[0], biases[0]), widths, dim=1)
             if self.in_steps:
                 out = tuple(
                     part * unit for part, unit in zip(out, (u for u in self.units for _ in (0, 1)), strict=True)
@@ -198,7 +194,10 @@ class CatContext(nn.Module):
 
 def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
     """inputs -> hidden, ReLU -> outputs; Xavier-uniform weights, no biases at first."""
-    layers = [nn.utils.skip_init(nn.Linear, *size) for size in ((inputs, hidden), (hidden, outputs))]
+    layers: list[nn.Linear] = [
+        nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
+        for size in ((inputs, hidden), (hidden, outputs))
+    ]
     for layer in layers:
         bound = math.sqrt(6 / (layer.in_features + layer.out_features))
         with torch.no_grad():

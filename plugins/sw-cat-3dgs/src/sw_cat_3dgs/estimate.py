@@ -20,7 +20,8 @@ SECTIONS = ("features", "scalings", "offsets")
 def estimated_bits(model: CatAnchors) -> dict[str, float]:
     """Estimate the bits of the sections features (all slices), scalings, offsets, triplane and masks.
 
-    Of all kept anchors, rounded; in floats, with the likelihood of training but for its floors; headers are not counted. Needs a triplane.
+    Of all kept anchors, rounded, in floats, with the likelihood of training but for its floors; headers are not
+    counted. Needs a triplane.
     """
     context, rounding = model.context, SteRound()
     rounded, context.rounded = context.rounded, True

@@ -41,7 +41,8 @@ class ExactPredictor:
 
     def known(self, symbols: Tensor, context: RowContext) -> Tensor:
         """Decoded features as the networks take them: their base step is 1."""
-        return symbols * context.step
+        multipliers: Tensor = context.step
+        return symbols * multipliers
 
     def steps(self, group: str, context: RowContext) -> Tensor:
         """Quantiser steps in units of the values, float64."""
@@ -66,7 +67,8 @@ class FloatPredictor:
 
     def known(self, symbols: Tensor, context: RowContext) -> Tensor:
         """Decoded features as the networks take them."""
-        return (symbols.to(torch.float64) * context.step).to(torch.float32)
+        step: Tensor = context.step
+        return (symbols.to(torch.float64) * step).to(torch.float32)
 
     def steps(self, group: str, context: RowContext) -> Tensor:
         """Quantiser steps in units of the values, float64."""

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from sw_anchors.anchors import two_layers
+from sw_anchors.anchors import linear_layers, two_layers
 from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from sw_anchors.lattice import TOP
 from sw_anchors.shape import AnchorShape
@@ -85,19 +85,19 @@ class HACAnchors(CodedAnchors):
 
     def forecast(self, rows: Tensor) -> AnchorForecast:
         features, bits = self._looked_up(rows)
-        first, last = self.mlp_grid[0], self.mlp_grid[2]
+        first, last = linear_layers(self.mlp_grid)
         hidden = torch.relu(first(features))
         # All anchors have noise of their own steps; the rest of the last layer is for the sample.
         widths = self.shape.outputs[:6]
         count = sum(widths)
-        weights, biases = last.weight.split([count, 3]), last.bias.split([count, 3])
+        weights, biases = torch.split(last.weight, [count, 3]), torch.split(last.bias, [count, 3])
         steps = torch.tanh(torch.nn.functional.linear(hidden, weights[1], biases[1]))
         steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
             outputs = torch.nn.functional.linear(hidden, weights[0], biases[0]) * self.units[:count]
-            parts = outputs.split(widths, dim=1)
+            parts = torch.split(outputs, widths, dim=1)
             return torch.cat(parts[0::2], dim=1), torch.cat(parts[1::2], dim=1)
 
         return AnchorForecast(steps, bits, hidden, sample)
@@ -110,7 +110,7 @@ class HACAnchors(CodedAnchors):
     @torch.no_grad()
     def fold_units(self) -> None:
         """Let the network predict in the units of the values, as it does in the file."""
-        last = self.mlp_grid[2]
+        _, last = linear_layers(self.mlp_grid)
         last.weight.mul_(self.units[:, None])
         last.bias.mul_(self.units)
         self.units.fill_(1)
@@ -124,7 +124,7 @@ class HACAnchors(CodedAnchors):
         rows = torch.nonzero(self.kept()).squeeze(1)
         if len(rows) < 2:
             return
-        last = self.mlp_grid[2]
+        _, last = linear_layers(self.mlp_grid)
         last.weight.mul_(0.01)
         found = []
         for values, step in zip(self.raw(rows), self.base_steps, strict=True):
@@ -137,7 +137,7 @@ def context_of(
 ) -> AnchorContext:
     """Read the float outputs [V, sum(shape.outputs)] of the network as means, deviations and steps."""
     parts: Sequence[Tensor] = torch.split(outputs, shape.outputs, dim=1)
-    logits = parts[6].split(1, dim=1)
+    logits = torch.split(parts[6], 1, dim=1)
     steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(base_steps, logits, strict=True)]
     return AnchorContext(
         (parts[0], parts[2], parts[4]), (parts[1], parts[3], parts[5]), (steps[0], steps[1], steps[2]), own_bits
