@@ -86,10 +86,10 @@ class Recorder(AttributeEncoder):
         super().__init__(*args)
         self.symbols, self.steps, self.bits = {g: [] for g in GROUPS}, {g: [] for g in GROUPS}, 0.0
 
-    def code(self, section, group, rows, columns, context, step, present=None):
-        symbols = super().code(section, group, rows, columns, context, step, present)
-        self.symbols[group].append(symbols)
-        self.steps[group].append(step)
+    def code(self, block, context, step, present=None):
+        symbols = super().code(block, context, step, present)
+        self.symbols[block.group].append(symbols)
+        self.steps[block.group].append(step)
         self.bits += self.coder.bits(symbols, context, present) if self.coder.mode == "exact" else 0.0
         return symbols
 

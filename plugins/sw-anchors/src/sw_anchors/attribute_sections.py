@@ -8,6 +8,7 @@ walk hands them to an `AttributeEncoder`, which rounds the values of a model and
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -26,6 +27,16 @@ if TYPE_CHECKING:
     from sw_anchors.decoded_anchors import DecodedAnchors
 
 
+@dataclass(frozen=True)
+class Block:
+    """Numbers of a section that are coded at once: some rows and columns of a group."""
+
+    section: str
+    group: str
+    rows: slice
+    columns: slice = slice(None)
+
+
 class AttributeCoder:
     """One side of the coding of all attributes.
 
@@ -37,22 +48,12 @@ class AttributeCoder:
         self.coder = ConditionalGaussian(mode)
         self.rows = self.coder.blocks(count, max(shape.widths))
 
-    def code(
-        self,
-        section: str,
-        group: str,
-        rows: slice,
-        columns: slice,
-        context: RowContext,
-        step: Tensor,
-        present: Tensor | None = None,
-    ) -> Tensor:
-        """Code one block of a section; the integers [n,C] int64, 0 where they are not there.
+    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+        """Code one block; its integers [n,C] int64, 0 where they are not in the file.
 
-        rows, columns   which part of the group it is
-        context         distributions of its numbers, in the units of the mode
-        step            [n,1] float64, quantiser steps in units of the values
-        present         [n,C] bool: numbers that are in the file; None: all
+        context     distributions of its numbers, in the units of the mode
+        step        [n,1] float64, quantiser steps in units of the values
+        present     [n,C] bool: numbers that are in the file; None: all
         """
         raise NotImplementedError
 
@@ -64,29 +65,20 @@ class AttributeEncoder(AttributeCoder):
         super().__init__(len(rows), model.shape, mode)
         self._values = dict(zip(GROUPS, (v.detach().cpu() for v in model.raw(rows)), strict=True))
         self._centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
-        self._blocks: dict[str, list[bytes]] = {name: [] for name in sections}
+        self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
         self._round = SteRound()
 
-    def code(
-        self,
-        section: str,
-        group: str,
-        rows: slice,
-        columns: slice,
-        context: RowContext,
-        step: Tensor,
-        present: Tensor | None = None,
-    ) -> Tensor:
-        values = self._values[group][rows, columns].double()
-        symbols, _ = self._round.encode(values, step, mean=self._centres[group])
+    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+        values = self._values[block.group][block.rows, block.columns].double()
+        symbols, _ = self._round.encode(values, step, mean=self._centres[block.group])
         symbols = symbols if present is None else symbols * present
-        self._blocks[section].append(self.coder.encode(symbols.numpy(), context, present))
+        self._coded[block.section].append(self.coder.encode(symbols.numpy(), context, present))
         return symbols
 
     def write(self, writer: ContainerWriter) -> None:
         """Add all sections, after the walk."""
         writer.require("entropy model", "conditional-gaussian")
-        for name, blocks in self._blocks.items():
+        for name, blocks in self._coded.items():
             writer.add(name, self.coder.join(blocks))
 
 
@@ -100,29 +92,20 @@ class AttributeDecoder(AttributeCoder):
         self._reader = reader
         found = (model.features.data, model.scales.data, model.offsets.data.view(-1, shape.widths[2]))
         self._found = dict(zip(GROUPS, found, strict=True))
-        self._blocks: dict[str, Iterator[bytes]] = {
+        self._coded: dict[str, Iterator[bytes]] = {
             name: self.coder.split(reader.section(name), len(self.rows)) for name in sections
         }
 
-    def code(
-        self,
-        section: str,
-        group: str,
-        rows: slice,
-        columns: slice,
-        context: RowContext,
-        step: Tensor,
-        present: Tensor | None = None,
-    ) -> Tensor:
+    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
         """Raises BitstreamError for damage."""
-        with self._reader.decoding(section):
-            symbols = torch.from_numpy(self.coder.decode(next(self._blocks[section]), context, present))
-        self._found[group][rows, columns] = (symbols * step).to(torch.float32)
+        with self._reader.decoding(block.section):
+            symbols = torch.from_numpy(self.coder.decode(next(self._coded[block.section]), context, present))
+        self._found[block.group][block.rows, block.columns] = (symbols * step).to(torch.float32)
         return symbols
 
     def finish(self) -> None:
         """Raise BitstreamError if bytes follow the last block of a section, or a value is not finite."""
-        for name, blocks in self._blocks.items():
+        for name, blocks in self._coded.items():
             with self._reader.decoding(name):
                 next(blocks, None)
         for group, values in self._found.items():

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder
+from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
 from sw_anchors.coded_anchors import triple
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import add_machine, one_thread, read_mode
@@ -120,7 +120,7 @@ def walk(attributes: AttributeCoder, predictor: Predictor, places: Tensor, masks
                 shift, widening = predictor.shift(f"slice{i}", known)
                 mean, scale = mean + shift, scale + widening
             context = RowContext(mean, scale, alone.step)
-            symbols = attributes.code(f"features.{i + 1}", "features", rows, columns, context, steps)
+            symbols = attributes.code(Block(f"features.{i + 1}", "features", rows, columns), context, steps)
             known = torch.cat([known, predictor.known(symbols, alone)], dim=1)
         for group, section in (("scales", "scalings"), ("offsets", "offsets")):
             context = first[group]
@@ -129,7 +129,7 @@ def walk(attributes: AttributeCoder, predictor: Predictor, places: Tensor, masks
                 shift, widening = predictor.shift(group, known)
                 context = RowContext(context.mean + shift, context.scale + widening, context.step)
             present = masks[rows].repeat_interleave(3, dim=1) if group == "offsets" else None
-            attributes.code(section, group, rows, slice(None), context, steps, present)
+            attributes.code(Block(section, group, rows), context, steps, present)
 
 
 def sections(shape: ContextShape) -> list[str]:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from sw_anchors.anchors import two_layers
-from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder
+from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import add_machine, read_mode
@@ -44,7 +44,6 @@ log = logging.getLogger(__name__)
 SECTIONS = {"features": "features", "scales": "scalings", "offsets": "offsets"}
 """Group -> section."""
 LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features": 16}
-EVERY = slice(None)
 
 
 def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec) -> None:
@@ -97,7 +96,7 @@ def walk(attributes: AttributeCoder, predict: Callable[[Tensor], BlockPrediction
         for group, section in SECTIONS.items():
             # Three coordinates of an offset are there or not together.
             present = geometry.masks[rows].repeat_interleave(3, dim=1) if group == "offsets" else None
-            attributes.code(section, group, rows, EVERY, *predicted[group], present)
+            attributes.code(Block(section, group, rows), *predicted[group], present)
 
 
 def add_header(model: HACAnchors, writer: ContainerWriter, codec: Codec) -> None:
