@@ -8,8 +8,7 @@ walk hands them to an `AttributeEncoder`, which rounds the values of a model and
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -27,8 +26,7 @@ if TYPE_CHECKING:
     from sw_anchors.decoded_anchors import DecodedAnchors
 
 
-@dataclass(frozen=True)
-class Block:
+class Block(NamedTuple):
     """Numbers of a section that are coded at once: some rows and columns of a group."""
 
     section: str

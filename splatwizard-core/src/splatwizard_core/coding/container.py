@@ -65,7 +65,8 @@ class ContainerWriter:
     raster      what the decoded scene asks of a rasterizer, JSON values, such as {"antialias": False, "sh_degree": 3}
 
     `static` is a dict of JSON values that goes into the header: fill it in place. `requires` is what a reader is told
-    to install if it lacks something; whoever knows the installed distributions fills it.
+    to install if it lacks something; whoever knows the installed distributions fills it, from what was asked of the
+    registries and from `required`, the (kind, name) of what `require` stated.
     """
 
     def __init__(self, method: str, version: int, *, raster: Mapping[str, Any] | None = None) -> None:
@@ -95,11 +96,12 @@ class ContainerWriter:
         self.add(name, pack_array(array))
 
     def require(self, kind: str, name: str) -> None:
-        """Name a part that decoding needs, such as ("coder", "octree"), for the header's list of requirements.
+        """State that decoding needs a registered part that the method imports, such as ("entropy model", "columns").
 
-        For fixed parts of a format that a method imports; what is asked for in a registry is listed by itself.
+        What a method loads from a registry while it encodes is recorded without this.
         """
-        self.required.append((kind, name))
+        if (kind, name) not in self.required:
+            self.required.append((kind, name))
 
     @property
     def sections(self) -> dict[str, int]:
@@ -283,6 +285,14 @@ class ContainerReader:
         if section is None or section == "header":
             return BitstreamError(f"{self.name}: {reason}", section=section)
         return BitstreamError(f"{self.name}: section '{section}': {reason}", section=section)
+
+    @property
+    def made_on(self) -> str | None:
+        """Description of the machine that alone can decode the file (header value `made_on`); None: any machine can."""
+        if "made_on" not in self.static:
+            return None
+        machine = self.static["made_on"]
+        return ", ".join(f"{key} {value}"[:80] for key, value in machine.items()) if isinstance(machine, dict) else "?"
 
     def __contains__(self, name: object) -> bool:
         return name in self._payload
