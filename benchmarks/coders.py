@@ -20,7 +20,7 @@ import torch
 import zstandard
 
 from splatwizard_core.plugins import load_plugins
-from sw_codecs import checksum
+from sw_codecs.bits import checksum
 
 models = constriction.stream.model
 queue, stack = constriction.stream.queue, constriction.stream.stack
@@ -261,20 +261,18 @@ def bench_positions(plugins, n, repeats):
                    "zstd-19, sorted", repeats)  # fmt: skip
         except Exception as error:
             print(f"{name:<34}{error}")
-    byte_planes, float_delta, packed = (
-        plugins.coders.load(name)() for name in ("byte-planes", "float-delta", "packed-bits")
-    )
+    byte_planes, float_delta = (plugins.array_coders.load(name)() for name in ("byte-planes", "float-delta"))
+    packed = plugins.array_coders.load("packed-bits")(8192)
     floats, halves = torus.astype(np.float32), (0.3 * r.normal(size=(n, 3))).astype(np.float16)
-    for curve in ("morton", "hilbert"):
-        ordered = floats[float_delta.sort(floats, curve=curve)]
-        report(f"float-delta (f32, {curve})", n, lambda o=ordered: float_delta.encode(o),
-               lambda d, o=ordered: float_delta.decode(d, o.shape), ordered, ordered.nbytes, "the floats", 1,
-               )  # fmt: skip
+    ordered = floats[float_delta.sort(floats)]
+    report("float-delta (f32, sorted)", n, lambda: float_delta.encode(ordered),
+           lambda d: float_delta.decode(d, ordered.dtype, ordered.shape), ordered,
+           ordered.nbytes, "the floats", 1)  # fmt: skip
     report("byte-planes (3 x f16)", n, lambda: byte_planes.encode(halves),
            lambda d: byte_planes.decode(d, halves.dtype, halves.shape), halves,
            len(level_19.compress(halves.tobytes())), "zstd-19", 1)  # fmt: skip
     indices = r.integers(0, 8192, n)
-    report("packed-bits (13)", n, lambda: packed.encode(indices, 13), lambda d: packed.decode(d, n, 13), indices,
+    report("packed-bits (13)", n, lambda: packed.encode(indices), lambda d: packed.decode(d, np.int64, (n,)), indices,
            13 * n / 8, "13 bits", repeats)  # fmt: skip
 
 

@@ -18,7 +18,8 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.coding import container, strict_json
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decoding import open_model
-from sw_codecs import column_plan, point_limit
+from sw_codecs.entropy import column_plan
+from sw_codecs.positions import point_limit
 
 TESTS = Path(__file__).parent
 PAGE = TESTS.parent / "docs" / "bitstream.md"

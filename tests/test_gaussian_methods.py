@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.coding.gaussian_codec import gaussian_codecs
 from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
@@ -14,7 +13,7 @@ from splatwizard_core.runs.config import apply_overrides
 PLUGINS = load_plugins()
 METHODS = [e.name for e in PLUGINS.methods if issubclass(e.load(), GaussianMethod)]
 CODECS = [
-    pytest.param(name, marks=pytest.mark.slow) if name == "vectree" else name for name in gaussian_codecs(PLUGINS)
+    pytest.param(name, marks=pytest.mark.slow) if name == "vectree" else name for name in PLUGINS.gaussian_codecs.names
 ]
 """`vectree` trains a codebook."""
 

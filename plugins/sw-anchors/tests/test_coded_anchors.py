@@ -10,7 +10,7 @@ from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer

@@ -17,7 +17,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import TrainingStopped
 from sw_cat_3dgs.estimate import estimated_bits
 from sw_cat_3dgs.method import Cat3DGS
-from sw_codecs import conditional
+from sw_codecs.entropy import conditional
 
 pytestmark = pytest.mark.pipeline
 

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 import torch
 
-from sw_codecs import rates
-from sw_codecs.categorical import Categorical, CategoricalContext
-from sw_codecs.channel_ar import ChannelAr
-from sw_codecs.factorised import Factorised
-from sw_codecs.float_models import GaussianFloat
-from sw_codecs.gaussian_exact import FloatContext
-from sw_codecs.hash_grid import MixedHashGrid
-from sw_codecs.mixture import Mixture, MixtureContext
-from sw_codecs.ordering import CURVES, spatial_order
-from sw_codecs.spatial_ar import SpatialAr
-from sw_codecs.triplane import Triplane
+from sw_codecs.context.channel_ar import ChannelAr
+from sw_codecs.context.hash_grid import MixedHashGrid
+from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context.triplane import Triplane
+from sw_codecs.entropy import rates
+from sw_codecs.entropy.categorical import Categorical, CategoricalContext
+from sw_codecs.entropy.factorised import Factorised
+from sw_codecs.entropy.float_models import GaussianFloat
+from sw_codecs.entropy.gaussian_exact import FloatContext
+from sw_codecs.entropy.mixture import Mixture, MixtureContext
+from sw_codecs.positions.ordering import spatial_order
 
 pytestmark = [
     pytest.mark.cuda,
@@ -22,12 +22,11 @@ pytestmark = [
 ]
 
 
-@pytest.mark.parametrize("curve", CURVES)
-def test_points_have_one_order(curve):
+def test_points_have_one_order():
     points = torch.randn(5000, 3, generator=torch.Generator().manual_seed(0))
-    order = spatial_order(points.cuda(), curve=curve)
+    order = spatial_order(points.cuda())
     assert order.is_cuda
-    assert torch.equal(order.cpu(), spatial_order(points, curve=curve))
+    assert torch.equal(order.cpu(), spatial_order(points))
 
 
 def test_rates_and_their_gradients_agree():

@@ -15,11 +15,8 @@ NAMES = {
         "ste-binary",
         "ste-mask",
         "fake-quant",
-        "lsq",
-        "position-grid",
         "vq",
         "residual-vq",
-        "ecvq",
     },
     "entropy_models": {
         "columns",

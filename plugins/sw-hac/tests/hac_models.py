@@ -12,7 +12,7 @@ from sw_anchors.shape import GROUPS
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
-from sw_codecs.hash_grid import MixedHashGrid
+from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.method import HAC
@@ -90,7 +90,7 @@ class Recorder(AttributeEncoder):
         symbols = super().code(block, context, step, present)
         self.symbols[block.group].append(symbols)
         self.steps[block.group].append(step)
-        self.bits += self.coder.bits(symbols, context, present) if self.coder.mode == "exact" else 0.0
+        self.bits += float(self.coder.bits(symbols, context, present).sum()) if self.coder.mode == "exact" else 0.0
         return symbols
 
 

@@ -16,7 +16,7 @@ from sw_anchors.float_mode import this_machine
 from sw_anchors.sections import morton_order
 from sw_anchors.shape import GROUPS
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError

@@ -7,7 +7,7 @@ import torch
 from hac_models import generator, make, method
 from sw_anchors.coded_anchors import ENTROPY
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions

@@ -25,12 +25,10 @@ MODULES = {
     "gaussians.model": "GaussianModel",
     "gaussians.inputs": "GaussianInputs SH",
     "gaussians.ply": "load_ply to_ply from_ply",
-    "gaussians.spherical_harmonics": "eval_sh view_colors",
     "gaussians.knn": "mean_squared_neighbor_distance",
-    "rendering.rasterizer": (
-        "Rasterizer RasterizerInfo RasterOptions RenderResult RasterStats AccumOutput GradBuffer Feature ScoreSpec"
-    ),
-    "rendering.checks": "check_request checked_background",
+    "rendering.rasterizer": ("Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec"),
+    "rendering.features": "Feature",
+    "rendering.info": "RasterizerInfo",
     "training.stage": "Stage StageContext LossPack CameraSampler CameraIterator",
     "training.scheduler": "Scheduler PhaseSwitch",
     "training.plan": "When",
@@ -41,7 +39,9 @@ MODULES = {
     "training.pruner": "Pruner load_pruner",
     "streams": "stream",
     "coding.container": "ContainerReader ContainerWriter",
-    "coding.contracts": "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder GaussianCodec",
+    "coding.contracts": (
+        "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
+    ),
     "evaluation.metrics": "Metric MetricSetup PreparedMetric",
     "native": "NativeModule",
     "progress": "track",

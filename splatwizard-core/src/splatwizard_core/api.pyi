@@ -7,6 +7,7 @@ from splatwizard_core.coding.contracts import EntropyModel as EntropyModel
 from splatwizard_core.coding.contracts import GaussianCodec as GaussianCodec
 from splatwizard_core.coding.contracts import PositionCodec as PositionCodec
 from splatwizard_core.coding.contracts import Quantizer as Quantizer
+from splatwizard_core.coding.contracts import VectorCoder as VectorCoder
 from splatwizard_core.errors import BitstreamError as BitstreamError
 from splatwizard_core.errors import CapabilityError as CapabilityError
 from splatwizard_core.errors import ConfigError as ConfigError
@@ -26,8 +27,6 @@ from splatwizard_core.gaussians.model import GaussianModel as GaussianModel
 from splatwizard_core.gaussians.ply import from_ply as from_ply
 from splatwizard_core.gaussians.ply import load_ply as load_ply
 from splatwizard_core.gaussians.ply import to_ply as to_ply
-from splatwizard_core.gaussians.spherical_harmonics import eval_sh as eval_sh
-from splatwizard_core.gaussians.spherical_harmonics import view_colors as view_colors
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method
@@ -36,13 +35,11 @@ from splatwizard_core.plugins.hookspecs import hookimpl as hookimpl
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.registry import Registry as Registry
 from splatwizard_core.progress import track as track
-from splatwizard_core.rendering.checks import check_request as check_request
-from splatwizard_core.rendering.checks import checked_background as checked_background
+from splatwizard_core.rendering.features import Feature as Feature
+from splatwizard_core.rendering.info import RasterizerInfo as RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput as AccumOutput
-from splatwizard_core.rendering.rasterizer import Feature as Feature
 from splatwizard_core.rendering.rasterizer import GradBuffer as GradBuffer
 from splatwizard_core.rendering.rasterizer import Rasterizer as Rasterizer
-from splatwizard_core.rendering.rasterizer import RasterizerInfo as RasterizerInfo
 from splatwizard_core.rendering.rasterizer import RasterOptions as RasterOptions
 from splatwizard_core.rendering.rasterizer import RasterStats as RasterStats
 from splatwizard_core.rendering.rasterizer import RenderResult as RenderResult

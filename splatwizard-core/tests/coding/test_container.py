@@ -275,6 +275,28 @@ def test_an_opened_file_is_in_memory_once(tmp_path):
     assert peak < 1.1 * size
 
 
+def test_what_decoding_requires_is_stated_once():
+    writer = ContainerWriter("toy", 1)
+    for name in ("columns", "octree", "columns"):
+        writer.require("entropy model" if name == "columns" else "coder", name)
+    assert writer.required == [("entropy model", "columns"), ("coder", "octree")]
+    assert writer.requires == []
+
+
+@pytest.mark.parametrize(
+    ("static", "expected"),
+    [
+        ({}, None),
+        ({"made_on": {"device": "cpu AVX2", "torch": "2.13.0"}}, "device cpu AVX2, torch 2.13.0"),
+        ({"made_on": 3}, "?"),
+    ],
+)
+def test_a_file_says_on_which_machine_alone_it_decodes(static, expected):
+    writer = ContainerWriter("toy", 1)
+    writer.static.update(static)
+    assert ContainerReader(writer.to_bytes()).made_on == expected
+
+
 def test_what_a_file_may_stand_for_is_bounded_by_its_size():
     writer = small_file()
     data = writer.to_bytes()

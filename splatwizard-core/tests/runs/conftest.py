@@ -158,6 +158,7 @@ def register_pruners(registry):
 @hookimpl
 def register_coders(registry):
     registry.add("toy-coder", "toy_helper:ToyPruner", summary="for tests")
+    registry.add("fixed-coder", "toy_helper:ToyPruner", summary="imported, not asked for")
 
 
 class ToyPruner:
@@ -196,6 +197,7 @@ class Borrower(toy_method.Toy):
 
     def encode(self, model, writer):
         self.plugins.coders.load("toy-coder")
+        writer.require("coder", "fixed-coder")
         super().encode(model, writer)
 '''
 

@@ -11,7 +11,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
 from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.plugins.registry import Registry
+from splatwizard_core.plugins.registry import Coders, Registry
 from splatwizard_core.training.params import OptimizationParams
 
 SHAPES = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (0, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
@@ -46,7 +46,7 @@ def plugins():
     coders = Registry("coder")
     coders.add("toy-codec", f"{__name__}:ToyCodec", summary="", codes="gaussians")
     coders.add("range", f"{__name__}:NoSuchClass", summary="an entropy coder")
-    return SimpleNamespace(coders=coders)
+    return SimpleNamespace(gaussian_codecs=Coders(coders, "gaussians"))
 
 
 @pytest.fixture

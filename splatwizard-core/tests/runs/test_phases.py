@@ -43,7 +43,11 @@ def expected(helped_plugins):
         # The stage is borrowed from sw-toy, one of its tasks is the helper's.
         "train: toy": [("stage", "toy", "sw-toy", "0.1"), ("task", "look", "sw-helper", "0.7"), drawn],
         "train: second": [("stage", "second", "sw-helper", "0.7"), ("pruner", "toy-pruner", "sw-helper", "0.7"), drawn],
-        "encode": [("method", "borrower", "sw-helper", "0.7"), ("coder", "toy-coder", "sw-helper", "0.7")],
+        "encode": [
+            ("method", "borrower", "sw-helper", "0.7"),
+            ("coder", "toy-coder", "sw-helper", "0.7"),
+            ("coder", "fixed-coder", "sw-helper", "0.7"),
+        ],
         "render": [drawn],
     }
 

@@ -16,9 +16,9 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.shape import GROUPS, AnchorShape
-from sw_codecs.conditional import ConditionalGaussian, RowContext
-from sw_codecs.integer_mlp import FRACTION, IntegerMlp
-from sw_codecs.rounding import SteRound
+from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
+from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
+from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter

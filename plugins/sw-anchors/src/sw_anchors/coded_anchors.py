@@ -16,9 +16,9 @@ from torch import Tensor, nn
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.fused_ops import anchor_values, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
-from sw_codecs.binary import SteMask
-from sw_codecs.rates import gaussian_bits
-from sw_codecs.rounding import SteRound, add_noise
+from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.quantizers.binary import SteMask
+from sw_codecs.quantizers.rounding import SteRound, add_noise
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""

@@ -26,11 +26,6 @@ def this_machine() -> dict[str, str]:
     return {"device": f"cpu {torch.backends.cpu.get_cpu_capability()}", "torch": str(torch.__version__)}
 
 
-def is_device_bound(reader: ContainerReader) -> bool:
-    """Whether a file decodes on the machine alone that made it."""
-    return "made_on" in reader.static
-
-
 def add_machine(writer: ContainerWriter, mode: Mode) -> None:
     """Note in the header (`made_on`) which machine a file of mode `float` is bound to."""
     if mode == "float":

@@ -18,8 +18,8 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.lattice import BITS, TOP, coded_positions
-from sw_codecs.bernoulli import Bernoulli
-from sw_codecs.octree import Octree
+from sw_codecs.entropy.bernoulli import Bernoulli
+from sw_codecs.positions.octree import Octree
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter

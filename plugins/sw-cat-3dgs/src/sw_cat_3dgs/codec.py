@@ -33,9 +33,9 @@ from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
 from sw_cat_3dgs.predictors import PREDICTORS, Predictor
 from sw_cat_3dgs.stage import base_resolution
-from sw_codecs.conditional import RowContext
-from sw_codecs.spatial_ar import SpatialAr
-from sw_codecs.triplane import GAIN
+from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context.triplane import GAIN
+from sw_codecs.entropy.conditional import RowContext
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter

@@ -18,11 +18,11 @@ from sw_anchors.lattice import low_and_step
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.channel_ar import ChannelAr
-from sw_codecs.principal_frame import PrincipalFrame
-from sw_codecs.rounding import add_noise
-from sw_codecs.spatial_ar import SpatialAr
-from sw_codecs.triplane import GAIN, PlaneSites, Triplane
+from sw_codecs.context.channel_ar import ChannelAr
+from sw_codecs.context.principal_frame import PrincipalFrame
+from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context.triplane import GAIN, PlaneSites, Triplane
+from sw_codecs.quantizers.rounding import add_noise
 
 STEP_OFFSET = 1.1
 """A step is its base times (1.1 + tanh t): never zero."""

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import torch
 from sw_anchors.coded_anchors import triple
 
-from sw_codecs.rates import gaussian_bits
-from sw_codecs.rounding import SteRound
+from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
     from sw_cat_3dgs.model import CatAnchors

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
-from sw_codecs.triplane import PlaneSites
+from sw_codecs.context.triplane import PlaneSites
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
 

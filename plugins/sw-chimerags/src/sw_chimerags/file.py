@@ -182,7 +182,7 @@ def _read_group(
 def _positions(group: str, n: int, reader: ContainerReader, plugins: PluginManager, xyz: str) -> NDArray[Any]:
     if xyz == "float32":
         with reader.decoding(f"{group}/xyz") as data:
-            return _finite(plugins.coders.load("float-delta")().decode(data, (n, 3)))
+            return _finite(plugins.coders.load("float-delta")().decode(data, np.float32, (n, 3)))
     if xyz == "float16":
         with reader.decoding(f"{group}/xyz") as data:
             return _finite(plugins.coders.load("byte-planes")().decode(data, np.float16, (n, 3)))

@@ -5,84 +5,79 @@ from splatwizard_core.api import Registry, hookimpl
 
 @hookimpl
 def register_quantizers(registry: Registry) -> None:
-    registry.add("uniform", "sw_codecs.uniform:Uniform",
+    registry.add("uniform", "sw_codecs.quantizers.uniform:Uniform",
                  summary="affine, bits and range per channel; rounding or noise")  # fmt: skip
-    registry.add("ste-round", "sw_codecs.rounding:SteRound", summary="multiples of a step, straight-through gradient")
-    registry.add("uniform-noise", "sw_codecs.rounding:UniformNoise", summary="noise of one step in training")
-    registry.add("ste-binary", "sw_codecs.binary:SteBinary", summary="the sign, +1 or -1")
-    registry.add("ste-mask", "sw_codecs.binary:SteMask", summary="a learned mask with a threshold")
-    registry.add("fake-quant", "sw_codecs.fake_quant:FakeQuantAffine",
+    registry.add("ste-round", "sw_codecs.quantizers.rounding:SteRound",
+                 summary="multiples of a step, straight-through gradient")  # fmt: skip
+    registry.add("uniform-noise", "sw_codecs.quantizers.rounding:UniformNoise", summary="noise of one step in training")
+    registry.add("ste-binary", "sw_codecs.quantizers.binary:SteBinary", summary="the sign, +1 or -1")
+    registry.add("ste-mask", "sw_codecs.quantizers.binary:SteMask", summary="a learned mask with a threshold")
+    registry.add("fake-quant", "sw_codecs.quantizers.fake_quant:FakeQuantAffine",
                  summary="affine with a zero point, range observed in training")  # fmt: skip
-    registry.add("lsq", "sw_codecs.lsq:Lsq", summary="a step learned by gradient")
-    registry.add("position-grid", "sw_codecs.position_grid:PositionQuantizer", summary="positions on a grid over a box")
-    registry.add("vq", "sw_codecs.vector_quantizer:VectorQuantizer",
+    registry.add("vq", "sw_codecs.quantizers.vector_quantizer:VectorQuantizer",
                  summary="nearest codebook entry; k-means or weighted batches, bounded memory")  # fmt: skip
-    registry.add("residual-vq", "sw_codecs.residual_quantizer:ResidualVectorQuantizer",
+    registry.add("residual-vq", "sw_codecs.quantizers.residual_quantizer:ResidualVectorQuantizer",
                  summary="a sum of entries, a codebook for each stage")  # fmt: skip
-    registry.add("ecvq", "sw_codecs.entropy_constrained:EntropyConstrainedQuantizer",
-                 summary="nearest entry with a price on its bits")  # fmt: skip
 
 
 @hookimpl
 def register_entropy_models(registry: Registry) -> None:
-    registry.add("columns", "sw_codecs.columns:Columns",
+    registry.add("columns", "sw_codecs.entropy.columns:Columns",
                  summary="integer matrix, stored statistics per column, any alphabet")  # fmt: skip
-    registry.add("categorical", "sw_codecs.categorical:Categorical", summary="stored counts, one table per context")
-    registry.add("bernoulli", "sw_codecs.bernoulli:Bernoulli", summary="masks, stored share of ones")
-    registry.add("gaussian-exact", "sw_codecs.gaussian_exact:GaussianExact",
+    registry.add("categorical", "sw_codecs.entropy.categorical:Categorical",
+                 summary="stored counts, one table per context")  # fmt: skip
+    registry.add("bernoulli", "sw_codecs.entropy.bernoulli:Bernoulli", summary="masks, stored share of ones")
+    registry.add("gaussian-exact", "sw_codecs.entropy.gaussian_exact:GaussianExact",
                  summary="mean and scale per symbol, integers only: decodes on any machine")  # fmt: skip
-    registry.add("laplace-exact", "sw_codecs.gaussian_exact:LaplaceExact",
+    registry.add("laplace-exact", "sw_codecs.entropy.gaussian_exact:LaplaceExact",
                  summary="as gaussian-exact, Laplacian")  # fmt: skip
-    registry.add("gaussian", "sw_codecs.float_models:GaussianFloat",
+    registry.add("gaussian", "sw_codecs.entropy.float_models:GaussianFloat",
                  summary="float mean and scale per symbol: for training and comparison, same machine kind")  # fmt: skip
-    registry.add("laplace", "sw_codecs.float_models:LaplaceFloat", summary="as gaussian, Laplacian")
-    registry.add("mixture", "sw_codecs.mixture:Mixture", summary="weighted Gaussians or Laplacians, counts in the file")
-    registry.add("factorised", "sw_codecs.factorised:Factorised",
+    registry.add("laplace", "sw_codecs.entropy.float_models:LaplaceFloat", summary="as gaussian, Laplacian")
+    registry.add("mixture", "sw_codecs.entropy.mixture:Mixture",
+                 summary="weighted Gaussians or Laplacians, counts in the file")  # fmt: skip
+    registry.add("factorised", "sw_codecs.entropy.factorised:Factorised",
                  summary="trained density per channel, counts in the file")  # fmt: skip
-    registry.add("conditional-gaussian", "sw_codecs.conditional:ConditionalGaussian",
+    registry.add("conditional-gaussian", "sw_codecs.entropy.conditional:ConditionalGaussian",
                  summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
 
 
 @hookimpl
 def register_context_models(registry: Registry) -> None:
-    registry.add("integer-mlp", "sw_codecs.integer_mlp:IntegerMlp",
+    registry.add("integer-mlp", "sw_codecs.context.integer_mlp:IntegerMlp",
                  summary="ReLU network evaluated in exact integer arithmetic")  # fmt: skip
-    registry.add("triplane", "sw_codecs.triplane:Triplane",
+    registry.add("triplane", "sw_codecs.context.triplane:Triplane",
                  summary="features of a place from three planes at several scales; exact in integers")  # fmt: skip
-    registry.add("spatial-ar", "sw_codecs.spatial_ar:SpatialAr",
+    registry.add("spatial-ar", "sw_codecs.context.spatial_ar:SpatialAr",
                  summary="integers of a plane from their causal neighbours, coded along wavefronts")  # fmt: skip
-    registry.add("channel-ar", "sw_codecs.channel_ar:ChannelAr",
+    registry.add("channel-ar", "sw_codecs.context.channel_ar:ChannelAr",
                  summary="channels in slices, each from the slices before it")  # fmt: skip
-    registry.add("hash-grid", "sw_codecs.hash_grid:MixedHashGrid",
+    registry.add("hash-grid", "sw_codecs.context.hash_grid:MixedHashGrid",
                  summary="learned signs on grids of many resolutions, looked up by position")  # fmt: skip
 
 
 @hookimpl
 def register_coders(registry: Registry) -> None:
-    registry.add("range", "sw_codecs.coders:RangeCoder", codes="symbols", summary="arithmetic coding under a ModelSpec")
-    registry.add("rans", "sw_codecs.coders:RansCoder", codes="symbols", summary="rANS under a ModelSpec")
-    registry.add(
-        "huffman", "sw_codecs.huffman_coder:HuffmanCoder", codes="symbols", summary="Huffman codes from count tables"
-    )
-    registry.add("octree", "sw_codecs.octree:Octree", codes="positions", summary="point positions as octree occupancy")
-    registry.add(
-        "morton-delta",
-        "sw_codecs.position_codecs:MortonDelta",
-        codes="positions",
-        summary="point positions as Morton steps",
-    )
-    registry.add(
-        "raw", "sw_codecs.position_codecs:RawPositions", codes="positions", summary="point positions as they are, zstd"
-    )
-    registry.add("draco", "sw_codecs.draco:Draco", codes="positions", available="sw_codecs.draco:unavailable",
+    registry.add("range", "sw_codecs.coders.arithmetic:RangeCoder", codes="symbols",
+                 summary="arithmetic coding under a ModelSpec")  # fmt: skip
+    registry.add("rans", "sw_codecs.coders.arithmetic:RansCoder", codes="symbols", summary="rANS under a ModelSpec")
+    registry.add("huffman", "sw_codecs.coders.huffman:HuffmanCoder", codes="symbols",
+                 summary="Huffman codes from count tables")  # fmt: skip
+    registry.add("octree", "sw_codecs.positions.octree:Octree", codes="positions",
+                 summary="point positions as octree occupancy")  # fmt: skip
+    registry.add("morton-delta", "sw_codecs.positions.plain:MortonDelta", codes="positions",
+                 summary="point positions as Morton steps")  # fmt: skip
+    registry.add("raw", "sw_codecs.positions.plain:RawPositions", codes="positions",
+                 summary="point positions as they are, zstd")  # fmt: skip
+    registry.add("draco", "sw_codecs.positions.draco:Draco", codes="positions",
+                 available="sw_codecs.positions.draco:unavailable",
                  summary="point positions by Draco (pip install 'sw-codecs[draco]')")  # fmt: skip
-    registry.add("byte-planes", "sw_codecs.byte_planes:BytePlanes", codes="arrays",
+    registry.add("byte-planes", "sw_codecs.arrays.byte_planes:BytePlanes", codes="arrays",
                  summary="float or integer arrays without loss: byte planes, zstd")  # fmt: skip
-    registry.add("float-delta", "sw_codecs.byte_planes:FloatDelta", codes="arrays",
+    registry.add("float-delta", "sw_codecs.arrays.byte_planes:FloatDelta", codes="arrays",
                  summary="float32 positions without loss: steps as byte planes, zstd")  # fmt: skip
-    registry.add(
-        "packed-bits", "sw_codecs.packed_bits:PackedBits", codes="indices", summary="indices of 1 to 16 bits, packed"
-    )
+    registry.add("packed-bits", "sw_codecs.arrays.packed_bits:PackedBits", codes="arrays",
+                 summary="indices of 1 to 16 bits, packed")  # fmt: skip
     registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip
     registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians",

@@ -30,8 +30,8 @@ from sw_anchors.sections import (
 from sw_anchors.shape import AnchorShape
 from torch import Tensor
 
-from sw_codecs.bernoulli import Bernoulli
-from sw_codecs.hash_grid import HashGrid, MixedHashGrid
+from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
+from sw_codecs.entropy.bernoulli import Bernoulli
 from sw_hac.model import HACAnchors
 from sw_hac.predictors import PREDICTORS, BlockPrediction
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.api import Method, SceneError
-from sw_codecs.hash_grid import MixedHashGrid
+from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors

@@ -17,7 +17,7 @@ from sw_anchors.lattice import TOP
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.hash_grid import GridPlaces, MixedHashGrid
+from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
 
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""

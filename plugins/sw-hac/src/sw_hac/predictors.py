@@ -9,8 +9,8 @@ from sw_anchors.lattice import TOP
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.conditional import RowContext
-from sw_codecs.hash_grid import MixedHashGrid
+from sw_codecs.context.hash_grid import MixedHashGrid
+from sw_codecs.entropy.conditional import RowContext
 from sw_hac.model import context_of
 
 BlockPrediction = dict[str, tuple[RowContext, Tensor]]

@@ -163,14 +163,14 @@ class ImportanceVQ:
     def pack(self, coded: CodedVectors) -> dict[str, bytes]:
         """The parts; the inverse of `unpack`, byte for byte."""
         load = self.plugins.coders.load
-        planes, bits = load("byte-planes")(), load("packed-bits")()
+        planes, packed = load("byte-planes")(), load("packed-bits")
         keeps = coded.codes < 0
         codes, size = coded.codes[~keeps], len(coded.codebook)
-        form, indices = PACKED, bits.encode(codes, bits.width(max(size, 1)))
+        form, indices = PACKED, packed(max(size, 1)).encode(codes)
         ranged = self._range(size, len(codes))
         if len(codes) and len(shorter := ranged[0].encode(codes.astype(np.int32), ranged[1])) < len(indices):
             form, indices = RANGE_CODED, shorter
-        mask = np.frombuffer(bits.encode(keeps.astype(np.uint8), 1), np.uint8)
+        mask = np.frombuffer(packed(2).encode(keeps.astype(np.uint8)), np.uint8)
         return {
             "header": HEADER.pack(VERSION, form, len(coded.codes), size, len(coded.own)),
             "mask": planes.encode(mask),
@@ -184,16 +184,16 @@ class ImportanceVQ:
         with _part(parts, "header") as data:
             form, size, own = _header(data, n)
         load = self.plugins.coders.load
-        planes, bits = load("byte-planes")(), load("packed-bits")()
+        planes, packed = load("byte-planes")(), load("packed-bits")
         with _part(parts, "mask") as data:
             mask = planes.decode(data, np.uint8, ((n + 7) // 8,))
-            keeps = bits.decode(mask.tobytes(), n, 1).astype(bool)
+            keeps = packed(2).decode(mask.tobytes(), np.uint8, (n,)).astype(bool)
             if int(keeps.sum()) != own:
                 raise BitstreamError(f"keeps {int(keeps.sum()):,} vectors, the header says {own:,}")
         codes = np.full(n, -1, np.int64)
         with _part(parts, "indices") as data:
             if form == PACKED:
-                found = bits.decode(data, n - own, bits.width(max(size, 1)))
+                found = packed(max(size, 1)).decode(data, np.int64, (n - own,))
             else:
                 model, context = self._range(size, n - own)
                 found = model.decode(data, context)

@@ -90,7 +90,7 @@ class VecTree:
         reader.allow(_decoded_bytes(n, degree), f"a model of {n:,} Gaussians")
         load = self.plugins.coders.load
         with reader.decoding("xyz") as data:
-            means = _finite(load("float-delta")().decode(data, (n, 3)))
+            means = _finite(load("float-delta")().decode(data, np.float32, (n, 3)))
         with reader.decoding("attr") as data:
             attributes = _finite(load("byte-planes")().decode(data, np.float16, (n, ATTRIBUTES))).astype(np.float32)
         bands = (degree + 1) ** 2

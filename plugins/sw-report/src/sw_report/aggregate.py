@@ -8,13 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sw_datasets.families import BENCHMARKS
-
+from sw_report.declared import dataset_facts
 from sw_report.numbers import ordered_metrics
 from sw_report.runs import Run, natural
-
-# The scenes that tables of the field report; the family also names the two of the original BungeeNeRF release.
-TABLE_SCENES = {"bungee": ("amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome")}
 
 
 @dataclass(frozen=True)
@@ -96,25 +92,19 @@ def _one_protocol_a_scene(group: Sequence[Run]) -> list[list[Run]]:
 
 
 def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
-    dataset = runs[0].facts.dataset
-    family = BENCHMARKS.get(dataset)
-    published = TABLE_SCENES.get(dataset, family.scenes) if family is not None else ()
-
-    def scene_of(run: Run) -> str:
-        known = family.scene_of(run.facts.scene) if family is not None else None
-        return known or run.facts.scene
-
-    scenes = published or tuple(sorted({scene_of(run) for run in runs}, key=natural))
+    dataset = dataset_facts(runs[0].facts.dataset)
+    scene_of = {run: dataset.scene_of(run.facts.scene) for run in runs}
+    scenes = dataset.scenes or tuple(sorted(set(scene_of.values()), key=natural))
     rows: dict[tuple[str, str | None], dict[str, Run]] = {}
-    for run in runs:
-        if scene_of(run) in scenes:
-            rows.setdefault((run.variant, run.facts.rate), {})[scene_of(run)] = run
+    for run, scene in scene_of.items():
+        if scene in scenes:
+            rows.setdefault((run.variant, run.facts.rate), {})[scene] = run
     names = ordered_metrics(name for run in runs for name in run.facts.metrics)
     return DatasetTable(
-        dataset,
-        family.title if family is not None else dataset,
+        runs[0].facts.dataset,
+        dataset.title,
         scenes,
-        bool(published),
+        bool(dataset.scenes),
         tuple(dict.fromkeys(run.facts.protocol.id for run in runs)),
         sorted(
             (_row(variant, rate, by_scene, scenes, names, partial) for (variant, rate), by_scene in rows.items()),

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
+from click.shell_completion import CompletionItem
 
-from splatwizard_core.cli import complete
 from splatwizard_core.tooling import console, debug_option, options, output_file, output_folder, print_json, say
 
 if TYPE_CHECKING:
@@ -15,15 +15,31 @@ if TYPE_CHECKING:
     from sw_report.blocks import Table
     from sw_report.runs import Run
 
-FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
+
+def _folders(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    return [CompletionItem(incomplete, type="dir")]
+
+
+def _files(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    return [CompletionItem(incomplete, type="file")]
+
+
+def _methods(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    from splatwizard_core.tooling import load_plugins
+
+    return [
+        CompletionItem(entry.name, help=entry.summary)
+        for entry in load_plugins().methods
+        if entry.name.startswith(incomplete)
+    ]
 
 
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
-@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete.folders)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=_folders)
 @options(
-    click.option("--html", metavar="FILE", shell_complete=complete.files,
+    click.option("--html", metavar="FILE", shell_complete=_files,
                  help="Write one self-contained page there.  [default: none]"),
-    click.option("--survey", metavar="FOLDER", shell_complete=complete.folders,
+    click.option("--survey", metavar="FOLDER", shell_complete=_folders,
                  help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
                  "[default: none]"),
     click.option("--csv", "form", flag_value="csv",
@@ -32,9 +48,9 @@ FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
-    click.option("--anchor", metavar="METHOD", shell_complete=complete.names("method"),
-                 help="What BD-rates compare against.  [default: hac, lightgaussian, "
-                 "3dgs, or the first]"),
+    click.option("--anchor", metavar="METHOD", shell_complete=_methods,
+                 help="What BD-rates compare against.  [default: the most usual "
+                 "of the methods, or the first]"),
     click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),
     click.option("--partial", is_flag=True, help="Means over the scenes that are there, the missing ones named; "
                  "without it, one missing scene leaves no mean."),
@@ -57,12 +73,7 @@ def report(
     Results are comparable inside one protocol only; runs of different protocols stand in different tables. Without an
     option that prints something else, tables are printed as text.
     """
-    from splatwizard_core.api import CapabilityError
-
-    try:
-        from sw_report import exports
-    except ModuleNotFoundError as error:
-        raise CapabilityError("sw report needs jinja2: pip install 'splatwizard-core[report]'") from error
+    from sw_report import exports
     from sw_report.distortion import choose_anchor
     from sw_report.runs import collect
 

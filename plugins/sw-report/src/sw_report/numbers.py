@@ -2,46 +2,46 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+
+from sw_report.declared import metric_key, metric_style
 
 MISSING = "–"
 FIELD_LPIPS = "lpips_vgg_3dgs"  # the form that the field's tables, the survey's among them, print
-_ORDER = ("psnr", "ssim", FIELD_LPIPS, "lpips_vgg", "lpips_alex", "l1")
-_HEADINGS = {
-    "psnr": "PSNR dB",
-    "ssim": "SSIM",
-    "l1": "L1",
-    "lpips_vgg_3dgs": "LPIPS (VGG, 3DGS)",
-    "lpips_vgg": "LPIPS (VGG)",
-    "lpips_alex": "LPIPS (Alex)",
-}
-
-
-def _key(metric: str) -> str:
-    return metric.lower().replace("-", "_")
 
 
 def ordered_metrics(names: Iterable[str]) -> list[str]:
-    """Metric names without repetition, the field's usual ones first."""
-    return sorted(dict.fromkeys(names), key=lambda n: (_ORDER.index(_key(n)) if _key(n) in _ORDER else 99, n))
+    """Metric names without repetition, by the positions that they declare; those without one last, by name."""
+    return sorted(dict.fromkeys(names), key=lambda name: (metric_style(name).position, name))
+
+
+def order_after_run(metric: str) -> float:
+    """Place of a metric in the table that `sw run` prints: further forms of LPIPS have none, like unknown metrics."""
+    further = is_lpips(metric) and metric_key(metric) != FIELD_LPIPS
+    return math.inf if further else metric_style(metric).position
+
+
+def is_lpips(metric: str) -> bool:
+    """Whether a metric is a form of LPIPS, which are never compared with each other."""
+    return metric_key(metric).startswith("lpips")
 
 
 def main_lpips(names: Iterable[str]) -> str | None:
     """The LPIPS that tables of the field use, or whichever is there."""
-    found = [name for name in ordered_metrics(names) if _key(name).startswith("lpips")]
-    return found[0] if found else None
+    return next((name for name in ordered_metrics(names) if is_lpips(name)), None)
 
 
 def heading(metric: str) -> str:
-    return _HEADINGS.get(_key(metric), metric)
+    """A metric with its unit, as the head of a column."""
+    return metric_style(metric).heading
 
 
 def score(metric: str, value: float | None, *, digits: int | None = None) -> str:
-    """A value of a metric: decibels with 2 decimals, the others with 4."""
+    """A value of a metric, with as many decimals as the metric declares unless told otherwise."""
     if value is None:
         return MISSING
-    decibel = "psnr" in _key(metric)
-    return f"{value:.{(2 if decibel else 4) if digits is None else digits}f}"
+    return f"{value:.{metric_style(metric).digits if digits is None else digits}f}"
 
 
 def megabytes(size: float | None) -> str:

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from splatwizard_core.tooling import Record
 
-FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
-"""Metrics that stand first in the table, in this order."""
 SHOWN_RECORDS = 3  # paths that are printed one by one
 COLOURS = ("blue", "dark_orange", "green", "magenta", "yellow", "red", "cyan", "bright_black")
 PLOT_WIDTH = 72
@@ -52,7 +50,7 @@ def print_table(records: Sequence[Record], out: Console) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from sw_report.numbers import heading
+    from sw_report.numbers import heading, order_after_run
 
     first = records[0]
     # A metric that nobody could compute has its reason below, and no column.
@@ -60,7 +58,7 @@ def print_table(records: Sequence[Record], out: Console) -> None:
         name for record in records for name, metric in record.metrics.items()
         if not metric.diagnostic and (metric.mean is not None or metric.per_view)
     ))  # fmt: skip
-    names.sort(key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
+    names.sort(key=lambda name: (order_after_run(name), name))
     best = _best(records, names) if len({record.method for record in records}) > 1 else {}
     columns: dict[str, list[str]] = {}
     digits = 3 if min(record.file.bytes for record in records) >= 100_000 else 4
@@ -175,7 +173,7 @@ def notes(records: Sequence[Record]) -> list[str]:
 
 def reasons_of_metrics(records: Sequence[Record]) -> dict[str, list[str]]:
     """Why metrics have no mean -> which ones."""
-    from splatwizard_core.evaluation.metrics import short_reason
+    from splatwizard_core.tooling import short_reason
 
     found: dict[str, dict[str, None]] = {}
     for record in records:
@@ -239,9 +237,13 @@ def bd_lines(directories: Sequence[Path]) -> list[str]:
 
 
 def _number(metric: str, value: float | None) -> str:
+    from sw_report.declared import metric_style
+
     if value is None:
         return "-"
-    return f"{value:.3f}" if metric == "psnr" else f"{value:.4f}"
+    style = metric_style(metric)
+    # Rate points of one scene may lie less than 0.01 dB apart.
+    return f"{value:.{style.digits + (style.unit == 'dB')}f}"
 
 
 def _seconds(value: float | None) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable
 from sw_report.blocks import Cell, Row, Table, columns, row
+from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
 from sw_report.facts import RunFacts, clean
 from sw_report.runs import Run, machine
@@ -115,24 +116,23 @@ def _some(names: Sequence[str], most: int = 6) -> str:
 
 def bd_table(table: BdTable) -> Table:
     """BD-rate and BD-quality of every method against the anchor."""
-    unit = "dB" if table.metric == "psnr" else numbers.heading(table.metric)
-    digits = 2 if table.metric == "psnr" else 4
+    style = metric_style(table.metric)
     rows = []
     for r in table.rows:
         rows.append(
             row(
                 [r.variant, r.scene or "mean", _bd(r.rate, numbers.percent(r.rate.value)),
-                 _bd(r.quality, numbers.signed(r.quality.value, digits))],
+                 _bd(r.quality, numbers.signed(r.quality.value, style.digits))],
                 emphasis=r.scene is None,
             )
         )  # fmt: skip
-    heads = ["method", "scene", f"BD-rate ({numbers.heading(table.metric).replace(' dB', '')}) %", f"BD gain, {unit}"]
+    heads = ["method", "scene", f"BD-rate ({style.label}) %", f"BD gain, {style.unit or style.label}"]
     marks = dict.fromkeys(
         f"* {c.reason}" if c.value is not None else f"{numbers.MISSING} {r.variant}, {r.scene or 'mean'}: {c.reason}"
         for r in table.rows for c in (r.rate, r.quality) if c.reason
     )  # fmt: skip
     return Table(
-        f"Against {table.anchor} by {numbers.heading(table.metric)}", columns(heads, text=("method", "scene")), rows,
+        f"Against {table.anchor} by {style.heading}", columns(heads, text=("method", "scene")), rows,
         f"Against {table.anchor}: rate at equal quality (negative saves), quality at equal rate (positive is better).",
         list(marks),
     )  # fmt: skip

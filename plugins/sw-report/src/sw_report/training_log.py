@@ -69,8 +69,8 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
                 last = before + step
                 if _is_number(entry.get("loss")):
                     losses.append((float(last), float(entry["loss"])))
-                for key in ("num_gaussians", "num_anchors"):
-                    if _is_number(entry.get(key)):
+                for key in entry:
+                    if key.startswith("num_") and _is_number(entry[key]):
                         counts.setdefault(key, []).append((float(last), float(entry[key])))
     except OSError as error:
         return TrainingCurves([], {}, [], missing=clean(f"log.jsonl: {error.strerror}"))

@@ -69,7 +69,7 @@ def truth_pixels(view: View, scene: Scene) -> Pixels:
 
 def picture_names(views: Sequence[str]) -> list[str]:
     """File names of the renders of views; imported late, since it comes with torch."""
-    from splatwizard_core.evaluation.evaluate import png_names
+    from splatwizard_core.tooling import png_names
 
     return png_names(views)
 

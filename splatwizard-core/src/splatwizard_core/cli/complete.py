@@ -75,25 +75,6 @@ def scene_or_file(context: click.Context, parameter: click.Parameter, incomplete
     return [CompletionItem(incomplete, type="file"), *scenes(context, parameter, incomplete)[1:]]
 
 
-def datasets(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Known data sets; after a slash, the scenes of one."""
-    from sw_datasets.downloads.registry import load_registry
-
-    try:
-        known = load_registry(None)
-    except SplatwizardError:  # a registry of the user's own that cannot be read
-        return []
-    name, slash, _ = incomplete.partition("/")
-    if slash:
-        return _starting(incomplete, [(f"{name}/{s}", None) for s in (known[name].scenes if name in known else ())])
-    return _starting(incomplete, [(each, known[each].title) for each in known])
-
-
-def dataset_or_folder(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """What `sw data verify` takes."""
-    return [CompletionItem(incomplete, type="dir"), *datasets(context, parameter, incomplete)]
-
-
 def image_folders(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """The `images*` folders of the scene on the line."""
     scene = context.params.get("scene")

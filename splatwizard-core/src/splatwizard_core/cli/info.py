@@ -132,9 +132,9 @@ def _ply_facts(path: Path) -> dict[str, Any]:
 
 
 def _scene_facts(spec: str, images: str | None, sets: tuple[str, ...]) -> dict[str, Any]:
+    from splatwizard_core.cli.describe_scene import describe
     from splatwizard_core.cli.setup import resolve_run_options
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.describe import describe
     from splatwizard_core.scene.loading import load_scene
 
     _, options_, _ = resolve_run_options(None, assignments(sets, images=images))

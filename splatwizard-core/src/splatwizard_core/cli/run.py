@@ -112,9 +112,8 @@ def run(
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))
         plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, out_console, say, written))
-    if len(finished) > 1:
-        written.clear()  # the pages of single runs lie beside their records
+    of_single_runs = set(written)
     plugins.hook.run_finished(runs=FinishedRuns(finished, True, out_console, say, written))
     if as_json:
         runs = [{"directory": str(f.directory), "record": f.record.model_dump(mode="json")} for f in finished]
-        print_json({"runs": runs, "written": [str(path) for path in written]})
+        print_json({"runs": runs, "written": [str(path) for path in written if path not in of_single_runs]})

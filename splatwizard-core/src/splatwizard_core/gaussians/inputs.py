@@ -1,4 +1,4 @@
-"""What a rasterizer draws: activated Gaussians as plain tensors."""
+"""Activated Gaussians as plain tensors: the input of every rasterizer."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.errors import ShapeError
+from splatwizard_core.gaussians.spherical_harmonics import eval_sh, rgb_to_dc
 
 
 @dataclass
@@ -28,6 +29,26 @@ class SH:
     codebook: Tensor | None = None
     indices: Tensor | None = None
     active_degree: int = 3
+
+    @classmethod
+    def from_rgb(cls, rgb: Tensor) -> SH:
+        """Degree 0: colours [N,3] that are the same from every side."""
+        return cls(dense=rgb_to_dc(rgb)[:, None], active_degree=0)
+
+    def colors_from(self, center: Tensor, means: Tensor, *, rows: Tensor | None = None, clamp: bool = True) -> Tensor:
+        """Colours as seen from `center`: max(0, 0.5 + SH), [N,3]; differentiable in coefficients and `means`.
+
+        center  [3] camera centre, world units, not on a mean
+        means   [N,3] world units
+        rows    which Gaussians; None: all
+        clamp   False leaves negative values (sensitivity passes)
+        """
+        sh = self.to_dense()
+        if rows is not None:
+            sh, means = sh[rows], means[rows]
+        raw = eval_sh(sh, torch.nn.functional.normalize(means - center, dim=-1), self.active_degree) + 0.5
+        # clamp's gradient passes at raw == 0, as the specification wants.
+        return raw.clamp(min=0) if clamp else raw
 
     def to_dense(self) -> Tensor:
         """[N,K,3], differentiable with respect to whatever is stored."""

@@ -1,10 +1,10 @@
-"""What a method trains: parameters, and how they become Gaussians."""
+"""The base of all scene models: parameters, and how they become Gaussians."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -26,8 +26,8 @@ class SplatModel(nn.Module):
 
     ROWS: tuple[str, ...] = ()
     """Names of the parameters and buffers whose first dimension is the primitive; attributes of the model."""
-    ROW_LABEL: str = "Gaussians"
-    """Name of the rows in progress and messages: the primitive's plural."""
+    ROW_LABEL: ClassVar[str] = "gaussians"
+    """The primitives' name in progress and messages, plural; a model of anchors says "anchors"."""
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
@@ -39,7 +39,7 @@ class SplatModel(nn.Module):
 
     @property
     def num_rows(self) -> int:
-        """How many primitives the model stores: Gaussians, or anchors."""
+        """Number of primitives that the model stores (`ROW_LABEL` names them)."""
         return int(getattr(self, self.ROWS[0]).shape[0])
 
     @property
@@ -48,7 +48,7 @@ class SplatModel(nn.Module):
         return next(self.parameters()).device
 
     def counts(self) -> dict[str, int]:
-        """Numbers of primitives for logs and records: {"num_gaussians": ...}, and more if a model stores others."""
+        """The counts that a record reports: {"num_gaussians": ...}; other models add those of their primitives."""
         return {"num_gaussians": self.num_rows}
 
     def prepare(self) -> None:

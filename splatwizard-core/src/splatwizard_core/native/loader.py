@@ -50,7 +50,7 @@ def cache_root() -> Path:
 
 @dataclass
 class _Session:
-    """What this process knows of a module; a loaded library cannot be unloaded, so it belongs to the process."""
+    """State of a module in this process, shared by all: a loaded library cannot be unloaded."""
 
     loaded: Path | None = None
     error: NativeBuildError | None = None
@@ -136,7 +136,7 @@ class NativeModule:
         return self._session.loaded is not None
 
     def available(self, *, cuda: bool = False) -> str | None:
-        """Why `load` would fail, or with `cuda` give no CUDA kernels; or None.
+        """The reason why `load` would fail, or with `cuda` give no CUDA kernels; or None.
 
         Compiles nothing: a compiler that is there is taken to work.
         """
@@ -326,7 +326,7 @@ class NativeModule:
         return bool(self.cuda_sources) and torch.version.cuda is not None
 
     def _without_cuda(self) -> str | None:
-        """Why a build here holds no CUDA kernels, or None."""
+        """The reason why a build here holds no CUDA kernels, or None."""
         if not self.cuda_sources:
             return f"module '{self.name}' has no CUDA kernels"
         return toolchain.cuda_mismatch()
@@ -424,7 +424,7 @@ def _timeout() -> float:
 
 
 def _facts(library: Path) -> dict[str, Any]:
-    """What the build wrote down of a library; empty if that cannot be read."""
+    """Facts that the build wrote beside a library; empty if they cannot be read."""
     try:
         facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
     except (OSError, ValueError):

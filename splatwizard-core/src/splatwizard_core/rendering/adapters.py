@@ -10,32 +10,23 @@ from torch import Tensor
 
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.rendering.rasterizer import (
-    AccumOutput,
-    Rasterizer,
-    RasterizerInfo,
-    RasterOptions,
-    RenderResult,
-)
+from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 
 _AS_FEATURES = frozenset({"DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED", "ALPHA_MAP"})
-ADAPTABLE = _AS_FEATURES | {"SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM"}
-"""Features that can be had from a rasterizer that does not declare them (maps need EXTRA_FEATURES instead)."""
+_REWRITTEN = frozenset({"SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM"})
 
 
 def adapted_requirements(required: frozenset[str], missing: frozenset[str]) -> frozenset[str] | None:
-    """What is asked of the rasterizer once `missing` is adapted; None if some of it cannot be."""
-    if not missing <= ADAPTABLE:
+    """The features that a rasterizer needs once `missing` is composed from others; None if some of it cannot be."""
+    if not missing <= _AS_FEATURES | _REWRITTEN:
         return None
-    needs = required - missing
-    if missing & _AS_FEATURES:
-        needs |= {"EXTRA_FEATURES"}
-    return needs
+    return required - missing | ({"EXTRA_FEATURES"} if missing & _AS_FEATURES else frozenset())
 
 
 class AdaptedRasterizer:
-    """A rasterizer behind rewritten requests; every feature in `missing` is composed from others.
+    """A rasterizer behind rewritten requests: every feature in `missing` is composed from others.
 
     SPLIT_SH      dc and rest are concatenated
     INDEXED_*     codebooks are gathered, scale factors multiplied in; autograd scatters

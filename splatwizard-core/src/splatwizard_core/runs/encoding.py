@@ -48,10 +48,9 @@ def encode(
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad(), method.plugins.recording() as loaded:
         method.encode(model, writer)
+    loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
     if method.name in method.plugins.methods:
         loaded.insert(0, method.plugins.methods.entry(method.name))
-    registries = method.plugins.registries
-    loaded += [registries[kind].entry(name) for kind, name in writer.required if name in registries[kind]]
     writer.requires = requirements(loaded)
     size = writer.write(path)
     _synchronize(device)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from sw_anchors.float_mode import is_device_bound
 
 from splatwizard_core.evaluation.evaluate import (
     INFINITE,
@@ -203,7 +202,7 @@ def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable
 
             return Opened(load_ply(path).to(device).eval().requires_grad_(False), {})
         model, reader = open_model(path, plugins, device)
-        return Opened(model, reader.raster, is_device_bound(reader))
+        return Opened(model, reader.raster, reader.made_on is not None)
 
     if path.suffix != ".ply":
         import_method(path, plugins)  # code is not memory of the model

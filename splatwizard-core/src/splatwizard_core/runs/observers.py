@@ -63,7 +63,8 @@ class FinishedRuns:
     complete    the command ends: these are all its runs
     console     where tables may be printed; None: the user asked for JSON
     say         takes one-line messages for the user
-    written     files that are named to the user at the end; a hook appends what it wrote
+    written     files that are named to the user at the end, those of single runs first; a hook appends what it wrote,
+                and may take back its own
     """
 
     runs: Sequence[FinishedRun]

@@ -82,7 +82,7 @@ class Housekeeping:
         self.guard = InterruptGuard()
         self.clock = LoopClock(progress.stage_seconds.get(name, 0.0))
         self._save, self._label = save, label
-        self._row_label = trainer.model.ROW_LABEL.lower()
+        self._rows_are = "anchors" if "num_anchors" in trainer.model.counts() else "gaussians"
         self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
         self._saved_at = -1
         self._stack = ExitStack()
@@ -113,7 +113,7 @@ class Housekeeping:
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
         with self.clock.paused():
             try:
-                self._bar.advance(1, loss=record.total, **{self._row_label: record.num_rows})
+                self._bar.advance(1, loss=record.total, **{self._rows_are: record.num_rows})
                 if self.on_step is not None:
                     self.on_step(record)
                 self._log_step(record)

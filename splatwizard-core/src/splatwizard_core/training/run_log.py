@@ -19,7 +19,7 @@ from splatwizard_core.files import naming_full_disk, write_atomic
 class RunLog:
     """Appends lines to a file; None as the path: keeps nothing.
 
-    Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "num_gaussians" and the like,
+    Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "num_gaussians" or "num_anchors",
     "lr", "seconds"; or "task" (a task that logs); or "metrics" (an evaluation).
     """
 

@@ -238,10 +238,11 @@ class Trainer:
     def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         view = self._view
         rows = self._num_rows()
+        what = "anchors" if "num_anchors" in self.model.counts() else "Gaussians"
         drawn = "" if view is None else f" at {view.camera.width}x{view.camera.height}"
         return out_of_memory(
             error,
-            f"step {self.step + 1} of stage '{self.stage.name}' with {rows:,} {self.model.ROW_LABEL}{drawn}",
+            f"step {self.step + 1} of stage '{self.stage.name}' with {rows:,} {what}{drawn}",
             "free the GPU and give the same command again, it goes on from the last checkpoint; "
             "smaller pictures, or a plan that makes fewer, start anew",
         )

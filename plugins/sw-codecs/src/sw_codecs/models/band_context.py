@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from splatwizard_core.api import BitstreamError
+from splatwizard_core.api import BitstreamError, EntropyModel
 from sw_codecs.models.attributes import MAX_SYMBOL
 
 MAX_CLASSES = 16
@@ -39,7 +39,7 @@ def activity_classes(lower: NDArray[np.int32], count: int) -> NDArray[np.int64]:
     return np.searchsorted(limits, activity, side="right")
 
 
-def encode_band(columns: Any, symbols: NDArray[np.int32], classes: NDArray[np.int64], count: int) -> bytes:
+def encode_band(columns: EntropyModel, symbols: NDArray[np.int32], classes: NDArray[np.int64], count: int) -> bytes:
     """u32 byte length of each class, then the classes; an empty class has no bytes.
 
     columns     the entropy model for integer matrices
@@ -51,7 +51,7 @@ def encode_band(columns: Any, symbols: NDArray[np.int32], classes: NDArray[np.in
     return struct.pack(f"<{count}I", *map(len, parts)) + b"".join(parts)
 
 
-def decode_matrix(columns: Any, data: bytes, rows: int, width: int) -> NDArray[np.int64]:
+def decode_matrix(columns: EntropyModel, data: bytes, rows: int, width: int) -> NDArray[np.int64]:
     """Symbols [rows,width], each within +-2^30. Raises BitstreamError."""
     symbols: NDArray[np.int64] = columns.decode(data, (rows, width))
     if symbols.size and not -MAX_SYMBOL <= int(symbols.min()) <= int(symbols.max()) <= MAX_SYMBOL:
@@ -59,7 +59,9 @@ def decode_matrix(columns: Any, data: bytes, rows: int, width: int) -> NDArray[n
     return symbols
 
 
-def decode_band(columns: Any, data: bytes, classes: NDArray[np.int64], count: int, width: int) -> NDArray[np.int32]:
+def decode_band(
+    columns: EntropyModel, data: bytes, classes: NDArray[np.int64], count: int, width: int
+) -> NDArray[np.int32]:
     """Symbols [N,width]. Raises BitstreamError."""
     start = 4 * count
     if len(data) < start:

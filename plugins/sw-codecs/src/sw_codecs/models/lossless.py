@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import GaussianModel
+from sw_codecs.positions.ordering import spatial_order
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
@@ -28,9 +29,9 @@ def encode(model: GaussianModel, writer: ContainerWriter, plugins: PluginManager
     writer.static["num_gaussians"] = model.num_rows
     writer.static["max_sh_degree"] = model.max_sh_degree
     writer.static["active_sh_degree"] = model.active_sh_degree
-    steps, planes = plugins.coders.load("float-delta")(), plugins.coders.load("byte-planes")()
+    steps, planes = plugins.array_coders.load("float-delta")(), plugins.array_coders.load("byte-planes")()
     means = _float32(model, "means")
-    order = steps.sort(np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0))  # for the order alone
+    order = spatial_order(np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0))  # for the order alone
     writer.add("means", steps.encode(means[order]))
     for name in (*TAILS, "sh_rest"):
         writer.add(name, planes.encode(_float32(model, name)[order]))
@@ -44,9 +45,9 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     active = reader.integer("active_sh_degree", low=0, high=degree)
     rest = (degree + 1) ** 2 - 1
     reader.allow(_bytes(n, rest), f"a model of {n:,} Gaussians")
-    steps, planes = plugins.coders.load("float-delta")(), plugins.coders.load("byte-planes")()
+    steps, planes = plugins.array_coders.load("float-delta")(), plugins.array_coders.load("byte-planes")()
     with reader.decoding("means") as data:
-        tensors = {"means": torch.from_numpy(steps.decode(data, (n, 3)))}
+        tensors = {"means": torch.from_numpy(steps.decode(data, np.float32, (n, 3)))}
     for name, tail in {**TAILS, "sh_rest": (rest, 3)}.items():
         with reader.decoding(name) as data:
             tensors[name] = torch.from_numpy(planes.decode(data, np.float32, (n, *tail)))

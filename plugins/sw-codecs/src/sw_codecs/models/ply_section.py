@@ -7,8 +7,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+import torch
+
 from splatwizard_core.api import BitstreamError, GaussianModel, from_ply, to_ply
-from splatwizard_core.gaussians.ply import ply_header, property_names
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
@@ -32,10 +33,17 @@ def decode(reader: ContainerReader) -> GaussianModel:
     """The model, all its SH bands active. Raises BitstreamError, also for any other .ply than `encode` writes."""
     n = reader.integer("num_gaussians", low=0, high=2**32 - 1)
     rest = (reader.integer("max_sh_degree", low=0, high=3) + 1) ** 2 - 1
-    header, row = ply_header(n, rest), 4 * len(property_names(rest))
+    header, row = _header(n, rest), 4 * (17 + 3 * rest)
     with reader.decoding("ply") as data:
         if data[: len(header)] != header:
             raise BitstreamError(f"is no .ply of {n:,} Gaussians with {rest} higher SH coefficients")
         if len(data) != len(header) + n * row:
             raise BitstreamError(f"is {len(data):,} bytes, {n:,} Gaussians take {len(header) + n * row:,}")
         return from_ply(data, f"{reader.name}: ply")
+
+
+def _header(n: int, rest: int) -> bytes:
+    """The text in front of the rows of n Gaussians with `rest` higher SH coefficients a channel, as `to_ply` has it."""
+    tails = ((3,), (1, 3), (rest, 3), (), (3,), (4,))
+    none = GaussianModel(*(torch.zeros(0, *tail) for tail in tails))
+    return to_ply(none).replace(b"element vertex 0\n", f"element vertex {n}\n".encode())

@@ -7,6 +7,7 @@ is not finite) are left out. The decoder needs integers and exact arithmetic onl
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -16,8 +17,6 @@ from numpy.typing import NDArray
 from pydantic import Field, ValidationError
 
 from splatwizard_core.api import BitstreamError, GaussianModel, Params
-from splatwizard_core.coding.gaussian_codec import BORROWED
-from splatwizard_core.gaussians.model import logit
 from sw_codecs.models.attributes import BASE_COLUMNS, Steps, Values, dequantize, quantize
 from sw_codecs.models.band_context import (
     MAX_CLASSES,
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-FAINTEST = logit(1 / 255)
+FAINTEST = math.log(1 / 255 / (1 - 1 / 255))
 """Rasterizers skip a splat whose alpha is below 1/255, and alpha never exceeds the opacity."""
 
 SECTIONS = {"color": (0, 3), "opacity": (3, 4), "scales": (4, 7), "quats": (7, 10)}
@@ -78,7 +77,7 @@ class Layout(Params):
 
 def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> None:
     """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
-    octree = plugins.coders.load("octree")()
+    octree = plugins.position_codecs.load("octree")()
     layout, cells, symbols = lattice(model, codec, octree.sort)
     writer.raster["sh_degree"] = layout.max_sh_degree
     writer.static.update(layout.model_dump(mode="json"))
@@ -98,7 +97,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     n = layout.num_gaussians
     reader.allow(layout.decoded_bytes, f"a model of {n:,} Gaussians")
     with reader.decoding("positions") as data:
-        cells = plugins.coders.load("octree")(max_points=n).decode(data)
+        cells = plugins.position_codecs.load("octree")(max_points=n).decode(data)
         if cells.shape != (n, 3):
             raise BitstreamError(f"holds {len(cells):,} points, header says {n:,}")
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
@@ -201,7 +200,9 @@ def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArr
 
 def _layout(reader: ContainerReader) -> Layout:
     try:
-        layout = Layout.model_validate({k: v for k, v in reader.static.items() if k not in ("mode", *BORROWED)})
+        layout = Layout.model_validate(
+            {key: value for key, value in reader.static.items() if key in Layout.model_fields}
+        )
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

@@ -1,0 +1,1 @@
+"""Coders of plain numbers and indices without loss."""

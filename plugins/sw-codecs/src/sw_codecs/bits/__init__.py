@@ -1,0 +1,1 @@
+"""Bits and bytes: packed integers, variable-length codes, checksums, zstd frames."""

@@ -1,0 +1,1 @@
+"""Training of codebooks and the search in them, in bounded memory."""

@@ -1,0 +1,1 @@
+"""Context models: networks and grids that predict the parameters of entropy models."""

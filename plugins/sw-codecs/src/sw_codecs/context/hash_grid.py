@@ -1,0 +1,487 @@
+"""Context model `hash-grid`: multi-resolution grids of learned features, looked up by position.
+
+Two kinds. `HashGrid.binary`: signs of learned numbers, as in HAC (arXiv 2403.14530): vertices on the border do not
+take part, the other weights are brought to sum 1, and outside [0,1] all features are 0. `HashGrid.real`: the learned
+numbers themselves, as in instant-ngp (arXiv 2201.05989). A level whose vertices all fit its table is dense, any other
+is hashed. `MixedHashGrid` puts a binary grid over space and three over its planes side by side.
+
+For files the lookup of 16-bit position codes is done in integers alone (`integer_features`), so that every machine
+has the same features. Source: specification of the codec library, context models, and exact mode, rule 2.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
+
+from sw_codecs.quantizers.binary import SteBinary
+
+PRIMES = (1, 2654435761, 805459861)
+INITIAL = 1e-4
+FRACTION = 12
+POSITION_TOP = 65535
+INTEGER_ROWS = 1 << 14
+"""Rows of `integer_features` that are looked up together."""
+PLACE_ROWS = 1 << 16
+"""Rows of `places` that are worked out together."""
+SUMMED = 1 << 26
+"""Numbers of a gradient that are summed together, at most about so many: bounds memory."""
+
+
+@dataclass(frozen=True)
+class Level:
+    """One resolution.
+
+    scale       position in cells is x * scale + 0.5
+    resolution  vertices an axis, R
+    size        entries of its table, first of them number `start`
+    dense       the table has an entry for every vertex
+    """
+
+    scale: float
+    resolution: int
+    size: int
+    start: int
+    dense: bool
+
+
+class HashGrid(nn.Module):
+    """[n, d] in [0,1] -> [n, levels * features]; d is 2 or 3.
+
+    table   [entries, features] parameter: learned numbers of all levels, level by level
+    """
+
+    def __init__(
+        self,
+        dimensions: int,
+        levels: Sequence[tuple[float, int]],
+        *,
+        features: int,
+        log2_size: int,
+        binary: bool,
+        generator: torch.Generator | None,
+    ) -> None:
+        """levels: (scale, resolution) of each. Raises ValueError if a level is out of range.
+
+        binary      signs, without border vertices; else the numbers with all vertices
+        generator   draws the first values; None: zeros, for a grid that is read from a file
+        """
+        super().__init__()
+        if dimensions not in (2, 3) or not levels or features < 1 or not 3 <= log2_size <= 30:
+            raise ValueError("a hash grid has 2 or 3 axes, at least one level and feature, and tables of 2^3..2^30")
+        self.dimensions, self.features, self.binary, self.log2_size = dimensions, features, binary, log2_size
+        self.levels: list[Level] = []
+        start = 0
+        for scale, resolution in levels:
+            if not 2 <= resolution <= 1 << 16 or not 0 < scale <= resolution:
+                raise ValueError(f"a level of {resolution} vertices and scale {scale} is out of range")
+            vertices = resolution**dimensions
+            size = table_size(resolution, dimensions, log2_size)
+            self.levels.append(Level(scale, resolution, size, start, vertices <= size))
+            start += size
+        self.table = nn.Parameter(torch.zeros(start, features))
+        if generator is not None:
+            with torch.no_grad():
+                self.table.uniform_(-INITIAL, INITIAL, generator=generator)
+        # Dense levels come first in the buffers below; `order` brings features back into the order of the levels.
+        dense_first = sorted(range(len(self.levels)), key=lambda i: not self.levels[i].dense)
+        chosen = [self.levels[i] for i in dense_first]
+        self._dense = sum(level.dense for level in chosen)
+        self._in_order = dense_first == list(range(len(chosen)))
+        order = sorted(range(len(chosen)), key=lambda i: dense_first[i])
+        for name, values, dtype in (
+            ("scale", [level.scale for level in chosen], torch.float64),
+            ("last", [level.resolution - 1 for level in chosen], torch.int64),
+            ("start", [level.start for level in chosen], torch.int32),
+            ("order", order, torch.int64),
+        ):
+            self.register_buffer(f"_{name}", torch.tensor(values, dtype=dtype), persistent=False)
+
+    @classmethod
+    def binary_grid(
+        cls,
+        dimensions: int,
+        resolutions: Sequence[int],
+        *,
+        features: int,
+        log2_size: int,
+        generator: torch.Generator | None,
+    ) -> HashGrid:
+        """As in HAC: resolutions R >= 3 count the border, R - 2 vertices an axis are used."""
+        if min(resolutions, default=0) < 3:
+            raise ValueError(f"resolutions {list(resolutions)} must be 3 or more: two vertices an axis are border")
+        levels = [(float(r - 2), int(r)) for r in resolutions]
+        return cls(dimensions, levels, features=features, log2_size=log2_size, binary=True, generator=generator)
+
+    @classmethod
+    def real_grid(
+        cls,
+        dimensions: int = 3,
+        *,
+        levels: int = 16,
+        features: int = 2,
+        log2_size: int = 19,
+        coarsest: int = 16,
+        finest: int = 2048,
+        generator: torch.Generator,
+    ) -> HashGrid:
+        """As in instant-ngp: resolutions from `coarsest` to `finest` in equal ratios."""
+        scales = [coarsest * (finest / coarsest) ** (i / max(levels - 1, 1)) - 1 for i in range(levels)]
+        found = [(scale, math.ceil(scale - 1e-9) + 1) for scale in scales]  # 39.0000000001 is 39
+        return cls(dimensions, found, features=features, log2_size=log2_size, binary=False, generator=generator)
+
+    @property
+    def width(self) -> int:
+        """Number of outputs."""
+        return len(self.levels) * self.features
+
+    def values(self) -> Tensor:
+        """[entries, features] what is looked up; signs have a straight-through gradient."""
+        return SteBinary()(self.table) if self.binary else self.table
+
+    def forward(self, x: Tensor, values: Tensor | None = None) -> Tensor:
+        """[n, width]. Differentiable for the table and for x.
+
+        values  `self.values()`, if the caller has them already
+        """
+        values = self.values() if values is None else values
+        n, levels = len(x), len(self.levels)
+        if n == 0:
+            return values.new_zeros(0, self.width)
+        index, weights = self._corners_of(x)
+        index, weights = index.view(n * levels, -1), weights.to(values.dtype).view(n * levels, -1)
+        found = _WeightedRows.apply(values, index, weights, levels)
+        return self._sorted(found.view(n, levels, self.features))
+
+    @torch.no_grad()
+    def places(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Entries of the table (int32) and their weights (dtype of x), both [n, levels, 2^d], levels in their order."""
+        index, weights = self._corners_of(x)
+        return (index, weights) if self._in_order else (index[:, self._order], weights[:, self._order])
+
+    def _corners_of(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The same in the order of the buffers; weights are differentiable for x."""
+        inside = ((x >= 0) & (x <= 1)).all(dim=1, keepdim=True)
+        lower, ends = [], []
+        for coordinate in x.clamp(0, 1).unbind(1):
+            place = coordinate[:, None] * self._scale.to(x.dtype) + 0.5  # [n,L]
+            cell = torch.floor(place.detach())
+            part = place - cell
+            lower.append(cell.to(torch.int64))
+            near, far = 1 - part, part
+            if self.binary:
+                # A corner counts if none of its coordinates is on the border, so weights can be set to 0, and brought
+                # to sum 1, axis by axis.
+                near, far = self._off_border(near, far, lower[-1])
+                total = near + far
+                total = torch.where(total > 0, total, torch.ones_like(total))
+                near, far = near / total * inside, far / total * inside
+            ends.append((near, far))
+        return self._entries(lower), _corners(ends, torch.mul)
+
+    def integer_features(self, codes: Tensor) -> Tensor:
+        """[n, width] int64 with 12 fractional bits, of 16-bit codes [n,d] (x = code / 65535); integers alone.
+
+        Raises ValueError for a grid that is not binary.
+        """
+        if not self.binary:
+            raise ValueError("only a binary hash grid is looked up in integers")
+        if codes.shape[1:] != (self.dimensions,) or codes.is_floating_point():
+            raise ValueError(f"position codes must be integers [n, {self.dimensions}], not {list(codes.shape)}")
+        signs = torch.where(self.table.detach() >= 0, 1.0, -1.0).to(torch.float64)
+        blocks = [self._integer_block(block, signs) for block in codes.to(torch.int64).split(INTEGER_ROWS)]
+        return torch.cat(blocks) if blocks else codes.new_zeros(0, self.width, dtype=torch.int64)
+
+    def _integer_block(self, codes: Tensor, signs: Tensor) -> Tensor:
+        inside = ((codes >= 0) & (codes <= POSITION_TOP)).all(dim=1)
+        lower, ends = [], []
+        for coordinate in codes.clamp(0, POSITION_TOP).unbind(1):
+            at = coordinate[:, None] * (self._last - 1) << FRACTION  # below 2^44
+            place = torch.div(at, POSITION_TOP, rounding_mode="floor") + (1 << (FRACTION - 1))  # [n,L]
+            part = place & ((1 << FRACTION) - 1)
+            lower.append(place >> FRACTION)
+            ends.append(self._off_border((1 << FRACTION) - part, part, lower[-1]))
+        weights = _corners(ends, torch.mul)  # [n,L,2^d]
+        total = weights.sum(dim=2)  # at most 2^36
+        # In float64, which is exact for sums of integers below 2^53, in whatever order.
+        index = self._entries(lower).flatten(0, 1)
+        sums = F.embedding_bag(index, signs, per_sample_weights=weights.flatten(0, 1).to(torch.float64), mode="sum")
+        found = sums.to(torch.int64).view(*total.shape, self.features)
+        found = torch.div(found << FRACTION, total.clamp(min=1)[..., None], rounding_mode="floor")
+        return self._sorted(found * inside[:, None, None])
+
+    def _off_border(self, near: Tensor, far: Tensor, lower: Tensor) -> tuple[Tensor, Tensor]:
+        """Weights [n,L] of the two ends of an axis, 0 where the end is a border vertex."""
+        return near * (lower > 0), far * (lower + 1 < self._last)
+
+    def _entries(self, lower: Sequence[Tensor]) -> Tensor:
+        """[n,L,2^d] int32: entries of the table for the corners of cells, [n,L] for each axis; beyond the last vertex
+        counts as it."""
+        dense, last = self._dense, self._last
+        straight, hashed = [], []
+        # All hashed tables have one size, a power of two: the remainder is a mask, which may be taken early.
+        mask = (1 << self.log2_size) - 1
+        for axis, cell in enumerate(lower):
+            ends = torch.minimum(cell, last), torch.minimum(cell + 1, last)
+            stride = (last[:dense] + 1) ** axis
+            straight.append(tuple((end[:, :dense] * stride).int() for end in ends))
+            hashed.append(tuple((end[:, dense:] * PRIMES[axis] & mask).int() for end in ends))
+        found = [_corners(straight, torch.add)] if dense else []
+        if dense < len(last):
+            found.append(_corners(hashed, torch.bitwise_xor))
+        return torch.cat(found, dim=1).add_(self._start[:, None])
+
+    def _sorted(self, found: Tensor) -> Tensor:
+        """[n, width] from [n,L,F] in the order of the buffers."""
+        if not self._in_order:
+            found = found[:, self._order]
+        return found.reshape(len(found), self.width)
+
+    def extra_repr(self) -> str:
+        kind = "binary" if self.binary else "real"
+        return f"{kind}, {self.dimensions} axes, resolutions {[level.resolution for level in self.levels]}"
+
+
+class GridPlaces(NamedTuple):
+    """Of n points in a MixedHashGrid: entries (int32, of all its tables in a row) and weights of the corners.
+
+    space, space_weights        [n, levels over space, 8]
+    planes, planes_weights      [n, levels over the three planes, 4]
+    """
+
+    space: Tensor
+    space_weights: Tensor
+    planes: Tensor
+    planes_weights: Tensor
+
+    def rows(self, rows: Tensor) -> GridPlaces:
+        """Those of some of the points."""
+        return GridPlaces(*(each.index_select(0, rows) for each in self))
+
+
+class MixedHashGrid(nn.Module):
+    """Binary grids over (x,y,z), (x,y), (x,z) and (y,z), outputs in this order: the context of HAC.
+
+    space, planes   resolutions of the levels over space, and over each plane
+    features        numbers an entry has
+    log2_space, log2_planes     logarithms of the largest table of a level
+    """
+
+    AXES = ((0, 1, 2), (0, 1), (0, 2), (1, 2))
+    Grid = HashGrid
+
+    def __init__(
+        self,
+        space: Sequence[int] = (18, 24, 33, 44, 59, 80, 108, 148, 201, 275, 376, 514),
+        planes: Sequence[int] = (130, 258, 514, 1026),
+        *,
+        features: int = 4,
+        log2_space: int = 13,
+        log2_planes: int = 15,
+        generator: torch.Generator | None = None,
+    ) -> None:
+        super().__init__()
+        self.grids = nn.ModuleList(
+            HashGrid.binary_grid(
+                len(axes),
+                space if len(axes) == 3 else planes,
+                features=features,
+                log2_size=log2_space if len(axes) == 3 else log2_planes,
+                generator=generator,
+            )
+            for axes in self.AXES
+        )
+
+    @staticmethod
+    def count(space: Sequence[int], planes: Sequence[int], *, features: int, log2_space: int, log2_planes: int) -> int:
+        """`entries` of such a grid, before anything is allocated."""
+        sizes = [table_size(r, 3, log2_space) for r in space] + 3 * [table_size(r, 2, log2_planes) for r in planes]
+        return features * sum(sizes)
+
+    @property
+    def width(self) -> int:
+        """Number of outputs."""
+        return sum(grid.width for grid in self._all())
+
+    @property
+    def entries(self) -> int:
+        """Number of signs."""
+        return sum(grid.table.numel() for grid in self._all())
+
+    def forward(self, x: Tensor) -> Tensor:
+        """[n,3] in [0,1] -> [n, width]."""
+        return self.with_bits(x)[0]
+
+    def with_bits(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """The features, and the bits of all signs under their own share of ones (+ 32), a differentiable scalar.
+
+        Not differentiable for x.
+        """
+        return self.at_places(self.places(x))
+
+    @property
+    def place_bytes(self) -> int:
+        """Of `places`, a row."""
+        return sum(8 * len(grid.levels) << grid.dimensions for grid in self._all())
+
+    @torch.no_grad()
+    def places(self, x: Tensor) -> GridPlaces:
+        """Where [n,3] in [0,1] lie: what a lookup needs, and no training changes."""
+        blocks = map(self._places, x.split(PLACE_ROWS))
+        first = next(blocks)
+        if len(first.space) == len(x):
+            return first
+        # Written in place: joined afterwards, all of it would be there twice.
+        found, start = GridPlaces(*(each.new_empty(len(x), *each.shape[1:]) for each in first)), 0
+        for block in itertools.chain([first], blocks):
+            for whole, part in zip(found, block, strict=True):
+                whole[start : start + len(part)] = part
+            start += len(part)
+        return found
+
+    def _places(self, x: Tensor) -> GridPlaces:
+        start, found = 0, []
+        for grid, axes in zip(self._all(), self.AXES, strict=True):
+            index, weights = grid.places(x[:, list(axes)])
+            found.append((index + start, weights))
+            start += len(grid.table)
+        planes = [torch.cat([each[i] for each in found[1:]], dim=1) for i in (0, 1)]
+        return GridPlaces(*found[0], *planes)
+
+    def at_places(self, places: GridPlaces) -> tuple[Tensor, Tensor]:
+        """`with_bits` of what `places` was made from."""
+        features, bits = _BinaryLookup.apply(*places, *(grid.table for grid in self._all()))
+        return features, bits
+
+    def integer_features(self, codes: Tensor) -> Tensor:
+        """[n,3] 16-bit codes -> [n, width] int64 with 12 fractional bits."""
+        return torch.cat(
+            [grid.integer_features(codes[:, list(axes)]) for grid, axes in zip(self._all(), self.AXES, strict=True)],
+            dim=1,
+        )
+
+    def signs(self) -> Tensor:
+        """[entries] int64 of 0 and 1, grid by grid, level by level, entry by entry: what the file holds."""
+        return torch.cat([(grid.table.detach() >= 0).reshape(-1) for grid in self._all()]).to(torch.int64)
+
+    @torch.no_grad()
+    def load_signs(self, signs: Any) -> None:
+        """Inverse of `signs`. Raises ValueError for another number of them."""
+        values = torch.as_tensor(signs).reshape(-1)
+        if len(values) != self.entries:
+            raise ValueError(f"{len(values):,} signs for {self.entries:,} entries")
+        start = 0
+        for grid in self._all():
+            part = values[start : start + grid.table.numel()]
+            grid.table.copy_(part.view_as(grid.table).to(grid.table) * 2 - 1)
+            start += grid.table.numel()
+
+    def _all(self) -> list[HashGrid]:
+        return [grid for grid in self.grids if isinstance(grid, HashGrid)]
+
+
+def table_size(resolution: int, dimensions: int, log2_size: int) -> int:
+    """Entries of a level: an entry for every vertex if they fit, a multiple of 8."""
+    return -(-min(1 << log2_size, resolution**dimensions) // 8) * 8
+
+
+def _corners(ends: Sequence[Sequence[Tensor]], combine: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
+    """[n,L,2^d] from two tensors [n,L] for each axis; the first axis changes fastest."""
+    found = list(ends[0])
+    for axis in ends[1:]:
+        found = [combine(one, end) for end in axis for one in found]
+    return torch.stack(found, dim=2)
+
+
+class _WeightedRows(torch.autograd.Function):
+    """sum_c weights[b,c] values[index[b,c]]: torch's embedding_bag, with a backward that takes a seventh of its time.
+
+    Bag b belongs to level b % levels; the gradient is summed level by level, to bound memory.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, index: Tensor, weights: Tensor, levels: int) -> Tensor:
+        ctx.save_for_backward(values, index, weights)
+        ctx.levels = levels
+        return F.embedding_bag(index, values, per_sample_weights=weights, mode="sum")
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        values, index, weights = ctx.saved_tensors
+        features = values.shape[1]
+        for_values = for_weights = None
+        if ctx.needs_input_grad[0]:
+            for_values = torch.zeros_like(values)
+            flat, columns = for_values.view(-1), torch.arange(features, device=index.device)
+            for level in range(ctx.levels):
+                part = slice(level, None, ctx.levels)
+                places = index[part].to(torch.int64)[..., None] * features + columns
+                flat.scatter_add_(0, places.reshape(-1), (weights[part, :, None] * grad[part, None]).reshape(-1))
+        if ctx.needs_input_grad[2]:
+            for_weights = (values[index.to(torch.int64)] * grad[:, None]).sum(dim=2)
+        return for_values, None, for_weights, None
+
+
+class _BinaryLookup(torch.autograd.Function):
+    """Features [n, width] and the bits of all signs, of a MixedHashGrid at GridPlaces: all its grids in one node.
+
+    The tables get a straight-through gradient within [-1,1], as of `SteBinary`, and that of `rates.mask_bits`.
+    """
+
+    @staticmethod
+    def forward(
+        ctx: Any, space: Tensor, space_weights: Tensor, planes: Tensor, planes_weights: Tensor, *tables: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        table = torch.cat(tables)
+        positive = table >= 0
+        signs = positive.to(table.dtype).mul_(2).sub_(1)
+        found = [
+            F.embedding_bag(i.flatten(0, 1), signs, per_sample_weights=w.flatten(0, 1), mode="sum").view(
+                len(i), i.shape[1] * table.shape[1]
+            )
+            for i, w in ((space, space_weights), (planes, planes_weights))
+        ]
+        ones = positive.sum(dtype=table.dtype)
+        share = (ones / table.numel()).clamp(1e-6, 1 - 1e-6)
+        one, zero = -torch.log2(share), -torch.log2(1 - share)  # bits of each
+        ctx.save_for_backward(space, space_weights, planes, planes_weights, table, one - zero)
+        ctx.sizes = [len(t) for t in tables]
+        return torch.cat(found, dim=1), ones * one + (table.numel() - ones) * zero + 32
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_features: Tensor, to_bits: Tensor) -> tuple[Tensor | None, ...]:
+        space, space_weights, planes, planes_weights, table, dearer = ctx.saved_tensors
+        width = space.shape[1] * table.shape[1]
+        total = torch.zeros_like(table)
+        for index, weights, part in (
+            (space, space_weights, to_features[:, :width]),
+            (planes, planes_weights, to_features[:, width:]),
+        ):
+            _add_weighted_rows(total, index, weights, part.unflatten(1, (index.shape[1], table.shape[1])))
+        total += to_bits * dearer / 2  # a sign is twice its bit, less one
+        total *= table.abs() <= 1
+        return None, None, None, None, *total.split(ctx.sizes)
+
+
+def _add_weighted_rows(total: Tensor, index: Tensor, weights: Tensor, grad: Tensor) -> None:
+    """total[index] += weights * grad, for index and weights [n,L,c], grad [n,L,F], total [entries,F]; all summed."""
+    features = total.shape[1]
+    at_once = max(1, SUMMED // max(index[:1].numel() * features, 1))
+    columns = None if total.is_cuda else torch.arange(features)
+    for i, w, g in zip(index.split(at_once), weights.split(at_once), grad.split(at_once), strict=True):
+        source = w[..., None] * g[:, :, None]
+        if columns is None:
+            total.index_add_(0, i.reshape(-1), source.view(-1, features))
+        else:  # on a CPU a seventh of the time of the above
+            places = i.to(torch.int64)[..., None] * features + columns
+            total.view(-1).scatter_add_(0, places.reshape(-1), source.reshape(-1))

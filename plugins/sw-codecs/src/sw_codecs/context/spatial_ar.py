@@ -1,0 +1,259 @@
+"""Context model `spatial-ar`: the distribution of each integer of a plane from its causal neighbours.
+
+A residual network of 1,058 weights looks at twelve neighbours and gives mean and scale of a Laplacian. In training it
+runs over whole planes at once; a decoder goes along wavefronts (`wavefront`), with the network in exact integers.
+Source: CAT-3DGS (arXiv 2503.00357), after Cool-Chic (arXiv 2212.05458).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
+
+from splatwizard_core.api import BitstreamError
+from sw_codecs.context import wavefront
+from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
+from sw_codecs.context.wavefront import NEIGHBORS
+from sw_codecs.entropy.exact_tables import LEVELS
+from sw_codecs.entropy.rates import laplace_bits, lower_bound
+
+HIDDEN = 16
+RESIDUALS = 3
+SMALLEST, LARGEST = 0.05, 64.0
+"""Scales of the first and the last table of the coder; those in between are spaced evenly in the logarithm."""
+P_MIN = 2.0**-16
+_S_RANGE = -2 * math.log(LARGEST), -2 * math.log(SMALLEST)
+
+# level = 63 ln(b / SMALLEST) / ln(LARGEST / SMALLEST) with ln b = -s / 2, to the nearest: (offset - slope s) >> 28 for
+# s with 12 fractional bits. Literals, so that no logarithm of a decoder's machine decides about a level:
+# round(63 / (2 ln 1280) 2^16) and round((63 ln 20 / ln 1280 + 1/2) 2^28).
+_SLOPE = 288_539
+_OFFSET = 7_215_259_165
+
+
+class SpatialAr(nn.Module):
+    """12 -> 16, ReLU; three times 16 -> 16 plus its input, ReLU; 16 -> 2: mean and s, the scale being exp(-s/2)."""
+
+    def __init__(self, generator: torch.Generator | None = None) -> None:
+        super().__init__()
+        sizes = [(len(NEIGHBORS), HIDDEN), *[(HIDDEN, HIDDEN)] * RESIDUALS, (HIDDEN, 2)]
+        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, *size) for size in sizes)
+        for i, layer in enumerate(self.layers):
+            for parameter in layer.parameters():
+                nn.init.zeros_(parameter)
+            if i in (0, len(self.layers) - 1):
+                drawn = torch.randn(layer.weight.shape, generator=generator)
+                with torch.no_grad():
+                    layer.weight.copy_(drawn / layer.out_features**2)
+
+    def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
+        """(mean, s), each of the shape of `planes` [..., H, W]: integers, or integers with noise in training."""
+        h, w = planes.shape[-2:]
+        padded = nn.functional.pad(planes.reshape(-1, h, w), (2, 2, 2, 0))
+        around = [padded[:, 2 + down : 2 + down + h, 2 + right : 2 + right + w] for down, right in NEIGHBORS]
+        a = torch.stack([each.flatten() for each in around])  # [12, n]: one column a value, so weights come first
+        last = len(self.layers) - 1
+        for i, layer in enumerate(self.layers):
+            out = torch.addmm(layer.bias[:, None], layer.weight, a)
+            a = out if i == last else torch.relu(out + a if i > 0 else out)
+        mean, s = a.view(2, *planes.shape)
+        return mean, s
+
+    def bits(self, planes: Tensor) -> Tensor:
+        """Bits of each value of `planes` [..., H, W], which are their own context; differentiable.
+
+        Scales are kept to those that the coder has; the gradient that would bring one back passes.
+        """
+        mean, s = self(planes)
+        s = lower_bound(s, -2 * math.log(LARGEST))
+        s = -lower_bound(-s, 2 * math.log(SMALLEST))
+        return laplace_bits(planes, mean, torch.exp(-0.5 * s), p_min=P_MIN)
+
+    @staticmethod
+    def joint_bits(networks: Sequence[SpatialAr], planes: Sequence[Tensor]) -> Tensor:
+        """The sum of `networks[k].bits(plane[k])` over all of planes [K, C, H, W] per scale; a differentiable scalar.
+
+        All networks and scales at once, as one node of the graph: a tenth of the operators.
+        """
+        parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
+        total: Tensor = _JointBits.apply(len(planes), *planes, *parameters)  # type: ignore[no-untyped-call]
+        return total
+
+    def state(self) -> dict[str, np.ndarray]:
+        """The float32 arrays that go into the file: weight0, bias0, ..."""
+        return {
+            f"{kind}{i}": getattr(layer, kind).detach().cpu().numpy().astype(np.float32)
+            for i, layer in enumerate(self.layers)
+            for kind in ("weight", "bias")
+        }
+
+    @staticmethod
+    def exact(state: Mapping[str, np.ndarray]) -> ExactSpatialAr:
+        """The integer form of what `state` gave. Raises BitstreamError if the arrays make no such network."""
+        return ExactSpatialAr(state)
+
+    @staticmethod
+    def encode(planes: Sequence[np.ndarray], networks: Sequence[ExactSpatialAr]) -> bytes:
+        """Bytes of integer planes [K, C, H, W] per scale, orientation k under networks[k] (`wavefront.encode`)."""
+        return wavefront.encode(planes, networks)
+
+    @staticmethod
+    def decode(
+        data: bytes, shapes: Sequence[tuple[int, int, int]], networks: Sequence[ExactSpatialAr]
+    ) -> list[np.ndarray]:
+        """Inverse of `encode`: shapes are (C, H, W) per scale (`wavefront.decode`)."""
+        return wavefront.decode(data, shapes, networks)
+
+    @staticmethod
+    def table_bits(planes: Sequence[np.ndarray], networks: Sequence[ExactSpatialAr]) -> float:
+        """Bits that `encode` spends on the integers, from the very tables it uses."""
+        return wavefront.table_bits(planes, networks)
+
+
+_WINDOW = (3, 5)
+"""Rows and columns that hold the neighbours: its first twelve places in raster order."""
+_BORDER = (2, 2, 2, 0)  # left, right, above, below
+_ABOVE = 10  # neighbours in full rows of the window; the other two are to the left
+_SHAPES = ((HIDDEN, len(NEIGHBORS)), *((HIDDEN, HIDDEN),) * RESIDUALS, (2, HIDDEN))
+_PIECES = tuple(size for out, inputs in _SHAPES for size in (out * inputs, out))
+"""Numbers of weight and bias of each layer."""
+_PARAMETER_SHAPES = tuple(shape for out, inputs in _SHAPES for shape in ((out, inputs), (out,)))
+
+
+class _JointBits(torch.autograd.Function):
+    """Planes per scale [K,C,H,W], then weight and bias of each layer of K networks -> bits of all values.
+
+    Products are taken channel by channel: a gradient of a weight is a sum over all values, which a GPU takes in one
+    thread block per product, so that three products of a million values each would leave it idle. Inputs of a layer
+    have a last row of ones, whose weights are the biases: no pass of their own over all values adds or sums them.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, scales: int, *tensors: Tensor) -> Tensor:
+        planes, parameters = tensors[:scales], tensors[scales:]
+        k, channels = planes[0].shape[:2]
+        counts = [plane.shape[2] * plane.shape[3] for plane in planes]
+        weights = _channel_weights(torch.cat([p.reshape(-1) for p in parameters]).view(k, -1), channels)
+        # [K C, inputs + 1, n] of each layer: a column for each value of all scales. The first has fewer inputs.
+        stored = weights[0].new_empty(len(_SHAPES), k * channels, HIDDEN + 1, sum(counts))
+        stored[:, :, HIDDEN] = 1
+        layers = [stored[0, :, HIDDEN - len(NEIGHBORS) :], *stored[1:].unbind(0)]
+        for plane, place in zip(planes, layers[0].split(counts, dim=2), strict=True):
+            _gather_neighbors(plane.flatten(0, 1), place)
+        for weight, inputs, following in zip(weights, layers, layers[1:], strict=False):
+            torch.bmm(weight, inputs, out=following[:, :HIDDEN])
+            following[:, :HIDDEN].relu_()
+        mean, s = torch.bmm(weights[-1], layers[-1]).unbind(1)  # [K C, n]
+
+        offset = torch.cat([plane.flatten(0, 1).flatten(1) for plane in planes], dim=1).sub_(mean)
+        narrowing = torch.exp(0.5 * s.clamp(*_S_RANGE))  # 1 / b
+        away = offset.abs()
+        near, far = (away - 0.5).mul_(narrowing), (away + 0.5).mul_(narrowing)
+        at_near, at_far = near.abs().neg_().exp_().mul_(0.5), (-far).exp_().mul_(0.5)
+        p = torch.where(near >= 0, at_near, 1 - at_near).sub_(at_far)  # as `rates.laplace_mass`
+        ctx.save_for_backward(offset, s, narrowing, near, far, at_near, at_far, p, *layers, *weights)
+        ctx.shapes, ctx.counts = [plane.shape for plane in planes], counts
+        ctx.planes_learn = any(ctx.needs_input_grad[1 : 1 + scales])
+        return -p.clamp_min(P_MIN).log2_().sum()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        offset, s, narrowing, near, far, at_near, at_far, p, *rest = ctx.saved_tensors
+        layers, weights = rest[: len(_SHAPES)], rest[len(_SHAPES) :]
+        k, channels = ctx.shapes[0][:2]
+        # Below its floor a probability still has the gradient that raises it, and a scale out of range that which
+        # brings it back, as in `rates.lower_bound`.
+        slope = grad / p.clamp_min(P_MIN).mul_(-math.log(2))
+        slope *= (p >= P_MIN) | (slope < 0)
+        to_far = slope * at_far
+        to_near = slope.mul_(at_near).neg_()
+        out = torch.stack([to_near + to_far, to_near * near + to_far * far], dim=1)  # [K C, 2, n]
+        to_x, to_s = out.unbind(1)
+        to_x.mul_(narrowing).mul_(offset.sign())
+        own = to_x.clone() if ctx.planes_learn else None
+        to_x.neg_()
+        to_s.mul_(0.5).mul_((s >= _S_RANGE[0]) | (to_s < 0)).mul_((s <= _S_RANGE[1]) | (to_s > 0))
+
+        found = []
+        for i in reversed(range(len(weights))):
+            found.append(torch.bmm(out, layers[i].transpose(1, 2)).unflatten(0, (k, channels)).sum(dim=1))
+            if i > 0:
+                inputs = layers[i][:, :HIDDEN]
+                out = torch.bmm(weights[i][:, :, :-1].transpose(1, 2), out)
+                torch.ops.aten.threshold_backward.grad_input(out, inputs, 0, grad_input=out)
+        pieces = [part.flatten(1) for both in reversed(found) for part in (both[:, :, :-1], both[:, :, -1:])]
+        # Two columns more: then each piece is aligned as the optimizer's kernel asks for (16 bytes).
+        to_parameters = [
+            piece.view(shape)
+            for row in torch.cat([*pieces, pieces[-1]], dim=1)
+            for piece, shape in zip(row.split([*_PIECES, 2]), _PARAMETER_SHAPES, strict=False)
+        ]
+        if own is None:
+            return None, *[None] * len(ctx.shapes), *to_parameters
+        # The window's last places are no neighbours: rows of zeros, so that `fold` can take the products as they are.
+        rest_of_window = _WINDOW[0] * _WINDOW[1] - len(NEIGHBORS)
+        first = nn.functional.pad(weights[0][:, :, :-1], (0, rest_of_window)).transpose(1, 2)
+        to_planes = []
+        parts = zip(ctx.shapes, out.split(ctx.counts, dim=2), own.split(ctx.counts, dim=1), strict=True)
+        for shape, part, direct in parts:
+            h, w = shape[2:]
+            window = torch.bmm(first, part).view(1, -1, h * w)
+            folded = nn.functional.fold(window, (h + 2, w + 4), _WINDOW)[:, :, 2:, 2:-2]
+            to_planes.append(folded.reshape(shape) + direct.reshape(shape))
+        return None, *to_planes, *to_parameters
+
+
+def _channel_weights(flat: Tensor, channels: int) -> list[Tensor]:
+    """[K C, outputs, inputs + 1] of each layer, biases last: the parameters flat [K, P], once for each channel."""
+    k = len(flat)
+    between = RESIDUALS * (HIDDEN + 1) * HIDDEN
+    first, middle, last = flat.split([sum(_PIECES[:2]), between, sum(_PIECES[-2:])], dim=1)
+    middle = middle.reshape(k * RESIDUALS, -1)  # these layers are alike
+    joined = []
+    for part, (out, inputs) in ((first, _SHAPES[0]), (middle, _SHAPES[1]), (last, _SHAPES[-1])):
+        weight, bias = part.split([out * inputs, out], dim=1)
+        joined.append(torch.cat([weight.unflatten(1, (out, inputs)), bias[:, :, None]], dim=2))
+    # The identity skip is part of the layer.
+    joined[1] = (joined[1] + torch.eye(HIDDEN, HIDDEN + 1, dtype=flat.dtype, device=flat.device)).view(
+        k, RESIDUALS, HIDDEN, HIDDEN + 1
+    )
+    first, middle, last = (each[:, None].expand(-1, channels, *each.shape[1:]).flatten(0, 1) for each in joined)
+    return [first, *middle.unbind(1), last]
+
+
+def _gather_neighbors(planes: Tensor, into: Tensor) -> None:
+    """Write the neighbours of each value of planes [P,H,W] into the first rows of `into` [P, 12 or more, H W]."""
+    h, w = planes.shape[1:]
+    window = nn.functional.pad(planes, _BORDER).unfold(1, h, 1).unfold(2, w, 1)  # [P, 3, 5, H, W]
+    into[:, :_ABOVE].unflatten(2, (h, w)).unflatten(1, (2, _WINDOW[1])).copy_(window[:, :2])
+    into[:, _ABOVE : len(NEIGHBORS)].unflatten(2, (h, w)).copy_(window[:, 2, :2])
+
+
+class ExactSpatialAr:
+    """The network of a file in integers: means and table levels do not depend on device or batch."""
+
+    def __init__(self, state: Mapping[str, np.ndarray]) -> None:
+        sizes = [(HIDDEN, len(NEIGHBORS)), *[(HIDDEN, HIDDEN)] * RESIDUALS, (2, HIDDEN)]
+        weights = []
+        for i, size in enumerate(sizes):
+            weight, bias = state.get(f"weight{i}"), state.get(f"bias{i}")
+            if weight is None or bias is None or weight.shape != size or bias.shape != size[:1]:
+                raise BitstreamError(f"layer {i} of a spatial model must be {list(size)} with as many biases")
+            skip = np.eye(HIDDEN, dtype=np.float32) if 0 < i <= RESIDUALS else np.float32(0)
+            weights.append((weight.astype(np.float32) + skip, bias))  # the identity skip is part of the layer
+        try:
+            self._network = IntegerMlp(weights)
+        except ValueError as error:
+            raise BitstreamError(f"a spatial model cannot be used: {error}") from error
+
+    def __call__(self, neighbors: Tensor) -> tuple[np.ndarray, np.ndarray]:
+        """(mean int64 [n] with 12 fractional bits, level 0..63 of the scale) for neighbours int64 [n, 12]."""
+        mean, s = self._network(neighbors << FRACTION).numpy().T
+        return mean, np.clip((_OFFSET - _SLOPE * s) >> 28, 0, LEVELS - 1)

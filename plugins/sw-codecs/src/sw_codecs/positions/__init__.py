@@ -1,0 +1,1 @@
+"""Position codecs for integer points, and the spatial order in which points are stored."""

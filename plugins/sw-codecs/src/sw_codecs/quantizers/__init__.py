@@ -1,0 +1,1 @@
+"""Quantizers: a differentiable surrogate for training and exact symbols for the file, in one object."""

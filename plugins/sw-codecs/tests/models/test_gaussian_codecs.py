@@ -1,0 +1,169 @@
+"""The files of 3DGS under other methods' names: chosen by name, checked on the way back."""
+
+import math
+import tracemalloc
+
+import pytest
+import torch
+
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
+from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.ply import save_ply
+from splatwizard_core.plugins import load_plugins
+
+
+@pytest.fixture(scope="module")
+def plugins():
+    return load_plugins()
+
+
+@pytest.fixture(scope="module")
+def model():
+    g = torch.Generator().manual_seed(3)
+    n = 500
+    return GaussianModel(
+        torch.randn(n, 3, generator=g), torch.randn(n, 1, 3, generator=g), 0.1 * torch.randn(n, 15, 3, generator=g),
+        torch.randn(n, generator=g), torch.randn(n, 3, generator=g) - 3, torch.randn(n, 4, generator=g),
+    )  # fmt: skip
+
+
+def written(plugins, name, model, **settings):
+    writer = ContainerWriter("some-method", 1)
+    encode_gaussians(plugins, name, model, writer, **settings)
+    return writer
+
+
+def test_each_codec_that_says_it_codes_gaussians_decodes_what_it_encodes(plugins, model):
+    assert {"gaussians-exact", "gaussians-quantized"} <= set(plugins.gaussian_codecs.names)
+    for name in plugins.gaussian_codecs.names:
+        reader = ContainerReader(written(plugins, name, model).to_bytes(), "file.swz")
+        decoded = decode_gaussians(plugins, reader)
+        assert isinstance(decoded, GaussianModel)
+        assert 0 < decoded.num_rows <= model.num_rows
+        for parameter in decoded.parameters():
+            assert bool(torch.isfinite(parameter).all())
+
+
+def test_exact_is_bit_for_bit(plugins, model):
+    data = written(plugins, "gaussians-exact", model).to_bytes()
+    decoded = decode_gaussians(plugins, ContainerReader(data, "file.swz"))
+    for (name, a), (_, b) in zip(model.named_parameters(), decoded.named_parameters(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_settings_reach_the_codec(plugins, model):
+    coarse = written(plugins, "gaussians-quantized", model, dc_step=0.2, rest_step=0.2).to_bytes()
+    fine = written(plugins, "gaussians-quantized", model).to_bytes()
+    assert len(coarse) < 0.8 * len(fine)
+
+
+def test_an_unknown_codec_is_an_error_that_names_those_there_are(plugins, model):
+    with pytest.raises(ConfigError, match="gaussians-exact"):
+        written(plugins, "range", model)  # a coder, but not one of Gaussians
+
+
+@pytest.mark.parametrize("claimed", ["range", "huffman", "x" * 500, 7, None])
+def test_a_file_may_name_only_codecs_of_gaussians(plugins, model, claimed):
+    writer = written(plugins, "gaussians-exact", model)
+    writer.static["codec"] = claimed
+    with pytest.raises(BitstreamError, match="codec"):
+        decode_gaussians(plugins, ContainerReader(writer.to_bytes(), "file.swz"))
+
+
+def rows(model):
+    """The Gaussians as raw bytes, whatever their order."""
+    parameters = [p.detach()[:, None].flatten(1) for p in model.parameters()]
+    return sorted(row.numpy().tobytes() for row in torch.cat(parameters, 1))
+
+
+def test_ply_is_the_file_that_is_exported(plugins, model, tmp_path):
+    save_ply(model, tmp_path / "model.ply")
+    reader = ContainerReader(written(plugins, "gaussians-ply", model).to_bytes(), "file.swz")
+    assert reader.section("ply") == (tmp_path / "model.ply").read_bytes()
+    assert len(reader.section("ply")) == pytest.approx(248 * model.num_rows, abs=1600)
+    decoded = decode_gaussians(plugins, reader)
+    for (name, a), (_, b) in zip(model.named_parameters(), decoded.named_parameters(), strict=True):
+        assert torch.equal(a, b), name
+
+
+def test_ply_writes_inactive_bands_as_zeros_and_leaves_the_model_alone(plugins, model):
+    partly = GaussianModel(*(p.detach() for p in model.parameters()), active_sh_degree=1)
+    before = partly.digest()
+    decoded = decode_gaussians(plugins, ContainerReader(written(plugins, "gaussians-ply", partly).to_bytes(), "f"))
+    assert partly.digest() == before
+    assert decoded.active_sh_degree == 3
+    assert torch.equal(decoded.sh_rest[:, :3], model.sh_rest[:, :3])
+    assert not bool(decoded.sh_rest[:, 3:].any())
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_zstd_gives_every_bit_back_in_spatial_order(plugins, model, degree):
+    k = (degree + 1) ** 2
+    raw = {name: p.detach().clone() for name, p in model.named_parameters()}
+    m = GaussianModel(**{**raw, "sh_rest": raw["sh_rest"][:, : k - 1]})
+    with torch.no_grad():
+        m.means[3, 0], m.means[4, 1], m.means[5, 2] = math.nan, math.inf, -0.0
+        m.opacity_logits[7] = -math.inf
+    data = written(plugins, "gaussians-zstd", m).to_bytes()
+    decoded = decode_gaussians(plugins, ContainerReader(data, "file.swz"))
+    assert rows(decoded) == rows(m)
+    assert len(data) < len(written(plugins, "gaussians-exact", m).to_bytes())
+    before, after = (each.means.detach().diff(dim=0).nan_to_num(0, 0, 0).abs().mean() for each in (m, decoded))
+    assert after < 0.5 * before
+
+
+@pytest.mark.parametrize("codec", ["gaussians-ply", "gaussians-zstd"])
+def test_no_gaussians_and_one(plugins, model, codec):
+    for n in (0, 1):
+        few = GaussianModel(*(p.detach()[:n] for p in model.parameters()))
+        decoded = decode_gaussians(plugins, ContainerReader(written(plugins, codec, few).to_bytes(), "file.swz"))
+        assert rows(decoded) == rows(few)
+
+
+def rewritten(data, change):
+    """The file with other header values or sections, checksums right."""
+    old = ContainerReader(data, "file.swz")
+    static, sections = dict(old.static), {name: old.section(name) for name in old.sections}
+    change(static, sections)
+    writer = ContainerWriter("some-method", 1)
+    writer.static.update(static)
+    for name, content in sections.items():
+        writer.add(name, content)
+    return ContainerReader(writer.to_bytes(), "file.swz")
+
+
+@pytest.mark.parametrize("codec", ["gaussians-ply", "gaussians-zstd"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda static, sections: static.update(num_gaussians=static["num_gaussians"] - 1),
+        lambda static, sections: static.update(num_gaussians=2**32 - 1),
+        lambda static, sections: static.update(num_gaussians=-1),
+        lambda static, sections: static.update(max_sh_degree=2, active_sh_degree=2),
+        lambda static, sections: static.update(max_sh_degree=4),
+        lambda static, sections: sections.update({name: data[:-1] for name, data in sections.items()}),
+        lambda static, sections: sections.update({name: data + b"\0" for name, data in sections.items()}),
+        lambda static, sections: sections.update(dict.fromkeys(sections, b"")),
+        lambda static, sections: sections.update({name: b"ply\n" + data for name, data in sections.items()}),
+        lambda static, sections: sections.clear(),
+    ],
+)
+def test_a_file_that_contradicts_itself_is_refused_before_memory_is_taken(plugins, model, codec, change):
+    reader = rewritten(written(plugins, codec, model).to_bytes(), change)
+    tracemalloc.start()
+    try:
+        with pytest.raises(BitstreamError, match=r"file\.swz"):
+            decode_gaussians(plugins, reader)
+        assert tracemalloc.get_traced_memory()[1] < 4 * 236 * model.num_rows + 100_000
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_ply_with_another_header_is_refused(plugins, model):
+    def swap(static, sections):
+        sections["ply"] = sections["ply"].replace(b"property float nx", b"property float x2")
+
+    with pytest.raises(BitstreamError, match=r"section 'ply': is no \.ply of 500 Gaussians"):
+        decode_gaussians(plugins, rewritten(written(plugins, "gaussians-ply", model).to_bytes(), swap))
