@@ -4,7 +4,7 @@ import math
 
 import pytest
 import torch
-from sw_gaussians import density
+from sw_gaussians.config import MCMC
 from sw_gaussians.mcmc import draw
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.statistics import accumulate_statistics
@@ -21,7 +21,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
-from sw_3dgs.config import MCMC, ThreeDGSConfig
+from sw_3dgs.config import ThreeDGSConfig
 
 pytestmark = [
     pytest.mark.cuda,

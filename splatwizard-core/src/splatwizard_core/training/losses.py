@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -11,7 +12,6 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.training.native import TRAINING
-from splatwizard_core.training.stage import LossPack
 
 Padding = Literal["same", "valid"]
 
@@ -19,6 +19,14 @@ RADIUS = 5  # 11 x 11 window
 SIGMA = 1.5
 C1 = 0.01**2
 C2 = 0.03**2
+
+
+@dataclass
+class LossPack:
+    """The loss of one step: `total` is what backward starts from, `parts` are what the log shows (scalars)."""
+
+    total: Tensor
+    parts: dict[str, Tensor] = field(default_factory=dict)
 
 
 def ssim(x: Tensor, y: Tensor, *, padding: Padding = "same") -> Tensor:

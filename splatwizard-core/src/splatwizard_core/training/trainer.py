@@ -22,11 +22,12 @@ from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.interrupt import InterruptGuard
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scalars import Verdict
 from splatwizard_core.training.scheduler import build_schedulers
-from splatwizard_core.training.stage import CameraIterator, LossPack, Stage
+from splatwizard_core.training.stage import CameraIterator, Stage
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
 
