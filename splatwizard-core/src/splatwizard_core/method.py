@@ -76,8 +76,9 @@ class Method:
 def create_method(
     plugins: PluginManager, name: str, config: Mapping[str, Any] | None = None, *, preset: str = "paper"
 ) -> Method:
-    """Another method by name, with values for its config by dotted key: how one method borrows from another.
+    """Return another method by name, with values for its config: how one method borrows from another.
 
+    config  values by dotted key, or nested as in a TOML file
     preset  values that it sets beyond the method's config (of the run or the scene, such as clamp_render) are left to
             the run: they are the user's, and one run has one of each
 
@@ -85,11 +86,11 @@ def create_method(
     """
     from splatwizard_core.errors import ConfigError
     from splatwizard_core.runs.config import apply_overrides
-    from splatwizard_core.runs.keys import is_beside_method
+    from splatwizard_core.runs.keys import dotted, is_beside_method
 
     cls: type[Method] = plugins.methods.load(name)
     if preset not in cls.PRESETS:
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
     borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
-    values = {**borrowed, **(config or {})}
+    values = {**borrowed, **dotted(config or {}, "")}
     return cls(plugins, apply_overrides(cls.Config(), values, source=f"config of '{name}'"))

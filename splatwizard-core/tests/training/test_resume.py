@@ -8,7 +8,7 @@ import signal
 import numpy as np
 import pytest
 import torch
-from sw_gaussians import density
+from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.errors import CheckpointError, NothingToDo, TaskError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -345,7 +345,7 @@ class LateStage:
 
 
 def collect(model: GaussianModel, result: RenderResult):
-    density.accumulate_statistics(model, result.grad2d.value, result.radii)
+    accumulate_statistics(model, result.grad2d.value, result.radii)
 
 
 def register_later(scheduler: Scheduler):

@@ -7,10 +7,11 @@ import torch
 from torch import nn
 
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.pipeline import TrainingStopped
-from splatwizard_core.training.stage import CameraSampler, LossPack, Stage
+from splatwizard_core.training.stage import CameraSampler, Stage
 
 
 class Masked(SplatModel):

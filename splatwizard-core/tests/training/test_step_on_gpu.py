@@ -14,11 +14,11 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.device import device_reason
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.training import trainer as trainer_module
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scalars import Verdict, read_scalars
-from splatwizard_core.training.stage import LossPack
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
 
 TWO_GIB = 2 << 30

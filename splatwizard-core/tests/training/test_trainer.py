@@ -9,11 +9,11 @@ import torch
 from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import STOP
-from splatwizard_core.training.stage import LossPack
 from splatwizard_core.training.trainer import Trainer
 
 

@@ -73,8 +73,7 @@ class DistillationStage(FineTuningStage):
     rates           step sizes of the student
     distill_loss    see `distillation_loss`
     pseudo_view_std, pseudo_view_every  see PseudoViewSampler
-    teacher         what teaches, set by `begin`: nobody's part and in no checkpoint, since `begin` finds the same one
-                    again on resume
+    teacher         the model that teaches, set by `begin`; in no checkpoint, since `begin` finds the same one on resume
     """
 
     name = "distill"
@@ -94,19 +93,10 @@ class DistillationStage(FineTuningStage):
         self.distill_loss = distill_loss
         self.pseudo_view_std, self.pseudo_view_every = pseudo_view_std, pseudo_view_every
 
-    @property
-    def starts_from(self) -> str | None:
-        return None
-
-    @property
-    def taught_by(self) -> tuple[str, ...]:
-        """Names of the methods whose trained scenes `find_teacher` asks for."""
-        return ("3dgs",)
-
     def find_teacher(self, context: StageContext) -> SplatModel:
-        """The frozen model that teaches: the trained scene of `taught_by`.
+        """Return the frozen model that teaches: the trained scene of `taught_by`, which a subclass names.
 
-        Override it for another one, and then `taught_by` too. It must be the same on resume: made from
+        Override it for a teacher that is no method's trained scene. It must be the same on resume: made from
         `context.trained(...)`, or a copy of `context.model`, which is what the stage before left.
         """
         return context.trained(self.taught_by[0])

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import bisect
 import functools
 import inspect
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -76,9 +76,15 @@ class Scheduler:
             self.stage, plan, steps_of(plan), task, name, priority, len(self._entries), log, self._step or 0
         )
         # A new list: exec may be iterating over the old one.
-        entries = list(self._entries)
-        bisect.insort(entries, (entry, binding), key=lambda e: (e[0].priority, e[0].order))
-        self._entries = entries
+        self._entries = sorted([*self._entries, (entry, binding)], key=_order)
+
+    def reprioritise(self, kind: type, priority: int) -> None:
+        """Give all registered tasks that are instances of `kind` another priority.
+
+        So a stage that wraps another one makes room between the tasks that it has taken over.
+        """
+        changed = [(replace(e, priority=priority) if isinstance(e.task, kind) else e, b) for e, b in self._entries]
+        self._entries = sorted(changed, key=_order)
 
     @property
     def registrations(self) -> list[Registration]:
@@ -125,6 +131,10 @@ class Scheduler:
     def plan_lines(self) -> list[str]:
         """What identifies the plan: everything but what tasks registered while they ran."""
         return plan_lines([e for e in self.registrations if e.after == 0], [])
+
+
+def _order(entry: tuple[Registration, Binding]) -> tuple[int, int]:
+    return entry[0].priority, entry[0].order
 
 
 class PhaseSwitch:

@@ -163,7 +163,7 @@ class Trainer:
             clock.mark("post")
 
         if step < self.stage.iterations:
-            self.optimizer.step(result.visible if self.optimizer.sparse else None)
+            self.optimizer.step(result)
         self.optimizer.zero_grad()
         if clock:
             clock.mark("optimize")
