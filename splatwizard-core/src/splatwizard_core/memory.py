@@ -44,6 +44,12 @@ def reset_peak_rss() -> bool:
     return True
 
 
+def synchronize(device: torch.device) -> None:
+    """Wait until the device has done what it was given; a CPU is not waited for."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
 _UNITS = {"bytes": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
 
 

@@ -121,7 +121,7 @@ def test_out_of_memory_names_the_figures_and_leaves_the_run_resumable(toy, tmp_p
             [Fails(OptimizationParams(iterations=60))], directory=directory, ppl=PipelineParams(checkpoint_every=20)
         )
 
-    with pytest.raises(DeviceMemoryError, match=r"step 25 .* Gaussians at 12x10 .*2,147,483,648 bytes wanted") as info:
+    with pytest.raises(DeviceMemoryError, match=r"step 25 .* gaussians at 12x10 .*2,147,483,648 bytes wanted") as info:
         train(tmp_path / "run")
     assert info.value.wanted == TWO_GIB
     assert info.value.exit_status == 1

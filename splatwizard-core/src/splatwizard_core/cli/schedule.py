@@ -46,11 +46,10 @@ def schedule(
 
     A stage says what trained scene it starts from, and a stage or task of another package which one that is.
     """
-    import json
-
     from splatwizard_core.cli.setup import resolve_one
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.training.scheduler import build_schedulers, format_plan
+    from splatwizard_core.training.plan import format_plan, plan_rows, row_facts
+    from splatwizard_core.training.scheduler import build_schedulers
 
     plugins = load_plugins()
     if config_file is None:
@@ -68,7 +67,8 @@ def schedule(
         pre, post = build_schedulers(stage, resolved.ppl)
         parts = stage_parts(origins, stage, resolved.ppl)
         if as_json:
-            rows = json.loads(format_plan(pre, post, style="json", total=stage.iterations, verbose=verbose))
+            plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
+            rows = [row_facts(row, verbose=verbose) for row in plan]
             found.append(
                 {
                     "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,

@@ -27,6 +27,9 @@ class SplatModel(nn.Module):
     ROWS: tuple[str, ...] = ()
     """Names of the parameters and buffers whose first dimension is the primitive; attributes of the model."""
 
+    ROW_LABEL: str = "gaussians"
+    """The word for its primitives in progress lines and messages."""
+
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
 

@@ -1,4 +1,4 @@
-"""What happens between the steps of a stage and is no part of it: log, progress, evaluation, checkpoints, Ctrl-C."""
+"""The work between the steps of a stage: log, progress, evaluation, checkpoints, Ctrl-C."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from typing import Any
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.progress import track
 from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scalars import read_scalars
-from splatwizard_core.training.timing import LoopClock, synchronize
+from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
 
 log = logging.getLogger(__name__)
@@ -30,7 +30,7 @@ UNREAD_LINES = 8  # log lines whose losses stay on a GPU until they are read tog
 
 @dataclass
 class Progress:
-    """What a run accumulates over processes; part of every checkpoint.
+    """Figures that a run accumulates over processes; part of every checkpoint.
 
     stage_seconds   stage name -> wall clock of its loop without housekeeping
     stage_steps     stage name -> steps done
@@ -82,7 +82,6 @@ class Housekeeping:
         self.guard = InterruptGuard()
         self.clock = LoopClock(progress.stage_seconds.get(name, 0.0))
         self._save, self._label = save, label
-        self._rows_are = "anchors" if "num_anchors" in trainer.model.counts() else "gaussians"
         self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
         self._saved_at = -1
         self._stack = ExitStack()
@@ -113,7 +112,7 @@ class Housekeeping:
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
         with self.clock.paused():
             try:
-                self._bar.advance(1, loss=record.total, **{self._rows_are: record.num_rows})
+                self._bar.advance(1, loss=record.total, **{self.trainer.model.ROW_LABEL: record.num_rows})
                 if self.on_step is not None:
                     self.on_step(record)
                 self._log_step(record)

@@ -14,11 +14,11 @@ import torch
 from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, scaled, steps_of
+from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, steps_of
 from splatwizard_core.training.stage import Stage
 from splatwizard_core.training.tasks import POST_ONLY, SOURCES, Binding, TaskContext, bind
 
-__all__ = ["STOP", "PhaseSwitch", "Scheduler", "TaskContext", "build_schedulers", "format_plan", "plan_lines", "scaled"]
+__all__ = ["STOP", "PhaseSwitch", "Scheduler", "build_schedulers", "format_plan"]
 
 log = logging.getLogger(__name__)
 
@@ -88,7 +88,7 @@ class Scheduler:
 
     @property
     def registrations(self) -> list[Registration]:
-        """In order of execution."""
+        """All registrations in order of execution."""
         return [entry for entry, _ in self._entries]
 
     def check(self, context: TaskContext) -> None:
@@ -129,8 +129,8 @@ class Scheduler:
         return any(e.after > 0 and e.fires_in(step, None) for e in self.registrations)
 
     def plan_lines(self) -> list[str]:
-        """What identifies the plan: everything but what tasks registered while they ran."""
-        return plan_lines([e for e in self.registrations if e.after == 0], [])
+        """Return what identifies the plan: everything but what tasks registered while they ran."""
+        return plan_lines([e for e in self.registrations if e.after == 0])
 
 
 def _order(entry: tuple[Registration, Binding]) -> tuple[int, int]:
@@ -138,7 +138,7 @@ def _order(entry: tuple[Registration, Binding]) -> tuple[int, int]:
 
 
 class PhaseSwitch:
-    """Sugar for the common change of mode: `PhaseSwitch(10_000, "entropy").register(scheduler)`.
+    """Change of the model's phase at a step: `PhaseSwitch(10_000, "entropy").register(scheduler)`.
 
     At `step` it sets `model.phase = name`, or runs `task` instead if there is one. The plan shows it as
     "switch to <name>". The model keeps its phase in `state_dict_extra()["phase"]`, so that a resumed run has it.
@@ -158,7 +158,7 @@ class PhaseSwitch:
 
 
 def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Scheduler]:
-    """The plan of a stage, (pre, post), without scene, model or device: what is printed is what is run."""
+    """Return the plan of a stage, (pre, post), without scene, model or device: what is printed is what is run."""
     pre, post = Scheduler("pre"), Scheduler("post")
     stage.register_pre_task(pre, ppl, stage.opt)
     stage.register_post_task(post, ppl, stage.opt)
@@ -166,7 +166,7 @@ def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Sche
 
 
 def task_name(task: Callable[..., Any]) -> str:
-    """The name of a function with spaces; of the function inside a partial; of the class of a callable object."""
+    """Return the name of a function (also inside a partial) with spaces, or of a callable object's class."""
     while isinstance(task, functools.partial):
         task = task.func
     named = inspect.isroutine(task) or inspect.isclass(task)
