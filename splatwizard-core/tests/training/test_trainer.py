@@ -254,9 +254,9 @@ def test_a_step_leaves_no_graph_behind(toy):
 
 
 def test_stage_times_are_opt_in_and_add_up(toy):
-    assert toy.train(iterations=5).stage_breakdown is None
+    assert toy.train(iterations=5).breakdown == {}
     outcome = toy.train(iterations=20, ppl=PipelineParams(profile="stages"))
-    breakdown = outcome.stage_breakdown["toy"]
+    breakdown = outcome.breakdown["toy"]
     assert list(breakdown) == ["pre", "render", "loss", "backward", "post", "optimize"]
     assert all(seconds > 0 for seconds in breakdown.values())
     assert sum(breakdown.values()) <= outcome.train_s

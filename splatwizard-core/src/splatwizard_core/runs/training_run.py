@@ -233,7 +233,7 @@ def run_stages(
         "peak_bytes": outcome.peak_memory,
         "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
         "pictures_in": outcome.pictures_in,
-        "breakdown_s": outcome.stage_breakdown,
+        "breakdown_s": outcome.breakdown or None,
         "plan": outcome.plan,
         "rasterizers": outcome.rasterizers,
         "phases": parts.phases(outcome.provided),

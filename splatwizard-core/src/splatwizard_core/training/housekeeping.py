@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any
 
@@ -52,9 +52,6 @@ class Progress:
     @property
     def steps(self) -> int:
         return sum(self.stage_steps.values())
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 class Housekeeping:

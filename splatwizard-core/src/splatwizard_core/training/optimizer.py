@@ -77,11 +77,11 @@ class SplatOptimizer:
                 self._group_of[member] = name
 
     def lr(self, name: str) -> float:
-        """Current learning rate of a group."""
+        """Return the current learning rate of a group."""
         return self.groups[name].lr
 
     def set_lr(self, name: str, lr: float) -> None:
-        """Learning rate of a group from the next `step` on."""
+        """Set the learning rate of a group from the next `step` on."""
         self.groups[name].lr = lr
 
     @torch.no_grad()

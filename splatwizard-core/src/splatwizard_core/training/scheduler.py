@@ -29,7 +29,7 @@ class _Stop:
 
 
 STOP: Final = _Stop()
-"""What a task returns to end its training stage cleanly after the current step."""
+"""Returned by a task to end its training stage cleanly after the current step."""
 
 
 class Scheduler:
