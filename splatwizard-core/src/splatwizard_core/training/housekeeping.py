@@ -105,7 +105,7 @@ class Housekeeping:
         self._account()
 
     def after_step(self, record: StepRecord) -> None:
-        """Everything that is due after this step."""
+        """Do everything that is due after this step."""
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
         with self.clock.paused():
             try:

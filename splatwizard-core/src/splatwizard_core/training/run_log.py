@@ -19,8 +19,8 @@ from splatwizard_core.files import naming_full_disk, write_atomic
 class RunLog:
     """Appends lines to a file; None as the path: keeps nothing.
 
-    Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "num_gaussians" or "num_anchors",
-    "lr", "seconds"; or "task" (a task that logs); or "metrics" (an evaluation).
+    Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "lr", "seconds" and the model's
+    `counts()`; or "task" (a task that logs); or "metrics" (an evaluation).
     """
 
     def __init__(self, path: Path | None) -> None:

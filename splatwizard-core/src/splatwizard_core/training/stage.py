@@ -108,7 +108,7 @@ class Stage:
 
     @property
     def starts_from(self) -> str | None:
-        """Name of a method whose trained scene this stage starts from (the runner supplies it).
+        """Name of the method whose trained scene this stage starts from (the runner supplies it).
 
         None: it goes on from the stage before.
         """
