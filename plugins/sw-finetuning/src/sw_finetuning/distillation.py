@@ -1,4 +1,4 @@
-"""Learning from a frozen teacher instead of photographs: a trained scene's renders, also from poses nobody stood at.
+"""Learning from a frozen teacher instead of photographs: a trained scene's renders, also from poses without a photograph.
 
 Source: LightGaussian (arXiv 2311.17245), distillation with pseudo views.
 """
@@ -29,7 +29,7 @@ DistillLoss = Literal["l1_ssim", "l2"]
 
 
 class PseudoViewSampler(CameraSampler):
-    """Training poses, most of them moved a little: views without a picture, for whoever has a teacher to ask.
+    """Training poses, most of them moved a little: those are views without a picture, for a teacher to draw.
 
     std     standard deviation of the camera centre's displacement along each axis, world units
     every   each `every`-th step keeps the training view as it is, the others move it; 1: none is moved

@@ -38,7 +38,7 @@ class Progress:
     peak_memory     bytes
     rasterizers     features asked for -> who served them
     pictures_in     where the training pictures were: "host" or "cuda"
-    provided        stage name -> what served it, as whoever started the training tells (JSON-able)
+    provided        stage name -> the rasterizers, pruners, ... that served it, as `train_stages(provided=...)` tells
     """
 
     stage_seconds: dict[str, float] = field(default_factory=dict)

@@ -93,7 +93,7 @@ class _Run:
         """
         stage, streams = self.stages[index], self.streams(index)
         if stage.starts_from is not None:
-            # The trained scene belongs to whoever made it, and other stages may be taught by it.
+            # A copy: the trained scene stays with the runner, and other stages may be taught by it.
             model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True).train()
         elif model is None:
             model = self.create_model()

@@ -175,7 +175,7 @@ def format_plan(
     pre, post   the two schedulers of a stage
     total       last step T; None: as far as the plans reach
     verbose     also first step, last step and number of executions up to T
-    origin      (task) -> whose it is, a column of the table if any of them is somebody else's; "" for the stage's own
+    origin      (task) -> whose it is, a column of the table if any of them is another package's; "" for the stage's own
     """
     cells = [["Stage", "Task", "Plan", *(["First", "Last", "Runs"] if verbose else [])]]
     for row in plan_rows(pre.registrations, post.registrations, total=total):

@@ -1,6 +1,6 @@
 """log.jsonl: one JSON object a line, appended while a run trains; a resumed run takes back what it will do again.
 
-A line is there once its line break is: whoever reads while a run writes passes over what follows the last one.
+A line is there once its line break is: a reader passes over what follows the last line break.
 """
 
 from __future__ import annotations
