@@ -54,6 +54,7 @@ from splatwizard_core.scene.scene import Scene as Scene
 from splatwizard_core.scene.scene import View as View
 from splatwizard_core.streams import stream as stream
 from splatwizard_core.training.learning_rate import exponential_lr as exponential_lr
+from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
 from splatwizard_core.training.optimizer import SplatOptimizer as SplatOptimizer
@@ -68,6 +69,6 @@ from splatwizard_core.training.scheduler import PhaseSwitch as PhaseSwitch
 from splatwizard_core.training.scheduler import Scheduler as Scheduler
 from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
-from splatwizard_core.training.stage import LossPack as LossPack
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
+from splatwizard_core.training.wrapped_stage import WrappedStage as WrappedStage

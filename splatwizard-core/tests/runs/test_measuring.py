@@ -8,8 +8,8 @@ import torch
 from lpips_backbones import write_backbones
 
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.measure import Asked
 from splatwizard_core.runs.config import parse_set, resolve
+from splatwizard_core.runs.measure import Asked
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import RunRequest, run
 from splatwizard_core.runs.session import Session

@@ -16,10 +16,10 @@ import pytest
 
 from splatwizard_core.errors import RunLockedError, SceneError
 from splatwizard_core.runs import lock
-from splatwizard_core.runs.training import FOLDER
+from splatwizard_core.runs.directory import StepLog
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.run import OWN_FILES, RunRequest, run
-from splatwizard_core.runs.directory import StepLog
+from splatwizard_core.runs.training import FOLDER
 from splatwizard_core.training.params import PipelineParams
 
 HOLD = """

@@ -15,13 +15,13 @@ from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardErr
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import RunRequest, run, train_only
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
+from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.scene.scene import PointCloud
 
 pytestmark = pytest.mark.pipeline
@@ -213,9 +213,8 @@ def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
-    from splatwizard_core.runs.training import cached_directory
     from splatwizard_core.runs.pretrained import base_config
-    from splatwizard_core.runs.training import train
+    from splatwizard_core.runs.training import cached_directory, train
 
     invocation = Run(toy_plugins, tmp_path)
     resolved = invocation.resolved()

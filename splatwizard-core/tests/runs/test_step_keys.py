@@ -23,15 +23,15 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs import file_digests, identity
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
-from splatwizard_core.runs.file_digests import FileDigests
-from splatwizard_core.runs.scene_digest import picture_files, scene_digest
-from splatwizard_core.training.keys import input_files
-from splatwizard_core.runs.run import RunRequest, run, run_directory, train_only
-from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.directory import StepLog
+from splatwizard_core.runs.file_digests import FileDigests
+from splatwizard_core.runs.run import RunRequest, run, run_directory, train_only
+from splatwizard_core.runs.scene_digest import picture_files, scene_digest
+from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.versions import changes, installed
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
+from splatwizard_core.training.keys import input_files
 from splatwizard_core.training.params import InputFile, OptimizationParams, Params
 
 pytestmark = pytest.mark.pipeline

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -36,7 +35,8 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     from splatwizard_core.plugins import load_plugins
     from splatwizard_core.plugins.origins import Origins
     from splatwizard_core.runs.phases import stage_parts
-    from splatwizard_core.training.scheduler import build_schedulers, format_plan
+    from splatwizard_core.training.plan import format_plan, plan_rows, row_facts
+    from splatwizard_core.training.scheduler import build_schedulers
 
     plugins = load_plugins()
     preset = chosen.preset or (None if chosen.config_file else "paper")
@@ -48,7 +48,8 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
         pre, post = build_schedulers(stage, resolved.ppl)
         parts = stage_parts(origins, stage, resolved.ppl)
         if as_json:
-            rows = json.loads(format_plan(pre, post, style="json", total=stage.iterations, verbose=verbose))
+            plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
+            rows = [row_facts(row, verbose=verbose) for row in plan]
             found.append(
                 {
                     "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,

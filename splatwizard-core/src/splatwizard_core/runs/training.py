@@ -257,7 +257,7 @@ class _StagesOfARun:
             "pretraining": self.before,
             "peak_bytes": outcome.peak_memory,
             "memory_kind": "cuda" if self.session.device.type == "cuda" else "rss",
-            "breakdown_s": outcome.stage_breakdown,
+            "breakdown_s": outcome.breakdown or None,
         }
         return {
             **{name: measured[name] for name in TrainBlock.model_fields if name in measured},
