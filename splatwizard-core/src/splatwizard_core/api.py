@@ -42,7 +42,8 @@ MODULES = {
     "streams": "stream",
     "coding.container": "ContainerReader ContainerWriter",
     "coding.contracts": "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder GaussianCodec",
-    "evaluation.metrics": "Metric MetricSetup PreparedMetric",
+    "evaluation.image": "ssim_map",
+    "evaluation.metrics": "MetricSetup PreparedMetric",
     "native": "NativeModule",
     "progress": "track",
 }

@@ -15,7 +15,7 @@ from splatwizard_core.errors import SceneError as SceneError
 from splatwizard_core.errors import ShapeError as ShapeError
 from splatwizard_core.errors import SplatwizardError as SplatwizardError
 from splatwizard_core.errors import UserInputError as UserInputError
-from splatwizard_core.evaluation.metrics import Metric as Metric
+from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.gaussian_method import GaussianMethod as GaussianMethod

@@ -32,8 +32,10 @@ class GaussianMethod(Method):
             check_gaussian_codec(plugins, self.config.codec)
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Nothing: it has no start of its own."""
-        raise SceneError(f"{self.name} starts from a trained 3dgs scene, not from points", path=scene.path)
+        """Raise SceneError: a stage starts from a trained scene, and there is no start from points."""
+        named = next((stage.starts_from for stage in self.stages() if stage.starts_from is not None), None)
+        start = f"a trained {named} scene" if named is not None else "a trained scene"
+        raise SceneError(f"{self.name} starts from {start}, not from points", path=scene.path)
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         """Write `model` with the codec of the config. Raises TypeError if it is no GaussianModel."""

@@ -117,8 +117,8 @@ def no_weights(render: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 def test_a_metric_that_cannot_run_or_load_is_null_with_its_reason(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(f"{IMAGE}.psnr_channel_mean", no_weights)
-    result = run(views(0, 1), weights=f"{IMAGE}:psnr_channel_mean", gone="no_such_module:x", l1=f"{IMAGE}:l1")
+    monkeypatch.setattr(f"{IMAGE}.ssim", no_weights)
+    result = run(views(0, 1), weights=f"{IMAGE}:ssim", gone="no_such_module:x", l1=f"{IMAGE}:l1")
     assert (result.metrics["weights"].mean, result.metrics["weights"].reason) == (None, "weights missing")
     assert "no_such_module" in (result.metrics["gone"].reason or "")
     assert result.metrics["l1"].mean is not None

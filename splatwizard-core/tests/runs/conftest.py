@@ -275,6 +275,10 @@ def absent(render, truth):
 """
 
 
+OURS = "datasets,metrics,reference"
+"""Packages that a run on the procedural scene needs beside the toy: no kernels, so that nothing is compiled."""
+
+
 @pytest.fixture(scope="session")
 def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder for PYTHONPATH that holds the distributions sw-toy and sw-helper."""
@@ -294,13 +298,13 @@ def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def toy_plugins(toy_site: Path):
     """The plugin manager with the core and sw-toy alone, here and in every process started from here."""
-    yield from _restricted(toy_site, "toy")
+    yield from _restricted(toy_site, f"toy,{OURS}")
 
 
 @pytest.fixture(scope="module")
 def helped_plugins(toy_site: Path):
     """The same with sw-helper."""
-    yield from _restricted(toy_site, "toy,helper")
+    yield from _restricted(toy_site, f"toy,helper,{OURS}")
 
 
 def _restricted(toy_site: Path, only: str):

@@ -12,8 +12,8 @@ from pydantic import Field
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.method import Method, create_method
 from splatwizard_core.runs.config import apply_overrides, parse_set, rate_points, resolve
-from splatwizard_core.training.values import parse_text
 from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.training.values import parse_text
 
 
 class Densify(Params):

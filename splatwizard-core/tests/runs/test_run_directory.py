@@ -16,10 +16,10 @@ import pytest
 
 from splatwizard_core.errors import RunLockedError, SceneError
 from splatwizard_core.runs import lock
-from splatwizard_core.runs.training import FOLDER
+from splatwizard_core.runs.directory import StepLog
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.run import OWN_FILES, RunRequest, run
-from splatwizard_core.runs.directory import StepLog
+from splatwizard_core.runs.training import CACHE
 from splatwizard_core.training.params import PipelineParams
 
 HOLD = """
@@ -188,7 +188,7 @@ def test_the_page_about_run_directories_says_what_is():
     if not page.exists():
         pytest.skip("no docs here: the package is tested alone")
     text = page.read_text(encoding="utf-8")
-    for name in (*OWN_FILES, lock.NAME, FOLDER):
+    for name in (*OWN_FILES, lock.NAME, CACHE):
         assert name in text, name
     for step in ("train", "encode", "decode", "evaluate", "record"):
         assert f"\n| {step} |" in text

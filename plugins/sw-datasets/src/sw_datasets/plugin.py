@@ -10,7 +10,7 @@ def register_datasets(registry: Registry) -> None:
     registry.add("blender", "sw_datasets.blender:BlenderDataset",
                  summary="transforms_train.json / transforms_test.json with RGBA pictures")  # fmt: skip
     registry.add("demo", "sw_datasets.demo.dataset:DemoDataset",
-                 default=True, summary="procedural scene with exact geometry, made on the spot")  # fmt: skip
+                 default=True, procedural=True, summary="procedural scene with exact geometry, made on the spot")  # fmt: skip
     collections = "sw_datasets.collections"
     registry.add("mipnerf360", f"{collections}:MIPNERF360",
                  summary="Mip-NeRF 360: COLMAP, nine scenes, every 8th view tested")  # fmt: skip

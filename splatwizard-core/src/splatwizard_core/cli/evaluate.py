@@ -28,6 +28,7 @@ from splatwizard_core.cli.options import (
 from splatwizard_core.cli.setup import (
     existing,
     lpips_folder,
+    metric_settings,
     open_session,
     output_folder,
     resolve_one,
@@ -99,6 +100,9 @@ def evaluate(
     if renders is not None:
         output_folder(renders)
     values = assignments(sets, images=images, device=device, seed=seed)
+    if lpips_weights is not None:
+        values["metrics.lpips.weights"] = str(Path(lpips_weights).resolve())
+    settings = metric_settings(plugins, values)
     stored = path.is_dir()
     if stored:
         if not (path / "config.toml").exists():
@@ -112,7 +116,7 @@ def evaluate(
         ppl, scene_options, said_scene = resolve_run_options(config_file, values)
         spec = scene or said_scene or "demo"
     asks_lpips = wanted is None or any(name.startswith("lpips") for name in wanted)
-    weights = lpips_folder(lpips_weights, quiet=quiet or not asks_lpips)
+    lpips_folder(lpips_weights, quiet=quiet or not asks_lpips)
     session = open_session(ppl, plugins)
 
     with contextlib.ExitStack() as stack:
@@ -140,7 +144,7 @@ def evaluate(
             session.device,
             ppl,
             metrics=wanted,
-            lpips_weights=weights,
+            metric_settings=settings,
             speed=not no_speed,
             repeats=repeats,
             renders=Path(renders) if renders else None,

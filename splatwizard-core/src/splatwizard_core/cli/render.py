@@ -56,12 +56,12 @@ def render(
     plugins = load_plugins()
     ppl, scene_options, said_scene = resolve_run_options(config_file, assignments(sets, images=images, device=device))
     session = open_session(ppl, plugins)
-    model, raster, _ = opener(path, plugins, session.device)()
+    opened = opener(path, plugins, session.device)()
     output_folder(out)  # only now: a file that cannot be opened leaves no empty folder
     loaded = load_scene(scene or said_scene or "demo", scene_options, plugins)
     chosen = {"test": loaded.test, "train": loaded.train, "all": [*loaded.train, *loaded.test]}[views]
     unique = list({view.name: view for view in chosen}.values())
-    files = render_views(model, raster, unique, loaded.background, plugins, session.device, ppl, Path(out))
+    files = render_views(opened, unique, loaded.background, plugins, session.device, ppl, Path(out))
     if as_json:
         print_json({"folder": out, "files": files})
     else:

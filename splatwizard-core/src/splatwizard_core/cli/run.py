@@ -82,13 +82,15 @@ def run(
     table, one page and rd.svg, their rate-distortion curves, in the folder above theirs.
     """
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.config import is_demo
+    from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
-    from splatwizard_core.runs.run import RunRequest
     from splatwizard_core.runs.run import run as run_one
 
     plugins = load_plugins()
     values = assignments(sets, images=images, device=device, seed=seed, init=init)
+    weights = lpips_folder(lpips_weights)
+    if weights is not None:
+        values["metrics.lpips.weights"] = str(weights)
     resolved = resolve_all(
         plugins, method_names(methods, config_file), rates,
         preset=preset, config_file=config_file, values=values, scene=scene,
@@ -97,17 +99,15 @@ def run(
     session = open_session(resolved[0].ppl, plugins)
     for each in resolved:
         session.scene(each)  # what is wrong with it is told before anything else is said
-    weights = lpips_folder(lpips_weights)
     say_device(resolved[0].ppl, session)
-    if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
+    if any(r.preset == "quick" and r.procedural for r in resolved) and preset is None:
         say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     finished: list[FinishedRun] = []
     written: list[Path] = []
     out_console = None if as_json else console()
     for each in resolved:
         request = RunRequest(
-            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, lpips_weights=weights,
-            repeats=repeats,
+            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, repeats=repeats,
         )  # fmt: skip
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))

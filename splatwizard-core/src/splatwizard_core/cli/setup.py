@@ -166,6 +166,17 @@ def resolve_run_options(
     return resolved.ppl, resolved.scene, tables.get("scene")
 
 
+def metric_settings(plugins: PluginManager, values: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Take the keys `metrics.GROUP.KEY` out of `values`; returns them by group, checked."""
+    from splatwizard_core.evaluation.metrics import check_settings
+    from splatwizard_core.training.keys import set_at
+
+    found: dict[str, Any] = {}
+    for key in [key for key in values if key.startswith("metrics.")]:
+        set_at(found, key.removeprefix("metrics."), values.pop(key))
+    return check_settings(plugins.metrics, found)
+
+
 def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
     """Threads and device as asked. Raises PluginError for rasterizers that are not installed, CapabilityError."""
     from splatwizard_core.runs.device import choose_device, set_threads

@@ -17,12 +17,11 @@ from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardErro
 from splatwizard_core.evaluation.speed import Spread, spread
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
 from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
-from splatwizard_core.training.timing import synchronize
 
 REPEATS = 3
 

@@ -25,7 +25,7 @@ from splatwizard_core.evaluation.metrics import MetricSettings
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.ply import load_ply
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -34,7 +34,6 @@ from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.timing import synchronize
 
 FEWEST_SPEED_VIEWS = 8
 

@@ -43,9 +43,7 @@ BEGUN = "begun"
 CACHE = ".trained"  # inside the output root: a scene that is trained for a run stays with the runs
 
 
-def train(
-    session: Session, request: RunRequest, directory: Path, *, stop_after: int | None = None
-) -> TrainedModel:
+def train(session: Session, request: RunRequest, directory: Path, *, stop_after: int | None = None) -> TrainedModel:
     """Return the trained model of this configuration on this scene, from wherever it already exists.
 
     request     with `resume` False neither a checkpoint nor another directory's training is used, only what this

@@ -12,13 +12,13 @@ from typing import Any
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.progress import track
 from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scalars import read_scalars
-from splatwizard_core.training.timing import LoopClock, synchronize
+from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
 
 log = logging.getLogger(__name__)

@@ -8,14 +8,10 @@ from contextlib import contextmanager
 
 import torch
 
+from splatwizard_core.memory import synchronize
+
 STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
 """The five stages of a step, the third in its two halves."""
-
-
-def synchronize(device: torch.device) -> None:
-    """Wait for the device; nothing to wait for on a CPU."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 class LoopClock:
