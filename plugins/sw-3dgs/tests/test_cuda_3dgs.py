@@ -12,7 +12,7 @@ from sw_gaussians.statistics import accumulate_statistics
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
@@ -36,7 +36,7 @@ def small_scene(channels: int) -> Scene:
     for i in range(6):
         angle = 2 * math.pi * i / 6
         eye = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.0])
-        camera = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=64, height=48, fov_x=0.8)
+        camera = Camera.look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=64, height=48, fov_x=0.8)
         pixels = torch.randint(0, 256, (48, 64, channels), generator=generator, dtype=torch.uint8).numpy()
         views.append(View(camera, f"view{i}.png", lambda pixels=pixels: pixels))
     points = PointCloud(torch.rand(500, 3, generator=generator) - 0.5, torch.rand(500, 3, generator=generator))

@@ -12,7 +12,7 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import save_ply
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides, resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
@@ -47,7 +47,9 @@ def plan_of(stage: ThreeDGSStage) -> dict[str, str]:
 def tiny_scene(background: str = "black", points: PointCloud | None = None) -> Scene:
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])
-    views = [View(look_at(e, target, up, width=16, height=16, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=16, height=16, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     return Scene("tiny", views, views[:1], points, Protocol("test", background=background))
 
 

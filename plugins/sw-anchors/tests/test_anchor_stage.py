@@ -11,7 +11,7 @@ from sw_anchors.stage import AnchorStage
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
@@ -39,7 +39,9 @@ def model_of(cls=CodedAnchors, **kwargs):
 def scene_of(extent=2.0):
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])
-    views = [View(look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     scene = Scene("tiny", views, views[:1], None, Protocol("test", background="black"))
     return SimpleNamespace(extent=extent, train=scene.train, views=views)
 

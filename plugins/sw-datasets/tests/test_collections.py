@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sw_datasets.colmap_model import ColmapCamera
 from sw_datasets.downloads.registry import load_registry
 from sw_datasets.families import BENCHMARKS, INDOOR, OUTDOOR
+from sw_datasets.loaders.colmap_model import ColmapCamera
 
 from splatwizard_core.errors import ConfigError, SceneError
 

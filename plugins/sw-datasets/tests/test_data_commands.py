@@ -23,7 +23,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 
-pytest.importorskip("pooch", reason="pip install 'splatwizard-core[download]'")
+pytest.importorskip("pooch", reason="pip install 'sw-datasets[download]'")
 
 REGISTRY = """
 [dataset.lab]
@@ -299,7 +299,7 @@ def test_without_pooch_the_extra_is_named_before_the_question(data: Path, site: 
     answer("y\n")
     assert main(["data", "fetch", "lab"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'splatwizard-core[download]'" in said
+    assert "pip install 'sw-datasets[download]'" in said
     assert "go on?" not in said
 
 
@@ -395,7 +395,7 @@ def test_what_is_wrong_with_a_scene_is_said(spoil, options: list[str], message: 
 
 
 def test_too_few_views_are_said(fetched: Path, capsys):
-    from sw_datasets.colmap_model import ColmapModel, read_model, write_model
+    from sw_datasets.loaders.colmap_model import ColmapModel, read_model, write_model
 
     model = read_model(fetched / "sparse" / "0")
     fewer = dict(list(model.images.items())[:-1])

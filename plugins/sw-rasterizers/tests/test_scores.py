@@ -15,7 +15,7 @@ from splatwizard_core.gaussians.inputs import SH
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from sw_rasterizers import scoring
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.scoring import CountRasterizer, PupRasterizer
@@ -38,7 +38,7 @@ def threads():
 
 def other_camera(width, height):
     eye, target, up = torch.tensor([[3.0, 0.5, -1.5], [0.0, 0.1, 0.0], [0.1, -1.0, 0.0]])
-    return look_at(eye, target, up, width=width, height=height, fov_x=0.8)
+    return Camera.look_at(eye, target, up, width=width, height=height, fov_x=0.8)
 
 
 def score_checks():

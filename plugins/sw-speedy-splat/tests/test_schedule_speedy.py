@@ -9,7 +9,7 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.rasterizer import GradBuffer, RenderResult
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
@@ -174,7 +174,9 @@ def splats(n: int, seed: int = 0) -> GaussianModel:
 def scene_of(n: int = 3) -> Scene:
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])[:n]
-    views = [View(look_at(e, target, up, width=16, height=16, fov_x=0.6), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=16, height=16, fov_x=0.6), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     return Scene("tiny", views, views[:1], None, Protocol("test"))
 
 

@@ -19,7 +19,8 @@ MODULES = {
     "runs.run": "run",
     "runs.device": "choose_device",
     "scene.loading": "load_scene",
-    "files": "file_sha256 full_disk_code new_folder replacing write_atomic write_json",
+    "scene.locate": "DATA_VARIABLE",
+    "files": "file_sha256 new_folder replacing write_atomic write_json",
     "progress": "Bar",
     "cores": "available_cores",
     "errors": "NativeBuildError PluginError RunLockedError",
@@ -27,8 +28,11 @@ MODULES = {
     "native.build": "declared_modules resolve_module",
     "native.toolchain": "find_compiler find_nvcc nvcc_version",
     "rendering.negotiation": "NegotiatedRasterizer info_from_entry obstacle",
-    "cli.options": "assignments console debug_option json_option options print_json set_option",
-    "cli.setup": "existing_file output_file output_folder resolve_run_options say",
+    "evaluation.metrics": "MetricInfo short_reason",
+    "cli.options": "console debug_option json_option options print_json say set_option",
+    "cli.complete": "complete_files complete_folders complete_image_folders complete_names complete_nothing",
+    "cli.paths": "existing_file output_file output_folder",
+    "cli.setup": "assignments resolve_run_options",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 

@@ -10,10 +10,10 @@ import torch
 from splatwizard_core.errors import SceneError, ShapeError
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud
 
-CAMERA = look_at(
+CAMERA = Camera.look_at(
     torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]), width=8, height=8, fov_x=1.0
 )
 

@@ -10,7 +10,7 @@ from sw_gaussians import density
 
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import GradBuffer, RasterizerInfo, RasterOptions, RenderResult
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer, exponential_lr
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
@@ -60,7 +60,7 @@ def make_scene(views=6, rgba=False, points=40, radius=3.0):
     made = []
     for i in range(views):
         angle = 2 * math.pi * i / views
-        camera = look_at(
+        camera = Camera.look_at(
             torch.tensor([radius * math.cos(angle), radius * math.sin(angle), 1.0]),
             torch.zeros(3),
             torch.tensor([0.0, 0.0, 1.0]),

@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatwizard_core.api import CapabilityError, SceneError, track
-from splatwizard_core.scene.images import FORMATS, find_pictures, load_mask, load_picture, picture_header
 from splatwizard_core.tooling import new_folder
-from sw_datasets.colmap import MAX_SIDE, PLAIN_FOCALS, RADIAL_FOCALS, mask_files, model_folder
-from sw_datasets.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model, write_model
+from sw_datasets.loaders.colmap import MAX_SIDE, PLAIN_FOCALS, RADIAL_FOCALS, mask_files, model_folder
+from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model, write_model
+from sw_datasets.pictures import FORMATS, find_pictures, load_mask, load_picture, picture_header
 
 SMALLEST_SHARE = 0.5
 """Of the undistorted picture that must survive when black corners are cut off; less means broken coefficients."""
@@ -123,7 +123,7 @@ def load_pycolmap() -> Any:
         return importlib.import_module("pycolmap")
     except ImportError as error:
         raise CapabilityError(
-            f"undistorting needs the package pycolmap ({error}): pip install 'splatwizard-core[pycolmap]'",
+            f"undistorting needs the package pycolmap ({error}): pip install 'sw-datasets[pycolmap]'",
             missing=["pycolmap"],
         ) from error
 

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.api import PluginManager, Scene, SceneError, SceneOptions, SplatwizardError, View, track
-from splatwizard_core.scene.images import find_pictures, is_inside, picture_header
 from splatwizard_core.tooling import file_sha256, load_scene
+from sw_datasets.pictures import find_pictures, is_inside, picture_header
 
 MAX_PROBLEMS = 5
 """Of one kind; more are counted."""

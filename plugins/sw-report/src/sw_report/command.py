@@ -98,14 +98,10 @@ def report(
 
 def open_scene(run: Run) -> Scene:
     """The scene of a run, read as the run read it. Raises what reading a scene raises."""
-    from splatwizard_core.api import SceneError
     from splatwizard_core.tooling import existing_file, load_plugins, load_scene, resolve_run_options
 
-    config = existing_file(str(run.directory / "config.toml"))
-    _, scene_options, spec = resolve_run_options(str(config), {})
-    if spec is None:
-        raise SceneError(f"{config} names no scene")
-    return load_scene(spec, scene_options, load_plugins())
+    resolved = resolve_run_options(str(existing_file(str(run.directory / "config.toml"))), {})
+    return load_scene(resolved.scene_spec, resolved.scene, load_plugins())
 
 
 def print_tables(tables: list[tuple[str, Table]], notes: list[str]) -> None:

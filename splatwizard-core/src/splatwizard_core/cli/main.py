@@ -44,12 +44,12 @@ class LazyGroup(click.Group):
             formatter.write_dl([(entry.name, entry.summary) for entry in command_entries()])
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
-        with _quiet_about_readers():
+        with _ended_by_reader():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a reader that goes away (`sw info x | head`) ends it quietly."""
-        with _quiet_about_readers():
+        with _ended_by_reader():
             result = super().invoke(ctx)
             sys.stdout.flush()
         return result
@@ -74,7 +74,7 @@ def command_entries() -> list[Entry]:
 
 
 @contextlib.contextmanager
-def _quiet_about_readers() -> Iterator[None]:
+def _ended_by_reader() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:

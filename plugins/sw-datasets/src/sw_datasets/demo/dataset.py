@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
-from splatwizard_core.scene.images import fitted_size
 from sw_datasets.demo.synthetic import SIZES, make_scene
 from sw_datasets.families import DEMO
+from sw_datasets.pictures import fitted_size
 from sw_datasets.rules import of_no_use, settle
 
 NO_USE = ("principal_point", "mask_background", "legacy_8bit_composite", "init_points")

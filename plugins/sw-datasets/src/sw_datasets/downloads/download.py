@@ -8,6 +8,7 @@ again. Beside FILE lie FILE.part, what came so far, and FILE.part.json, of what 
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import json
 import re
@@ -19,14 +20,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from splatwizard_core.api import CapabilityError, track
-from splatwizard_core.errors import FetchError
-from splatwizard_core.tooling import Bar, full_disk_code, write_json
+from splatwizard_core.tooling import Bar, write_json
+from sw_datasets.errors import FetchError
 
 CHUNK_BYTES = 1 << 15  # what a broken connection costs at most
 ATTEMPTS = 6  # in a row without one new byte; with the pauses below that is half a minute of silence
 PAUSE_SECONDS = 1.0  # before the second attempt; doubled for each further one
 TIMEOUT_SECONDS = 30.0  # without a byte
 MEGABYTE = 1_000_000
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 RETRIED = (408, 425, 429, 500, 502, 503, 504)
 """Answers that pass: too busy, being restarted."""
 
@@ -60,7 +62,7 @@ def require_pooch() -> Any:
         return importlib.import_module("pooch")
     except ImportError as error:
         raise CapabilityError(
-            f"downloading needs the package pooch ({error}): pip install 'splatwizard-core[download]'",
+            f"downloading needs the package pooch ({error}): pip install 'sw-datasets[download]'",
             missing=["pooch"],
         ) from error
 
@@ -177,7 +179,7 @@ class _Transfer:
                 self.pause(PAUSE_SECONDS * 2 ** (failures - 1))
                 continue
             except OSError as error:
-                if full_disk_code(error) is None:
+                if error.errno not in NO_SPACE:
                     raise
                 raise FetchError(
                     f"{self.path}: the disk is full; {self._have():,} bytes are kept, make space and give the same "

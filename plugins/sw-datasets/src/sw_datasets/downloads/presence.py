@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import DATA_VARIABLE
 from sw_datasets.downloads.registry import DataSet
 from sw_datasets.families import BENCHMARKS
 
-DATA_VARIABLE = "SPLATWIZARD_DATA"
 RECEIPTS = ".fetched"
 """Folder of a data set where `sw data fetch` keeps what it unpacked: one JSON file a scene."""
 

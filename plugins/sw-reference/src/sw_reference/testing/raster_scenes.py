@@ -10,7 +10,6 @@ from torch import Tensor
 
 from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
 from splatwizard_core.gaussians.spherical_harmonics import num_coefficients
-from splatwizard_core.scene.camera import look_at
 from sw_reference.projection import covariances
 from sw_reference.testing.naive_rasterizer import naive_render
 
@@ -90,7 +89,7 @@ def draw_scene(case: RasterCase, seed: int, dtype: torch.dtype = torch.float64) 
         g.features = randn(n, case.features)
 
     eye = torch.tensor([0.3, -0.4, -4.0], dtype=torch.float64)
-    cam = look_at(
+    cam = Camera.look_at(
         eye, torch.tensor([0.05, 0.1, 0.0], dtype=torch.float64), torch.tensor([0.1, -1.0, 0.0], dtype=torch.float64),
         width=case.width, height=case.height, fov_x=0.8,
     )  # fmt: skip

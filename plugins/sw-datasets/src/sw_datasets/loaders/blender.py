@@ -16,7 +16,8 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
-from splatwizard_core.scene.images import (
+from sw_datasets.families import BLENDER
+from sw_datasets.pictures import (
     find_pictures,
     fitted_size,
     load_composited,
@@ -24,7 +25,6 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from sw_datasets.families import BLENDER
 from sw_datasets.rules import Rules, of_no_use, settle
 
 HALF_CUBE = 1.3  # start points fill [-1.3, 1.3]^3 (3DGS)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
-from sw_datasets.blender import has_blender_layout, load_blender
-from sw_datasets.colmap import load_colmap, model_folder
-from sw_datasets.dtu import has_dtu_layout, load_dtu
-from sw_datasets.enu import has_enu_layout, load_enu
 from sw_datasets.families import BENCHMARKS, Family
+from sw_datasets.loaders.blender import has_blender_layout, load_blender
+from sw_datasets.loaders.colmap import load_colmap, model_folder
+from sw_datasets.loaders.dtu import has_dtu_layout, load_dtu
+from sw_datasets.loaders.enu import has_enu_layout, load_enu
 from sw_datasets.rules import Rules, settle
 
 AT_HOME, BY_SIGNS, BY_OWN_FILE = 0.9, 0.8, 0.9
@@ -22,8 +22,10 @@ AT_HOME, BY_SIGNS, BY_OWN_FILE = 0.9, 0.8, 0.9
 class Layout:
     """One way in which a family's scenes lie on disk.
 
-    looks_for   for messages
-    own         no other family of the core has this layout
+    is_there    whether a folder has this layout
+    load        reads such a folder
+    looks_for   the file by which it is known, for messages
+    own         no other family of this package has this layout
     """
 
     is_there: Callable[[Path], bool]
@@ -32,10 +34,12 @@ class Layout:
     own: bool = False
 
 
-COLMAP = Layout(lambda path: model_folder(path) is not None, load_colmap, "sparse/0/cameras.bin or .txt (run COLMAP)")
-BLENDER = Layout(has_blender_layout, load_blender, "transforms_train.json")
-ENU = Layout(has_enu_layout, load_enu, "poses_enu.json", own=True)
-DTU = Layout(has_dtu_layout, load_dtu, "sparse/0/cameras.bin beside cameras.npz", own=True)
+COLMAP_LAYOUT = Layout(
+    lambda path: model_folder(path) is not None, load_colmap, "sparse/0/cameras.bin or .txt (run COLMAP)"
+)
+BLENDER_LAYOUT = Layout(has_blender_layout, load_blender, "transforms_train.json")
+ENU_LAYOUT = Layout(has_enu_layout, load_enu, "poses_enu.json", own=True)
+DTU_LAYOUT = Layout(has_dtu_layout, load_dtu, "sparse/0/cameras.bin beside cameras.npz", own=True)
 
 
 class Collection:
@@ -90,9 +94,11 @@ class Collection:
         return next((layout for layout in self.layouts if layout.is_there(path)), None)
 
 
-MIPNERF360 = Collection(BENCHMARKS["mipnerf360"], [COLMAP])
-TANDT = Collection(BENCHMARKS["tandt"], [COLMAP])
-DB = Collection(BENCHMARKS["db"], [COLMAP])
-BUNGEE = Collection(BENCHMARKS["bungee"], [COLMAP, ENU])  # the archive with SfM points is what published tables use
-NERF_SYNTHETIC = Collection(BENCHMARKS["nerf_synthetic"], [BLENDER])
-DTU_SCANS = Collection(BENCHMARKS["dtu"], [DTU])
+MIPNERF360 = Collection(BENCHMARKS["mipnerf360"], [COLMAP_LAYOUT])
+TANDT = Collection(BENCHMARKS["tandt"], [COLMAP_LAYOUT])
+DB = Collection(BENCHMARKS["db"], [COLMAP_LAYOUT])
+BUNGEE = Collection(
+    BENCHMARKS["bungee"], [COLMAP_LAYOUT, ENU_LAYOUT]
+)  # the archive with SfM points is what published tables use
+NERF_SYNTHETIC = Collection(BENCHMARKS["nerf_synthetic"], [BLENDER_LAYOUT])
+DTU = Collection(BENCHMARKS["dtu"], [DTU_LAYOUT])

@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene
-from splatwizard_core.scene.images import (
+from sw_datasets.families import COLMAP
+from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
+from sw_datasets.pictures import (
     find_pictures,
     fitted_size,
     list_pictures,
@@ -20,8 +22,6 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
-from sw_datasets.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
-from sw_datasets.families import COLMAP
 from sw_datasets.rules import Rules, of_no_use, settle
 
 PLAIN_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}

@@ -1,4 +1,4 @@
-"""What was found in a scene, as plain values for `sw info SCENE`."""
+"""Facts of a scene as plain values, for `sw info SCENE`."""
 
 from __future__ import annotations
 

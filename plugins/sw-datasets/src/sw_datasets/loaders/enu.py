@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 
 from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
-from splatwizard_core.scene.images import fitted_size, list_pictures, load_picture, picture_header
+from sw_datasets.pictures import fitted_size, list_pictures, load_picture, picture_header
 from sw_datasets.rules import Rules, of_no_use
 
 POSES = "poses_enu.json"

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
-from splatwizard_core.scene.images import list_pictures
-from sw_datasets.colmap import load_colmap, mask_files, model_folder
+from sw_datasets.loaders.colmap import load_colmap, mask_files, model_folder
+from sw_datasets.pictures import list_pictures
 from sw_datasets.rules import Rules
 
 CAMERAS = "cameras.npz"
