@@ -10,7 +10,7 @@ from pydantic import BaseModel
 from sw_metrics.lpips_weights import BACKBONES
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.runs import measuring, record
+from splatwizard_core.runs import measure, record
 from splatwizard_core.scene.scene import Protocol
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -61,7 +61,7 @@ def test_every_field_of_the_record_has_a_row():
 
 def test_the_schema_and_the_flags_are_the_ones_that_are_written():
     assert f"schema {record.SCHEMA}" in PAGE
-    source = Path(measuring.__file__).read_text()
+    source = Path(measure.__file__).read_text()
     flags = re.findall(r'"([a-z-]+)": ', source.partition("told = {")[2].partition("}")[0])
     assert flags
     assert set(re.findall(r"`([\w-]+)`", row("flags").split("|")[2])) == set(flags)

@@ -152,7 +152,7 @@ ROWS = [
     Row("decode {cut.swz}", "truncated"),
     Row("decode {flipped.swz}", "flipped.swz"),
     Row("decode {newer.swz}", "newer.swz"),
-    Row("decode {mars.swz}", "pip install sw-method-from-mars"),
+    Row("decode {mars.swz}", "install the package that provides it"),
     Row("decode {later.swz}", "newer than"),
     Row("decode {hollow.swz}", "hollow.swz"),
     Row("info {cut.swz}", "truncated"),

@@ -262,7 +262,7 @@ def test_decoding_a_file_of_a_method_that_is_not_installed_says_what_to_install(
     said = " ".join(capsys.readouterr().err.split())
     assert said == (
         "error: x.swz was written by method 'method-from-mars', which is not installed: "
-        "pip install sw-method-from-mars (or the package that provides it)"
+        "install the package that provides it (`sw list-plugins` shows what is there)"
     )
 
 

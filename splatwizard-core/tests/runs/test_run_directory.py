@@ -198,7 +198,7 @@ def test_the_page_about_run_directories_says_what_is():
 
 
 def test_a_scene_that_no_record_can_name_is_refused_before_anything_is_written(tmp_path: Path):
-    resolved = SimpleNamespace(scene_spec=str(tmp_path / "caf\udce9"), method="toy", rate="r1")
+    resolved = SimpleNamespace(absolute_scene=str(tmp_path / "caf\udce9"), method="toy", rate="r1")
     with pytest.raises(SceneError, match="is not UTF-8"):
         run(None, RunRequest(resolved, tmp_path / "out"))
     assert not (tmp_path / "out").exists()

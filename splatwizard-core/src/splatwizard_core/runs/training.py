@@ -151,7 +151,7 @@ def _ordinary_run(parent: Path, key: str) -> Path | None:
 
 
 def finished_directory(directory: Path, key: str, cached: Path) -> Path | None:
-    """Find the directory (this, that of another rate point beside it, or `cached`) that holds this training, finished."""
+    """Find the directory with this finished training: `directory`, that of a rate point beside it, or `cached`."""
     beside = sorted(p for p in directory.parent.iterdir() if p.is_dir()) if directory.parent.is_dir() else []
     candidates = dict.fromkeys([directory, *beside, cached])
     return next((candidate for candidate in candidates if holds_training(candidate, key)), None)
