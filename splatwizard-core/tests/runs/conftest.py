@@ -139,6 +139,7 @@ class Secret(Toy):
 HELPER = '''
 """What another distribution lends: a stage, a task, a pruner, a coder. And `borrower`, a method made of such."""
 
+import torch
 import toy_method
 from splatwizard_core.method import create_method
 from splatwizard_core.plugins import hookimpl
@@ -158,6 +159,31 @@ def register_pruners(registry):
 @hookimpl
 def register_coders(registry):
     registry.add("toy-coder", "toy_helper:ToyPruner", summary="for tests")
+
+
+NOTES = []
+WATCH = False
+FAILS_AT = 0
+
+
+@hookimpl
+def run_started(training):
+    if WATCH:
+        NOTES.append(f"started {training.method} {training.directory.name} {training.scene.name}")
+        return Watcher()
+
+
+class Watcher:
+    """Draws random numbers, which the training must not notice."""
+
+    def after_step(self, model, record):
+        if record.step == FAILS_AT:
+            raise OSError("no screen")
+        torch.rand(3)
+        NOTES.append(f"step {record.step} of {model.num_rows}")
+
+    def finished(self):
+        NOTES.append("finished")
 
 
 class ToyPruner:
