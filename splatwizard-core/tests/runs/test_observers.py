@@ -40,7 +40,7 @@ def watched(helped_plugins: PluginManager, monkeypatch: pytest.MonkeyPatch):
 
 def test_an_observer_sees_every_step_and_changes_nothing(helped_plugins, watched, tmp_path, monkeypatch):
     found = Run(helped_plugins, tmp_path / "watched").train()
-    assert watched.NOTES == ["started toy r2 demo-tiny", *(f"step {i} of 60" for i in range(1, 7)), "finished"]
+    assert ["started toy r2 demo-tiny", *(f"step {i} of 60" for i in range(1, 7)), "finished"] == watched.NOTES
     monkeypatch.setattr(watched, "WATCH", False)
     assert Run(helped_plugins, tmp_path / "alone").train().model.digest() == found.model.digest()
 

@@ -63,7 +63,7 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
             key=f"pretrained.{beside}",
         )
     try:
-        base = resolve(cls, str(preset), sets=wanted, scene=outer.scene_spec, plugins=plugins)
+        base = resolve(cls, str(preset), sets=wanted, scene=outer.scene_spec or None, plugins=plugins)
     except ConfigError as error:
         # What the other method's configuration says of its keys, with the names that they have here.
         told = re.sub(r"\b(key|for|mean) '([\w.]+)'", r"\1 'pretrained.\2'", str(error))

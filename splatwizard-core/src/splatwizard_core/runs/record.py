@@ -58,7 +58,7 @@ def picked(block: type[Part], *sources: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class ProtocolBlock(Part):
-    """What makes results comparable: only equal ids may stand in one table. Rules that came later may stand beside."""
+    """The rules that make results comparable: only equal ids may stand in one table. Later rules may stand beside."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -83,7 +83,7 @@ class MetricBlock(Part):
 
 
 class SpreadBlock(Part):
-    """How much repeated measurements of one thing differ."""
+    """Spread of repeated measurements of one thing."""
 
     n: int = Field(ge=2, description="measurements")
     mean: float
@@ -184,7 +184,7 @@ class RecordFile(Part):
 
 
 class ProvidedBlock(Part):
-    """Who served: a registered thing by its kind and name, a training `stage`, or a `task` of another package."""
+    """A part that served: a registered thing by kind and name, a training `stage`, or a `task` of another package."""
 
     kind: str
     name: str

@@ -1,4 +1,4 @@
-"""What several runs of one command share: plugins, device, loaded scenes and trained models."""
+"""Plugins, device, loaded scenes and trained models that several runs of one command share."""
 
 from __future__ import annotations
 
