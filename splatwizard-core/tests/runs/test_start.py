@@ -15,13 +15,13 @@ from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardErr
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import save_ply
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import RunRequest, run, train_only
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
+from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.scene.scene import PointCloud
 
 pytestmark = pytest.mark.pipeline
@@ -213,16 +213,15 @@ def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
-    from splatwizard_core.runs.training import cached_directory
     from splatwizard_core.runs.pretrained import base_config
-    from splatwizard_core.runs.training import train
+    from splatwizard_core.runs.training import cached_directory, train
 
     invocation = Run(toy_plugins, tmp_path)
     resolved = invocation.resolved()
     base = base_config(toy_plugins, "toy", resolved)
     directory = cached_directory(invocation.session, base, tmp_path, training_key(invocation.session, base))
     with pytest.raises(KeyboardInterrupt), directory_lock(directory):
-        train(invocation.session, base, directory, trained=lambda name: pytest.fail(name), stop_after=2)
+        train(invocation.session, RunRequest(base, tmp_path), directory, stop_after=2)
     trained_scene(invocation.session, "toy", resolved, tmp_path)
     assert "the trained toy scene for this configuration is not finished yet: going on with it first" in invocation.said
 

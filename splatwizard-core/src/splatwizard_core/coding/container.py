@@ -65,7 +65,8 @@ class ContainerWriter:
     raster      what the decoded scene asks of a rasterizer, JSON values, such as {"antialias": False, "sh_degree": 3}
 
     `static` is a dict of JSON values that goes into the header: fill it in place. `requires` is what a reader is told
-    to install if it lacks something; whoever knows the installed distributions fills it.
+    to install if it lacks something; whoever knows the installed distributions fills it, from what was asked of the
+    registries and from `required`, the (kind, name) of what `require` stated.
     """
 
     def __init__(self, method: str, version: int, *, raster: Mapping[str, Any] | None = None) -> None:
@@ -77,6 +78,7 @@ class ContainerWriter:
         self.raster: dict[str, Any] = dict(raster or {})
         self.static: dict[str, Any] = {}
         self.requires: list[Requirement] = []
+        self.required: list[tuple[str, str]] = []
         self._sections: dict[str, bytes] = {}
 
     def add(self, name: str, data: bytes | bytearray | memoryview) -> None:
@@ -92,6 +94,14 @@ class ContainerWriter:
     def add_array(self, name: str, array: npt.ArrayLike) -> None:
         """Append a section that states dtype and shape: bool, (u)int8-64 or float16-64, at most 8 axes."""
         self.add(name, pack_array(array))
+
+    def require(self, kind: str, name: str) -> None:
+        """State that decoding needs a registered part that the method imports, such as ("entropy model", "columns").
+
+        What a method loads from a registry while it encodes is recorded without this.
+        """
+        if (kind, name) not in self.required:
+            self.required.append((kind, name))
 
     @property
     def sections(self) -> dict[str, int]:
@@ -276,6 +286,14 @@ class ContainerReader:
             return BitstreamError(f"{self.name}: {reason}", section=section)
         return BitstreamError(f"{self.name}: section '{section}': {reason}", section=section)
 
+    @property
+    def made_on(self) -> str | None:
+        """Description of the machine that alone can decode the file (header value `made_on`); None: any machine can."""
+        if "made_on" not in self.static:
+            return None
+        machine = self.static["made_on"]
+        return ", ".join(f"{key} {value}"[:80] for key, value in machine.items()) if isinstance(machine, dict) else "?"
+
     def __contains__(self, name: object) -> bool:
         return name in self._payload
 
@@ -373,11 +391,6 @@ class ContainerReader:
         if not isinstance(value, str) or value not in choices:
             raise self._damage(f"header value '{key}' is {value!r:.80}, must be one of {', '.join(choices)}", "header")
         return value
-
-    @property
-    def device_bound(self) -> bool:
-        """Whether the file decodes only on the machine that made it, which its header then names as `made_on`."""
-        return "made_on" in self.static
 
     def summary(self) -> dict[str, Any]:
         """What `sw info` prints: identity, requirements, and bytes by section that sum to `size`."""

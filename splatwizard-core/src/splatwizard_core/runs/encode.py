@@ -50,6 +50,7 @@ def encode(
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad(), method.plugins.recording() as loaded:
         method.encode(model, writer)
+    loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
     if method.name in method.plugins.methods:
         loaded.insert(0, method.plugins.methods.entry(method.name))
     writer.requires = requirements(loaded)

@@ -214,7 +214,7 @@ def opener(path: Path, plugins: PluginManager, device: torch.device) -> Callable
         if path.suffix == ".ply":
             return Opened(load_ply(path).to(device).eval().requires_grad_(False), {})
         model, reader = open_model(path, plugins, device)
-        return Opened(model, reader.raster, reader.device_bound)
+        return Opened(model, reader.raster, reader.made_on is not None)
 
     if path.suffix != ".ply":
         import_method(path, plugins)  # code is not memory of the model

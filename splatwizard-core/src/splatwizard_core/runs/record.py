@@ -155,9 +155,9 @@ class TrainBlock(Part):
     pictures_in: Annotated[str | None, WhyNull("trained by a release that did not note it")] = Field(
         description="where the training pictures lay: host, cuda"
     )
-    breakdown_s: Annotated[
-        dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")
-    ] = Field(description="stage -> part of a step -> seconds, if profiled")
+    breakdown_s: Annotated[dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")] = Field(
+        description="stage -> part of a step -> seconds, if profiled"
+    )
     trained_in: str | None = Field(description="rate point whose training this one shares (its own, as a rule)")
 
 
@@ -227,9 +227,9 @@ class Record(Part):
     geometry: Annotated[dict[str, float] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
-    phases: Annotated[
-        list[PhaseBlock] | None, WhyNull("trained or encoded by a release that did not note them")
-    ] = Field(description="who served each phase, with distribution and version")
+    phases: Annotated[list[PhaseBlock] | None, WhyNull("trained or encoded by a release that did not note them")] = (
+        Field(description="who served each phase, with distribution and version")
+    )
     environment: dict[str, Any]
     flags: list[str] = Field(description="fit, rss, ...")
     unknown: dict[str, str] = Field(description="dotted name of each null -> why")
