@@ -10,6 +10,7 @@ from pydantic import BaseModel
 from sw_metrics.lpips_weights import BACKBONES
 
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.runs import measure, record
 from splatwizard_core.scene.scene import Protocol
 
@@ -27,12 +28,12 @@ def row(first: str) -> str:
     return "\n".join(found)
 
 
-def core_metrics() -> list[str]:
-    return [entry.name for entry in load_plugins().metrics if entry.distribution == "splatwizard-core"]
+def our_metrics() -> list[str]:
+    return [entry.name for entry in load_plugins().metrics if is_ours(entry.distribution)]
 
 
 def test_every_metric_has_its_row_with_direction_and_kind():
-    for name in core_metrics():
+    for name in our_metrics():
         declared = load_plugins().metrics.entry(name).declared
         assert declared["direction"] in row(name)
         assert ("*diagnostic.*" in row(name)) == bool(declared.get("diagnostic")), name
@@ -43,7 +44,7 @@ def test_no_row_describes_a_metric_that_is_not_there():
     assert re.findall(r"^\| `(\w+)` \|", section, re.M) == list(
         dict.fromkeys(re.findall(r"^\| `(\w+)` \|", section, re.M))
     )
-    assert set(re.findall(r"^\| `(\w+)` \|", section, re.M)) == set(core_metrics())
+    assert set(re.findall(r"^\| `(\w+)` \|", section, re.M)) == set(our_metrics())
 
 
 @pytest.mark.parametrize("block", BLOCKS)

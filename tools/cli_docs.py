@@ -16,8 +16,8 @@ WIDTH = 100
 INTRODUCTION = """\
 # The command `sw`
 
-This page is generated from `--help` (`make docs`); a test holds the two together. It has the commands of all packages of
-this project; `sw --help` lists those that are installed, other people's among them.
+This page is generated from `--help` (`make docs`); a test holds the two together. It has the commands of all packages
+of this project; `sw --help` lists those that are installed, other people's among them.
 
 Exit status: 0 done, 1 failure, 2 wrong input, 130 interrupted. Errors are one or two lines on stderr; `--debug` adds a
 traceback. Results go to stdout, progress and messages to stderr; with `--json` stdout is one JSON object.

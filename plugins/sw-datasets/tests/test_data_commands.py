@@ -434,3 +434,19 @@ def test_the_views_that_synth_tells_are_those_that_are_read(layout, options, tmp
     assert main(["info", out, "--set", options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["views"] == {"train": 6, "test": 2}
+
+
+def test_synth_writes_a_scene_that_info_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["data", "synth", str(tmp_path / "s"), "--size", "tiny", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert main(["info", str(tmp_path / "s"), "--set", "test_every=4", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["dataset"] == "colmap"
+    assert found["views"] == {"train": written["train_views"], "test": written["test_views"]}
+    assert found["points"]["count"] == written["points"]
+
+
+def test_synth_leaves_a_folder_alone_that_holds_something(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "notes.txt").touch()
+    assert main(["data", "synth", str(tmp_path)]) == 2
+    assert "not an empty folder" in capsys.readouterr().err

@@ -21,7 +21,7 @@ from splatwizard_core.plugins import load_plugins
 
 # Not importorskip: the package imports only once torchvision does, which is what is tested.
 if importlib.util.find_spec("lpips") is None:
-    pytest.skip("LPIPS is the extra splatwizard-core[lpips]", allow_module_level=True)
+    pytest.skip("LPIPS is the extra sw-metrics[lpips]", allow_module_level=True)
 
 CPU = torch.device("cpu")
 
@@ -203,9 +203,9 @@ class TestWithoutWeights:
             raise importlib.metadata.PackageNotFoundError(name)
 
         monkeypatch.setattr(importlib.metadata, "version", absent)
-        with pytest.raises(CapabilityError, match=r"^package-missing: .*splatwizard-core\[lpips\]"):
+        with pytest.raises(CapabilityError, match=r"^package-missing: .*sw-metrics\[lpips\]"):
             VGG.prepare(setup_with(lpips_folder))
-        assert "splatwizard-core[lpips]" in (not_available(lpips_folder) or "")
+        assert "sw-metrics[lpips]" in (not_available(lpips_folder) or "")
 
 
 def test_weights_that_are_brought_change_what_a_finished_evaluation_is_asked_for(lpips_folder: Path):

@@ -23,7 +23,7 @@ LPIPS = ("lpips_vgg_3dgs", "lpips_vgg", "lpips_alex")
 def runs(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
     """One run, given three times: plain, with weights and repeats, plain again."""
     if importlib.util.find_spec("lpips") is None:
-        pytest.skip("LPIPS is the extra splatwizard-core[lpips]")
+        pytest.skip("LPIPS is the extra sw-metrics[lpips]")
     root = tmp_path_factory.mktemp("measured")
     weights = write_backbones(tmp_path_factory.mktemp("weights"), "alex")
     with pytest.MonkeyPatch.context() as patch:

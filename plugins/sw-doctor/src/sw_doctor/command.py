@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.cli.setup import DEFAULT_METHOD
-from splatwizard_core.tooling import debug_option, json_option, options, print_json
+from splatwizard_core.tooling import debug_option, json_option, load_plugins, options, print_json
 
 if TYPE_CHECKING:
     from sw_doctor import Diagnosis
@@ -25,7 +24,7 @@ def doctor(as_json: bool) -> None:
     """
     from sw_doctor import examine
 
-    found = examine(DEFAULT_METHOD)
+    found = examine(load_plugins().methods.default)
     if as_json:
         print_json(found.as_dict())
     else:

@@ -25,7 +25,7 @@ from sw_metrics.conventions import check_pair
 from sw_metrics.lpips_weights import BACKBONES, Weights, check_folder, find_weights, load_weights
 from sw_metrics.torchvision_import import import_torchvision
 
-EXTRA = "splatwizard-core[lpips]"
+EXTRA = "sw-metrics[lpips]"
 SMALLEST = {"vgg": 16, "alex": 31}  # pixels; below, a pooling layer is left with nothing
 
 

@@ -7,8 +7,18 @@ from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.tooling import console, debug_option, options, output_file, output_folder, print_json, say
+from splatwizard_core.tooling import (
+    complete_files,
+    complete_folders,
+    complete_names,
+    console,
+    debug_option,
+    options,
+    output_file,
+    output_folder,
+    print_json,
+    say,
+)
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
@@ -19,11 +29,11 @@ FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
 
 
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
-@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete.folders)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete_folders)
 @options(
-    click.option("--html", metavar="FILE", shell_complete=complete.files,
+    click.option("--html", metavar="FILE", shell_complete=complete_files,
                  help="Write one self-contained page there.  [default: none]"),
-    click.option("--survey", metavar="FOLDER", shell_complete=complete.folders,
+    click.option("--survey", metavar="FOLDER", shell_complete=complete_folders,
                  help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
                  "[default: none]"),
     click.option("--csv", "form", flag_value="csv",
@@ -32,7 +42,7 @@ FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
-    click.option("--anchor", metavar="METHOD", shell_complete=complete.names("method"),
+    click.option("--anchor", metavar="METHOD", shell_complete=complete_names("method"),
                  help="What BD-rates compare against.  [default: hac, lightgaussian, "
                  "3dgs, or the first]"),
     click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),

@@ -175,7 +175,7 @@ def notes(records: Sequence[Record]) -> list[str]:
 
 def reasons_of_metrics(records: Sequence[Record]) -> dict[str, list[str]]:
     """Why metrics have no mean -> which ones."""
-    from splatwizard_core.evaluation.metrics import short_reason
+    from splatwizard_core.tooling import short_reason
 
     found: dict[str, dict[str, None]] = {}
     for record in records:

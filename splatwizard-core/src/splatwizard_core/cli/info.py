@@ -121,7 +121,7 @@ def _print_file(facts: dict[str, Any]) -> None:
     sections = [[name, f"{n:,}", f"{n / facts['size']:.1%}"] for name, n in facts["bytes"].items()]
     click.echo(without_orders("\n".join(lines)))
     total = ["file", f"{facts['size']:,}", "100.0%"]
-    shared.print_table(["section", "bytes", "share"], [*sections, total], right=2)
+    shared.print_table(["section", "bytes", "share"], [*sections, [], total], right=2)
     for reason in facts["missing"].values():
         click.echo(without_orders(reason))
 
@@ -134,14 +134,15 @@ def _print_record(facts: dict[str, Any]) -> None:
     if facts["phases"] is None:
         click.echo("who served which phase is not known of this record")
         return
-    rows = []
+    rows: list[list[str]] = []
     for phase in facts["phases"]:
         served: dict[str, list[str]] = {}
         for part in phase["provided_by"]:
             owner = f"{part['distribution']} {part['version']}".strip() or "no distribution"
             served.setdefault(owner, []).append(f"{part['kind']} {part['name']}")
-        for owner, parts in (served or {"": ["-"]}).items():
-            rows.append([phase["phase"], ", ".join(parts), owner])
+        for i, (owner, parts) in enumerate((served or {"": ["-"]}).items()):
+            rows.append(["" if i else phase["phase"], ", ".join(parts), owner])
+        rows.append([])
     shared.print_table(["phase", "provided by", "from"], rows)
 
 

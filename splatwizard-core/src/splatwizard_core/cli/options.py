@@ -149,6 +149,7 @@ def print_table(columns: list[str], rows: list[list[str]], *, title: str | None 
     """Print a table on stdout as it is: brackets in its cells are no markup.
 
     columns     headings; empty: a table without
+    rows        an empty one is a line between sections
     right       columns at the end that are aligned to the right
     """
     from rich.markup import escape
@@ -159,5 +160,8 @@ def print_table(columns: list[str], rows: list[list[str]], *, title: str | None 
     for index, heading in enumerate(columns or [""] * width):
         table.add_column(heading, justify="right" if index >= width - right else "left", overflow="fold")
     for row in rows:
-        table.add_row(*map(escape, row))
+        if row:
+            table.add_row(*map(escape, row))
+        else:
+            table.add_section()
     console().print(table)

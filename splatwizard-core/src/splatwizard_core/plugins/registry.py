@@ -126,7 +126,7 @@ class Registry(Generic[T_co]):
         if name in self._entries:
             return self._entries[name]
         if name in self._clashes:
-            owners = " and ".join(f"{e.distribution} {e.version}" for e in self._clashes[name])
+            owners = " and ".join(sorted(f"{e.distribution} {e.version}" for e in self._clashes[name]))
             raise PluginError(
                 f"{self.kind} '{name}' is claimed by {owners}: uninstall one, or restrict with SW_PLUGINS"
             )
