@@ -9,9 +9,10 @@ from lpips_backbones import write_backbones
 
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.measure import Scope
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import RunRequest, run
+from splatwizard_core.runs.run import run
 from splatwizard_core.runs.session import Session
 
 pytestmark = pytest.mark.pipeline

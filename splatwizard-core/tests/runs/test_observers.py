@@ -8,8 +8,9 @@ import torch
 
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.observers import Observers
-from splatwizard_core.runs.run import RunRequest, train_in, train_only
+from splatwizard_core.runs.run import train_in, train_only
 from splatwizard_core.runs.session import Session
 
 pytestmark = pytest.mark.pipeline

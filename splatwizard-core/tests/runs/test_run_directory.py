@@ -16,9 +16,9 @@ import pytest
 
 from splatwizard_core.errors import RunLockedError, SceneError
 from splatwizard_core.runs import lock
-from splatwizard_core.runs.directory import StepLog
+from splatwizard_core.runs.directory import OWN_FILES, RunRequest, StepLog
 from splatwizard_core.runs.lock import directory_lock
-from splatwizard_core.runs.run import OWN_FILES, RunRequest, run
+from splatwizard_core.runs.run import run
 from splatwizard_core.runs.training import CACHE
 from splatwizard_core.training.params import PipelineParams
 

@@ -16,10 +16,11 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import save_ply
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import RunRequest, run, train_only
+from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.scene.scene import PointCloud

@@ -23,9 +23,9 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs import file_digests
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
-from splatwizard_core.runs.directory import StepLog
+from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
 from splatwizard_core.runs.file_digests import FileDigests
-from splatwizard_core.runs.run import RunRequest, run, run_directory, train_only
+from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.scene_digest import picture_files, scene_digest
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.versions import changes, installed
