@@ -189,12 +189,11 @@ def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
 
 
 def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
-    from splatwizard_core.cli.setup import resolve_all
+    from splatwizard_core.cli.setup import Choices
 
     def resolved(*methods: str, **values: str) -> list[ResolvedConfig]:
-        return resolve_all(
-            toy_plugins, methods, None, preset=None, config_file=None, values=values, scene="demo:tiny"
-        )  # fmt: skip
+        sets = tuple(f"{key}={value}" for key, value in values.items())
+        return Choices(methods=methods, sets=sets, scene="demo:tiny").resolve(toy_plugins)
 
     plain, student = resolved("toy", "toy-student", init=str(ply))
     assert (plain.init, student.init) == ("", str(ply))
