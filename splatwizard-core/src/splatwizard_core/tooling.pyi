@@ -39,6 +39,7 @@ from splatwizard_core.progress import Bar as Bar
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.device import choose_device as choose_device
+from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.lock import directory_lock as directory_lock
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun
 from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
@@ -49,5 +50,6 @@ from splatwizard_core.runs.record import SCHEMA as SCHEMA
 from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import read_record as read_record
 from splatwizard_core.runs.run import run as run
+from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE

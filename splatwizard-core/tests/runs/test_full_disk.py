@@ -22,7 +22,8 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.decode import open_model
-from splatwizard_core.runs.run import RunRequest, run, train_only
+from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.training.run_log import RunLog

@@ -12,10 +12,11 @@ from splatwizard_core.errors import CheckpointError, RunLockedError, Splatwizard
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.decode import open_model, save_decoded, timed_decode
+from splatwizard_core.runs.directory import RunRequest, run_directory
 from splatwizard_core.runs.fresh import FreshProcessError, decode_fresh, run_fresh
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.record import Record, read_record
-from splatwizard_core.runs.run import RunRequest, run, run_directory, train_in, train_only
+from splatwizard_core.runs.run import run, train_in, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training import trained_scene
 

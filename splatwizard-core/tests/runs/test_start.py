@@ -16,10 +16,11 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import RunRequest, run, train_only
+from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.scene.scene import PointCloud
@@ -188,12 +189,11 @@ def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
 
 
 def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
-    from splatwizard_core.cli.setup import resolve_all
+    from splatwizard_core.cli.setup import Choices
 
     def resolved(*methods: str, **values: str) -> list[ResolvedConfig]:
-        return resolve_all(
-            toy_plugins, methods, None, preset=None, config_file=None, values=values, scene="demo:tiny"
-        )  # fmt: skip
+        sets = tuple(f"{key}={value}" for key, value in values.items())
+        return Choices(methods=methods, sets=sets, scene="demo:tiny").resolve(toy_plugins)
 
     plain, student = resolved("toy", "toy-student", init=str(ply))
     assert (plain.init, student.init) == ("", str(ply))
@@ -221,7 +221,7 @@ def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
     base = base_config(toy_plugins, "toy", resolved)
     directory = cached_directory(invocation.session, base, tmp_path, training_key(invocation.session, base))
     with pytest.raises(KeyboardInterrupt), directory_lock(directory):
-        train(invocation.session, base, directory, trained=lambda name: pytest.fail(name), stop_after=2)
+        train(invocation.session, RunRequest(base, tmp_path), directory, stop_after=2)
     trained_scene(invocation.session, "toy", resolved, tmp_path)
     assert "the trained toy scene for this configuration is not finished yet: going on with it first" in invocation.said
 

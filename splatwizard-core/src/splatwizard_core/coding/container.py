@@ -392,11 +392,6 @@ class ContainerReader:
             raise self._damage(f"header value '{key}' is {value!r:.80}, must be one of {', '.join(choices)}", "header")
         return value
 
-    @property
-    def device_bound(self) -> bool:
-        """Whether the file decodes only on the machine that made it, which its header then names as `made_on`."""
-        return "made_on" in self.static
-
     def summary(self) -> dict[str, Any]:
         """What `sw info` prints: identity, requirements, and bytes by section that sum to `size`."""
         return {

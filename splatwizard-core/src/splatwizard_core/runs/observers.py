@@ -110,7 +110,7 @@ class FinishedRun:
 
 @dataclass(frozen=True)
 class FinishedRuns:
-    """What a command has finished: one run, or at its end all of them.
+    """The runs that a command has finished: one, or at its end all of them.
 
     complete    the command ends: these are all its runs
     console     where tables may be printed; None: the user asked for JSON

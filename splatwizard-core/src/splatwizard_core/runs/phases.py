@@ -102,7 +102,10 @@ class StageParts:
             self._mark = len(self._loaded)
 
     def phases(self, provided: Mapping[str, Sequence[Part]]) -> list[dict[str, Any]]:
-        """Return the phases of the training; `provided`: the parts that `since_asked` told during each stage, by its name."""
+        """Return the phases of the training.
+
+        provided    stage name -> the parts that `since_asked` told during it
+        """
         found = [_phase(TRAIN, self._common)] if self._common else []
         for fixed, (name, parts) in zip(self._fixed, provided.items(), strict=True):
             found.append(_phase(f"{TRAIN}: {name}", [*fixed, *parts]))
@@ -115,7 +118,7 @@ def phases_of_run(
     encoding: Mapping[str, Any],
     rasterizers: Mapping[str, str],
 ) -> list[dict[str, Any]] | None:
-    """Return all phases of a run from the facts of its steps; None if one was done by a release that did not note them."""
+    """Return all phases of a run from the facts of its steps; None if an older release did one, which noted none."""
     if "phases" not in training or "parts" not in encoding:
         return None
     return [

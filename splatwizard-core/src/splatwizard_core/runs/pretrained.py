@@ -36,7 +36,7 @@ def make_method(plugins: PluginManager, resolved: ResolvedConfig) -> Method:
 
 
 def named_scenes(method: Method) -> list[str]:
-    """List the methods whose trained scenes its stages start from or are taught by; the one of the first stage first."""
+    """List the methods whose trained scenes the stages start from or are taught by, that of the first stage first."""
     stages = list(method.stages())
     names = [name for stage in stages for name in (stage.starts_from, *stage.taught_by) if name is not None]
     return list(dict.fromkeys(names))
@@ -63,7 +63,7 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
             key=f"pretrained.{beside}",
         )
     try:
-        base = resolve(cls, str(preset), sets=wanted, scene=outer.scene_spec, plugins=plugins)
+        base = resolve(cls, str(preset), sets=wanted, scene=outer.scene_spec or None, plugins=plugins)
     except ConfigError as error:
         # What the other method's configuration says of its keys, with the names that they have here.
         told = re.sub(r"\b(key|for|mean) '([\w.]+)'", r"\1 'pretrained.\2'", str(error))

@@ -58,7 +58,7 @@ def picked(block: type[Part], *sources: Mapping[str, Any]) -> dict[str, Any]:
 
 
 class ProtocolBlock(Part):
-    """What makes results comparable: only equal ids may stand in one table. Rules that came later may stand beside."""
+    """The rules that make results comparable: only equal ids may stand in one table. Later rules may stand beside."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -83,7 +83,7 @@ class MetricBlock(Part):
 
 
 class SpreadBlock(Part):
-    """How much repeated measurements of one thing differ."""
+    """Spread of repeated measurements of one thing."""
 
     n: int = Field(ge=2, description="measurements")
     mean: float
@@ -155,9 +155,9 @@ class TrainBlock(Part):
     pictures_in: Annotated[str | None, WhyNull("trained by a release that did not note it")] = Field(
         description="where the training pictures lay: host, cuda"
     )
-    breakdown_s: Annotated[
-        dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")
-    ] = Field(description="stage -> part of a step -> seconds, if profiled")
+    breakdown_s: Annotated[dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")] = Field(
+        description="stage -> part of a step -> seconds, if profiled"
+    )
     trained_in: str | None = Field(description="rate point whose training this one shares (its own, as a rule)")
 
 
@@ -184,7 +184,7 @@ class RecordFile(Part):
 
 
 class ProvidedBlock(Part):
-    """Who served: a registered thing by its kind and name, a training `stage`, or a `task` of another package."""
+    """A part that served: a registered thing by kind and name, a training `stage`, or a `task` of another package."""
 
     kind: str
     name: str
@@ -227,9 +227,9 @@ class Record(Part):
     geometry: Annotated[dict[str, float] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
-    phases: Annotated[
-        list[PhaseBlock] | None, WhyNull("trained or encoded by a release that did not note them")
-    ] = Field(description="who served each phase, with distribution and version")
+    phases: Annotated[list[PhaseBlock] | None, WhyNull("trained or encoded by a release that did not note them")] = (
+        Field(description="who served each phase, with distribution and version")
+    )
     environment: dict[str, Any]
     flags: list[str] = Field(description="fit, rss, ...")
     unknown: dict[str, str] = Field(description="dotted name of each null -> why")

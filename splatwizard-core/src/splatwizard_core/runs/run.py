@@ -17,12 +17,10 @@ from splatwizard_core.runs.config import METRICS, ResolvedConfig, content_hash
 from splatwizard_core.runs.decode import REPEATS
 from splatwizard_core.runs.directory import (
     ENCODED,
-    OWN_FILES,
     RENDERS,
     RunRequest,
     StepLog,
     begin,
-    discard,
     run_directory,
     write_config,
 )
@@ -49,8 +47,6 @@ from splatwizard_core.runs.training import pretraining, train
 from splatwizard_core.runs.versions import changes, installed, providers
 from splatwizard_core.scene.images import check_pictures, decode_all
 from splatwizard_core.training.keys import dotted
-
-__all__ = ["OWN_FILES", "RunRequest", "discard", "run", "run_directory", "train_in", "train_only"]
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 

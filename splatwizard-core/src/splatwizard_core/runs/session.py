@@ -1,4 +1,4 @@
-"""What several runs of one command share: plugins, device, loaded scenes and trained models."""
+"""Plugins, device, loaded scenes and trained models that several runs of one command share."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.native.build import declared_modules, resolve_module
 from splatwizard_core.native.loader import cache_root
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.file_digests import FileDigests
 from splatwizard_core.runs.scene_digest import scene_digest
@@ -61,7 +62,8 @@ class Session:
 
         def load() -> Scene:
             if not resolved.scene_spec:
-                raise SceneError("no scene is named, and no installed package makes one on the spot: give --scene")
+                package = package_of("default", "dataset") or "'splatwizard-core[all]'"
+                raise SceneError(f"no scene is named, and the default one is not there: pip install {package}")
             scene = load_scene(resolved.scene_spec, resolved.scene, self.plugins)
             for warning in scene.warnings:
                 self.say(f"scene {scene.name}: {warning}")

@@ -43,9 +43,7 @@ BEGUN = "begun"
 CACHE = ".trained"  # inside the output root: a scene that is trained for a run stays with the runs
 
 
-def train(
-    session: Session, request: RunRequest, directory: Path, *, stop_after: int | None = None
-) -> TrainedModel:
+def train(session: Session, request: RunRequest, directory: Path, *, stop_after: int | None = None) -> TrainedModel:
     """Return the trained model of this configuration on this scene, from wherever it already exists.
 
     request     with `resume` False neither a checkpoint nor another directory's training is used, only what this
@@ -153,7 +151,7 @@ def _ordinary_run(parent: Path, key: str) -> Path | None:
 
 
 def finished_directory(directory: Path, key: str, cached: Path) -> Path | None:
-    """Find the directory (this, that of another rate point beside it, or `cached`) that holds this training, finished."""
+    """Find the directory with this finished training: `directory`, that of a rate point beside it, or `cached`."""
     beside = sorted(p for p in directory.parent.iterdir() if p.is_dir()) if directory.parent.is_dir() else []
     candidates = dict.fromkeys([directory, *beside, cached])
     return next((candidate for candidate in candidates if holds_training(candidate, key)), None)
