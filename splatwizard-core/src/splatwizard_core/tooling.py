@@ -27,7 +27,7 @@ MODULES = {
     "evaluation.evaluate": "png_names",
     "evaluation.metrics": "MetricInfo short_reason",
     "errors": "NativeBuildError PluginError RunLockedError",
-    "native": "cache_root",
+    "native.loader": "cache_root",
     "native.build": "declared_modules",
     "native.toolchain": "installed_compilers",
     "rendering.negotiation": "NegotiatedRasterizer",

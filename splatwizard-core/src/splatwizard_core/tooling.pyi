@@ -27,8 +27,8 @@ from splatwizard_core.files import new_folder as new_folder
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
 from splatwizard_core.files import write_json as write_json
-from splatwizard_core.native import cache_root as cache_root
 from splatwizard_core.native.build import declared_modules as declared_modules
+from splatwizard_core.native.loader import cache_root as cache_root
 from splatwizard_core.native.toolchain import installed_compilers as installed_compilers
 from splatwizard_core.plugins.check import Check as Check
 from splatwizard_core.plugins.check import State as State

@@ -343,12 +343,12 @@ def ply(tmp_path: Path) -> Path:
     import torch
 
     from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.gaussians.ply import save_ply
+    from splatwizard_core.gaussians.ply import export_ply
     from splatwizard_core.scene.scene import PointCloud
 
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     path = tmp_path / "grey.ply"
-    save_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), path)
+    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), path)
     return path
 
 

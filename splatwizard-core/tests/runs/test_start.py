@@ -13,7 +13,7 @@ import torch
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import save_ply
+from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
@@ -49,7 +49,7 @@ class Run:
 def write_ply(path: Path, count: int = 90, seed: int = 0) -> Path:
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(count, 3, generator=generator) - 0.5
-    save_ply(GaussianModel.from_points(PointCloud(points, torch.full((count, 3), 0.5)), max_sh_degree=1), path)
+    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((count, 3), 0.5)), max_sh_degree=1), path)
     return path
 
 
@@ -158,7 +158,7 @@ def test_wrong_files(tmp_path, ply):
     damaged = GaussianModel.from_points(PointCloud(torch.rand(4, 3), torch.rand(4, 3)), max_sh_degree=0)
     with torch.no_grad():
         damaged.means[1, 2] = float("nan")
-    save_ply(damaged, tmp_path / "nan.ply")
+    export_ply(damaged, tmp_path / "nan.ply")
     (tmp_path / "x.swz").write_bytes(b"SPWZ....")
     (tmp_path / "cut.ply").write_bytes(ply.read_bytes()[:-9])
     for name, told in {

@@ -33,7 +33,7 @@ def build_kernels(
 
     Without this they are compiled when first used.
     """
-    from splatwizard_core.native import build_all
+    from splatwizard_core.native.build import build_all
     from splatwizard_core.plugins import load_plugins
 
     rows = build_all(

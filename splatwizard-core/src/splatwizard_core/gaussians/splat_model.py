@@ -81,5 +81,6 @@ class SplatModel(nn.Module):
         sha = hashlib.sha256(json.dumps(self.state_dict_extra(), sort_keys=True).encode())
         for name, tensor in sorted(self.state_dict().items()):
             sha.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
-            sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+            if tensor.numel():  # an empty tensor cannot be seen as bytes
+                sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
         return sha.hexdigest()

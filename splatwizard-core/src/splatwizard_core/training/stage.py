@@ -13,6 +13,7 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
+from splatwizard_core.training.plan import When, scaled
 
 if TYPE_CHECKING:
     from splatwizard_core.training.optimizer import SplatOptimizer
@@ -150,11 +151,12 @@ class Stage:
         """Which view is trained next."""
         return CameraSampler(scene.train, generator)
 
-    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        """Register what runs before rendering.
+    def when(self, when: When) -> When:
+        """Return a plan of the full run in steps of this one: scaled with `opt.scale_schedule`, else as it is."""
+        return scaled(when, self.opt.schedule_scale)
 
-        With `opt.scale_schedule` a plan is that of a shorter run: `plan.scaled(when, opt.schedule_scale)`.
-        """
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        """Register what runs before rendering, at the steps of `self.when(plan of the full run)`."""
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         """Register what runs between backward and the optimizer step."""

@@ -1,7 +1,7 @@
-"""Rows of an anchor model's parameters, side by side: what noise, rate and decoding of a step share.
+"""Operators of a training step on anchors, each one node of the graph of derivatives.
 
-One matrix of all numbers of an anchor, and gradients that are written into place: rows are taken once each, so nothing
-has to be summed (indexing a CUDA tensor sorts its index on the way back).
+Noise, rate and decoding of a step share one matrix of all numbers of an anchor. Gradients are written into place: rows
+are taken once each, so nothing has to be summed (indexing a CUDA tensor sorts its index on the way back).
 """
 
 from __future__ import annotations

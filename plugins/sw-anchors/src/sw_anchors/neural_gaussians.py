@@ -1,4 +1,4 @@
-"""From anchors to the Gaussians of a view, as one node of the graph: three networks that share their input.
+"""Neural Gaussians of a view, decoded from anchors by three networks: one node of the graph of derivatives.
 
 A step of training is bound by how many operators the host has to launch, not by what they compute. Written out, this
 was 215 operators forward and backward, each with a node of its own; here it is 90 in one (benchmarks/train_anchors.py).
@@ -19,7 +19,7 @@ _SHORTEST = 1e-12  # floor of a quaternion's norm, that of torch.nn.functional.n
 
 
 @dataclass(frozen=True)
-class Spawned:
+class NeuralGaussians:
     """M Gaussians with opacity > 0 of V anchors with k offsets each.
 
     means, opacities, scales, quats, colors     [M,...] as in GaussianInputs; differentiable
@@ -44,8 +44,8 @@ def spawn(
     scales: Tensor,
     masks: Tensor | None,
     networks: tuple[nn.Sequential, nn.Sequential, nn.Sequential],
-) -> Spawned:
-    """Decode V anchors for a camera at `center` [3], which gets no gradient.
+) -> NeuralGaussians:
+    """Decode the Gaussians of V anchors for a camera at `center` [3], which gets no gradient.
 
     positions [V,3], features [V,F], offsets [V,k,3], scales [V,6], masks [V,k] or None: as in AnchorAttributes
     networks    opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs
@@ -53,7 +53,7 @@ def spawn(
     Waits for the device once, for M.
     """
     parameters = [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
-    return Spawned(*_Spawn.apply(center, positions, features, offsets, scales, masks, *parameters))  # type: ignore[no-untyped-call]
+    return NeuralGaussians(*_Spawn.apply(center, positions, features, offsets, scales, masks, *parameters))  # type: ignore[no-untyped-call]
 
 
 class _Spawn(torch.autograd.Function):
