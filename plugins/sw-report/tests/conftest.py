@@ -33,6 +33,8 @@ def register_metrics(registry: Any) -> None:
         ("lpips_vgg_3dgs", "LPIPS (VGG, 3DGS)", 3), ("lpips_vgg", "LPIPS (VGG)", 4), ("lpips_alex", "LPIPS (Alex)", 5),
     ):  # fmt: skip
         registry.add(name, "nowhere:metric", summary="", direction="lower", label=label, digits=4, position=position)
+    registry.add("psnr_unrounded", "nowhere:metric", summary="", direction="higher", label="PSNR, unrounded", unit="dB",
+                 digits=2, diagnostic=True)  # fmt: skip
     registry.add("odd", "nowhere:metric", summary="", direction="lower", digits="many", position="first")
 
 

@@ -286,6 +286,11 @@ def test_metrics_are_written_as_they_declare():
     assert numbers.heading("LPIPS-VGG") == "LPIPS (VGG)"
 
 
+def test_a_diagnostic_metric_is_shown_by_its_exact_name():
+    assert numbers.heading("psnr_unrounded") == "psnr_unrounded"
+    assert numbers.score("psnr_unrounded", 27.2049) == "27.20"
+
+
 @pytest.mark.parametrize("name", ["not_installed", "odd"])
 def test_a_metric_that_declares_nothing_of_use_is_shown_by_its_name(name):
     assert numbers.heading(name) == name

@@ -55,14 +55,18 @@ class DatasetFacts:
 
 
 def metric_style(name: str) -> MetricStyle:
-    """Spelling of a metric, as its entry declares it; names are compared without case, and with `-` and `_` alike."""
+    """Spelling of a metric, as its entry declares it; names are compared without case, and with `-` and `_` alike.
+
+    A diagnostic metric, which tells conventions apart, is shown by its exact name.
+    """
     metrics = load_plugins().metrics
     key = metric_key(name)
     declared: Mapping[str, Any] = metrics.entry(key).declared if key in metrics else {}
     digits, position = declared.get("digits"), declared.get("position")
+    by_name = declared.get("diagnostic", False)
     return MetricStyle(
-        str(declared.get("label", name)),
-        str(declared.get("unit", "")),
+        name if by_name else str(declared.get("label", name)),
+        "" if by_name else str(declared.get("unit", "")),
         digits if isinstance(digits, int) and 0 <= digits < 16 else MetricStyle.digits,
         position if isinstance(position, (int, float)) else math.inf,
     )
