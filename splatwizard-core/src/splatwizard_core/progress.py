@@ -129,7 +129,7 @@ def track(
 ) -> Iterator[Bar]:
     """Show the progress of one long step.
 
-        with track("train 3dgs", total=7000, start=1200) as bar:
+        with track("train", total=7000, start=1200) as bar:
             bar.advance(1, loss=0.03, gaussians=120_331)
 
     label   what is being done

@@ -40,7 +40,7 @@ def gather() -> dict[str, Any]:
         for info in plugins.plugins
     ]
     clashes = [
-        {"kind": kind, "name": name, "distributions": sorted(f"{e.distribution} {e.version}" for e in entries)}
+        {"kind": kind, "name": name, "distributions": [f"{e.distribution} {e.version}" for e in entries]}
         for kind, registry in plugins.registries.items()
         for name, entries in registry.clashes.items()
     ]

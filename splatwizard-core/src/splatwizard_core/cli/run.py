@@ -10,7 +10,7 @@ import click
 
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import output_folder
-from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices, warn_of_metrics
+from splatwizard_core.cli.setup import Choices, open_training_session, say_device, takes_choices, warn_of_metrics
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
@@ -41,6 +41,7 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     output_folder(out)
     session = open_training_session(resolved, plugins)
     warn_of_metrics(session, None, resolved[0].metrics)
+    say_device(resolved[0].ppl, session)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
         shared.say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     finished: list[FinishedRun] = []

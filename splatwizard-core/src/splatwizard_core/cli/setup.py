@@ -186,15 +186,18 @@ def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
 
 
 def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> Session:
-    """The session of trainings: their scenes are loaded, and it is said where it computes, and why there."""
+    """The session of trainings, with their scenes loaded: what is wrong with one is told before anything else is."""
+    session = open_session(resolved[0].ppl, plugins)
+    for each in resolved:
+        session.scene(each)
+    return session
+
+
+def say_device(ppl: PipelineParams, session: Session) -> None:
+    """Tell where a training computes, and why there."""
     from splatwizard_core.runs.device import device_reason
 
-    ppl = resolved[0].ppl
-    session = open_session(ppl, plugins)
-    for each in resolved:
-        session.scene(each)  # what is wrong with it is told before anything else is said
-    say(device_reason(ppl.device, session.device, plugins))
-    return session
+    say(device_reason(ppl.device, session.device, session.plugins))
 
 
 def warn_of_metrics(session: Session, names: Sequence[str] | None, settings: Any, *, quiet: bool = False) -> None:

@@ -8,7 +8,7 @@ import click
 
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import output_folder
-from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices
+from splatwizard_core.cli.setup import Choices, open_training_session, say_device, takes_choices
 
 
 @click.command(short_help="train one method on one scene")
@@ -29,6 +29,7 @@ def train(out: str, resume: bool, allow_changed_plan: bool, as_json: bool, chose
     resolved = chosen.resolve_one(plugins)
     output_folder(out)
     session = open_training_session([resolved], plugins)
+    say_device(resolved.ppl, session)
     request = RunRequest(resolved, Path(out), resume=resume, allow_changed_plan=allow_changed_plan)
     trained, directory = train_only(session, request)
     facts = {
