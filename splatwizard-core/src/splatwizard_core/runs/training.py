@@ -250,7 +250,7 @@ class _StagesOfARun:
 
     def _facts(self, outcome: TrainOutcome) -> dict[str, Any]:
         measured = {
-            **vars(outcome),
+            **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},
             "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
             "pretraining": self.before,
             "peak_bytes": outcome.peak_memory,
