@@ -8,7 +8,6 @@ with its own statistics. It is integer arithmetic on decoded symbols; only the n
 from __future__ import annotations
 
 import struct
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
