@@ -166,3 +166,16 @@ def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
     found = probe._check_rasterizer(plugins.rasterizers.entry("gsplat"), plugins)
     assert (found.state, found.detail) == ("missing", "gsplat is not installed")
     assert found.mend == "pip install 'sw-gsplat[gsplat]'"
+
+
+def test_beside_the_core_alone_it_names_the_packages_that_a_run_needs(fresh_environment, wheels):
+    fresh_environment.install(wheels["splatwizard-core"], wheels["sw-doctor"])
+    done = fresh_environment.run("doctor", "--json", check=False)
+    assert done.returncode == 1
+    checks = checks_of(done)
+    job = checks["sw run"]
+    assert (job["state"], job["needed"]) == ("broken", True)
+    assert job["mend"] == "pip install sw-3dgs sw-datasets sw-rasterizers"
+    assert {name: check for name, check in checks.items() if check["needed"] and check["state"] != "ok"} == {
+        "sw run": job
+    }

@@ -9,7 +9,7 @@ from sw_gaussians.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import save_ply
+from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import Camera
@@ -230,7 +230,7 @@ def test_a_scene_without_points_is_refused():
 
 def test_a_ply_is_a_start_with_all_bands_active(tmp_path):
     trained = GaussianModel.from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)))
-    save_ply(trained, tmp_path / "m.ply")
+    export_ply(trained, tmp_path / "m.ply")
     model = create(tiny_scene(), init=str(tmp_path / "m.ply"))
     assert model.active_sh_degree == 3
     assert torch.equal(model.means, trained.means)

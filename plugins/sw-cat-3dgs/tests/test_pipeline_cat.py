@@ -84,7 +84,7 @@ def test_a_fresh_process_decodes_the_same_model(method, trained, tmp_path):
     path.write_bytes(encoded(trained, method))
     code = (
         "import torch, sys; torch.set_num_threads(2)\n"
-        "from splatwizard_core.runs.decoding import open_model\n"
+        "from splatwizard_core.runs.decode import open_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "print(open_model(sys.argv[1], load_plugins(), torch.device('cpu'))[0].digest())"
     )

@@ -16,7 +16,8 @@ import pytest
 from sw_doctor import child, compilers, diagnosis, packages, probe, registered, system
 from sw_doctor.text import gigabytes, one_line
 
-from splatwizard_core.native import NativeModule, toolchain
+from splatwizard_core.api import NativeModule
+from splatwizard_core.native import toolchain
 from splatwizard_core.plugins import Entry, PluginManager, load_plugins
 from splatwizard_core.plugins.check import Check
 
@@ -474,7 +475,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
     package = tmp_path / "src" / "doctored_kernels"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(
-        "from splatwizard_core.native import NativeModule\n"
+        "from splatwizard_core.api import NativeModule\n"
         "MODULE = NativeModule(name='doctored', package='doctored_kernels', sources=('a.cpp',), seconds=7,"
         " without='it is slow')\n"
     )

@@ -21,7 +21,7 @@ from sw_reference.testing.raster_scenes import front_camera
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.runs import measuring
+from splatwizard_core.runs import measure
 from splatwizard_core.scene.scene import Protocol
 from sw_hac import codec
 from sw_hac.method import HAC
@@ -99,7 +99,7 @@ def test_another_process_decodes_the_same(tmp_path):
     code = (
         "import sys, torch\n"
         "from splatwizard_core.coding.container import ContainerReader\n"
-        "from splatwizard_core.runs.decoding import decode_model\n"
+        "from splatwizard_core.runs.decode import decode_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "torch.set_num_threads(2)\n"
         "for path in sys.argv[1:]:\n"
@@ -253,9 +253,9 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
 @pytest.mark.parametrize(("mode", "flags"), [("exact", []), ("float", ["device-bound"])])
 def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path):
     (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
-    bound = measuring.opener(tmp_path / "scene.swz", PLUGINS, torch.device("cpu"))().device_bound
+    bound = measure.opener(tmp_path / "scene.swz", PLUGINS, torch.device("cpu"))().device_bound
     scene, quality = SimpleNamespace(protocol=Protocol("test")), SimpleNamespace(metrics={})
-    assert measuring._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
+    assert measure._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
 
 
 def test_a_weight_that_does_not_fit_half_precision_is_named():

@@ -43,4 +43,4 @@ def test_a_package_lpips_that_is_not_installed_is_an_extra(monkeypatch):
 
     monkeypatch.setattr("sw_metrics.perceptual.importlib.metadata.version", absent)
     found = check_lpips()[0]
-    assert (found.state, found.mend) == ("missing", "pip install 'splatwizard-core[lpips]'")
+    assert (found.state, found.mend) == ("missing", "pip install 'sw-metrics[lpips]'")

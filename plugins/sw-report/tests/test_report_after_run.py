@@ -11,9 +11,9 @@ from sw_report import after_run
 from sw_report.after_run import plot_above, report_above, report_finished, report_run
 
 from splatwizard_core.errors import SceneError
+from splatwizard_core.runs.directory import OWN_FILES
 from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
 from splatwizard_core.runs.record import read_record
-from splatwizard_core.runs.run import OWN_FILES
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 

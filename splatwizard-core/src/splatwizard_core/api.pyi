@@ -16,7 +16,7 @@ from splatwizard_core.errors import SceneError as SceneError
 from splatwizard_core.errors import ShapeError as ShapeError
 from splatwizard_core.errors import SplatwizardError as SplatwizardError
 from splatwizard_core.errors import UserInputError as UserInputError
-from splatwizard_core.evaluation.metrics import Metric as Metric
+from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.gaussian_method import GaussianMethod as GaussianMethod
@@ -30,7 +30,7 @@ from splatwizard_core.gaussians.ply import to_ply as to_ply
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method
-from splatwizard_core.native import NativeModule as NativeModule
+from splatwizard_core.native.loader import NativeModule as NativeModule
 from splatwizard_core.plugins.hookspecs import hookimpl as hookimpl
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.registry import Registry as Registry
@@ -54,6 +54,7 @@ from splatwizard_core.scene.scene import Scene as Scene
 from splatwizard_core.scene.scene import View as View
 from splatwizard_core.streams import stream as stream
 from splatwizard_core.training.learning_rate import exponential_lr as exponential_lr
+from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
 from splatwizard_core.training.optimizer import SplatOptimizer as SplatOptimizer
@@ -68,6 +69,6 @@ from splatwizard_core.training.scheduler import PhaseSwitch as PhaseSwitch
 from splatwizard_core.training.scheduler import Scheduler as Scheduler
 from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
-from splatwizard_core.training.stage import LossPack as LossPack
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
+from splatwizard_core.training.wrapped_stage import WrappedStage as WrappedStage

@@ -88,3 +88,19 @@ def test_a_tensor_of_another_dtype_is_named():
     )
     with pytest.raises(ShapeError, match="of float32: means is float16"):
         info.check_request(g, RasterOptions())
+
+
+def test_gathered_inputs_have_rows_of_their_own():
+    generator = torch.Generator().manual_seed(0)
+    table = {"scales": torch.rand(3, 3, generator=generator), "quats": torch.rand(3, 4, generator=generator)}
+    rows = torch.tensor([2, 0, 0, 1])
+    sh = SH(dc=DC, codebook=torch.rand(2, 3, 3, generator=generator), indices=torch.tensor([1, 0, 1, 1]))
+    g = inputs(**table, geom_indices=rows, scale_factors=torch.arange(1.0, 5), colors=None, sh=sh)
+    own = g.gathered()
+    assert torch.equal(own.scales, table["scales"][rows] * torch.arange(1.0, 5)[:, None])
+    assert torch.equal(own.quats, table["quats"][rows])
+    assert own.geom_indices is None and own.scale_factors is None and own.sh.codebook is None  # noqa: PT018
+    assert torch.equal(own.sh.to_dense(), sh.to_dense())
+    assert g.gathered(geometry=False).scales is table["scales"]
+    assert g.gathered(colors=False).sh is sh
+    assert g.geom_indices is rows  # the inputs themselves are left alone

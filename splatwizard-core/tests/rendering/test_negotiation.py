@@ -234,18 +234,19 @@ def test_a_failed_build_falls_back_with_one_warning(plugins, scene, caplog, base
     assert "'reference'" in warnings(caplog)[0]
 
 
-def test_a_rasterizer_that_cannot_be_made_harms_no_other(plugins, scene, caplog, monkeypatch):
+@pytest.mark.parametrize("raised", [OSError, SystemExit])
+def test_a_rasterizer_that_cannot_be_made_harms_no_other(plugins, scene, caplog, monkeypatch, raised):
     class Broken(Fake):
         def __init__(self):
-            raise OSError(f"libfoo.so ({REASON})")
+            raise raised(f"libfoo.so ({REASON})")
 
     plugins.install("broken", base=Broken)
     rasterizer = NegotiatedRasterizer(plugins, device="cpu")
     rasterizer.render(*scene, RasterOptions())
     assert rasterizer.choices == {"plain": "reference"}
-    assert [w for w in warnings(caplog) if "OSError: libfoo.so" in w]
+    assert [w for w in warnings(caplog) if f"{raised.__name__}: libfoo.so" in w]
     monkeypatch.setenv("SW_RASTERIZER", "broken")
-    with pytest.raises(PluginError, match=r"'broken' of .* cannot be made: OSError: libfoo"):
+    with pytest.raises(PluginError, match=rf"'broken' of .* cannot be made: {raised.__name__}: libfoo"):
         NegotiatedRasterizer(plugins, device="cpu").render(*scene, RasterOptions())
 
 

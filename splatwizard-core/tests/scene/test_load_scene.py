@@ -88,7 +88,7 @@ def test_what_was_looked_for_is_what_the_families_declare(families, tmp_path):
 
 
 def test_the_ways_to_name_a_scene_are_those_that_are_installed(families):
-    with pytest.raises(SceneError, match=r"give a scene folder, dataset/scene$"):
+    with pytest.raises(SceneError, match=r"give a scene folder or dataset/scene$"):
         families.load("/nowhere")
     families.add("made", procedural=True)
     with pytest.raises(SceneError, match=r"give a scene folder, dataset/scene, or made$"):

@@ -7,16 +7,19 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians import density
+from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import GradBuffer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer, exponential_lr
+from splatwizard_core.training.learning_rate import exponential_lr
+from splatwizard_core.training.losses import LossPack
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.scheduler import PhaseSwitch
-from splatwizard_core.training.stage import LossPack, Stage
+from splatwizard_core.training.stage import Stage
 
 WIDTH, HEIGHT = 12, 10
 
@@ -105,7 +108,7 @@ class UpdateRate:
 
 
 def collect(model: GaussianModel, result: RenderResult) -> None:
-    density.accumulate_statistics(model, result.grad2d.value, result.radii)
+    accumulate_statistics(model, result.grad2d.value, result.radii)
 
 
 def densify(model: GaussianModel, optimizer: SplatOptimizer, step: int) -> None:

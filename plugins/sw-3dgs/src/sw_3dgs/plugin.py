@@ -1,4 +1,4 @@
-"""What this package provides: the method 3dgs."""
+"""Registers the method 3dgs."""
 
 from splatwizard_core.api import Registry, hookimpl
 

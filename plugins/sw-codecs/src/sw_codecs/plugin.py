@@ -1,10 +1,68 @@
 """What this package provides."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from splatwizard_core.api import Registry, hookimpl
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from splatwizard_core import api
+    from sw_codecs.arrays import byte_planes, packed_bits
+    from sw_codecs.coders import arithmetic, huffman
+    from sw_codecs.context import channel_ar, hash_grid, integer_mlp, spatial_ar, triplane
+    from sw_codecs.entropy import (
+        bernoulli,
+        categorical,
+        columns,
+        conditional,
+        factorised,
+        float_models,
+        gaussian_exact,
+        mixture,
+    )
+    from sw_codecs.models import codecs
+    from sw_codecs.positions import draco, octree, plain
+    from sw_codecs.quantizers import (
+        binary,
+        fake_quant,
+        residual_quantizer,
+        rounding,
+        uniform,
+        vector_quantizer,
+    )
+
+    # mypy holds each class that is registered below to its contract.
+    QUANTIZERS: list[Callable[..., api.Quantizer]] = [
+        uniform.Uniform, rounding.SteRound, rounding.UniformNoise, binary.SteBinary, binary.SteMask,
+        fake_quant.FakeQuantAffine, vector_quantizer.VectorQuantizer, residual_quantizer.ResidualVectorQuantizer,
+    ]  # fmt: skip
+    ENTROPY_MODELS: list[Callable[..., api.EntropyModel]] = [
+        columns.Columns, categorical.Categorical, bernoulli.Bernoulli, gaussian_exact.GaussianExact,
+        gaussian_exact.LaplaceExact, float_models.GaussianFloat, float_models.LaplaceFloat, mixture.Mixture,
+        factorised.Factorised, conditional.ConditionalGaussian,
+    ]  # fmt: skip
+    CONTEXT_MODELS: list[Callable[..., api.ContextModel]] = [
+        integer_mlp.IntegerMlp, triplane.Triplane, spatial_ar.SpatialAr, channel_ar.ChannelAr, hash_grid.MixedHashGrid,
+    ]  # fmt: skip
+    ENTROPY_CODERS: list[Callable[..., api.EntropyCoder]] = [
+        arithmetic.RangeCoder, arithmetic.RansCoder, huffman.HuffmanCoder,
+    ]  # fmt: skip
+    POSITION_CODECS: list[Callable[..., api.PositionCodec]] = [
+        octree.Octree, plain.MortonDelta, plain.RawPositions, draco.Draco,
+    ]  # fmt: skip
+    ARRAY_CODERS: list[Callable[..., api.ArrayCoder]] = [
+        byte_planes.BytePlanes, byte_planes.FloatDelta, packed_bits.PackedBits,
+    ]  # fmt: skip
+    GAUSSIAN_CODECS: list[Callable[..., api.GaussianCodec]] = [
+        codecs.Exact, codecs.Quantized, codecs.Ply, codecs.Lossless,
+    ]  # fmt: skip
 
 
 @hookimpl
-def register_quantizers(registry: Registry) -> None:
+def register_quantizers(registry: Registry[Any]) -> None:
     registry.add("uniform", "sw_codecs.quantizers.uniform:Uniform",
                  summary="affine, bits and range per channel; rounding or noise")  # fmt: skip
     registry.add("ste-round", "sw_codecs.quantizers.rounding:SteRound",
@@ -21,7 +79,7 @@ def register_quantizers(registry: Registry) -> None:
 
 
 @hookimpl
-def register_entropy_models(registry: Registry) -> None:
+def register_entropy_models(registry: Registry[Any]) -> None:
     registry.add("columns", "sw_codecs.entropy.columns:Columns",
                  summary="integer matrix, stored statistics per column, any alphabet")  # fmt: skip
     registry.add("categorical", "sw_codecs.entropy.categorical:Categorical",
@@ -43,7 +101,7 @@ def register_entropy_models(registry: Registry) -> None:
 
 
 @hookimpl
-def register_context_models(registry: Registry) -> None:
+def register_context_models(registry: Registry[Any]) -> None:
     registry.add("integer-mlp", "sw_codecs.context.integer_mlp:IntegerMlp",
                  summary="ReLU network evaluated in exact integer arithmetic")  # fmt: skip
     registry.add("triplane", "sw_codecs.context.triplane:Triplane",
@@ -57,7 +115,7 @@ def register_context_models(registry: Registry) -> None:
 
 
 @hookimpl
-def register_coders(registry: Registry) -> None:
+def register_coders(registry: Registry[Any]) -> None:
     registry.add("range", "sw_codecs.coders.arithmetic:RangeCoder", codes="symbols",
                  summary="arithmetic coding under a ModelSpec")  # fmt: skip
     registry.add("rans", "sw_codecs.coders.arithmetic:RansCoder", codes="symbols", summary="rANS under a ModelSpec")

@@ -1,7 +1,5 @@
 """What holds for every registered quantizer: a file's symbols and side information suffice, on a fresh object."""
 
-import json
-
 import numpy as np
 import pytest
 import torch
@@ -10,9 +8,10 @@ from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
+from sw_codecs.testing import check_quantizer
 
 QUANTIZERS = load_plugins().quantizers
-OURS = [entry.name for entry in QUANTIZERS if entry.distribution == "sw-codecs"]
+NAMES = QUANTIZERS.names
 FITTED = {"vq", "residual-vq"}
 NOT_IDEMPOTENT = {"residual-vq"}  # greedy: a decoded row may be encoded otherwise, see its docstring
 NOISY = {"uniform-noise"}
@@ -32,29 +31,16 @@ def rows(n, seed, spread):
     return x[torch.randint(n, (n,), generator=g)]  # some rows twice
 
 
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=15, deadline=None)
 @given(n=st.integers(1, 24), seed=st.integers(0, 2**31), spread=st.sampled_from([1e-3, 1.0, 50.0]))
 def test_symbols_and_side_information_are_all_a_decoder_needs(name, n, seed, spread):
     x = rows(n, seed, spread)
     quantizer = made(name, x)
-    expected = quantizer.forward(x).detach()
     if hasattr(quantizer, "observing"):
+        quantizer.forward(x)
         quantizer.observing = False
-    symbols, side = quantizer.encode(x)
-    assert symbols.dtype == torch.int64
-    # Through what a container does to it: arrays as bytes, the rest as JSON.
-    stored = {
-        key: np.frombuffer(value.tobytes(), value.dtype).reshape(value.shape)
-        if isinstance(value, (np.ndarray, np.generic))
-        else json.loads(json.dumps(value))
-        for key, value in side.items()
-    }
-    decoded = QUANTIZERS.load(name).decode(symbols.clone(), stored)
-    assert decoded.dtype == torch.float32
-    assert decoded.shape == x.shape
-    if name not in NOISY:
-        assert torch.equal(decoded, expected)
+    decoded, symbols, side = check_quantizer(QUANTIZERS.load(name), x, trained=quantizer, is_noisy=name in NOISY)
     if name not in NOT_IDEMPOTENT:
         again, _ = quantizer.encode(decoded if name != "ste-mask" else torch.where(decoded > 0, 1.0, -100.0))
         if name == "uniform":  # measures its range; it has to be told to keep it
@@ -63,7 +49,7 @@ def test_symbols_and_side_information_are_all_a_decoder_needs(name, n, seed, spr
         assert torch.equal(again, symbols)
 
 
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("name", NAMES)
 def test_gradient_reaches_what_was_quantized(name):
     x = rows(20, 0, 0.5).requires_grad_()
     made(name, x.detach()).forward(x).sum().backward()
@@ -72,7 +58,7 @@ def test_gradient_reaches_what_was_quantized(name):
     assert (x.grad != 0).any()
 
 
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_training_step_leaves_no_tensor_behind_and_waits_for_none(name):
     """The device "meta" has shapes but no data: another device's tensor, or a look at a value, would fail."""
     x = rows(20, 0, 0.5)
@@ -94,7 +80,7 @@ def test_a_training_step_leaves_no_tensor_behind_and_waits_for_none(name):
         assert step.grad.shape == (3,)
 
 
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("name", NAMES)
 def test_damaged_side_information_is_refused_or_decodes_to_numbers(name):
     x = rows(12, 3, 1.0)
     symbols, side = made(name, x).encode(x)
@@ -122,7 +108,7 @@ def test_damaged_side_information_is_refused_or_decodes_to_numbers(name):
 
 
 @pytest.mark.cuda
-@pytest.mark.parametrize("name", OURS)
+@pytest.mark.parametrize("name", NAMES)
 def test_cuda_symbols_decode_on_a_cpu(name):
     x = rows(200, 1, 1.0)
     quantizer = made(name, x)

@@ -21,8 +21,8 @@ def register_datasets(registry: Registry) -> None:
     for family in BENCHMARKS.values():
         looks_for = {"looks_for": family.looks_for} if family.looks_for else {}
         registry.add(family.name, f"{LOADERS}.collections:{family.name.upper()}", summary=family.summary,
-                     title=family.title, scenes=list(family.scenes), folders=list(family.folders),
-                     prefix=family.prefix, **looks_for)  # fmt: skip
+                     title=family.title, scenes=list(family.scenes), table_scenes=list(family.table_scenes),
+                     folders=list(family.folders), prefix=family.prefix, **looks_for)  # fmt: skip
 
 
 @hookimpl

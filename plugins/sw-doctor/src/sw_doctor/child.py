@@ -1,4 +1,4 @@
-"""Tests that may take their process down, or hang, run in a process of its own that reports one JSON line a test."""
+"""A process for steps that may take it down, or hang; it reports one JSON line a step."""
 
 from __future__ import annotations
 

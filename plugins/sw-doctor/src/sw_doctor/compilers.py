@@ -1,4 +1,4 @@
-"""The C++ and the CUDA compiler, each asked to compile a few lines."""
+"""Checks of the C++ and the CUDA compiler: each compiles a few lines."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def _torch_is_cpu_build() -> bool:
 
 
 def how_to_get_a_compiler() -> str:
-    """One line for this system."""
+    """Line that installs a compiler on this system."""
     if sys.platform == "darwin":
         return "xcode-select --install"
     if shutil.which("apt-get") is not None:
@@ -110,7 +110,7 @@ def how_to_get_a_compiler() -> str:
 
 
 def _compile(command: list[str], flags: list[str], lines: str, name: str) -> str | None:
-    """Why these lines do not compile, in one line; None if they do."""
+    """Compile these lines; return in one line why they do not compile, or None."""
     with tempfile.TemporaryDirectory(prefix="sw-doctor-") as folder:
         source, output = Path(folder) / name, Path(folder) / "out"
         source.write_text(lines)

@@ -23,20 +23,18 @@ GROUPS = (
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """Findings in reading order.
-
-    ok  `sw run` on the demo scene can run: no needed check is missing or broken
-    """
+    """Findings in reading order, and the seconds that they took."""
 
     checks: list[Check]
     seconds: float
 
     @property
     def ok(self) -> bool:
+        """Whether `sw run` on the demo scene can run: no needed check is missing or broken."""
         return all(c.state == "ok" for c in self.checks if c.needed)
 
     def as_dict(self) -> dict[str, Any]:
-        """What `sw doctor --json` prints."""
+        """Plain values, as `sw doctor --json` prints them."""
         return {"ok": self.ok, "seconds": round(self.seconds, 2), "checks": [c.as_dict() for c in self.checks]}
 
 

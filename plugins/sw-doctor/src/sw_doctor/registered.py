@@ -36,7 +36,7 @@ def needs_of(entry: Entry) -> set[str]:
 
 
 def failed(entry: Entry, how: str) -> Check:
-    """The one line about a check that failed itself."""
+    """Finding about a check that failed itself."""
     mend = f"pip install --upgrade --force-reinstall --no-deps {entry.distribution}"
     return Check(_group(entry), entry.name, "broken", f"the check of {entry.distribution} {how}", mend)
 

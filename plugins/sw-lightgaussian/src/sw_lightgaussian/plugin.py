@@ -1,4 +1,4 @@
-"""What this package provides: the method lightgaussian, its score as a pruner, and its two coders for anybody."""
+"""Registers the method lightgaussian, its score as a pruner, and its two coders for anybody."""
 
 from splatwizard_core.api import Registry, hookimpl
 

@@ -31,7 +31,8 @@ def check_lpips() -> list[Check]:
         get = f"curl -L --create-dirs -o {hub_folder() / backbone.file_name} {backbone.address}"
         path = find_weights(net, None)
         if path is None:
-            detail = f"{backbone.file_name} is not in {hub_folder()} (sw eval --lpips-weights DIR names another folder)"
+            other = "--set metrics.lpips.weights=DIR names another folder"
+            detail = f"{backbone.file_name} is not in {hub_folder()} ({other})"
             checks.append(Check(GROUP, name, "missing", detail, get))
         elif not file_sha256(path).startswith(backbone.sha256_prefix):
             checks.append(Check(GROUP, name, "broken", f"{path} is not the published file: its checksum differs", get))

@@ -115,18 +115,15 @@ def view_fisher(draw: Callable[[GaussianInputs], Tensor], g: GaussianInputs) -> 
     Returns [N,21] float64, the upper triangle row by row of F = sum over pixels and channels of g g^T,
     g = d image / d (mean, log scale): mean, projected covariance and viewing direction (PUP 3D-GS, arXiv 2406.10219).
     """
+    with torch.no_grad():
+        g = g.gathered(colors=False)
     assert g.scales is not None
     assert g.quats is not None
-    scales, quats = g.scales.detach(), g.quats.detach()
-    if g.geom_indices is not None:
-        scales, quats = scales[g.geom_indices], quats[g.geom_indices]
-    if g.scale_factors is not None:
-        scales = scales * g.scale_factors.detach()[:, None]
     first, second = torch.triu_indices(6, 6, device=g.means.device)
     blocks = torch.zeros(len(g), len(first), dtype=torch.float64, device=g.means.device)
     with torch.enable_grad():
-        means, scales = g.means.detach().requires_grad_(), scales.requires_grad_()
-        image = draw(replace(g, means=means, scales=scales, quats=quats, geom_indices=None, scale_factors=None))
+        means, scales = g.means.detach().requires_grad_(), g.scales.detach().requires_grad_()
+        image = draw(replace(g, means=means, scales=scales, quats=g.quats.detach()))
         if not image.requires_grad:
             return blocks
         for value in image.flatten():

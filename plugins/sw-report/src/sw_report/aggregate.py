@@ -1,4 +1,4 @@
-"""From scenes to data sets: plain means, and nothing where a scene is missing.
+"""Means over the scenes of a data set: plain, and none where a scene is missing.
 
 Source: evaluation protocol, aggregation. A mean over what happens to exist would compare different scenes.
 """
@@ -59,7 +59,7 @@ def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[Datase
 
 
 def comparable(runs: Sequence[Run]) -> list[list[Run]]:
-    """The runs that may share a mean over scenes: one data set, one set of rules.
+    """Group the runs that may share a mean over scenes: of one data set, by one set of rules.
 
     Only the picture folder may differ between scenes, and then only within one named protocol: `survey` and `inria`
     read the same scenes of Mip-NeRF 360 from different folders.
@@ -134,7 +134,7 @@ def _row(
 
 
 def mean(values: Sequence[float | None], *, partial: bool = False) -> float | None:
-    """The plain mean; None if one is unknown (partial: those are left out) or there is none."""
+    """Plain mean; None if one is unknown (partial: those are left out) or there is none."""
     known = [value for value in values if value is not None]
     if not known or (len(known) < len(values) and not partial):
         return None

@@ -16,7 +16,7 @@ from splatwizard_core.tooling import load_plugins
 
 @dataclass(frozen=True)
 class MetricStyle:
-    """How the values of one metric are written.
+    """Spelling of one metric: its name in tables, its unit, its decimals.
 
     label       as papers write it; the metric's name if nothing is declared
     unit        "dB", or nothing
@@ -55,7 +55,7 @@ class DatasetFacts:
 
 
 def metric_style(name: str) -> MetricStyle:
-    """How the values of a metric are written; names are compared without case, and with `-` and `_` alike."""
+    """Spelling of a metric, as its entry declares it; names are compared without case, and with `-` and `_` alike."""
     metrics = load_plugins().metrics
     key = metric_key(name)
     declared: Mapping[str, Any] = metrics.entry(key).declared if key in metrics else {}
@@ -69,7 +69,7 @@ def metric_style(name: str) -> MetricStyle:
 
 
 def metric_key(name: str) -> str:
-    """The name of a metric as the registry spells it."""
+    """Name of a metric as the registry spells it."""
     return name.lower().replace("-", "_")
 
 
@@ -82,7 +82,7 @@ def dataset_facts(name: str) -> DatasetFacts:
 
 
 def bd_anchor_rank(method: str) -> float:
-    """How usual a method is as the one that BD-rates compare against, smaller first; infinite: it is not."""
+    """Rank of a method among those that BD-rates usually compare against, smallest first; infinite for others."""
     methods = load_plugins().methods
     declared: Mapping[str, Any] = methods.entry(method).declared if method in methods else {}
     rank = declared.get("bd_anchor")

@@ -40,7 +40,7 @@ class BdRow:
 
 @dataclass(frozen=True)
 class BdTable:
-    """All methods against one anchor by one metric, in one protocol group."""
+    """BD values of all methods against one anchor, by one metric, in one protocol group."""
 
     metric: str
     anchor: str
@@ -49,10 +49,12 @@ class BdTable:
 
 
 def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
-    """The variant that is compared against; None if there is only one. Raises UserInputError for an unknown one.
+    """Choose the variant that others are compared against; None if there is only one.
 
     wanted  a variant or a method; None: the method that declares the smallest `bd_anchor`, else the alphabetically
             first variant
+
+    Raises UserInputError for a name that no run is of, or that several variants share.
     """
     variants = list(dict.fromkeys(run.variant for run in runs))
     if wanted is not None:
@@ -69,7 +71,7 @@ def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
 
 
 def bd_metrics(runs: Sequence[Run]) -> list[str]:
-    """The metrics that curves are compared by: PSNR, SSIM and one LPIPS, as far as they are there."""
+    """Metrics that curves are compared by: PSNR, SSIM and one LPIPS, as far as they are there."""
     known = {name for run in runs for name, metric in run.facts.metrics.items() if metric.mean is not None}
     lpips = main_lpips(known)
     return [name for name in ("psnr", "ssim", lpips) if name in known]

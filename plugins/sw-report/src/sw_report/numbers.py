@@ -1,4 +1,4 @@
-"""How numbers and metric names are written, the same in every kind of report."""
+"""Spelling of numbers and metric names, the same in every kind of report."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def is_lpips(metric: str) -> bool:
 
 
 def main_lpips(names: Iterable[str]) -> str | None:
-    """The LPIPS that tables of the field use, or whichever is there."""
+    """Name of the LPIPS that tables of the field use, else of the first that is there; None without any."""
     return next((name for name in ordered_metrics(names) if is_lpips(name)), None)
 
 
@@ -53,12 +53,14 @@ def megabytes(size: float | None) -> str:
 
 
 def seconds(value: float | None) -> str:
+    """Seconds without their unit, three significant digits or so."""
     if value is None:
         return MISSING
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
 def count(value: float | None) -> str:
+    """A whole number with separators."""
     return MISSING if value is None else f"{value:,.0f}"
 
 
@@ -82,9 +84,10 @@ def rate(value: float | None) -> str:
 
 
 def percent(value: float | None) -> str:
-    """Signed, one decimal, with a real minus sign."""
+    """A percentage without its sign: one decimal, plus or a real minus before it."""
     return MISSING if value is None else f"{value:+.1f}".replace("-", "−")
 
 
 def signed(value: float | None, digits: int = 2) -> str:
+    """A difference, with a real minus sign."""
     return MISSING if value is None else f"{value:+.{digits}f}".replace("-", "−")

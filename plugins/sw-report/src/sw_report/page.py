@@ -1,4 +1,4 @@
-"""The page: one self-contained HTML file about one run or many."""
+"""Composition of the page: one self-contained HTML file about one run or many."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ SHORT = {PICTURES: "Pictures", BYTES: "Bytes", VIEWS: "Views"}
 
 @dataclass(frozen=True)
 class PageOptions:
-    """What a page shows.
+    """Contents of a page.
 
     anchor      variant or method that BD-rates compare against; None: the usual one
     partial     means also where scenes are missing
@@ -64,7 +64,7 @@ def write_page(collection: Collection, path: Path, options: PageOptions | None =
 
 
 def render_page(collection: Collection, options: PageOptions) -> str:
-    """The HTML text. Raises UserInputError for an anchor that no run is of."""
+    """Return the HTML text. Raises UserInputError for an anchor that no run is of."""
     runs = collection.runs
     single = len(runs) == 1
     sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
@@ -218,7 +218,7 @@ def _as_sections(parts: Sequence[Part], title: str, text: str) -> list[Section]:
 def _place_parts(
     runs: Sequence[Run], style_of: dict[str, int], views: int, budget: PictureBudget, options: PageOptions
 ) -> list[Part]:
-    """All about the runs of one scene under one protocol."""
+    """Compose the parts about the runs of one scene under one protocol."""
     parts = [Part(table=tables.runs_table(runs))]
     charts = plots.distortion_charts(runs, style_of)
     if charts is not None and len(runs) > 1:

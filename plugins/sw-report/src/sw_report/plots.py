@@ -1,4 +1,4 @@
-"""The charts of a report: rate and distortion, bytes by section, training, scores view by view."""
+"""Charts of a report: rate and distortion, bytes by section, training, scores view by view."""
 
 from __future__ import annotations
 
@@ -21,11 +21,12 @@ MOST_BARS = 24
 
 
 def variants_of(runs: Sequence[Run]) -> list[str]:
+    """Names of the methods, in the order of the runs."""
     return list(dict.fromkeys(run.variant for run in runs))
 
 
 def counts_anchors(run: Run) -> bool:
-    """Whether its primitives are anchors, whose number is not comparable: drawn dashed, as in the field."""
+    """Whether a run stores anchors, whose number is not comparable with Gaussians: its line is dashed."""
     return "num_anchors" in run.facts.counts
 
 

@@ -1,4 +1,4 @@
-"""What `sw run` prints at its end: one table, the rate-distortion curves on a terminal, and where everything lies."""
+"""Output at the end of `sw run`: one table, the rate-distortion curves on a terminal, and where everything lies."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def print_results(done: Sequence[tuple[Record, Path]], written: Sequence[Path], 
 
 
 def print_table(records: Sequence[Record], out: Console) -> None:
-    """One row a run, the rows of a method together; the best value of a column is marked if there is a choice.
+    """Print one row a run, the rows of a method together; the best value of a column is marked if there is a choice.
 
     Columns that do not fit are left out, and named.
     """
@@ -113,7 +113,7 @@ def _cells(record: Record, names: Sequence[str], digits: int) -> dict[str, str]:
 def _too_wide(
     fixed: dict[str, list[str]], columns: dict[str, list[str]], heads: dict[str, str], names: Sequence[str], room: int
 ) -> set[str]:
-    """The columns to leave out so that the rest fits: metrics after the first three, then times, and so on."""
+    """Choose the columns to leave out so that the rest fits: metrics after the first three, then times, and so on."""
     needed = 1 + sum(3 + _content(name, cells) for name, cells in fixed.items())
     needed += sum(3 + _content(heads[name], cells) for name, cells in columns.items())
     found: set[str] = set()
@@ -152,7 +152,7 @@ def _best(records: Sequence[Record], names: Sequence[str]) -> dict[str, set[int]
 
 
 def notes(records: Sequence[Record]) -> list[str]:
-    """What a reader of the table must know: what times hold, and why values are missing."""
+    """Lines under the table: which times include another training, and why values are missing."""
     found = []
     before: dict[str, dict[str, None]] = {}
     for record in records:
@@ -172,7 +172,7 @@ def notes(records: Sequence[Record]) -> list[str]:
 
 
 def reasons_of_metrics(records: Sequence[Record]) -> dict[str, list[str]]:
-    """Why metrics have no mean -> which ones."""
+    """Reason -> metrics that have no mean for it."""
     from splatwizard_core.tooling import short_reason
 
     found: dict[str, dict[str, None]] = {}
@@ -185,7 +185,7 @@ def reasons_of_metrics(records: Sequence[Record]) -> dict[str, list[str]]:
 
 
 def print_plot(directories: Sequence[Path], out: Console) -> None:
-    """PSNR against bytes, in characters."""
+    """Print PSNR against bytes, in characters."""
     from rich.text import Text
 
     from sw_report.runs import collect

@@ -71,7 +71,7 @@ class ContextModel(Protocol):
     imports it.
     """
 
-    def __call__(self, *inputs: Tensor) -> Tensor | tuple[Tensor, ...]:
+    def __call__(self, *inputs: Any, **options: Any) -> Tensor | tuple[Tensor, ...]:
         """Differentiable features or parameters for each row (or place) of the inputs."""
         ...
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
@@ -81,11 +83,13 @@ class SH:
         if held < needed:
             raise ShapeError(f"SH degree {self.active_degree} needs {needed} coefficients, here are {held}")
 
-    def __len__(self) -> int:
-        for tensor in (self.dense, self.dc, self.indices):
-            if tensor is not None:
-                return tensor.shape[0]
-        return 0
+
+def check_shape(name: str, tensor: Tensor, expected: tuple[int | str, ...]) -> None:
+    """Raise ShapeError unless `tensor` has the sizes `expected`; a string there stands for any size."""
+    shape = tensor.shape
+    if len(shape) != len(expected) or any(a != e for a, e in zip(shape, expected, strict=True) if isinstance(e, int)):
+        wanted = ", ".join(str(e) for e in expected)
+        raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}", actual=shape, expected=expected)
 
 
 _TENSORS = (
@@ -139,6 +143,31 @@ class GaussianInputs:
                     found[full] = stored[name]
         return found
 
+    def gathered(
+        self,
+        *,
+        geometry: bool = True,
+        colors: bool = True,
+        lookup: Callable[[Tensor, Tensor], Tensor] = operator.getitem,
+    ) -> GaussianInputs:
+        """A shallow copy in which every Gaussian has its own scales, quaternion and colours; differentiable.
+
+        geometry, colors    False leaves the shapes, or the colours, in the form in which they are stored
+        lookup              (table [M,...], indices [N]) -> its rows [N,...]
+        """
+        g = replace(self)
+        if geometry and g.scales is not None and g.quats is not None:
+            if g.geom_indices is not None:
+                g.scales, g.quats = lookup(g.scales, g.geom_indices), lookup(g.quats, g.geom_indices)
+            if g.scale_factors is not None:
+                g.scales = g.scales * g.scale_factors[:, None]
+            g.geom_indices = g.scale_factors = None
+        if colors and g.sh is not None and g.sh.codebook is not None and g.sh.indices is not None:
+            rest = lookup(g.sh.codebook, g.sh.indices)
+            own: dict[str, Tensor] = {"dense": rest} if g.sh.dc is None else {"dc": g.sh.dc, "rest": rest}
+            g.sh = SH(**own, active_degree=g.sh.active_degree)
+        return g
+
     def requires_grad(self) -> bool:
         """Whether autograd would record anything for these inputs now."""
         return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors().values())
@@ -148,18 +177,8 @@ class GaussianInputs:
         n = self.means.shape[0]
 
         def need(name: str, tensor: Tensor | None, *expected: int | str) -> None:
-            if tensor is None or tensor.shape == expected:
-                return
-            ok = tensor.dim() == len(expected) and all(
-                isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
-            )
-            if not ok:
-                wanted = ", ".join(str(e) for e in expected)
-                raise ShapeError(
-                    f"GaussianInputs.{name} must be [{wanted}], got {list(tensor.shape)}",
-                    actual=tensor.shape,
-                    expected=expected,
-                )
+            if tensor is not None and tensor.shape != expected:
+                check_shape(f"GaussianInputs.{name}", tensor, expected)
 
         rows: int | str = n if self.geom_indices is None else "M"
         need("means", self.means, n, 3)

@@ -29,6 +29,9 @@ class SplatModel(nn.Module):
     ROW_LABEL: ClassVar[str] = "gaussians"
     """The primitives' name in progress and messages, plural; a model of anchors says "anchors"."""
 
+    ROW_LABEL: str = "gaussians"
+    """The word for its primitives in progress lines and messages."""
+
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
 
@@ -81,5 +84,6 @@ class SplatModel(nn.Module):
         sha = hashlib.sha256(json.dumps(self.state_dict_extra(), sort_keys=True).encode())
         for name, tensor in sorted(self.state_dict().items()):
             sha.update(f"{name}{tuple(tensor.shape)}{tensor.dtype}".encode())
-            sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
+            if tensor.numel():  # an empty tensor cannot be seen as bytes
+                sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
         return sha.hexdigest()

@@ -89,10 +89,7 @@ def register_executors(registry: Registry) -> None:
 
 @hookspec
 def register_checks(registry: Registry) -> None:
-    """Add checks of the machine: callables () -> list[Check], each run in a process of its own when a user asks.
-
-    Fields: `group`, the heading of their lines; `needs`, checks without which this one can only fail ("torch").
-    """
+    """Add checks of the machine: callables () -> list[Check], each run in a process of its own when a user asks."""
 
 
 @hookspec

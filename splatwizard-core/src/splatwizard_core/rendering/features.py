@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import functools
+import itertools
 import operator
 from typing import TYPE_CHECKING
 
@@ -65,19 +66,38 @@ class Feature(enum.Flag):
         asked: Feature | None = vars(opt).get("_asked")  # options do not change, and every step of a training asks
         if asked is None:
             asked = vars(opt)["_asked"] = _of_options(opt)
-        return asked if g is None else asked | cls.geometry_of(g) | _of_colors(g)
+        return asked if g is None else _union(asked, (*_shape_traits(g), *_other_traits(g)))
 
     @classmethod
     def geometry_of(cls, g: GaussianInputs) -> Feature:
         """The features that reading the shapes of `g` needs, whatever is drawn."""
-        return _union(
-            (g.cov3d is not None, cls.COV3D),
-            (g.geom_indices is not None or g.scale_factors is not None, cls.INDEXED_GEOM),
-            (g.scales is not None and g.scales.shape[-1] == 2, cls.SURFEL),
-            (g.means.dtype == torch.float64, cls.FLOAT64),
-        )
+        return _union(cls(0), _shape_traits(g))
 
 
+def _shape_traits(g: GaussianInputs) -> tuple[bool, ...]:
+    return (
+        g.cov3d is not None,
+        g.geom_indices is not None or g.scale_factors is not None,
+        g.scales is not None and g.scales.shape[-1] == 2,
+        g.means.dtype == torch.float64,
+    )
+
+
+def _other_traits(g: GaussianInputs) -> tuple[bool, ...]:
+    return (
+        g.requires_grad(),
+        g.features is not None,
+        g.colors is not None and g.colors.shape[-1] != 3,
+        g.sh is not None and g.sh.codebook is not None,
+        g.sh is not None and g.sh.dc is not None,
+    )
+
+
+_TRAITS = (
+    Feature.COV3D, Feature.INDEXED_GEOM, Feature.SURFEL, Feature.FLOAT64,
+    Feature.BACKWARD, Feature.EXTRA_FEATURES, Feature.COLORS_ND, Feature.INDEXED_SH, Feature.SPLIT_SH,
+)  # fmt: skip
+"""The features that the traits of inputs stand for, in their order."""
 _DEPTHS = {
     "inverse": Feature.DEPTH_INVERSE,
     "accumulated": Feature.DEPTH_ACCUM,
@@ -95,8 +115,9 @@ def _names(features: Feature) -> frozenset[str]:
     return frozenset(f.name for f in Feature if f in features and f.name is not None)
 
 
-def _union(*pairs: tuple[bool, Feature]) -> Feature:
-    return functools.reduce(operator.or_, (feature for asked, feature in pairs if asked), Feature(0))
+@functools.cache  # a training asks for the same at every step, and `|` of flags is slow
+def _union(asked: Feature, traits: tuple[bool, ...]) -> Feature:
+    return functools.reduce(operator.or_, itertools.compress(_TRAITS, traits), asked)
 
 
 def _of_options(opt: RasterOptions) -> Feature:
@@ -109,7 +130,7 @@ def _of_options(opt: RasterOptions) -> Feature:
         for name in asked:
             if name not in known:
                 raise ValueError(f"unknown {what} '{name}': one of {', '.join(known)}")
-    return _union(
+    needed = (
         (opt.antialias, Feature.ANTIALIAS),
         (opt.absgrad, Feature.ABSGRAD),
         (opt.normals, Feature.NORMALS),
@@ -123,13 +144,4 @@ def _of_options(opt: RasterOptions) -> Feature:
         *((True, _DEPTHS[mode]) for mode in opt.depth),
         *((True, _SCORES[spec.kind]) for spec in opt.scores),
     )
-
-
-def _of_colors(g: GaussianInputs) -> Feature:
-    return _union(
-        (g.requires_grad(), Feature.BACKWARD),
-        (g.features is not None, Feature.EXTRA_FEATURES),
-        (g.colors is not None and g.colors.shape[-1] != 3, Feature.COLORS_ND),
-        (g.sh is not None and g.sh.codebook is not None, Feature.INDEXED_SH),
-        (g.sh is not None and g.sh.dc is not None, Feature.SPLIT_SH),
-    )
+    return functools.reduce(operator.or_, (feature for asked, feature in needed if asked), Feature(0))

@@ -149,7 +149,7 @@ class NegotiatedRasterizer:
             made: Rasterizer = entry.load()()
         except SplatwizardError:
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             reason = f"{type(error).__name__}: {error}"
             raise PluginError(f"rasterizer '{name}' of {entry.distribution} cannot be made: {reason}") from error
         return made

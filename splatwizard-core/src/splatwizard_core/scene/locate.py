@@ -38,8 +38,8 @@ def locate(spec: str, families: Families) -> tuple[Path, str | None]:
     path = Path(os.path.expanduser(spec))
     if os.path.exists(path):
         return path, None
-    made = [entry.name for entry in families if entry.declared.get("procedural")]
-    cure = f": give a scene folder, dataset/scene{''.join(f', or {name}' for name in made)}"
+    *ways, last = "a scene folder", "dataset/scene", *(e.name for e in families if e.declared.get("procedural"))
+    cure = f": give {', '.join(ways)}{',' * (len(ways) > 1)} or {last}"
     if path.is_absolute() or spec.startswith("~"):
         raise _missing(spec, cure)
     named = os.environ.get(DATA_VARIABLE)
@@ -71,21 +71,21 @@ def _homes(root: Path, dataset: str, families: Families) -> list[str]:
 
 
 def _what_is_there(root: Path, parts: Sequence[str], families: Families) -> str:
-    """The rest of the message: how far the name leads, and what could be meant."""
-    datasets = _folders(root)
+    """Rest of the message: how far the name leads, and what could be meant."""
     if len(parts) == 1:
-        holders = [name for name in datasets if os.path.isdir(root / name / parts[0])]
+        holders = [name for name in _folders(root) if os.path.isdir(root / name / parts[0])]
         if holders:
             return f": did you mean {holders[0]}/{parts[0]} (below ${DATA_VARIABLE})?"
-        return f", nor is {root / parts[0]}: datasets are named as dataset/scene; {_listed(root, datasets, parts[0])}"
+        return f", nor is {root / parts[0]}: datasets are named as dataset/scene; {_listed(root, parts[0])}"
     homes = _homes(root, parts[0], families)
     if not homes:
-        return f", nor is {root / Path(*parts)}: {_listed(root, datasets, parts[0])}"
+        return f", nor is {root / Path(*parts)}: {_listed(root, parts[0])}"
     home = root / homes[0]
-    return f", nor is {home / Path(*parts[1:])}: {_listed(home, _folders(home), parts[1])}"
+    return f", nor is {home / Path(*parts[1:])}: {_listed(home, parts[1])}"
 
 
-def _listed(folder: Path, names: Sequence[str], wanted: str) -> str:
+def _listed(folder: Path, wanted: str) -> str:
+    names = _folders(folder)
     if not names:
         return f"there is no folder in {folder}"
     near = difflib.get_close_matches(wanted, names, n=1)

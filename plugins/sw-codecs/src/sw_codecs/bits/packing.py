@@ -105,7 +105,7 @@ def write_signed(value: int) -> bytes:
 class ByteReader:
     """Takes fields off the front of a byte string; running out of bytes is a BitstreamError."""
 
-    def __init__(self, data: bytes) -> None:
+    def __init__(self, data: bytes | memoryview) -> None:
         self._data = memoryview(data)
         self._position = 0
 

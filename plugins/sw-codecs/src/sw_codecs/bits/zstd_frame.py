@@ -7,6 +7,7 @@ import zstandard
 from splatwizard_core.api import BitstreamError
 
 LEVEL = 19
+LONGEST_EMPTY = 32  # bytes of a frame that holds none: header, one block, checksum
 
 
 def compress(*parts: bytes) -> bytes:
@@ -23,7 +24,13 @@ def decompress(frame: bytes | memoryview, size: int) -> bytes:
     try:
         if zstandard.frame_content_size(frame) != size:
             raise BitstreamError(f"a zstd frame does not hold the {size:,} bytes that are expected")
-        plain = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
+        if size == 0:  # the library answers from the header alone, however the frame goes on
+            stream = zstandard.ZstdDecompressor().decompressobj()
+            plain = stream.decompress(frame[:LONGEST_EMPTY])
+            if not stream.eof or stream.unused_data or len(frame) > LONGEST_EMPTY:
+                raise BitstreamError("a zstd frame of no bytes is damaged")
+        else:
+            plain = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise BitstreamError(f"a zstd frame is damaged: {error}") from error
     if len(plain) != size:

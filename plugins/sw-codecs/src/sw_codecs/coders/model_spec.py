@@ -50,8 +50,8 @@ def changed(spec: Spec, **fields: Any) -> Spec:
     return unchecked(type(spec), **{**vars(spec), **fields})
 
 
-def _cut(array: np.ndarray, start: int, stop: int) -> np.ndarray:
-    return array if array.ndim == 0 else array[start:stop]
+def _cut(array: np.ndarray | float, start: int, stop: int) -> np.ndarray | float:
+    return array if np.ndim(array) == 0 else np.asarray(array)[start:stop]
 
 
 @dataclass(frozen=True)

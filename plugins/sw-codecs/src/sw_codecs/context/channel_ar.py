@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -57,7 +57,7 @@ class ChannelAr(nn.Module):
         """Refined (mean, scale) [n, F] of all slices; values [n, F] are noisy in training, dequantised otherwise."""
         if len(self.slices) == 1:
             return mean, scale
-        networks = [self.networks[f"slice{i}"] for i in range(1, len(self.slices))]
+        networks = [cast(nn.Sequential, self.networks[f"slice{i}"]) for i in range(1, len(self.slices))]
         parameters = [p for net in networks for layer in (net[0], net[2]) for p in (layer.weight, layer.bias)]
         refined: tuple[Tensor, Tensor] = _Refined.apply(self.slices, values, mean, scale, *parameters)  # type: ignore[no-untyped-call]
         return refined

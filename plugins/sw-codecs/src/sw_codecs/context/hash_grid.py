@@ -59,6 +59,11 @@ class HashGrid(nn.Module):
     table   [entries, features] parameter: learned numbers of all levels, level by level
     """
 
+    _scale: Tensor
+    _last: Tensor
+    _start: Tensor
+    _order: Tensor
+
     def __init__(
         self,
         dimensions: int,

@@ -83,8 +83,8 @@ class PrincipalFrame:
             raise ValueError(f"position codes must have {CODE_BITS} bits")
         one = 1 << _FRACTION
         columns = []
-        for x, y, z, constant, extra in rows:
-            total = codes[:, 0] * x + codes[:, 1] * y + codes[:, 2] * z + constant
+        for a, b, c, constant, extra in rows:
+            total = codes[:, 0] * a + codes[:, 1] * b + codes[:, 2] * c + constant
             columns.append((total >> extra).clamp(-FAR * one, FAR * one))
         y = torch.stack(columns, dim=1)  # [N,3] standard deviations, 16 fractional bits
         norm = _integer_sqrt((y * y).sum(dim=1, keepdim=True))

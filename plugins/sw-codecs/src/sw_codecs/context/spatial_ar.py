@@ -44,13 +44,16 @@ class SpatialAr(nn.Module):
         super().__init__()
         sizes = [(len(NEIGHBORS), HIDDEN), *[(HIDDEN, HIDDEN)] * RESIDUALS, (HIDDEN, 2)]
         self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, *size) for size in sizes)
-        for i, layer in enumerate(self.layers):
+        for i, layer in enumerate(self._linear()):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)
             if i in (0, len(self.layers) - 1):
                 drawn = torch.randn(layer.weight.shape, generator=generator)
                 with torch.no_grad():
                     layer.weight.copy_(drawn / layer.out_features**2)
+
+    def _linear(self) -> list[nn.Linear]:
+        return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def forward(self, planes: Tensor) -> tuple[Tensor, Tensor]:
         """(mean, s), each of the shape of `planes` [..., H, W]: integers, or integers with noise in training."""
@@ -59,7 +62,7 @@ class SpatialAr(nn.Module):
         around = [padded[:, 2 + down : 2 + down + h, 2 + right : 2 + right + w] for down, right in NEIGHBORS]
         a = torch.stack([each.flatten() for each in around])  # [12, n]: one column a value, so weights come first
         last = len(self.layers) - 1
-        for i, layer in enumerate(self.layers):
+        for i, layer in enumerate(self._linear()):
             out = torch.addmm(layer.bias[:, None], layer.weight, a)
             a = out if i == last else torch.relu(out + a if i > 0 else out)
         mean, s = a.view(2, *planes.shape)

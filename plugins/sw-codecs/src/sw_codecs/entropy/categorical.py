@@ -76,7 +76,7 @@ class Categorical:
         head = bytes([VERSION])
         if len(symbols) == 0:
             return head
-        return head + pack_tables(tables) + RangeCoder().encode(symbols, _spec(list(tables), index))
+        return head + pack_tables(list(tables)) + RangeCoder().encode(symbols, _spec(list(tables), index))
 
     def decode(self, data: bytes, context: CategoricalContext) -> np.ndarray:
         """int32 [n]. Raises BitstreamError for damage or another context."""

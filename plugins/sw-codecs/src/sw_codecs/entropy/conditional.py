@@ -99,9 +99,10 @@ class ConditionalGaussian:
         else:
             low, high = int(coded.min(initial=0)), int(coded.max(initial=0))
             spec = _floats(context, where, values.shape, low, high)
-            bits = gaussian_bits(
-                *(torch.from_numpy(each) for each in (coded.astype(np.float64), spec.mu, spec.sigma)), 1.0
-            ).numpy()
+            values64, mu, sigma = (
+                torch.from_numpy(np.asarray(each, np.float64)) for each in (coded, spec.mu, spec.sigma)
+            )
+            bits = gaussian_bits(values64, mu, sigma, 1.0).numpy()
         found[where] = bits if where is not Ellipsis else bits.reshape(values.shape)
         return torch.from_numpy(found)
 

@@ -119,14 +119,14 @@ class Factorised(nn.Module):
         steps = torch.as_tensor(self._step(context or FactorisedContext(), ends)).to(ends).expand(self.channels, 1)
         if not bool((steps > 0).all()):
             raise ValueError("the step must be positive")
-        ends = (ends / steps).cpu().numpy()
+        limits = (ends / steps).cpu().numpy()
 
         def mass(column: int, integers: np.ndarray) -> np.ndarray:
             x = torch.from_numpy(integers).to(steps) * steps[column]
             with torch.no_grad():
                 return self.mass(x[None], steps[column], slice(column, column + 1))[0].cpu().numpy()
 
-        return density_tables.encode(matrix, density_tables.windows(matrix, *ends.T), mass)
+        return density_tables.encode(matrix, density_tables.windows(matrix, *limits.T), mass)
 
     def decode(self, data: bytes, context: tuple[int, ...]) -> np.ndarray:
         """int64 of the shape `context`: (N, C) or (N,). Raises BitstreamError. Needs no parameters of this object."""

@@ -73,6 +73,10 @@ def step_multipliers(outputs: np.ndarray) -> np.ndarray:
     return exact_tables().multipliers[j]
 
 
+Floats = FloatContext
+Integers = IntegerContext
+
+
 class ExactModel:
     """Codes integer symbols [n], |k| < 2^30, in units of the step; see the two subclasses.
 
@@ -81,15 +85,15 @@ class ExactModel:
     """
 
     family: ClassVar[str]
-    FloatContext = FloatContext
-    IntegerContext = IntegerContext
+    FloatContext = Floats
+    IntegerContext = Integers
     step_multipliers = staticmethod(step_multipliers)
 
-    def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
+    def bits(self, symbols: Tensor, context: Floats) -> Tensor:
         """Bits of each value (its unit is the context's; rounded or with noise added); differentiable."""
         raise NotImplementedError
 
-    def table_bits(self, symbols: np.ndarray, context: IntegerContext) -> np.ndarray:
+    def table_bits(self, symbols: np.ndarray, context: Integers) -> np.ndarray:
         """Bits that `encode` spends on each symbol, float64 [n], from the very tables it uses; no gradient."""
         tables, _ = self._family()
         symbols = _check_symbols(symbols)
@@ -103,7 +107,7 @@ class ExactModel:
             found[rows[outside]] += 2 * (np.floor(np.log2(over)) + 1)
         return found
 
-    def encode(self, symbols: np.ndarray, context: IntegerContext) -> bytes:
+    def encode(self, symbols: np.ndarray, context: Integers) -> bytes:
         """u16 table version, u32 table CRC-32, then chunks; each is decoded again and compared.
 
         Raises ValueError for symbols or parameters out of range.
@@ -122,7 +126,7 @@ class ExactModel:
             parts.append(payload)
         return b"".join(parts)
 
-    def decode(self, data: bytes, context: IntegerContext) -> np.ndarray:
+    def decode(self, data: bytes, context: Integers) -> np.ndarray:
         """int32 [n], n as in the context. Raises BitstreamError for damage, a wrong context or other tables."""
         try:
             centre, number = _lattice(context, len(np.asarray(context.mean)))
@@ -155,7 +159,7 @@ class GaussianExact(ExactModel):
 
     family = "gaussian"
 
-    def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
+    def bits(self, symbols: Tensor, context: Floats) -> Tensor:
         return gaussian_bits(symbols, context.mean, context.scale, context.step, **context.bound)
 
 
@@ -164,7 +168,7 @@ class LaplaceExact(ExactModel):
 
     family = "laplace"
 
-    def bits(self, symbols: Tensor, context: FloatContext) -> Tensor:
+    def bits(self, symbols: Tensor, context: Floats) -> Tensor:
         return laplace_bits(symbols, context.mean, context.scale, context.step, **context.bound)
 
 

@@ -114,8 +114,8 @@ class _GaussianBits(torch.autograd.Function):
         inner = (at_far - at_near) * scale  # of the distance to the mean
         found: list[Tensor | None] = [None] * 4
         if ctx.needs_input_grad[0] or ctx.needs_input_grad[1]:
-            found[0] = inner * offset.sign()
-            found[1] = -found[0]
+            to_symbol = inner * offset.sign()
+            found[:2] = to_symbol, -to_symbol
         if ctx.needs_input_grad[2]:
             found[2] = (at_near * near - at_far * far) / sigma
         if ctx.needs_input_grad[3]:

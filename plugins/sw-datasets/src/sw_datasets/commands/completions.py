@@ -6,9 +6,6 @@ import click
 from click.shell_completion import CompletionItem
 
 from splatwizard_core.api import SplatwizardError
-from splatwizard_core.cli.complete import folders, image_folders, nothing
-
-__all__ = ["dataset_or_folder", "datasets", "folders", "image_folders", "nothing"]
 
 
 def datasets(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:

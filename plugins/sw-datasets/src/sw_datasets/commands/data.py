@@ -10,6 +10,8 @@ import click
 
 from splatwizard_core.tooling import (
     assignments,
+    complete_folders,
+    complete_image_folders,
     console,
     debug_option,
     json_option,
@@ -265,11 +267,11 @@ data.add_command(fetch)
 
 
 @data.command(short_help="a pinhole copy of a COLMAP scene with lens distortion")
-@click.argument("scene", metavar="SCENE", shell_complete=completions.folders)
-@click.argument("out", metavar="OUT", shell_complete=completions.folders)
+@click.argument("scene", metavar="SCENE", shell_complete=complete_folders)
+@click.argument("out", metavar="OUT", shell_complete=complete_folders)
 @options(
     click.option("--images", metavar="FOLDER", default="images", show_default=True,
-                 shell_complete=completions.image_folders,
+                 shell_complete=complete_image_folders,
                  help="Which picture folder of SCENE to undistort; OUT/images holds the result."),
     click.option("--quality", type=click.IntRange(1, 100), default=100, show_default=True, metavar="1..100",
                  help="Of JPEG pictures that are written."),
@@ -295,7 +297,7 @@ def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) ->
 
 
 @data.command(short_help="write the procedural demo scene")
-@click.argument("out", metavar="OUT", shell_complete=completions.folders)
+@click.argument("out", metavar="OUT", shell_complete=complete_folders)
 @options(
     click.option(
         "--size", type=click.Choice(["demo", "tiny"]), default="demo", show_default=True,
@@ -321,7 +323,7 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UserInputError(f"{out} is not an empty folder: choose another one")
     output_folder(target)
-    _, scene_options, _ = resolve_run_options(None, assignments(sets))
+    scene_options = resolve_run_options(None, assignments(sets)).scene
     scene = load_scene("demo" if size == "demo" else f"demo:{size}", scene_options, load_plugins())
     say(f"drawing {len(scene.train) + len(scene.test)} views")
     write_scene(scene, target, layout, text=text)

@@ -1,4 +1,4 @@
-"""Text of the command line to values, by the type of the field that takes them."""
+"""Parse text of the command line into values, by the type of the field that takes them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ import typing
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from splatwizard_core.runs.keys import block_of, members
+from splatwizard_core.training.keys import block_of, members
 
 _TRUE, _FALSE = ("true", "yes", "on", "1"), ("false", "no", "off", "0")
 _NONE = ("none", "null")
 
 
 def parse_text(annotation: Any, text: str) -> Any:
-    """The value that `text` means for a field of this type; bounds are checked elsewhere.
+    """Return the value that `text` means for a field of this type; bounds are checked elsewhere.
 
     bool        true/false, yes/no, on/off, 1/0
     int, float  as in Python, `30_000` and `3e4` included
@@ -134,7 +134,7 @@ def _is_bracketed(text: str) -> bool:
 
 
 def _split(text: str) -> list[str]:
-    """At commas that stand in no bracket."""
+    """Split at commas that stand in no bracket."""
     parts, depth, last = [], 0, 0
     for i, character in enumerate(text):
         depth += (character in "[({") - (character in "])}")

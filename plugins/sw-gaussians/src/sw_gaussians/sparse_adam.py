@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import math
-from typing import Literal
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ShapeError
-from splatwizard_core.training.native import TRAINING
+from splatwizard_core.api import ShapeError, SplatOptimizer
+from sw_gaussians.native import GAUSSIANS
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import ParamGroup, RenderResult, SplatModel
 
 BiasCorrection = Literal["none", "per_row"]
 
@@ -56,8 +60,8 @@ def sparse_adam(
     grad = grad.contiguous()
     floats = (param, grad, exp_avg, exp_avg_sq)
     compiled = all(t.device.type == "cpu" and t.dtype == torch.float32 and t.is_contiguous() for t in floats)
-    if compiled and TRAINING.try_load():
-        torch.ops.splatwizard_training.sparse_adam(*floats, rows.contiguous(), row_steps, lr, beta1, beta2, eps)
+    if compiled and GAUSSIANS.try_load():
+        torch.ops.splatwizard_gaussians.sparse_adam(*floats, rows.contiguous(), row_steps, lr, beta1, beta2, eps)
         for tensor in (param, exp_avg, exp_avg_sq):  # the kernel writes behind autograd's back
             torch.autograd.graph.increment_version(tensor)
         return
@@ -76,3 +80,39 @@ def sparse_adam(
     param.copy_(torch.where(seen, param - lr * update, param))
     exp_avg.copy_(torch.where(seen, average, exp_avg))
     exp_avg_sq.copy_(torch.where(seen, square, exp_avg_sq))
+
+
+class SparseSplatOptimizer(SplatOptimizer):
+    """Adam that updates only the Gaussians that the view shows; parameters without rows (networks) as always.
+
+    bias_correction     as in `sparse_adam`; with "per_row" a state holds "row_steps" [N] int32, the updates of each row
+    """
+
+    def __init__(
+        self, model: SplatModel, groups: Iterable[ParamGroup], *, bias_correction: BiasCorrection = "none"
+    ) -> None:
+        super().__init__(model, groups)
+        self.bias_correction: BiasCorrection = bias_correction
+
+    def step(self, result: RenderResult | None = None) -> None:
+        self.step_rows(None if result is None else result.visible)
+
+    @torch.no_grad()
+    def step_rows(self, rows: Tensor | None) -> None:
+        """Update the marked rows [N] bool; None: all of them. Raises ShapeError if the mask does not fit."""
+        dense = []
+        for name, update in self.due():
+            if name not in self.model.ROWS:
+                dense.append(update)
+                continue
+            state = self.states[name].tensors
+            if rows is None:
+                rows = torch.ones(len(update.param), dtype=torch.bool, device=update.param.device)
+            if self.bias_correction == "per_row" and "row_steps" not in state:
+                state["row_steps"] = torch.zeros(len(update.param), dtype=torch.int32, device=update.param.device)
+            sparse_adam(
+                update.param, update.grad, update.exp_avg, update.exp_avg_sq, rows,
+                lr=update.lr, beta1=update.beta1, beta2=update.beta2, eps=update.eps,
+                bias_correction=self.bias_correction, row_steps=state.get("row_steps"),
+            )  # fmt: skip
+        self.update(dense)

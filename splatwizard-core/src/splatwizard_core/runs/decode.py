@@ -1,4 +1,4 @@
-"""A file and nothing else to a model: choosing the method from the header, and timing it by the protocol."""
+"""Decode a model from a file and nothing else: by the method that its header names, timed by the protocol."""
 
 from __future__ import annotations
 
@@ -17,21 +17,18 @@ from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardErro
 from splatwizard_core.evaluation.speed import Spread, spread
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
+from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
-from splatwizard_core.runs.file_needs import (
-    missing_plugin,
-    newer_than_installed,
-    upgrade_command,
-)
+from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
 
 REPEATS = 3
 
 
 @dataclass(frozen=True)
 class DecodeReport:
-    """What decoding a file showed.
+    """Facts and times of decoding a file.
 
     digest              of the model; equal models have equal digests
     decode_s            median of `decode_runs_s`: from opening the file to a model on the device
@@ -62,7 +59,7 @@ class DecodeReport:
 
 
 def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
-    """The decoded model, ready to render on `device`, and the file it came from.
+    """Return the decoded model, ready to render on `device`, and the file it came from.
 
     Raises BitstreamError for a damaged file, PluginError if something that it needs is not installed.
     """
@@ -71,7 +68,7 @@ def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -
 
 
 def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
-    """The model in a parsed file, on the CPU. Raises as `open_model`."""
+    """Return the model in a parsed file, on the CPU. Raises as `open_model`."""
     method_class = _method_of(reader, plugins)
     if reader.version > method_class.version:
         entry = plugins.methods.entry(reader.method)
@@ -82,7 +79,7 @@ def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
         )
     try:
         with torch.no_grad():
-            model: SplatModel = method_class(plugins, None).decode(reader)
+            model = method_class(plugins, None).decode(reader)
     except PluginError as error:
         # Asked for only now: what helped to write the file may have nothing to do with reading it.
         if error.kind is None or error.name is None:
@@ -105,8 +102,8 @@ def import_method(path: str | Path, plugins: PluginManager) -> None:
     _method_of(ContainerReader.open(path), plugins)
 
 
-def _method_of(reader: ContainerReader, plugins: PluginManager) -> Any:
-    """The class of the method that wrote a file. Raises PluginError that says what to install."""
+def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
+    """Return the class of the method that wrote a file. Raises PluginError that says what to install."""
     name, methods = reader.method, plugins.methods
     if name in methods or name in methods.clashes:
         return methods.load(name)
@@ -129,10 +126,10 @@ def timed_decode(
     """
 
     def once() -> tuple[SplatModel, ContainerReader, float]:
-        _synchronize(device)
+        synchronize(device)
         began = time.perf_counter()
         model, reader = open_model(path, plugins, device)
-        _synchronize(device)
+        synchronize(device)
         return model, reader, time.perf_counter() - began
 
     import_method(path, plugins)
@@ -207,8 +204,3 @@ def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: st
             raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
     plugins.exporters.load(name)(model, path)
     return name
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

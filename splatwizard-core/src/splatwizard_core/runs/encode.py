@@ -1,4 +1,4 @@
-"""A trained model to one file: from a run directory, or from a .ply."""
+"""Encode a trained model into one file: from a run directory, or from a .ply."""
 
 from __future__ import annotations
 
@@ -17,25 +17,27 @@ from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import synchronize
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
-from splatwizard_core.runs.cache import cached_directory, trained_scene
+from splatwizard_core.plugins.catalogue import CORE
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.phases import part_of, unique
+from splatwizard_core.runs.pretrained import make_method, training_key
 from splatwizard_core.runs.session import Session, TrainedModel
-from splatwizard_core.runs.start import make_method, training_key
-from splatwizard_core.runs.training_run import finished_directory, train
-from splatwizard_core.runs.versions import CORE, made_by
+from splatwizard_core.runs.training import cached_directory, finished_directory, train
+from splatwizard_core.runs.versions import made_by
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
-"""What a decoder may want again; a pruner or a rasterizer has done its work by then."""
+"""Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""
 
 
 def encode(
     method: Method, model: SplatModel, raster: dict[str, Any], path: Path, device: torch.device
 ) -> dict[str, Any]:
-    """Write one file; {"encode_s", "bytes", "sha256", "made_by", "parts"}: versions by distribution, who took part.
+    """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
     raster  what the header asks of a rasterizer
     device  where the model is
@@ -43,7 +45,7 @@ def encode(
     The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
     """
     before = model.digest()
-    _synchronize(device)
+    synchronize(device)
     began = time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad(), method.plugins.recording() as loaded:
@@ -53,7 +55,7 @@ def encode(
         loaded.insert(0, method.plugins.methods.entry(method.name))
     writer.requires = requirements(loaded)
     size = writer.write(path)
-    _synchronize(device)
+    synchronize(device)
     seconds = time.perf_counter() - began
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
@@ -67,7 +69,7 @@ def encode(
 
 
 def requirements(entries: Iterable[Entry]) -> list[Requirement]:
-    """What a reader needs for a file that these entries wrote: the core first, each distribution once."""
+    """List what a reader needs for a file that these entries wrote: the core first, each distribution once."""
     versions = {CORE: importlib.metadata.version(CORE)}
     provided: dict[str, dict[tuple[str, str], None]] = {CORE: {}}
     for entry in entries:
@@ -80,30 +82,23 @@ def requirements(entries: Iterable[Entry]) -> list[Requirement]:
 
 
 def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
-    """The finished training of a run directory. Raises UserInputError if it is not finished."""
-    key = training_key(session, resolved)
+    """Return the finished training of a run directory. Raises UserInputError if it is not finished."""
     parents = directory.resolve().parents
-    root = parents[min(2, len(parents) - 1)]  # of <scene>/<method>/<rate>
-    cached = cached_directory(session, resolved, root, key)
-    if (
-        finished_directory(directory, key, cached) is None
-    ):  # asked before the lock too, which is a file in the directory
-        raise _not_finished(directory)
-    with directory_lock(directory, say=session.say):
+    request = RunRequest(resolved, parents[min(2, len(parents) - 1)])  # OUT/<scene>/<method>/<rate>
+    key = training_key(session, resolved)
+    cached = cached_directory(session, resolved, request.out, key)
+
+    def check() -> None:
         if finished_directory(directory, key, cached) is None:
-            raise _not_finished(directory)
-        # Its stages begin with what they began with, before the checkpoint takes its place.
-        return train(
-            session, resolved, directory,
-            trained=lambda name: trained_scene(session, name, resolved, root), cached=cached,
-        )  # fmt: skip
+            raise UserInputError(
+                f"{directory} holds no finished training of this configuration: `sw train --config "
+                f"{directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
+            )
 
-
-def _not_finished(directory: Path) -> UserInputError:
-    return UserInputError(
-        f"{directory} holds no finished training of this configuration: "
-        f"`sw train --config {directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
-    )
+    check()  # before the lock too, which is a file in the directory
+    with directory_lock(directory, say=session.say):
+        check()
+        return train(session, request, directory)
 
 
 def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
@@ -130,8 +125,3 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
         return encode(method, model, raster, target, session.device)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error
-
-
-def _synchronize(device: torch.device) -> None:
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)

@@ -1,4 +1,4 @@
-"""What a training starts from: a trained scene of another method, or one that a file holds; and what identifies both.
+"""The trained scene of another method, or of a file, that a training starts from; and the key that identifies both.
 
 A stage names the method (`starts_from`, `taught_by`). How its scene is trained follows from the run: the same preset if
 that method has it, the same run and scene options, and the values of `pretrained.KEY`. With `init = FILE.ply` the file
@@ -12,43 +12,43 @@ import os
 import re
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.ply import load_ply
 from splatwizard_core.method import Method
-from splatwizard_core.runs.config import INIT, ResolvedConfig, apply_overrides, content_hash, resolve
-from splatwizard_core.runs.keys import field_at, input_files, is_beside_method, value_at
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
+from splatwizard_core.runs.session import Session
+from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
+from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import PipelineParams
-
-if TYPE_CHECKING:
-    from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.plugins import PluginManager
-    from splatwizard_core.runs.session import Session
 
 IDENTITY = 2  # raised when checkpoints come to say something else of what they were made from
 PRESET = "preset"  # `pretrained.preset`: of the method that is started from
 
 
 def make_method(plugins: PluginManager, resolved: ResolvedConfig) -> Method:
-    """The configured method."""
+    """Return the configured method."""
     method: Method = plugins.methods.load(resolved.method)(plugins, resolved.config)
     return method
 
 
 def named_scenes(method: Method) -> list[str]:
-    """The methods whose trained scenes its stages start from or are taught by; the one of the first stage first."""
+    """List the methods whose trained scenes the stages start from or are taught by, that of the first stage first."""
     stages = list(method.stages())
     names = [name for stage in stages for name in (stage.starts_from, *stage.taught_by) if name is not None]
     return list(dict.fromkeys(names))
 
 
 def first_scene(method: Method) -> str | None:
-    """The method whose trained scene the first stage starts from; None: it starts from the scene's points, say."""
+    """Name the method whose trained scene the first stage starts from; None: from the scene's points, say."""
     return method.stages()[0].starts_from
 
 
 def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> ResolvedConfig:
-    """How a scene of method `name` that `outer` starts from is trained.
+    """Return the configuration that trains the scene of method `name` which `outer` starts from.
 
     Raises PluginError if the method is not installed, ConfigError that names the key `pretrained.KEY`.
     """
@@ -63,7 +63,7 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
             key=f"pretrained.{beside}",
         )
     try:
-        base = resolve(cls, str(preset), sets=wanted)
+        base = resolve(cls, str(preset), sets=wanted, scene=outer.scene_spec or None, plugins=plugins)
     except ConfigError as error:
         # What the other method's configuration says of its keys, with the names that they have here.
         told = re.sub(r"\b(key|for|mean) '([\w.]+)'", r"\1 'pretrained.\2'", str(error))
@@ -71,11 +71,11 @@ def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> Res
     # What a preset says about the run (clamped renders, say) belongs to the base method; the rest is as outside.
     said = {key: value for key, value in cls.PRESETS[base.preset].items() if field_at(PipelineParams, key) is not None}
     ppl = apply_overrides(outer.ppl, said, source=f"preset '{base.preset}' of '{name}'")
-    return replace(base, ppl=ppl, scene=outer.scene, scene_spec=outer.scene_spec)
+    return replace(base, ppl=ppl, scene=outer.scene)
 
 
 def starts(session: Session, resolved: ResolvedConfig) -> dict[str, dict[str, Any]]:
-    """Name of each method that is started from -> everything that its scene depends on; empty for most methods."""
+    """Map each method that is started from to everything that its scene depends on; empty for most methods."""
     method = make_method(session.plugins, resolved)
     found: dict[str, dict[str, Any]] = {}
     for name in named_scenes(method):
@@ -92,7 +92,7 @@ def starts(session: Session, resolved: ResolvedConfig) -> dict[str, dict[str, An
 
 
 def training_key(session: Session, resolved: ResolvedConfig) -> str:
-    """What a training was made from: equal keys mean an interchangeable model."""
+    """Return the key of everything a training is made from: equal keys mean an interchangeable model."""
     cls = session.plugins.methods.load(resolved.method)
     content: list[Any] = [
         IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version
@@ -101,14 +101,14 @@ def training_key(session: Session, resolved: ResolvedConfig) -> str:
     return content_hash([*content, before] if before else content)
 
 
-def of_no_use(plugins: PluginManager, resolved: ResolvedConfig) -> ConfigError | None:
-    """What is said of `init` or `pretrained.KEY` for a method that starts from nothing that they could be about."""
+def unused_start(plugins: PluginManager, resolved: ResolvedConfig) -> ConfigError | None:
+    """Return the error for `init` or `pretrained.KEY` of a method that starts from no trained scene; None: it does."""
     if not resolved.init and not resolved.pretrained:
         return None
     method = make_method(plugins, resolved)
-    key = INIT if resolved.init else f"pretrained.{next(iter(resolved.pretrained))}"
     if first_scene(method) is not None or (not resolved.init and named_scenes(method)):
         return None
+    key = INIT if resolved.init else f"pretrained.{next(iter(resolved.pretrained))}"
     about = f"'init' ({resolved.init})" if resolved.init else f"'{key}'"
     return ConfigError(
         f"method '{resolved.method}' does not start from a trained scene, so {about} is of no use to it: leave it out",
@@ -116,15 +116,15 @@ def of_no_use(plugins: PluginManager, resolved: ResolvedConfig) -> ConfigError |
     )
 
 
-def settled(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
-    """The configuration with what it starts from checked, and the values of `pretrained.KEY` parsed.
+def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
+    """Return the configuration with its start checked, and the values of `pretrained.KEY` parsed.
 
     Before anything runs: raises UserInputError for a file that is no model, ConfigError for a wrong key or value, or
-    if the method starts from nothing that these could be about.
+    for either of them where the method starts from no trained scene.
     """
-    useless = of_no_use(plugins, resolved)
-    if useless is not None:
-        raise useless
+    unused = unused_start(plugins, resolved)
+    if unused is not None:
+        raise unused
     if resolved.pretrained:
         resolved = _with_parsed_values(plugins, resolved)
     own = str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
@@ -151,14 +151,12 @@ def _with_parsed_values(plugins: PluginManager, resolved: ResolvedConfig) -> Res
     for name in names:
         base = base_config(plugins, name, resolved)
         parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}
-        settled(plugins, base)
+        checked_start(plugins, base)
     return replace(resolved, pretrained=parsed)
 
 
 def check_model(path: str) -> GaussianModel:
-    """The explicit Gaussians of a .ply. Raises UserInputError that says what is wrong with it, and what to do."""
-    from splatwizard_core.gaussians.ply import load_ply
-
+    """Read the explicit Gaussians of a .ply. Raises UserInputError that says what is wrong with it, and what to do."""
     where = Path(path)
     if where.is_dir():
         inside = sorted(where.rglob("*.ply"))

@@ -5,14 +5,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians import sparse_adam as module
+from sw_gaussians.native import GAUSSIANS
+from sw_gaussians.sparse_adam import SparseSplatOptimizer, sparse_adam
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.scene.scene import PointCloud
-from splatwizard_core.training import sparse_adam as module
-from splatwizard_core.training.native import TRAINING
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.sparse_adam import sparse_adam
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 OPTIONS = {"beta1": BETA1, "beta2": BETA2, "eps": EPS}
@@ -25,9 +25,9 @@ NEEDS_GPU = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(),
 @pytest.fixture(params=["kernels", "torch", pytest.param("cuda", marks=NEEDS_GPU)])
 def device(request, monkeypatch) -> str:
     if request.param == "torch":
-        monkeypatch.setattr(module, "TRAINING", SimpleNamespace(try_load=lambda: False))
-    elif request.param == "kernels" and not TRAINING.try_load():
-        pytest.skip(f"no compiled kernels: {TRAINING.available()}")
+        monkeypatch.setattr(module, "GAUSSIANS", SimpleNamespace(try_load=lambda: False))
+    elif request.param == "kernels" and not GAUSSIANS.try_load():
+        pytest.skip(f"no compiled kernels: {GAUSSIANS.available()}")
     return "cuda" if request.param == "cuda" else "cpu"
 
 
@@ -108,8 +108,8 @@ def test_hidden_rows_keep_every_bit_and_their_gradient_is_not_read(device, mode)
 
 
 def test_any_number_of_threads_gives_the_same_bits():
-    if not TRAINING.try_load():
-        pytest.skip(f"no compiled kernels: {TRAINING.available()}")
+    if not GAUSSIANS.try_load():
+        pytest.skip(f"no compiled kernels: {GAUSSIANS.available()}")
     threads, results = torch.get_num_threads(), []
     try:
         for count in (1, 3):
@@ -133,12 +133,14 @@ def test_wrong_arguments_are_refused():
         sparse_adam(x, x, x.clone(), x.clone(), rows, lr=1, bias_correction="per_row", **OPTIONS)
 
 
-def made(sparse, n: int = 12) -> tuple[GaussianModel, SplatOptimizer]:
+def made(mode, n: int = 12) -> tuple[GaussianModel, SplatOptimizer]:
     generator = torch.Generator().manual_seed(4)
     points = PointCloud(torch.rand(n, 3, generator=generator), torch.rand(n, 3, generator=generator))
     model = GaussianModel.from_points(points, max_sh_degree=1)
     groups = [ParamGroup(name, lr=0.01) for name, _ in model.named_parameters()]
-    return model, SplatOptimizer(model, groups, sparse=sparse)
+    if mode is None:
+        return model, SplatOptimizer(model, groups)
+    return model, SparseSplatOptimizer(model, groups, bias_correction=mode)
 
 
 def give_gradients(model: GaussianModel, seed: int) -> None:
@@ -153,7 +155,7 @@ def test_the_optimizer_updates_the_rows_it_is_told_of(mode):
     before = {k: v.detach().clone() for k, v in model.named_parameters()}
     seen = torch.arange(12) % 3 == 0
     give_gradients(model, 1)
-    optimizer.step(seen)
+    optimizer.step_rows(seen)
     for name, parameter in model.named_parameters():
         moved = (parameter.detach() != before[name]).view(12, -1)
         assert moved[seen].all()
@@ -179,12 +181,12 @@ def test_counts_follow_the_rows_that_come_go_and_are_rewritten(mode):
     seen[:6] = True
     for seed in (1, 2):
         give_gradients(model, seed)
-        optimizer.step(seen)
+        optimizer.step_rows(seen)
     optimizer.append_rows(model, {k: v.detach()[:2] for k, v in model.named_parameters()})
     optimizer.set_rows(model, torch.tensor([1]), {})
     optimizer.keep_rows(model, torch.arange(14) != 0)
     give_gradients(model, 3)
-    optimizer.step(torch.ones(13, dtype=torch.bool))
+    optimizer.step_rows(torch.ones(13, dtype=torch.bool))
     counts = optimizer.state_dict()["moments"]["means"].get("row_steps")
     if mode == "none":
         assert counts is None
@@ -197,25 +199,26 @@ def test_a_loaded_state_goes_on_in_the_same_bits(mode):
     model, optimizer = made(mode)
     seen = torch.arange(12) < 5
     give_gradients(model, 1)
-    optimizer.step(seen)
+    optimizer.step_rows(seen)
     other, resumed = made(mode)
     other.load_state_dict(model.state_dict())
     resumed.load_state_dict(optimizer.state_dict())
     for one, two in ((model, optimizer), (other, resumed)):
         give_gradients(one, 2)
-        two.step(torch.arange(12) < 8)
+        two.step_rows(torch.arange(12) < 8)
     assert model.digest() == other.digest()
 
 
-def test_a_dense_optimizer_takes_no_mask():
-    model, optimizer = made(None)
+def test_a_step_of_training_updates_what_its_render_shows():
+    model, optimizer = made("none")
+    before = model.means.detach().clone()
     give_gradients(model, 1)
-    with pytest.raises(ValueError, match="made with `sparse`"):
-        optimizer.step(torch.ones(12, dtype=torch.bool))
+    optimizer.step(SimpleNamespace(visible=torch.arange(12) < 4))
+    assert (model.means.detach() != before).any(dim=1).tolist() == [True] * 4 + [False] * 8
 
 
 def test_a_mask_of_another_length_is_refused():
     model, optimizer = made("none")
     give_gradients(model, 1)
     with pytest.raises(ShapeError, match="rows is"):
-        optimizer.step(torch.ones(11, dtype=torch.bool))
+        optimizer.step_rows(torch.ones(11, dtype=torch.bool))

@@ -1,4 +1,4 @@
-"""What makes two scenes the same scene, for keys of cached and finished work."""
+"""Checksum of the content of a scene, for keys of cached and finished work."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SAMPLED_PICTURES = 8
 
 
 def scene_digest(scene: Scene, digests: FileDigests | None = None) -> str:
-    """SHA-256 over protocol, view names, cameras, start points, and what every picture and mask file holds.
+    """Return the SHA-256 over protocol, view names, cameras, start points, and what every picture and mask file holds.
 
     digests     remembers checksums of files; None: they are read
 
@@ -52,10 +52,10 @@ def scene_digest(scene: Scene, digests: FileDigests | None = None) -> str:
 
 
 def picture_files(view: View) -> list[Path]:
-    """The files that a view's picture and mask are read from; empty if that cannot be told.
+    """List the files that a view's picture and mask are read from; empty if that cannot be told.
 
     A loader tells by making `View.load` and `View.load_mask` a `functools.partial` of a function that takes the paths
-    of all its files as positional arguments; the core's do.
+    of all its files as positional arguments.
     """
     found: list[Path] = []
     for load in (view.load, view.load_mask):

@@ -8,7 +8,7 @@ from lpips_backbones import write_backbones
 
 @pytest.fixture(scope="session")
 def lpips_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder for --lpips-weights."""
+    """A folder for metrics.lpips.weights."""
     return write_backbones(tmp_path_factory.mktemp("lpips-weights"))
 
 

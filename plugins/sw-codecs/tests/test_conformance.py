@@ -1,0 +1,198 @@
+"""Every installed provider of a coding contract, of whichever package, keeps it."""
+
+import numpy as np
+import pytest
+import torch
+
+from splatwizard_core.api import GaussianModel
+from splatwizard_core.plugins import load_plugins
+from sw_codecs import testing
+from sw_codecs.testing import EntropyCase
+
+PLUGINS = load_plugins()
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def gaussian_case(n, *, laplace=False, exact=False):
+    """Symbols that follow their distributions; parameters as floats, or as integers with 12 fractional bits."""
+    r = rng()
+    mean, scale = r.normal(0, 20, n), r.uniform(0.5, 8, n)
+    symbols = np.rint(r.laplace(mean, scale) if laplace else r.normal(mean, scale)).astype(np.int64)
+    model = PLUGINS.entropy_models.load("laplace-exact" if laplace else "gaussian-exact")
+    floats = model.FloatContext(torch.from_numpy(mean), torch.from_numpy(scale))
+    if not exact:
+        return EntropyCase(symbols, floats, floats, floats)
+    integers = model.IntegerContext(*(np.rint(4096 * each).astype(np.int64) for each in (mean, scale)))
+    return EntropyCase(symbols, integers, floats, integers)
+
+
+def rows_case(n):
+    r, rows = rng(), (n + 4) // 5
+    mean, scale, step = r.normal(0, 20, (rows, 5)), r.uniform(0.5, 8, (rows, 5)), r.uniform(0.5, 1.5, (rows, 1))
+    symbols = np.rint(r.normal(mean, scale) / step).astype(np.int64)
+    context = PLUGINS.entropy_models.load("conditional-gaussian").Context(
+        *(np.rint(4096 * each).astype(np.int64) for each in (mean, scale, step))
+    )
+    return EntropyCase(symbols, context, context, context)
+
+
+def columns_case(n):
+    rows = (n + 1) // 2
+    symbols = np.rint(rng().normal(0, [3, 40], (rows, 2))).astype(np.int64)
+    return EntropyCase(symbols, None, None, symbols.shape)
+
+
+def categorical_case(n):
+    index = rng(1).integers(0, 2, n)
+    symbols = np.minimum(rng().geometric(np.array([0.6, 0.2])[index]) - 1, 31)
+    context = PLUGINS.entropy_models.load("categorical").Context(32, index=index, tables=2)
+    return EntropyCase(symbols, context, context, context)
+
+
+def bernoulli_case(n):
+    return EntropyCase(rng().random(n) < 0.3, None, None, n)
+
+
+def mixture_case(n):
+    r = rng()
+    symbols = np.rint(np.where(r.random(n) < 0.6, r.normal(-25, 9, n), r.normal(40, 3, n))).astype(np.int64)[:, None]
+    logits, mean, scale = torch.tensor([0.6, 0.4]).log(), torch.tensor([[-25.0, 40.0]]), torch.tensor([[9.0, 3.0]])
+    context = PLUGINS.entropy_models.load("mixture").Context(logits, mean, scale)
+    return EntropyCase(symbols, context, context, symbols.shape)
+
+
+def factorised_case(n):
+    symbols = np.rint(rng().normal(0, 5, n)).astype(np.int64)[:, None]
+    return EntropyCase(symbols, None, None, symbols.shape)
+
+
+ENTROPY_CASES = {
+    "columns": columns_case,
+    "categorical": categorical_case,
+    "bernoulli": bernoulli_case,
+    "gaussian-exact": lambda n: gaussian_case(n, exact=True),
+    "laplace-exact": lambda n: gaussian_case(n, exact=True, laplace=True),
+    "gaussian": gaussian_case,
+    "laplace": lambda n: gaussian_case(n, laplace=True),
+    "mixture": mixture_case,
+    "factorised": factorised_case,
+    "conditional-gaussian": rows_case,
+}
+"""Context and symbols for each entropy model, since these differ; a new model needs one here."""
+
+CONTEXT_INPUTS = {
+    "integer-mlp": lambda load: (
+        load.from_module(torch.nn.Sequential(torch.nn.Linear(3, 4), torch.nn.ReLU(), torch.nn.Linear(4, 2))),
+        torch.arange(30).reshape(10, 3),
+    ),
+    "triplane": lambda load: (load(8, multiples=(1, 2)), torch.rand(10, 3)),
+    "spatial-ar": lambda load: (load(), torch.zeros(2, 5, 6)),
+    "channel-ar": lambda load: (load((2, 2)), torch.randn(10, 4), torch.randn(10, 4), torch.rand(10, 4)),
+    "hash-grid": lambda load: (load((6, 10), (10,), features=2, log2_space=8, log2_planes=8), torch.rand(10, 3)),
+}
+
+ARRAYS = {
+    "byte-planes": np.arange(60, dtype=np.float32).reshape(20, 3) / 7,
+    "float-delta": np.arange(60, dtype=np.float32).reshape(20, 3) / 7,
+    "packed-bits": np.arange(40, dtype=np.int64) * 1000,
+}
+
+QUICK = {"importance-vq": {"iterations": 5, "batch": 100}, "vectree": {"iterations": 5, "batch": 100}}
+"""Settings with which a coder that trains a codebook takes no minutes."""
+
+
+def trained(factory):
+    """A trained density, fitted to what it will code."""
+    torch.manual_seed(0)
+    model = factory()
+    values = torch.from_numpy(factorised_case(5000).symbols).float()
+    optimizer = torch.optim.Adam(model.parameters(), lr=0.02)
+    for _ in range(150):
+        optimizer.zero_grad()
+        model.bits(values + torch.rand_like(values) - 0.5, None).mean().backward()
+        optimizer.step()
+    return model
+
+
+@pytest.mark.parametrize("name", PLUGINS.entropy_models.names)
+def test_entropy_models(name):
+    factory = PLUGINS.entropy_models.load(name)
+    encoder = trained(factory) if name == "factorised" else None
+    testing.check_entropy_model(factory, ENTROPY_CASES[name], trained=encoder)
+
+
+@pytest.mark.parametrize("name", PLUGINS.context_models.names)
+def test_context_models(name):
+    testing.check_context_model(*CONTEXT_INPUTS[name](PLUGINS.context_models.load(name)))
+
+
+@pytest.mark.parametrize("name", PLUGINS.entropy_coders.names)
+def test_entropy_coders(name):
+    counts = np.array([9, 8, 7, 6, 5, 4, 3, 2, 1])
+    testing.check_entropy_coder(PLUGINS.entropy_coders.load(name), counts, rng().integers(0, 9, 300))
+
+
+@pytest.mark.parametrize("name", PLUGINS.position_codecs.names)
+def test_position_codecs(name):
+    reason = next((e.declared.get("available") for e in PLUGINS.coders if e.name == name), None)
+    if name == "draco":
+        pytest.importorskip("DracoPy", reason=reason)
+    points = rng().integers(0, 1 << 10, (200, 3))
+    testing.check_position_codec(PLUGINS.position_codecs.load(name), np.concatenate([points, points[:20]]), 10)
+
+
+@pytest.mark.parametrize("name", PLUGINS.array_coders.names)
+def test_array_coders(name):
+    testing.check_array_coder(PLUGINS.array_coders.load(name), ARRAYS.get(name, ARRAYS["byte-planes"]))
+
+
+@pytest.mark.parametrize("name", PLUGINS.vector_coders.names)
+def test_vector_coders(name):
+    vectors = rng().normal(size=(200, 6)).astype(np.float32)
+    testing.check_vector_coder(PLUGINS.vector_coders.load(name), PLUGINS, vectors, **QUICK.get(name, {}))
+
+
+@pytest.mark.parametrize("n", [0, 300])
+@pytest.mark.parametrize("name", PLUGINS.gaussian_codecs.names)
+def test_gaussian_codecs(name, n):
+    g = torch.Generator().manual_seed(3)
+    tails = ((3,), (1, 3), (8, 3), (), (3,), (4,))
+    model = GaussianModel(*(torch.randn(n, *tail, generator=g) for tail in tails))
+    codec = PLUGINS.gaussian_codecs.load(name)
+    decoded = testing.check_gaussian_codec(codec, PLUGINS, model, **QUICK.get(name, {}))
+    assert decoded.num_rows <= n
+    assert all(bool(torch.isfinite(parameter).all()) for parameter in decoded.parameters())
+    if n:
+        assert decoded.num_rows > 0
+
+
+def test_every_coder_says_what_it_codes():
+    views = (PLUGINS.entropy_coders, PLUGINS.position_codecs, PLUGINS.array_coders, PLUGINS.vector_coders)
+    typed = [name for view in (*views, PLUGINS.gaussian_codecs) for name in view.names]
+    assert sorted(typed) == PLUGINS.coders.names
+
+
+class Broken:
+    """A coder of arrays that keeps nothing but the number of its bytes."""
+
+    def encode(self, array):
+        return array.tobytes()
+
+    def decode(self, data, dtype, shape):
+        return np.zeros(shape, dtype)
+
+
+class Dicing(Broken):
+    def encode(self, array):
+        return np.random.default_rng().bytes(8)
+
+
+@pytest.mark.parametrize(
+    ("coder", "reason"), [(Broken, "bit for bit"), (Dicing, "repeatable"), (dict, "lacks .*encode")]
+)
+def test_a_provider_that_breaks_the_contract_is_told_how(coder, reason):
+    with pytest.raises(AssertionError, match=reason):
+        testing.check_array_coder(coder, ARRAYS["byte-planes"])
