@@ -1,7 +1,6 @@
 """The anchor method: Scaffold-GS in miniature, with a file whose features a context network predicts."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import torch
@@ -29,6 +28,8 @@ from splatwizard_core.api import (
     View,
     photometric_loss,
 )
+from sw_codecs.context.integer_mlp import IntegerMlp
+from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
 from sw_test_anchors.model import POSITION_BITS, ContextAnchors, context_inputs
 
 NETWORKS = ("mlp_opacity", "mlp_cov", "mlp_color")
@@ -112,7 +113,7 @@ class TestAnchors(Method):
         return [AnchorStage(self.config)]
 
     def encode(self, model: ContextAnchors, writer: ContainerWriter) -> None:
-        octree = self.plugins.coders.load("octree")()
+        octree = self.plugins.position_codecs.load("octree")()
         codes, side = model.grid.encode(model.anchors)
         order = torch.from_numpy(octree.sort(codes.cpu().numpy()))
         codes = codes.cpu()[order]
@@ -121,15 +122,16 @@ class TestAnchors(Method):
         writer.add_array("positions.low", side["low"])
         writer.add_array("positions.step", side["step"])
 
-        network = self.plugins.context_models.load("integer-mlp").from_module(model.context)
+        writer.require("context model", "integer-mlp")
+        network = IntegerMlp.from_module(model.context)
         for key, weights in network.state().items():
             writer.add_array(f"context.{key}", weights)
-        entropy = self.plugins.entropy_models.load("gaussian-exact")()
+        writer.require("entropy model", "gaussian-exact")
         rounded = self.plugins.quantizers.load("ste-round")(model.feature_step)
         symbols, _ = rounded.encode(model.features.cpu()[order])
         writer.add(
             "features",
-            entropy.encode(symbols.flatten().numpy(), distribution(entropy, network, codes, model.features.shape[1])),
+            GaussianExact().encode(symbols.flatten().numpy(), distribution(network, codes, model.features.shape[1])),
         )
 
         columns = self.plugins.entropy_models.load("columns")()
@@ -148,17 +150,16 @@ class TestAnchors(Method):
         voxel_size, step = (reader.number(name, low=1e-9, high=1e9) for name in ("voxel_size", "feature_step"))
         uniform = self.plugins.quantizers.load("uniform")
         with reader.decoding("positions") as data:
-            codes = torch.from_numpy(self.plugins.coders.load("octree")().decode(data))
+            codes = torch.from_numpy(self.plugins.position_codecs.load("octree")().decode(data))
             bits = np.full(3, POSITION_BITS, np.uint8)
             anchors = uniform.decode(codes, {**grid_side(reader, "positions", 3), "bits": bits})
         n = len(codes)
 
         keys = [f"{kind}{layer}" for layer in (0, 1) for kind in ("weight", "bias")]
         state = {key: reader.array(f"context.{key}", dtype="<f4") for key in keys}
-        entropy = self.plugins.entropy_models.load("gaussian-exact")()
         with reader.decoding("features") as data:
-            network = self.plugins.context_models.load("integer-mlp").from_state(state)
-            symbols = torch.from_numpy(entropy.decode(data, distribution(entropy, network, codes, feature_dim)))
+            network = IntegerMlp.from_state(state)
+            symbols = torch.from_numpy(GaussianExact().decode(data, distribution(network, codes, feature_dim)))
             rounded = self.plugins.quantizers.load("ste-round")
             features = rounded.decode(symbols.reshape(n, feature_dim), {"step": np.float64(step)})
 
@@ -183,13 +184,13 @@ class TestAnchors(Method):
         return model
 
 
-def distribution(entropy: Any, network: Any, codes: Tensor, feature_dim: int) -> Any:
+def distribution(network: IntegerMlp, codes: Tensor, feature_dim: int) -> IntegerContext:
     """Mean and scale of every feature, anchor by anchor: what encoder and decoder both derive from the positions.
 
     Raises ValueError if the network has another number of outputs.
     """
     mean, scale = network(context_inputs(codes)).split(feature_dim, dim=1)
-    return entropy.IntegerContext(mean.flatten().numpy(), scale.flatten().numpy())
+    return IntegerContext(mean.flatten().numpy(), scale.flatten().numpy())
 
 
 def grid_side(reader: ContainerReader, name: str, channels: int) -> dict[str, np.ndarray]:

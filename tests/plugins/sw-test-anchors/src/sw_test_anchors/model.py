@@ -7,6 +7,7 @@ from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from torch import Tensor, nn
 
 from splatwizard_core.api import PluginManager
+from sw_codecs.entropy.rates import gaussian_bits
 
 POSITION_BITS = 16
 OCTAVES = 5
@@ -63,7 +64,6 @@ class ContextAnchors(AnchorModel):
         self._uniform = plugins.quantizers.load("uniform")
         self._noisy = plugins.quantizers.load("uniform-noise")(feature_step)
         self._rounded = plugins.quantizers.load("ste-round")(feature_step)
-        self._entropy = plugins.entropy_models.load("gaussian-exact")()
 
     @property
     def grid(self) -> Any:
@@ -82,8 +82,7 @@ class ContextAnchors(AnchorModel):
             codes, _ = self.grid.encode(positions)
             mean, scale = self.context(context_inputs(codes).to(features) / 4096).chunk(2, dim=1)
             step = self.feature_step
-            distribution = self._entropy.FloatContext(mean * step, scale.clamp(min=MIN_SCALE) * step, step)
-            extras["bits"] = self._entropy.bits(features, distribution)  # [V,F]
+            extras["bits"] = gaussian_bits(features, mean * step, scale.clamp(min=MIN_SCALE) * step, step)  # [V,F]
         else:
             features = self._rounded.forward(features)
         return AnchorAttributes(positions, features, self.offsets[rows], self.log_scales[rows].exp(), extras=extras)
