@@ -3,6 +3,7 @@
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
 # make kernels  compile every native module ahead of time
+# make docs   docs/cli.md and the core's catalogue of packages, from what is registered
 
 PYTHON ?= python3
 VENV ?= .venv
@@ -45,7 +46,8 @@ kernels: $(VENV)/.ready
 	$(BIN)/sw build-kernels
 
 docs: $(VENV)/.ready
-	$(BIN)/python -m splatwizard_core.cli.docs docs/cli.md
+	$(BIN)/python tools/cli_docs.py docs/cli.md
+	$(BIN)/python tools/make_catalogue.py
 
 $(VENV)/bin/python:
 	@PYTHON=$(PYTHON) tools/check-system python

@@ -32,7 +32,7 @@ from torch.utils._pytree import tree_leaves
 
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.camera import Camera, look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 
@@ -58,7 +58,9 @@ class Moved(TorchDispatchMode):
 
 def camera_before() -> Camera:
     """Three units before the anchors."""
-    return look_at(torch.tensor([0.0, 0, -3]), torch.zeros(3), torch.tensor([0.0, 1, 0]), width=8, height=8, fov_x=1)
+    return Camera.look_at(
+        torch.tensor([0.0, 0, -3]), torch.zeros(3), torch.tensor([0.0, 1, 0]), width=8, height=8, fov_x=1
+    )
 
 
 def made(name: str, count: int, preset: str, device: torch.device) -> tuple[Any, Any, Any]:

@@ -34,7 +34,7 @@ from sw_report.after_run import plot_above, report_above
 
 from splatwizard_core.cores import available_cores
 from splatwizard_core.plugins.manager import load_plugins
-from splatwizard_core.runs.start import named_scenes
+from splatwizard_core.runs.pretrained import named_scenes
 
 EXPLICIT = ("3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "chimerags")
 ANCHORS = ("hac", "cat-3dgs")

@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions
+from splatwizard_core.api import Rasterizer, RasterOptions
 from sw_rasterizers import native, ops
 from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.standard import StandardRasterizer

@@ -27,9 +27,7 @@ from pathlib import Path
 
 import torch
 
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
 from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
 from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES
 from sw_rasterizers.standard import StandardRasterizer

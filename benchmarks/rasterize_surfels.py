@@ -20,9 +20,7 @@ from pathlib import Path
 import torch
 from sw_reference.testing.raster_scenes import cast_inputs, with_tensors
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterOptions
 from sw_rasterizers.standard import StandardRasterizer
 from sw_rasterizers.surfel import SurfelRasterizer
 

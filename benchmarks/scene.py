@@ -18,8 +18,7 @@ import math
 import numpy as np
 import torch
 
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import SH, Camera, GaussianInputs
 
 SEED = 7
 PATCHES = 300  # surface patches of the object
@@ -104,7 +103,7 @@ def orbit_cameras(k: int, width: int, height: int, hfov: float = HFOV) -> list[C
 
 
 def main() -> None:
-    from splatwizard_core.rendering.rasterizer import RasterOptions
+    from splatwizard_core.api import RasterOptions
     from sw_rasterizers.standard import StandardRasterizer
 
     parser = argparse.ArgumentParser(description="Statistics of a benchmark scene.")

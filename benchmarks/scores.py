@@ -18,7 +18,7 @@ from pathlib import Path
 import torch
 from sw_reference.testing.raster_scenes import cast_inputs, with_tensors
 
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import RasterOptions, ScoreSpec
 from sw_rasterizers.scoring import PupRasterizer
 from sw_rasterizers.standard import StandardRasterizer
 

@@ -36,8 +36,8 @@ from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import resolve
+from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.start import make_method
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
@@ -269,7 +269,7 @@ def _named(call: Callable[..., Any], name: str) -> Callable[..., Any]:
 
 def phases_of(method: str, stage: Any) -> list[Phase]:
     """The phases of a plan, in steps of this run."""
-    at, end = stage.config.phases, stage.iterations
+    at, end = stage.opt.phases, stage.iterations
     if method == "hac":
         names = ("full precision", "noise", "entropy")
         starts: tuple[int, ...] = (0, stage.when(at.quantized), stage.when(at.entropy))

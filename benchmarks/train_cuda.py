@@ -39,8 +39,8 @@ from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve
 from splatwizard_core.runs.device import device_reason
+from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.start import make_method
 from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import train_stages
 from splatwizard_core.training.trainer import StepRecord

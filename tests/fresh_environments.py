@@ -65,6 +65,14 @@ class FreshEnvironment:
             raise AssertionError(f"sw {' '.join(args)} exited {done.returncode}:\n{done.stdout}\n{done.stderr}")
         return done
 
+    def python_c(self, program: str, *args: str) -> None:
+        """Run a program in its interpreter, away from the source tree; AssertionError with its output if it fails."""
+        done = subprocess.run(
+            [str(self.python), "-c", program, *args], **self._surroundings({}), capture_output=True, timeout=300
+        )
+        if done.returncode:
+            raise AssertionError(f"the program exited {done.returncode}:\n{done.stdout}\n{done.stderr}")
+
     def start(self, *args: str, **env: str) -> subprocess.Popen[str]:
         """Start `sw ARGS` there as a foreground process of a terminal would run: Ctrl-C (SIGINT) reaches it."""
 

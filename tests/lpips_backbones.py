@@ -19,7 +19,7 @@ def random_state(net: str) -> dict[str, torch.Tensor]:
 
 
 def write_backbones(folder: Path, *nets: str) -> Path:
-    """Files for --lpips-weights; returns the folder."""
+    """Files for metrics.lpips.weights; returns the folder."""
     for net in nets or BACKBONES:
         torch.save(random_state(net), folder / BACKBONES[net].file_name)
     return folder

@@ -17,7 +17,7 @@ from bitstream_page import entropy_coders, entropy_models, method_files, positio
 from splatwizard_core.cli.main import main
 from splatwizard_core.coding import container, strict_json
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.runs.decoding import open_model
+from splatwizard_core.runs.decode import open_model
 from sw_codecs.entropy import column_plan
 from sw_codecs.positions import point_limit
 

@@ -14,7 +14,7 @@ import pytest
 from click.shell_completion import BashComplete
 
 from splatwizard_core.cli import complete
-from splatwizard_core.cli.main import COMMANDS, cli, main
+from splatwizard_core.cli.main import cli, command_entries, main
 from splatwizard_core.plugins import load_plugins
 
 
@@ -91,7 +91,7 @@ def test_a_restriction_to_a_plugin_that_is_not_there_offers_nothing_and_says_not
 def commands() -> list[tuple[str, click.Command]]:
     found = []
     context = click.Context(cli)
-    for name in COMMANDS:
+    for name in (entry.name for entry in command_entries()):
         command = cli.get_command(context, name)
         assert command is not None
         inner = command.commands.items() if isinstance(command, click.Group) else []

@@ -7,9 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 
 from sw_datasets.families import BENCHMARKS
+from sw_datasets.pictures import fitted_size
 
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.images import fitted_size
 
 DOCS = (Path(__file__).resolve().parents[1] / "docs" / "datasets.md").read_text(encoding="utf-8")
 

@@ -15,6 +15,8 @@ import pytest
 
 def doctor(*arguments: str, **env: str) -> subprocess.CompletedProcess[str]:
     kept = {k: v for k, v in os.environ.items() if k not in ("SW_PLUGINS", "SPLATWIZARD_DATA", "SPLATWIZARD_NATIVE")}
+    if "PYTHONPATH" in env:
+        env["PYTHONPATH"] = os.pathsep.join(filter(None, (env["PYTHONPATH"], os.environ.get("PYTHONPATH"))))
     return subprocess.run(
         [sys.executable, "-m", "splatwizard_core", "doctor", *arguments],
         capture_output=True, text=True, timeout=120, env={**kept, **env}, check=False,
@@ -100,10 +102,53 @@ def test_without_a_torch_that_imports_the_main_job_cannot_run(tmp_path):
 
 
 def test_without_the_method_the_main_job_cannot_run():
-    done = doctor("--json", SW_PLUGINS="")
+    done = doctor("--json", SW_PLUGINS="doctor,datasets,rasterizers")
     assert done.returncode == 1
-    job = checks_of(done)["sw run --method 3dgs --scene demo"]
-    assert (job["state"], job["mend"]) == ("broken", "unset SW_PLUGINS")
+    job = checks_of(done)["sw run"]
+    assert (job["state"], job["detail"], job["mend"]) == ("broken", "not installed: a method", "unset SW_PLUGINS")
+
+
+def test_without_torch_a_registered_check_that_needs_it_is_left_out(tmp_path):
+    (tmp_path / "torch").mkdir()
+    (tmp_path / "torch" / "__init__.py").write_text("raise ImportError('libtorch.so: cannot open shared object file')")
+    checks = checks_of(doctor("--json", PYTHONPATH=str(tmp_path)))
+    assert checks["torch"]["state"] == "broken"
+    assert not any(check["group"] == "metrics" for check in checks.values())
+
+
+def test_checks_of_strangers_stand_beside_ours_and_harm_none(tmp_path):
+    """One that works, one that kills its process, one that claims to be the main job."""
+    plugin(
+        tmp_path, "sw-radio",
+        """
+import os
+from splatwizard_core.api import hookimpl
+from splatwizard_core.tooling import Check
+
+@hookimpl
+def register_checks(registry):
+    registry.add("aerial", "sw_radio:aerial", summary="", group="radio")
+    registry.add("fuse", "sw_radio:fuse", summary="", group="radio")
+    registry.add("liar", "sw_radio:liar", summary="")
+
+def aerial():
+    return [Check("radio", "aerial", "missing", "none is plugged in", "buy one")]
+
+def fuse():
+    os.abort()
+
+def liar():
+    return [Check("main job", "liar", "broken", "nothing works", needed=True)]
+""",
+    )  # fmt: skip
+    done = doctor("--json", PYTHONPATH=str(tmp_path))
+    assert done.returncode == 0, done.stdout
+    checks = checks_of(done)
+    assert (checks["aerial"]["state"], checks["aerial"]["mend"]) == ("missing", "buy one")
+    assert (checks["fuse"]["group"], checks["fuse"]["state"]) == ("radio", "broken")
+    assert "the check of sw-radio" in checks["fuse"]["detail"]
+    assert "SIGABRT" in checks["fuse"]["detail"]
+    assert (checks["liar"]["group"], checks["liar"]["needed"]) == ("checks", False)
 
 
 def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
@@ -121,3 +166,16 @@ def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
     found = probe._check_rasterizer(plugins.rasterizers.entry("gsplat"), plugins)
     assert (found.state, found.detail) == ("missing", "gsplat is not installed")
     assert found.mend == "pip install 'sw-gsplat[gsplat]'"
+
+
+def test_beside_the_core_alone_it_names_the_packages_that_a_run_needs(fresh_environment, wheels):
+    fresh_environment.install(wheels["splatwizard-core"], wheels["sw-doctor"])
+    done = fresh_environment.run("doctor", "--json", check=False)
+    assert done.returncode == 1
+    checks = checks_of(done)
+    job = checks["sw run"]
+    assert (job["state"], job["needed"]) == ("broken", True)
+    assert job["mend"] == "pip install sw-3dgs sw-datasets sw-rasterizers"
+    assert {name: check for name, check in checks.items() if check["needed"] and check["state"] != "ok"} == {
+        "sw run": job
+    }

@@ -1,60 +1,53 @@
-"""Who may import whom: knowledge flows downward, and no plugin is known by name."""
+"""Who may import whom: knowledge flows downward, through two faces, and no method is imported by anybody."""
 
 from __future__ import annotations
 
-import ast
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-
-ROOT = Path(__file__).parents[1]
-CORE = ROOT / "splatwizard-core" / "src" / "splatwizard_core"
-PLUGINS = sorted(p for folder in ("plugins", "examples", "tests/plugins") for p in ROOT.glob(f"{folder}/*/src/sw_*"))
+from import_graph import (
+    CORE,
+    PACKAGES,
+    STRANGERS,
+    circles,
+    declared_dependencies,
+    files_of,
+    imported,
+    longest_chain,
+    module_graph,
+)
 
 BELOW_ALL = {"errors", "files", "progress", "streams", "memory", "cores"}
 """Single modules that know no room."""
+BELOW_RUNS = {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins", "native"}
 ROOMS = {
     "plugins": set(),
-    "native": set(),
+    "native": {"plugins"},
     "scene": {"plugins"},
     "gaussians": {"scene"},
-    "rendering": {"gaussians", "scene", "plugins", "builtin"},
-    "training": {"rendering", "gaussians", "scene", "native"},
-    "coding": {"gaussians", "scene"},
+    "rendering": {"gaussians", "scene", "plugins"},
+    "training": {"rendering", "gaussians", "scene", "native", "plugins"},
+    "coding": {"gaussians", "scene", "plugins"},
     "evaluation": {"rendering", "gaussians", "scene", "plugins"},
-    "testing": {"rendering", "gaussians", "scene"},
-    "experiments": {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins", "native"},
-    "cli": {
-        "experiments", "training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins", "native",
-    },
+    "method": {"training", "coding", "gaussians", "scene", "plugins"},
+    "gaussian_method": {"method", "training", "coding", "gaussians", "scene", "plugins"},
+    "runs": {"method", *BELOW_RUNS},
+    "cli": {"runs", "method", *BELOW_RUNS},
     "builtin": {"plugins"},
     "__main__": {"cli"},
+    # The faces import what they lend when somebody asks for it.
+    "api": set(),
+    "tooling": set(),
     **{module: set() for module in BELOW_ALL},
-}  # fmt: skip
-"""Room -> the rooms that it may import when it runs. What only a type checker reads is free."""
+}
+"""Room of the core -> the rooms that it may import when it runs. What only a type checker reads is free."""
 
-
-def imported(path: Path) -> Iterator[str]:
-    """Dotted names of all modules that a file imports, at any depth but under `if TYPE_CHECKING:`."""
-
-    def visit(node: ast.AST) -> Iterator[str]:
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
-        typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
-        for child in node.orelse if typing_only else ast.iter_child_nodes(node):
-            yield from visit(child)
-
-    return visit(ast.parse(path.read_text(encoding="utf-8")))
-
-
-def files_of(package: Path) -> list[Path]:
-    return sorted(package.rglob("*.py"))
+LIBRARIES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference"}
+"""Packages that others may import when they declare them."""
+ABOUT_RUNS = {"sw_report", "sw_doctor", "sw_datasets", "sw_metrics"}
+"""Packages that may use `tooling` besides `api`."""
 
 
 def room_of(path: Path) -> str:
@@ -78,11 +71,16 @@ def test_a_room_imports_only_what_lies_below(room):
 
 
 def test_the_table_has_no_circle():
-    below: set[str] = set()
-    while len(below) < len(ROOMS):
-        ready = {room for room, uses in ROOMS.items() if uses <= below} - below
-        assert ready, f"these import each other: {sorted(set(ROOMS) - below)}"
-        below |= ready
+    assert circles({room: frozenset(uses) for room, uses in ROOMS.items()}) == []
+
+
+def test_no_modules_import_each_other():
+    assert circles(module_graph()) == []
+
+
+def test_the_longest_chain_of_imports_stays_short():
+    chain = longest_chain(module_graph())
+    assert len(chain) <= 26, " -> ".join(chain)
 
 
 def test_the_core_imports_no_plugin():
@@ -90,11 +88,30 @@ def test_the_core_imports_no_plugin():
     assert found == []
 
 
-@pytest.mark.parametrize("package", PLUGINS, ids=lambda p: p.name)
-def test_a_plugin_imports_no_sibling(package):
-    modules = [(p.name, m.split(".")[0]) for p in files_of(package) for m in imported(p)]
-    assert modules, "no import was found: the test looks in the wrong place"
-    assert [(f, m) for f, m in modules if m.startswith("sw_") and m != package.name] == []
+@pytest.mark.parametrize("package", [*PACKAGES, *STRANGERS], ids=lambda p: p.name)
+def test_a_package_imports_the_core_through_its_faces(package):
+    faces = {"api", "tooling"} if package.name in ABOUT_RUNS else {"api"}
+    inside = [
+        f"{p.relative_to(package)} imports {m}"
+        for p in files_of(package)
+        for m in imported(p)
+        if m.startswith("splatwizard_core") and m.split(".")[1] not in faces
+    ]
+    assert inside == []
+
+
+@pytest.mark.parametrize("package", [*PACKAGES, *STRANGERS], ids=lambda p: p.name)
+def test_a_package_imports_declared_libraries_alone(package):
+    others = {m.split(".")[0] for p in files_of(package) for m in imported(p) if m.startswith("sw_")} - {package.name}
+    assert others <= LIBRARIES
+    assert {name.replace("_", "-") for name in others} <= declared_dependencies(package)
+
+
+def test_the_dependencies_of_packages_form_no_circle():
+    ours = {package.name.replace("_", "-"): package for package in PACKAGES}
+    graph = {name: frozenset(declared_dependencies(package) & set(ours)) for name, package in ours.items()}
+    assert circles(graph) == []
+    assert any(graph.values()), "no dependency was found: the test looks in the wrong place"
 
 
 def test_imports_are_found_wherever_they_stand(tmp_path):
@@ -118,11 +135,19 @@ def test_imports_are_found_wherever_they_stand(tmp_path):
     assert list(imported(path)) == ["a.b", "c", "d.e.f", "g.h", "i", "j", "k"]
 
 
+def test_circles_and_chains_are_found():
+    graph = {"a": frozenset("b"), "b": frozenset("ca"), "c": frozenset(), "d": frozenset("d"), "e": frozenset("ac")}
+    assert circles(graph) == [["a", "b"]]
+    assert longest_chain({"a": frozenset("b"), "b": frozenset("c"), "c": frozenset(), "d": frozenset("c")}) == list(
+        "abc"
+    )
+
+
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["list-plugins"]], ids=["import", "help", "list-plugins"])
 def test_what_must_be_quick_imports_no_torch(arguments):
     program = f"""
 import sys
-import splatwizard_core
+import splatwizard_core, splatwizard_core.api, splatwizard_core.tooling
 
 status = 0
 if {arguments}:

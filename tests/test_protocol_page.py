@@ -10,7 +10,8 @@ from pydantic import BaseModel
 from sw_metrics.lpips_weights import BACKBONES
 
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.runs import measuring, record
+from splatwizard_core.plugins.catalogue import is_ours
+from splatwizard_core.runs import measure, record
 from splatwizard_core.scene.scene import Protocol
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "protocol.md").read_text(encoding="utf-8")
@@ -27,12 +28,12 @@ def row(first: str) -> str:
     return "\n".join(found)
 
 
-def core_metrics() -> list[str]:
-    return [entry.name for entry in load_plugins().metrics if entry.distribution == "splatwizard-core"]
+def our_metrics() -> list[str]:
+    return [entry.name for entry in load_plugins().metrics if is_ours(entry.distribution)]
 
 
 def test_every_metric_has_its_row_with_direction_and_kind():
-    for name in core_metrics():
+    for name in our_metrics():
         declared = load_plugins().metrics.entry(name).declared
         assert declared["direction"] in row(name)
         assert ("*diagnostic.*" in row(name)) == bool(declared.get("diagnostic")), name
@@ -43,7 +44,7 @@ def test_no_row_describes_a_metric_that_is_not_there():
     assert re.findall(r"^\| `(\w+)` \|", section, re.M) == list(
         dict.fromkeys(re.findall(r"^\| `(\w+)` \|", section, re.M))
     )
-    assert set(re.findall(r"^\| `(\w+)` \|", section, re.M)) == set(core_metrics())
+    assert set(re.findall(r"^\| `(\w+)` \|", section, re.M)) == set(our_metrics())
 
 
 @pytest.mark.parametrize("block", BLOCKS)
@@ -61,7 +62,7 @@ def test_every_field_of_the_record_has_a_row():
 
 def test_the_schema_and_the_flags_are_the_ones_that_are_written():
     assert f"schema {record.SCHEMA}" in PAGE
-    source = Path(measuring.__file__).read_text()
+    source = Path(measure.__file__).read_text()
     flags = re.findall(r'"([a-z-]+)": ', source.partition("told = {")[2].partition("}")[0])
     assert flags
     assert set(re.findall(r"`([\w-]+)`", row("flags").split("|")[2])) == set(flags)

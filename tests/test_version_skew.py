@@ -80,7 +80,7 @@ def test_a_missing_method(tmp_path, capsys, command):
 
 
 def test_a_missing_method_of_a_file_that_names_no_package(tmp_path, capsys):
-    assert "pip install sw-mars (or the package that provides it)" in said(
+    assert "install the package that provides it (`sw list-plugins` shows what is there)" in said(
         capsys, "decode", write(tmp_path, method="mars", requires={})
     )
 

@@ -135,12 +135,12 @@ def make_models(root: Path) -> None:
 
     from splatwizard_core.coding.container import ContainerWriter
     from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.gaussians.ply import save_ply
+    from splatwizard_core.gaussians.ply import export_ply
     from splatwizard_core.scene.scene import PointCloud
 
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     ply = root / "grey.ply"
-    save_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), ply)
+    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), ply)
     content = ply.read_bytes()
     head, _, body = content.partition(b"end_header\n")
     (root / "cut.ply").write_bytes(content[:-50])
@@ -153,7 +153,7 @@ def make_models(root: Path) -> None:
     damaged = GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1)
     with torch.no_grad():
         damaged.means[3, 1] = float("nan")
-    save_ply(damaged, root / "nan.ply")
+    export_ply(damaged, root / "nan.ply")
     (root / "trained" / "point_cloud").mkdir(parents=True)
     shutil.copyfile(ply, root / "trained" / "point_cloud" / "point_cloud.ply")
 

@@ -1,4 +1,4 @@
-"""docs/cli.md from `--help`: `python -m splatwizard_core.cli.docs docs/cli.md`."""
+"""Write docs/cli.md from `--help`, with every package of ours installed: `python tools/cli_docs.py docs/cli.md`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 
 import click
 
-from splatwizard_core.cli.main import COMMANDS, cli
+from splatwizard_core.cli.main import cli, command_entries
+from splatwizard_core.plugins.catalogue import is_ours
 
 WIDTH = 100
 
 INTRODUCTION = """\
 # The command `sw`
 
-This page is generated from `--help` (`make docs`); a test holds the two together. Commands that installed plugins add
-are not in it: `sw --help` lists them.
+This page is generated from `--help` (`make docs`); a test holds the two together. It has the commands of all packages
+of this project; `sw --help` lists those that are installed, other people's among them.
 
 Exit status: 0 done, 1 failure, 2 wrong input, 130 interrupted. Errors are one or two lines on stderr; `--debug` adds a
 traceback. Results go to stdout, progress and messages to stderr; with `--json` stdout is one JSON object.
@@ -24,7 +25,7 @@ traceback. Results go to stdout, progress and messages to stderr; with `--json` 
 
 
 def pages(command: click.Command, name: str, parent: click.Context | None) -> Iterator[tuple[str, str]]:
-    """(`sw run`, its help) for a command and, if it is a group, what is in it; plugins' commands left out."""
+    """(`sw run`, its help) for a command and, if it is a group, for those in it; strangers' commands are left out."""
     context = click.Context(
         command,
         info_name=name,
@@ -34,12 +35,12 @@ def pages(command: click.Command, name: str, parent: click.Context | None) -> It
         help_option_names=cli.context_settings["help_option_names"],
     )
     if command is cli:
-        # The list of commands would contain what happens to be installed.
+        # The list of commands would contain what strangers have installed.
         formatter = context.make_formatter()
         command.format_usage(context, formatter)
         command.format_help_text(context, formatter)
         yield context.command_path, formatter.getvalue().rstrip()
-        names = list(COMMANDS)
+        names = [entry.name for entry in command_entries() if is_ours(entry.distribution)]
     else:
         yield context.command_path, command.get_help(context)
         names = command.list_commands(context) if isinstance(command, click.Group) else []

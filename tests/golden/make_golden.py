@@ -23,8 +23,8 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import create_method
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.runs.decoding import decode_model
-from splatwizard_core.runs.encoding import encode
+from splatwizard_core.runs.decode import decode_model
+from splatwizard_core.runs.encode import encode
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 
 FOLDER = Path(__file__).resolve().parent

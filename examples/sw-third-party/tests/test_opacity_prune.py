@@ -3,9 +3,8 @@
 import torch
 from sw_third_party.method import OpacityPrune, OpacityPruneConfig, most_opaque
 
-from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.plugins import load_plugins
+from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel
+from splatwizard_core.tooling import load_plugins
 
 
 def test_the_most_opaque_half_stays():

@@ -4,15 +4,15 @@ import math
 
 import pytest
 import torch
-from sw_gaussians import density
+from sw_gaussians.config import MCMC
 from sw_gaussians.mcmc import draw
 from sw_gaussians.stage import ThreeDGSStage
-from sw_gaussians.statistics import accumulate_statistics
+from sw_gaussians.statistics import accumulate_in_torch, accumulate_statistics
 
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
@@ -21,7 +21,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
-from sw_3dgs.config import MCMC, ThreeDGSConfig
+from sw_3dgs.config import ThreeDGSConfig
 
 pytestmark = [
     pytest.mark.cuda,
@@ -36,7 +36,7 @@ def small_scene(channels: int) -> Scene:
     for i in range(6):
         angle = 2 * math.pi * i / 6
         eye = torch.tensor([3 * math.cos(angle), 3 * math.sin(angle), 1.0])
-        camera = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=64, height=48, fov_x=0.8)
+        camera = Camera.look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]), width=64, height=48, fov_x=0.8)
         pixels = torch.randint(0, 256, (48, 64, channels), generator=generator, dtype=torch.uint8).numpy()
         views.append(View(camera, f"view{i}.png", lambda pixels=pixels: pixels))
     points = PointCloud(torch.rand(500, 3, generator=generator) - 0.5, torch.rand(500, 3, generator=generator))
@@ -110,7 +110,7 @@ def test_statistics_of_one_launch_are_those_of_many():
         radii = torch.randint(-1, 20, (500,), generator=generator, dtype=torch.int32).cuda()
         gradients[radii <= 0] = float("nan")
         accumulate_statistics(ours, gradients, radii)
-        density.accumulate_statistics(theirs, gradients, radii)
+        accumulate_in_torch(theirs, gradients, radii)
     for name in ("grad_accum", "denom", "max_radii2d"):
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-6, atol=0)
     accumulate_statistics(ours, gradients.double(), radii)  # what no kernel takes goes the other way

@@ -120,9 +120,9 @@ def test_quantised_files_trade_bytes_for_quality(scene, rasterizer, trained):
 
 
 def test_training_starts_again_from_a_decoded_file(scene, rasterizer, trained, tmp_path):
-    from splatwizard_core.gaussians.ply import save_ply
+    from splatwizard_core.gaussians.ply import export_ply
 
-    save_ply(trained.model, tmp_path / "model.ply")
+    export_ply(trained.model, tmp_path / "model.ply")
     resumed = train(
         scene, rasterizer, init=str(tmp_path / "model.ply"), iterations=20, densify__stop=0, lr__position_init=1.6e-5
     )

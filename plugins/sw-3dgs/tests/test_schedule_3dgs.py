@@ -9,10 +9,10 @@ from sw_gaussians.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import save_ply
+from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides, resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
@@ -47,7 +47,9 @@ def plan_of(stage: ThreeDGSStage) -> dict[str, str]:
 def tiny_scene(background: str = "black", points: PointCloud | None = None) -> Scene:
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])
-    views = [View(look_at(e, target, up, width=16, height=16, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=16, height=16, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     return Scene("tiny", views, views[:1], points, Protocol("test", background=background))
 
 
@@ -228,7 +230,7 @@ def test_a_scene_without_points_is_refused():
 
 def test_a_ply_is_a_start_with_all_bands_active(tmp_path):
     trained = GaussianModel.from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)))
-    save_ply(trained, tmp_path / "m.ply")
+    export_ply(trained, tmp_path / "m.ply")
     model = create(tiny_scene(), init=str(tmp_path / "m.ply"))
     assert model.active_sh_degree == 3
     assert torch.equal(model.means, trained.means)

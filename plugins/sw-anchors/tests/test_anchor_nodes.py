@@ -3,8 +3,8 @@
 import pytest
 import torch
 from sw_anchors.anchors import two_layers
-from sw_anchors.decoding import spawn
-from sw_anchors.values import anchor_values, mean_product, take_rows, widen
+from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, widen
+from sw_anchors.neural_gaussians import spawn
 
 
 def written_out(center, positions, features, offsets, scales, masks, networks):

@@ -1,4 +1,4 @@
-"""The stage that methods on anchors share: its plan, its rates, its statistics, its loss."""
+"""The stages of methods on anchors: their plans, rates, statistics and loss."""
 
 from types import SimpleNamespace
 
@@ -6,12 +6,12 @@ import pytest
 import torch
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
-from sw_anchors.params import AnchorGrowth, AnchorLearningRates, AnchorParams
-from sw_anchors.stage import AnchorStage
+from sw_anchors.params import AnchorGrowth, AnchorParams, CodedAnchorLearningRates, CodedAnchorParams
+from sw_anchors.stage import AnchorStage, CodedAnchorStage
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
@@ -31,7 +31,6 @@ Post  | adjust anchor               | range(4000, 15000, 100)"""
 
 def model_of(cls=CodedAnchors, **kwargs):
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
-    kwargs |= {} if cls is AnchorModel else {"entropy": None}
     return cls.from_points(PointCloud(points), voxel_size=0.05, num_offsets=3, feature_dim=4, hidden=6,
                            generator=torch.Generator().manual_seed(1), **kwargs)  # fmt: skip
 
@@ -39,7 +38,9 @@ def model_of(cls=CodedAnchors, **kwargs):
 def scene_of(extent=2.0):
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])
-    views = [View(look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     scene = Scene("tiny", views, views[:1], None, Protocol("test", background="black"))
     return SimpleNamespace(extent=extent, train=scene.train, views=views)
 
@@ -49,11 +50,35 @@ def begin(stage, model, scene=None):
 
 
 def test_the_plan_is_the_papers():
-    assert format_plan(*build_schedulers(AnchorStage(AnchorParams()), PipelineParams())) == PLAN
+    assert format_plan(*build_schedulers(CodedAnchorStage(CodedAnchorParams()), PipelineParams())) == PLAN
+
+
+def test_a_plain_method_has_the_same_plan_without_the_lattice():
+    plan = format_plan(*build_schedulers(AnchorStage(AnchorParams()), PipelineParams()))
+    assert plan.split("\n") == [line for line in PLAN.split("\n") if "bound" not in line]
+
+
+def test_a_plain_model_is_trained_by_the_plain_stage():
+    stage = AnchorStage(AnchorParams(growth=AnchorGrowth(start_stat=0)))
+    scene = scene_of()
+    model = begin(stage, model_of(AnchorModel), scene)
+    optimizer = stage.create_optimizer(model, scene)
+    assert list(optimizer.groups) == ["offsets", "features", "log_scales", "mlp_opacity", "mlp_cov", "mlp_color"]
+    view = scene.views[0]
+    result = rendered(model, view.camera)
+    seen = SimpleNamespace(image=lambda background, device: torch.ones(3, 24, 24))
+    pack = stage.loss(model, seen, result, torch.zeros(3), step=1)
+    assert set(pack.parts) == {"l1", "ssim", "volume"}
+    pack.total.backward()
+    before = model.mlp_color[2].weight.detach().clone()
+    stage.collect_gradient_statistics(model, result, 1)
+    optimizer.step()
+    assert bool(model.anchor_denom.any())
+    assert not torch.equal(model.mlp_color[2].weight, before)
 
 
 def test_a_scaled_plan_keeps_its_shape():
-    stage = AnchorStage(AnchorParams(iterations=600, scale_schedule=True))
+    stage = CodedAnchorStage(CodedAnchorParams(iterations=600, scale_schedule=True))
     plan = format_plan(*build_schedulers(stage, PipelineParams()))
     assert "range(30, 60, 2)" in plan
     assert "range(80, 300, 2)" in plan
@@ -61,7 +86,7 @@ def test_a_scaled_plan_keeps_its_shape():
 
 
 def test_rates_decay_and_those_of_places_grow_with_the_scene():
-    stage = AnchorStage(AnchorParams())
+    stage = CodedAnchorStage(CodedAnchorParams())
     scene = scene_of(extent=2.0)
     model = begin(stage, model_of(), scene)
     optimizer = stage.create_optimizer(model, scene)
@@ -86,7 +111,7 @@ def rendered(model, camera):
 
 
 def test_early_statistics_are_dropped():
-    stage = AnchorStage(AnchorParams(growth=AnchorGrowth(start_stat=5)))
+    stage = CodedAnchorStage(CodedAnchorParams(growth=AnchorGrowth(start_stat=5)))
     model = begin(stage, model_of())
     result = rendered(model, scene_of().views[0].camera)
     result.image.sum().backward()
@@ -97,11 +122,11 @@ def test_early_statistics_are_dropped():
 
 
 def test_the_loss_adds_volume_and_what_a_method_adds():
-    class More(AnchorStage):
+    class More(CodedAnchorStage):
         def extra_loss(self, model, result, step):
             return {"more": torch.tensor(0.25 * step)}
 
-    stage = More(AnchorParams())
+    stage = More(CodedAnchorParams())
     model, view = begin(stage, model_of()), scene_of().views[0]
     result = rendered(model, view.camera)
     image = torch.rand(3, 24, 24, generator=torch.Generator().manual_seed(0))
@@ -114,7 +139,7 @@ def test_the_loss_adds_volume_and_what_a_method_adds():
 
 
 def test_a_view_without_gaussians_has_a_finite_loss():
-    stage = AnchorStage(AnchorParams())
+    stage = CodedAnchorStage(CodedAnchorParams())
     model, view = begin(stage, model_of()), scene_of().views[0]
     with torch.no_grad():
         model.mask_logits.fill_(-9)
@@ -125,10 +150,10 @@ def test_a_view_without_gaussians_has_a_finite_loss():
 
 
 def test_only_anchors_with_a_lattice_are_trained():
-    with pytest.raises(TypeError, match="not a AnchorModel"):
-        begin(AnchorStage(AnchorParams()), model_of(AnchorModel))
+    with pytest.raises(TypeError, match="trains a CodedAnchors, not a AnchorModel"):
+        begin(CodedAnchorStage(CodedAnchorParams()), model_of(AnchorModel))
 
 
 def test_a_rate_that_never_decays_is_constant():
-    stage = AnchorStage(AnchorParams(lr=AnchorLearningRates(max_steps=100)))
+    stage = CodedAnchorStage(CodedAnchorParams(lr=CodedAnchorLearningRates(max_steps=100)))
     assert stage.learning_rates(50)["mlp_cov"] == pytest.approx(0.004)

@@ -7,7 +7,7 @@ import torch
 from sw_anchors.anchors import AnchorAttributes, AnchorModel, AnchorSelection
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.errors import EmptyModel, SceneError, ShapeError
 from splatwizard_core.rendering.rasterizer import RasterOptions

@@ -10,24 +10,12 @@ from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 
 RASTERIZER = ReferenceRasterizer()
-
-
-class Gaussians:
-    """Bits under a density, as an entropy model of the registry gives them."""
-
-    class FloatContext:
-        def __init__(self, mean, scale, step, smallest_probability):
-            self.mean, self.scale, self.step, self.least = mean, scale, step, smallest_probability
-
-    def bits(self, x, c):
-        z = torch.distributions.Normal(c.mean, c.scale)
-        return -torch.log2((z.cdf(x + c.step / 2) - z.cdf(x - c.step / 2)).clamp(min=c.least))
 
 
 class Flat(CodedAnchors):
@@ -55,7 +43,7 @@ def make(n=8, k=4, feature_dim=5, seed=0, **kwargs):
         torch.randn(n, feature_dim, generator=g),
         torch.randn(n, k, 3, generator=g),
         torch.randn(n, 6, generator=g) * 0.3 - 2,
-        voxel_size=0.1, hidden=8, generator=g, entropy=Gaussians(), **kwargs,
+        voxel_size=0.1, hidden=8, generator=g, **kwargs,
     )  # fmt: skip
 
 
@@ -74,7 +62,7 @@ def test_positions_lie_on_the_lattice_below_the_anchors():
 
 def test_bounds_have_the_published_margin_or_a_tenth_of_the_extent():
     x = torch.tensor([[-1.0, 2.0, 0.0], [4.0, 3.0, -5.0]])
-    torch.testing.assert_close(bounds_of(x, "hac"), torch.tensor([[-1.2, 1.6, -6.0], [4.8, 3.6, 0.0]]))
+    torch.testing.assert_close(bounds_of(x, "origin"), torch.tensor([[-1.2, 1.6, -6.0], [4.8, 3.6, 0.0]]))
     torch.testing.assert_close(bounds_of(x, "extent"), torch.tensor([[-1.5, 1.9, -5.5], [4.5, 3.1, 0.5]]))
     torch.testing.assert_close(bounds_of(x, "none"), torch.tensor([[-1.0, 2.0, -5.0], [4.0, 3.0, 0.0]]))
 
@@ -148,7 +136,9 @@ def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
     values = tuple(v.detach() for v in model.raw(rows))
     steps = forecast.steps.repeat_interleave(torch.tensor([5, 6, 12]), dim=1)
     again = model.rate(torch.cat(values, dim=1), steps, forecast, masks)
-    bits = Gaussians().bits(values[2], Gaussians.FloatContext(0.0, 1.0, 0.2, 1e-6)) * masks.repeat_interleave(3, 1)
+    normal = torch.distributions.Normal(0.0, 1.0)
+    probability = normal.cdf(values[2] + 0.1) - normal.cdf(values[2] - 0.1)
+    bits = -torch.log2(probability.clamp(min=1e-6)) * masks.repeat_interleave(3, 1)
     torch.testing.assert_close(again.by_group[2], bits[20:].sum().detach(), rtol=1e-4, atol=0.01)
     torch.testing.assert_close(again.bits, again.by_group.sum() / rate.numbers * 40 / 60)
 

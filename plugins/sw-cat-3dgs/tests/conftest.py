@@ -8,7 +8,7 @@ import torch
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import apply_overrides
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
@@ -93,7 +93,9 @@ def little_scene() -> Scene:
     points = torch.rand(60, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])
-    views = [View(look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=24, height=24, fov_x=1.0), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     return Scene("tiny", views, views[:1], PointCloud(points, points + 0.5), Protocol("test", background="black"))
 
 

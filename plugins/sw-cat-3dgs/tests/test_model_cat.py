@@ -17,12 +17,12 @@ def count(module):
 
 
 def test_counts_are_the_papers():
-    context = CatContext(load_plugins(), Cat3DGS(load_plugins(), CatConfig()).shape(), torch.Generator())
+    context = CatContext(Cat3DGS(load_plugins(), CatConfig()).shape(), torch.Generator())
     assert count(context.network) == 60_975
     assert count(context.slices) == 14_390
     assert [count(arm) for arm in context.arms] == [1_058] * 3
     assert context.triplane.width == 432
-    assert sum(context.shape.splits) == 175
+    assert sum(context.shape.outputs) == 175
     assert sum(context.shape.widths) == 86
 
 

@@ -17,6 +17,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import TrainingStopped
 from sw_cat_3dgs.estimate import estimated_bits
 from sw_cat_3dgs.method import Cat3DGS
+from sw_codecs.entropy import conditional
 
 pytestmark = pytest.mark.pipeline
 
@@ -68,7 +69,7 @@ def test_stopping_changes_nothing(train, tmp_path):
 @pytest.mark.parametrize("mode", ["exact", "float"])
 def test_the_estimate_is_the_size_of_the_file(method, trained, mode):
     reader = ContainerReader(encoded(trained, method, codec__mode=mode), "test.swz")
-    bits = estimated_bits(trained, method(codec__mode=mode).plugins)
+    bits = estimated_bits(trained)
     framing = 30  # bytes of a section's first block
     for name, estimate in bits.items():
         size = 8 * sum(v for k, v in reader.sections.items() if k.split(".")[0] == name)
@@ -83,7 +84,7 @@ def test_a_fresh_process_decodes_the_same_model(method, trained, tmp_path):
     path.write_bytes(encoded(trained, method))
     code = (
         "import torch, sys; torch.set_num_threads(2)\n"
-        "from splatwizard_core.runs.decoding import open_model\n"
+        "from splatwizard_core.runs.decode import open_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "print(open_model(sys.argv[1], load_plugins(), torch.device('cpu'))[0].digest())"
     )
@@ -95,8 +96,7 @@ def test_a_fresh_process_decodes_the_same_model(method, trained, tmp_path):
 def test_exact_symbols_do_not_depend_on_the_block(method, trained, monkeypatch, rows):
     """Blocks are part of the file; what is predicted for a row is not."""
     usual = decoded(encoded(trained, method)).digest()
-    coding = sys.modules[load_plugins().entropy_models.load("conditional-gaussian").__module__]
-    monkeypatch.setattr(coding, "BLOCK_SYMBOLS", 12 * rows)
+    monkeypatch.setattr(conditional, "BLOCK_SYMBOLS", 12 * rows)
     assert decoded(encoded(trained, method)).digest() == usual
 
 

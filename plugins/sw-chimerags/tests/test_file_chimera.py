@@ -14,7 +14,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from sw_chimerags.file import POSITIONS, ROW_BYTES
 from sw_chimerags.method import ChimeraGS
 from sw_chimerags.model import LOWER
@@ -109,7 +109,7 @@ def test_the_picture_does_not_depend_on_the_order_in_the_file(student):
     model = student(on=60)
     rasterizer = NegotiatedRasterizer(load_plugins(), device="cpu", prefer=["reference"])
     eye, up = torch.tensor([0.0, 0, -6]), torch.tensor([0.0, 1, 0])
-    camera = look_at(eye, torch.zeros(3), up, width=24, height=16, fov_x=0.8)
+    camera = Camera.look_at(eye, torch.zeros(3), up, width=24, height=16, fov_x=0.8)
     with torch.no_grad():
         images = [
             rasterizer.render(m.gaussians(camera, rasterizer), camera, RasterOptions()).image

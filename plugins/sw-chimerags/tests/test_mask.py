@@ -10,7 +10,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import train_stages
@@ -47,7 +47,9 @@ def masked(plugins, model: GaussianModel, init: float = INIT) -> MaskedGaussians
 def scene_of() -> Scene:
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -3], [2.0, 0, -2], [-2.0, 1, -2]])
-    views = [View(look_at(e, target, up, width=24, height=16, fov_x=0.7), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=24, height=16, fov_x=0.7), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     return Scene("tiny", views, views[:1], None, Protocol("test"))
 
 

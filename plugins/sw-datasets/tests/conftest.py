@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from sw_datasets.colmap_model import (
+from sw_datasets.loaders.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapModel,

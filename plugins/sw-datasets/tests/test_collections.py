@@ -12,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sw_datasets.colmap_model import ColmapCamera
 from sw_datasets.downloads.registry import load_registry
 from sw_datasets.families import BENCHMARKS, INDOOR, OUTDOOR
+from sw_datasets.loaders.colmap_model import ColmapCamera
 
 from splatwizard_core.errors import ConfigError, SceneError
+from splatwizard_core.plugins import load_plugins
 
 
 def reduced(root: Path, factor: int, suffix: str = ".JPG") -> None:
@@ -428,3 +429,11 @@ def test_the_registry_of_public_data_and_the_rules_name_the_same_scenes():
             family = BENCHMARKS[name]
             assert set(dataset.scenes) <= set(family.scenes), name
             assert (dataset.prefix, dataset.views) == (family.prefix, family.views)
+
+
+def test_entries_declare_the_scenes_that_published_tables_report():
+    declared = {entry.name: entry.declared for entry in load_plugins().datasets}
+    assert declared["bungee"]["table_scenes"] == ["amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome"]
+    assert {"56Leonard", "Transamerica"} < set(declared["bungee"]["scenes"])
+    for name in BENCHMARKS.keys() - {"bungee"}:
+        assert declared[name]["table_scenes"] == declared[name]["scenes"]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sw_datasets.colmap import pinhole, pose
-from sw_datasets.colmap_model import MODELS, ColmapCamera, ColmapImage
+from sw_datasets.loaders.colmap import pinhole, pose
+from sw_datasets.loaders.colmap_model import MODELS, ColmapCamera, ColmapImage
 
 from splatwizard_core.errors import SceneError
 

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sw_datasets.colmap_model import (
+from sw_datasets.loaders import colmap_model
+from sw_datasets.loaders.colmap_model import (
     MODELS,
     ColmapCamera,
     ColmapImage,
@@ -22,7 +23,6 @@ from sw_datasets.colmap_model import (
 )
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.loading import colmap_model
 
 READERS = {
     "cameras": colmap_model.read_cameras,

@@ -13,6 +13,7 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import click
 import pytest
 from PIL import Image
 from range_server import Site, running_site
@@ -23,7 +24,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 
-pytest.importorskip("pooch", reason="pip install 'splatwizard-core[download]'")
+pytest.importorskip("pooch", reason="pip install 'sw-datasets[download]'")
 
 REGISTRY = """
 [dataset.lab]
@@ -299,7 +300,7 @@ def test_without_pooch_the_extra_is_named_before_the_question(data: Path, site: 
     answer("y\n")
     assert main(["data", "fetch", "lab"]) == 2
     said = capsys.readouterr().err
-    assert "pip install 'splatwizard-core[download]'" in said
+    assert "pip install 'sw-datasets[download]'" in said
     assert "go on?" not in said
 
 
@@ -395,7 +396,7 @@ def test_what_is_wrong_with_a_scene_is_said(spoil, options: list[str], message: 
 
 
 def test_too_few_views_are_said(fetched: Path, capsys):
-    from sw_datasets.colmap_model import ColmapModel, read_model, write_model
+    from sw_datasets.loaders.colmap_model import ColmapModel, read_model, write_model
 
     model = read_model(fetched / "sparse" / "0")
     fewer = dict(list(model.images.items())[:-1])
@@ -434,3 +435,39 @@ def test_the_views_that_synth_tells_are_those_that_are_read(layout, options, tmp
     assert main(["info", out, "--set", options, "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["views"] == {"train": 6, "test": 2}
+
+
+@pytest.mark.parametrize(
+    ("typed", "offered"), [("dt", ["dtu", "dtu_truth"]), ("dtu/2", ["dtu/24"]), ("nobody/", []), ("tandt", ["tandt"])]
+)
+def test_names_of_data_sets_and_scenes_are_completed(typed, offered, monkeypatch):
+    from sw_datasets.commands.completions import dataset_or_folder, datasets
+
+    monkeypatch.delenv("SPLATWIZARD_DATA_REGISTRY", raising=False)
+    context = click.Context(click.Command("fetch"))
+    parameter = click.Argument(["targets"])
+    assert [item.value for item in datasets(context, parameter, typed)] == offered
+    assert [item.type for item in dataset_or_folder(context, parameter, typed)] == ["dir", *["plain"] * len(offered)]
+
+
+def test_completion_says_nothing_of_a_registry_that_cannot_be_read(monkeypatch):
+    from sw_datasets.commands.completions import datasets
+
+    monkeypatch.setenv("SPLATWIZARD_DATA_REGISTRY", "/nowhere/at/all.toml")
+    assert datasets(click.Context(click.Command("fetch")), click.Argument(["targets"]), "dt") == []
+
+
+def test_synth_writes_a_scene_that_info_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    assert main(["data", "synth", str(tmp_path / "s"), "--size", "tiny", "--json"]) == 0
+    written = json.loads(capsys.readouterr().out)
+    assert main(["info", str(tmp_path / "s"), "--set", "test_every=4", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["dataset"] == "colmap"
+    assert found["views"] == {"train": written["train_views"], "test": written["test_views"]}
+    assert found["points"]["count"] == written["points"]
+
+
+def test_synth_leaves_a_folder_alone_that_holds_something(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    (tmp_path / "notes.txt").touch()
+    assert main(["data", "synth", str(tmp_path)]) == 2
+    assert "not an empty folder" in capsys.readouterr().err

@@ -19,10 +19,11 @@ import pytest
 from range_server import Site, running_site
 from sw_datasets.downloads import download as module
 from sw_datasets.downloads.download import download
+from sw_datasets.errors import FetchError
 
-from splatwizard_core.errors import CapabilityError, FetchError
+from splatwizard_core.errors import CapabilityError
 
-pytest.importorskip("pooch", reason="pip install 'splatwizard-core[download]'")
+pytest.importorskip("pooch", reason="pip install 'sw-datasets[download]'")
 
 CONTENT = np.random.default_rng(0).bytes(3_000_000)
 SHA256 = hashlib.sha256(CONTENT).hexdigest()
@@ -283,7 +284,7 @@ def test_progress_and_time_left_are_shown(
 
 def test_without_pooch_it_names_what_to_install(site: Site, target: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setitem(sys.modules, "pooch", None)
-    with pytest.raises(CapabilityError, match=r"pip install 'splatwizard-core\[download\]'"):
+    with pytest.raises(CapabilityError, match=r"pip install 'sw-datasets\[download\]'"):
         download(site.url(PATH), target)
     assert site.asked == []
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from sw_datasets.colmap import pinhole, pose
-from sw_datasets.dtu import projection_centres, read_alignments
+from sw_datasets.loaders.colmap import pinhole, pose
+from sw_datasets.loaders.dtu import projection_centres, read_alignments
 
 from splatwizard_core.errors import SceneError
 

@@ -10,10 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-
-from splatwizard_core.errors import ConfigError, SceneError
-from splatwizard_core.scene.images import (
-    decode_all,
+from sw_datasets.pictures import (
     find_pictures,
     fitted_size,
     is_inside,
@@ -22,6 +19,8 @@ from splatwizard_core.scene.images import (
     load_picture,
     picture_header,
 )
+
+from splatwizard_core.errors import ConfigError, SceneError
 
 
 @pytest.mark.parametrize(
@@ -206,8 +205,3 @@ def test_names_that_lead_out_are_recognised(name):
 @pytest.mark.parametrize("name", ["x.png", "a/b.png", "a..b.png", "..a/b.png", "./a.png", "ü/ b.png"])
 def test_ordinary_names_are_inside(name):
     assert is_inside(name)
-
-
-def test_decode_all_decodes_every_view_once(tiny):
-    decode_all(tiny.test, workers=2)
-    assert all("pixels" in view.__dict__ for view in tiny.test)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from sw_datasets.colmap_model import read_model
+from sw_datasets.loaders.colmap_model import read_model
 
 
 @pytest.mark.parametrize(

@@ -1,18 +1,22 @@
-"""The registry of data sets: what ships with the core, and what a lab adds."""
+"""Registries of data sets: the one that ships with the package, those of other packages, and what a lab adds."""
 
 from __future__ import annotations
 
 import re
 import subprocess
 import sys
+import types
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from sw_datasets.downloads.presence import dataset_state, read_receipt, scene_presence
 from sw_datasets.downloads.registry import REGISTRY_VARIABLE, load_registry, parse_registry
 from sw_datasets.families import BENCHMARKS
+from sw_datasets.plugin import register_downloads
 
 from splatwizard_core.errors import ConfigError, UserInputError
+from splatwizard_core.plugins.registry import Registry as PluginRegistry
 
 OWN = """
 [dataset.lab]
@@ -149,12 +153,13 @@ def test_the_two_archives_of_bungee_fill_one_folder(tmp_path: Path):
 @pytest.mark.parametrize("where", ["dtu/scan24", "dtu/24", "DTU/scan24"])
 def test_scenes_are_found_where_the_loader_finds_them(where: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     from splatwizard_core.scene.locate import locate
+    from splatwizard_core.tooling import load_plugins
 
     (tmp_path / where / "images").mkdir(parents=True)
     found = scene_presence(tmp_path, load_registry()["dtu"], "24")
     assert (found.path, found.state) == (tmp_path / where, "partly")
     monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
-    assert locate("dtu/24")[0] == found.path
+    assert locate("dtu/24", load_plugins().datasets)[0] == found.path
 
 
 @pytest.mark.parametrize("content", [b"", b"[]", b"{}", b'{"archive": 1, "files": {}}', b"\xff", b"[" * 100_000])
@@ -171,3 +176,51 @@ def test_the_registry_is_read_without_torch():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True)
     assert done.stdout.split() == ["False"]
+
+
+LAB = """
+[dataset.lab]
+title = "The lab"
+scenes = ["desk"]
+
+[dataset.tandt]
+title = "not ours"
+"""
+
+
+@pytest.fixture
+def another_package(monkeypatch: pytest.MonkeyPatch):
+    """another_package(content): a package beside this one that registers such a registry."""
+
+    def register(content: Callable[[], bytes]) -> None:
+        downloads = PluginRegistry("download")
+        register_downloads(downloads)
+        downloads._owner = ("another-package", "1.0")
+        downloads.add("another", "another_package:data", summary="")
+        module = types.ModuleType("another_package")
+        module.data = content  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "another_package", module)
+        plugins = types.SimpleNamespace(downloads=downloads)
+        monkeypatch.setattr("sw_datasets.downloads.registry.load_plugins", lambda: plugins)
+
+    return register
+
+
+def test_another_package_can_say_what_can_be_fetched(another_package, caplog):
+    another_package(LAB.encode)
+    known = load_registry()
+    assert (known["lab"].title, known["lab"].registry) == ("The lab", "another")
+    assert (known["tandt"].title, known["tandt"].registry) == ("Tanks & Temples", "public")
+    assert "data set 'tandt' of another-package is left out: 'public' lists one of that name" in caplog.text
+
+
+@pytest.mark.parametrize("content", [b"[", None, SystemExit, ZeroDivisionError])
+def test_a_package_whose_registry_cannot_be_read_harms_no_other(another_package, caplog, content):
+    def data() -> bytes:
+        if isinstance(content, type):
+            raise content("no good")
+        return content
+
+    another_package(data)
+    assert "mipnerf360" in load_registry()
+    assert "downloads 'another' of another-package cannot be read" in caplog.text

@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from sw_datasets.colmap import pose
-from sw_datasets.colmap_model import (
+from sw_datasets.loaders.colmap import pose
+from sw_datasets.loaders.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapModel,
@@ -29,7 +29,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 
-pytest.importorskip("pycolmap", reason="pip install 'splatwizard-core[pycolmap]'")
+pytest.importorskip("pycolmap", reason="pip install 'sw-datasets[pycolmap]'")
 
 WIDTH, HEIGHT = 240, 180
 SIGMA = 2.0  # px of a dot; wide enough that its centre is exact to a hundredth of a pixel
@@ -372,5 +372,5 @@ def test_without_pycolmap_the_command_names_what_to_install(tmp_path: Path, caps
     scene = write_scene(tmp_path / "in", "OPENCV")
     monkeypatch.setitem(__import__("sys").modules, "pycolmap", None)
     assert main(["data", "undistort", str(scene), str(tmp_path / "out")]) == 2
-    assert "pip install 'splatwizard-core[pycolmap]'" in capsys.readouterr().err
+    assert "pip install 'sw-datasets[pycolmap]'" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

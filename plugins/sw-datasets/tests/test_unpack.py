@@ -17,8 +17,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from sw_datasets.downloads import unpack as module
 from sw_datasets.downloads.unpack import unpack_scenes, unpack_whole
+from sw_datasets.errors import FetchError
 
-from splatwizard_core.errors import DiskFullError, FetchError
+from splatwizard_core.errors import DiskFullError
 
 SCENES = {
     "360/garden/images/a b.jpg": b"a",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import shutil
 import sys
 import tempfile
@@ -12,11 +13,13 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
-from sw_doctor import child, compilers, diagnosis, metrics, packages, probe, system
-from sw_doctor.check import Check, gigabytes, one_line
+from sw_doctor import child, compilers, diagnosis, packages, probe, registered, system
+from sw_doctor.text import gigabytes, one_line
 
-from splatwizard_core.native import NativeModule, toolchain
-from splatwizard_core.plugins import PluginManager, load_plugins
+from splatwizard_core.api import NativeModule
+from splatwizard_core.native import toolchain
+from splatwizard_core.plugins import Entry, PluginManager, load_plugins
+from splatwizard_core.plugins.check import Check
 
 needs_compiler = pytest.mark.skipif(
     not any(shutil.which(name) for name in toolchain.COMPILERS), reason="no C++ compiler on this machine"
@@ -229,7 +232,7 @@ def site(tmp_path, monkeypatch) -> Path:
     folder = tmp_path / "site"
     folder.mkdir()
     monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setenv("PYTHONPATH", str(folder))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, (str(folder), os.environ.get("PYTHONPATH")))))
     return folder
 
 
@@ -313,7 +316,7 @@ def serving(site: Path, *steps: str) -> str:
     body = "\n".join(steps)
     (site / "served.py").write_text(
         "import os, sys, time\n"
-        "from sw_doctor.check import Check\n"
+        "from splatwizard_core.plugins.check import Check\n"
         "from sw_doctor.child import serve\n"
         "def ok(name):\n    print('noise')\n    return [Check('g', name, 'ok', 'fine')]\n"
         f"def bad():\n    {body}\n"
@@ -335,6 +338,7 @@ def test_noise_and_exceptions_do_not_stop_the_steps(site):
         ("os.kill(os.getpid(), 11)", "was killed by signal SIGSEGV"),
         ("print('last words', file=sys.stderr); os._exit(3)", "ended with status 3: last words"),
         ("time.sleep(60)", "gave no answer within"),
+        ("os._exit(0)", "ended before it had answered"),
     ],
 )
 def test_a_process_that_dies_or_hangs_is_a_finding(site, step, how):
@@ -344,6 +348,89 @@ def test_a_process_that_dies_or_hangs_is_a_finding(site, step, how):
     assert how in answer.died_in[1]
     broken = diagnosis.probed(answer)[-1]
     assert (broken.state, broken.needed) == ("broken", True)
+
+
+# -------------------------------------------------------------------------------------- registered checks
+
+
+@pytest.fixture
+def check_of(site):
+    """(body of the check, **fields) -> entry of a check that the installed distribution sw-stranger registers."""
+
+    def register(body: str, **fields: object) -> Entry:
+        distribution(
+            site, "sw-stranger",
+            sw_stranger="from splatwizard_core.api import hookimpl\n"
+            "@hookimpl\n"
+            "def register_checks(registry):\n"
+            f"    registry.add('strange', 'sw_strange:check', summary='', **{fields!r})\n",
+            sw_strange="import os, sys, time\n"
+            "from splatwizard_core.tooling import Check\n"
+            f"def check():\n    {body}\n",
+        )  # fmt: skip
+        info = site / "sw_stranger-1.0.dist-info"
+        (info / "entry_points.txt").write_text("[splatwizard]\nstranger = sw_stranger\n")
+        return Entry("check", "strange", "sw_strange:check", "", fields, "sw-stranger", "1.0")
+
+    return register
+
+
+def test_a_registered_check_runs_in_a_process_of_its_own(check_of):
+    entry = check_of("return [Check('radio', 'aerial', 'missing', str(os.getpid()), 'buy one', facts={'n': 1})]")
+    (found,) = registered.run_registered(entry)
+    assert (found.group, found.name, found.state, found.mend, found.facts) == (
+        "radio", "aerial", "missing", "buy one", {"n": 1}
+    )  # fmt: skip
+    assert found.detail != str(os.getpid())
+
+
+@pytest.mark.parametrize(
+    ("body", "how"),
+    [
+        ("os.abort()", "was killed by signal SIGABRT"),
+        ("time.sleep(60)", "gave no answer within 5 s"),
+        ("os._exit(0)", "ended before it had answered"),
+        ("os._exit(4)", "ended with status 4"),
+        ("raise SystemExit(3)", "SystemExit: 3"),
+        ("raise OSError('no\\nradio')", "OSError: no radio"),
+        ("return 'fine'", "no list of Check"),
+        ("return [Check('g', 'n', 'fine', '')]", "the state of 'n' is 'fine'"),
+        ("return [Check('g', 'n', 'ok', '', facts={'n': float('nan')})]", "Out of range float"),
+        ("import no_such_library", "No module named 'no_such_library'"),
+    ],
+)
+def test_a_registered_check_that_fails_is_one_line_with_its_distribution(check_of, body, how):
+    entry = check_of(body, group="radio")
+    (found,) = registered.run_registered(entry, seconds=5 if "sleep" in body else 60)
+    assert (found.group, found.name, found.state, found.needed) == ("radio", "strange", "broken", False)
+    assert how in found.detail
+    assert "sw-stranger" in found.detail
+    assert "\n" not in found.detail
+    assert "sw-stranger" in (found.mend or "")
+
+
+def test_what_a_registered_check_prints_stands_nowhere(check_of, capfd):
+    entry = check_of("print('noise'); os.write(1, b'more'); return [Check('g', 'n', 'ok', 'fine')]")
+    (found,) = registered.run_registered(entry)
+    assert (found.state, found.detail) == ("ok", "fine")
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_registered_check_decides_nothing_about_the_main_job(check_of):
+    entry = check_of("return [Check('main job', 'sw run', 'broken', 'a\\nb' + 'x' * 999, 'c\\nd', True)]")
+    (found,) = registered.run_registered(entry)
+    assert (found.group, found.needed, found.mend) == ("checks", False, "c d")
+    assert "\n" not in found.detail
+    assert len(found.detail) < 400
+
+
+def test_a_registered_check_is_left_out_where_what_it_needs_does_not_work():
+    def needs_of(**fields: object) -> set[str]:
+        return registered.needs_of(Entry("check", "c", "module:attribute", "", fields))
+
+    assert needs_of(needs="torch") == {"torch"}
+    assert needs_of(needs=["torch", "C++"]) == {"torch", "C++"}
+    assert needs_of() == needs_of(needs=3) == set()
 
 
 # ------------------------------------------------------------------------------------- what needs torch
@@ -358,7 +445,7 @@ def test_without_torch_nothing_that_needs_it_is_tried(monkeypatch):
     monkeypatch.setitem(sys.modules, "torch", None)
     found = probe.check_torch()[0]
     assert (found.state, found.needed) == ("missing", True)
-    assert [name for name, _ in probe.steps("3dgs")] == ["torch"]
+    assert [name for name, _ in probe.steps()] == ["torch"]
 
 
 @pytest.mark.parametrize(
@@ -388,7 +475,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
     package = tmp_path / "src" / "doctored_kernels"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(
-        "from splatwizard_core.native import NativeModule\n"
+        "from splatwizard_core.api import NativeModule\n"
         "MODULE = NativeModule(name='doctored', package='doctored_kernels', sources=('a.cpp',), seconds=7,"
         " without='it is slow')\n"
     )
@@ -429,10 +516,10 @@ def test_a_native_module_that_cannot_be_imported_is_broken():
 
 
 def manager(site: Path, name: str, source: str) -> PluginManager:
-    """The core and one plugin, whose module holds `source`."""
+    """The core, the reference rasterizer and one plugin, whose module holds `source`."""
     (site / f"{name}.py").write_text("from splatwizard_core.plugins import hookimpl\n" + textwrap.dedent(source))
-    core = EntryPoint("core", "splatwizard_core.builtin", "splatwizard")
-    return PluginManager([core, EntryPoint(name, name, "splatwizard")])
+    modules = {"core": "splatwizard_core.builtin", "reference": "sw_reference.plugin", name: name}
+    return PluginManager([EntryPoint(key, module, "splatwizard") for key, module in modules.items()])
 
 
 def test_an_entry_whose_target_is_not_there_is_broken(site):
@@ -533,43 +620,6 @@ def test_a_rasterizer_of_surfels_draws_surfels(site):
     assert checks["flat"].state == "ok", checks["flat"].detail
 
 
-def test_weights_of_lpips_are_known_by_their_checksum(tmp_path, monkeypatch):
-    import hashlib
-
-    from sw_metrics import lpips_weights
-
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    backbones = lpips_weights.BACKBONES
-    content = b"weights"
-    name = f"vgg-{hashlib.sha256(content).hexdigest()[:8]}.pth"
-    monkeypatch.setitem(backbones, "vgg", lpips_weights.Backbone(name, {}))
-    folder = tmp_path / "hub" / "checkpoints"
-    folder.mkdir(parents=True)
-    (folder / name).write_bytes(content)
-    (folder / backbones["alex"].file_name).write_bytes(b"half a file")
-    checks = {c.name: c for c in metrics.check_lpips()}
-    assert checks["LPIPS weights, vgg"].state == "ok"
-    broken = checks["LPIPS weights, alex"]
-    assert broken.state == "broken"
-    assert broken.mend == (
-        f"curl -L --create-dirs -o {tmp_path}/hub/checkpoints/{backbones['alex'].file_name} {backbones['alex'].address}"
-    )
-    (folder / name).unlink()
-    assert {c.name: c.state for c in metrics.check_lpips()}["LPIPS weights, vgg"] == "missing"
-    assert not any(c.needed for c in checks.values())
-
-
-def test_a_package_lpips_that_is_not_installed_is_an_extra(monkeypatch):
-    import importlib.metadata
-
-    def absent(name: str) -> str:
-        raise importlib.metadata.PackageNotFoundError(name)
-
-    monkeypatch.setattr("sw_metrics.perceptual.importlib.metadata.version", absent)
-    found = metrics.check_lpips()[0]
-    assert (found.state, found.mend) == ("missing", "pip install 'splatwizard-core[lpips]'")
-
-
 def test_scenes_are_counted_by_dataset(tmp_path, monkeypatch):
     plugins = load_plugins()
     monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
@@ -587,10 +637,24 @@ def test_scenes_are_counted_by_dataset(tmp_path, monkeypatch):
     assert (found.state, found.facts["scenes"]) == ("ok", {"park": 2})
 
 
-def test_a_method_that_is_not_installed_stops_the_main_job(monkeypatch):
+def test_with_the_core_alone_the_packages_that_the_main_job_needs_are_named(monkeypatch):
     monkeypatch.delenv("SW_PLUGINS", raising=False)
-    found = probe.check_main_job(PluginManager([]), "3dgs")
-    assert (found.state, found.needed, found.mend) == ("broken", True, "pip install sw-3dgs")
+    core = PluginManager([EntryPoint("core", "splatwizard_core.builtin", "splatwizard")])
+    found = probe.check_main_job(core)
+    assert (found.name, found.state, found.needed) == ("sw run", "broken", True)
+    assert found.detail == "not installed: a method, a scene, a rasterizer"
+    assert found.mend == "pip install sw-3dgs sw-datasets sw-rasterizers"
+    (rasterizers,) = probe.check_rasterizers(core)
+    assert (rasterizers.state, rasterizers.mend) == ("missing", "pip install sw-rasterizers")
+    monkeypatch.setenv("SPLATWIZARD_DATA", "/")
+    assert probe.check_scenes(core).mend == "pip install sw-datasets"
+
+
+def test_the_main_job_is_the_default_method_on_the_default_scene():
+    plugins = load_plugins()
+    found = probe.check_main_job(plugins)
+    assert found.name == f"sw run --method {plugins.methods.default} --scene {plugins.datasets.default}"
+    assert (found.state, found.needed) == ("ok", True)
 
 
 # ------------------------------------------------------------------------------------------ the whole page

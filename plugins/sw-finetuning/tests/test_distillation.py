@@ -83,11 +83,16 @@ def test_both_losses():
 
 class Before(FineTuningStage):
     name = "before"
+    starts_from = "3dgs"
+
+
+class Taught(DistillationStage):
+    taught_by = ("3dgs",)
 
 
 def stages(**options):
     opt = OptimizationParams(iterations=20)
-    return [Before(opt, RATES), DistillationStage(opt, RATES, **options)]
+    return [Before(opt, RATES), Taught(opt, RATES, **options)]
 
 
 @pytest.fixture
@@ -99,7 +104,7 @@ def teacher(toy):
 
 
 def test_a_student_that_is_its_teacher_stays_it(toy, teacher):
-    stage = DistillationStage(OptimizationParams(iterations=10), RATES)
+    stage = Taught(OptimizationParams(iterations=10), RATES)
     losses = []
     toy.train([stage], model=lambda: copy.deepcopy(teacher).requires_grad_(True), trained=lambda name: teacher,
               on_step=lambda record: losses.append(float(record.total)))  # fmt: skip
@@ -119,7 +124,7 @@ def test_a_student_comes_nearer_to_its_teacher_and_leaves_it_alone(toy, teacher,
     rates = FineTuningRates(sh_rest=0.01, opacity=0)
     losses = []
     outcome = toy.train(
-        [DistillationStage(OptimizationParams(iterations=60), rates, distill_loss=kind)],
+        [Taught(OptimizationParams(iterations=60), rates, distill_loss=kind)],
         model=lambda: student, trained=trained, on_step=lambda record: losses.append(float(record.total)),
     )  # fmt: skip
     assert sum(losses[-6:]) < 0.7 * sum(losses[:6])
@@ -134,7 +139,7 @@ def test_no_photograph_is_looked_at(toy, teacher, monkeypatch):
     blind.train = [View(v.camera, v.name) for v in blind.train]
     monkeypatch.setattr("splatwizard_core.training.pipeline.decode_all", lambda views: None)
     toy.train(
-        [DistillationStage(OptimizationParams(iterations=6), RATES)],
+        [Taught(OptimizationParams(iterations=6), RATES)],
         scene=blind, model=lambda: copy.deepcopy(teacher).requires_grad_(True), trained=lambda name: teacher,
     )  # fmt: skip
 
@@ -151,10 +156,6 @@ def test_stopped_and_resumed_equals_one_go(toy, teacher, tmp_path, stop):
 
 class Selftaught(DistillationStage):
     """Taught by what the stage before left."""
-
-    @property
-    def taught_by(self):
-        return ()
 
     def find_teacher(self, context):
         return copy.deepcopy(context.model).requires_grad_(False)
@@ -178,7 +179,7 @@ def test_the_teacher_is_clamped_where_the_student_is(toy, teacher):
     losses = {}
     for clamp in (False, True):
         toy.train(
-            [DistillationStage(OptimizationParams(iterations=2), RATES)],
+            [Taught(OptimizationParams(iterations=2), RATES)],
             model=lambda: copy.deepcopy(bright).requires_grad_(True), trained=lambda name: bright,
             ppl=PipelineParams(clamp_render=clamp), on_step=lambda r, clamp=clamp: losses.setdefault(clamp, r.total),
         )  # fmt: skip

@@ -57,6 +57,7 @@ class Params(OptimizationParams):
 
 class Recording(FineTuningStage):
     name = "tuning"
+    starts_from = "3dgs"
     statistics = True
 
     def register_post_task(self, scheduler, ppl, opt):

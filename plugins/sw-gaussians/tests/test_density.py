@@ -5,12 +5,12 @@ import math
 import pytest
 import torch
 from sw_gaussians.density import (
-    accumulate_statistics,
     densify_and_prune,
     increase_sh_degree,
     reset_opacity,
     rotate,
 )
+from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.errors import EmptyModel
 from splatwizard_core.gaussians.model import GaussianModel, logit

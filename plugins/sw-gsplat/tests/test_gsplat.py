@@ -11,11 +11,8 @@ import torch
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
-from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.plugins.manager import load_plugins
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.api import SH, Camera, CapabilityError, ConfigError, GaussianInputs, RasterOptions, ScoreSpec
+from splatwizard_core.tooling import load_plugins
 from sw_gsplat.availability import unavailable
 from sw_gsplat.rasterizer import GsplatRasterizer
 
@@ -136,7 +133,7 @@ def test_what_it_does_not_declare_is_refused(gsplat):
 
 def test_without_the_package_the_reason_names_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    with pytest.raises(PluginError, match=r"pip install 'sw-gsplat\[gsplat\]'"):
+    with pytest.raises(CapabilityError, match=r"pip install 'sw-gsplat\[gsplat\]'"):
         GsplatRasterizer()
 
 

@@ -1,14 +1,23 @@
 """Small models of HAC with values that follow their predicted distributions, as those of a trained one do."""
 
+import copy
+from types import SimpleNamespace
+
 import torch
+from sw_anchors.attribute_sections import AttributeEncoder
 from sw_anchors.coded_anchors import ENTROPY
+from sw_anchors.sections import kept_geometry, round_networks
+from sw_anchors.shape import GROUPS
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
+from sw_codecs.context.hash_grid import MixedHashGrid
+from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.method import HAC
 from sw_hac.model import HACAnchors
+from sw_hac.predictors import PREDICTORS
 
 PLUGINS = load_plugins()
 SMALL_GRID = {"features": 2, "log2_space": 8, "log2_planes": 8}
@@ -27,11 +36,10 @@ def make(n: int = 300, feature_dim: int = 8, k: int = 4, *, seed: int = 0, **kwa
     """n anchors in front of the test camera; a fifth of the offsets, and anchors 0 to 4, are masked."""
     g = generator(seed)
     anchors = torch.rand(n, 3, generator=g) * 2 - torch.tensor([1.0, 1.0, -3.0])
-    grid = PLUGINS.context_models.load("hash-grid")((6, 10, 18), (10, 34), **SMALL_GRID, generator=g)
+    grid = MixedHashGrid((6, 10, 18), (10, 34), **SMALL_GRID, generator=g)
     model = HACAnchors(
         anchors, torch.zeros(n, feature_dim), torch.zeros(n, k, 3), torch.zeros(n, 6), voxel_size=0.01, hidden=8,
-        generator=g, entropy=PLUGINS.entropy_models.load("gaussian-exact")(), grid=grid, grid_hidden=16,
-        margin="extent", **kwargs,
+        generator=g, grid=grid, grid_hidden=16, margin="extent", **kwargs,
     )  # fmt: skip
     with torch.no_grad():
         for part in model.grid.grids:
@@ -69,3 +77,43 @@ def encoded(model: HACAnchors, **values) -> bytes:
 def decoded(data: bytes):
     with torch.no_grad():
         return HAC(PLUGINS, None).decode(ContainerReader(data))
+
+
+class Recorder(AttributeEncoder):
+    """An encoder that keeps integers and steps, and counts the bits of the tables."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.symbols, self.steps, self.bits = {g: [] for g in GROUPS}, {g: [] for g in GROUPS}, 0.0
+
+    def code(self, block, context, step, present=None):
+        symbols = super().code(block, context, step, present)
+        self.symbols[block.group].append(symbols)
+        self.steps[block.group].append(step)
+        self.bits += float(self.coder.bits(symbols, context, present).sum()) if self.coder.mode == "exact" else 0.0
+        return symbols
+
+
+def predictor(model, mode="exact"):
+    return PREDICTORS[mode](model.grid, model.mlp_grid, model.shape, model.base_steps)
+
+
+def lattice_of(model, *, mode="exact", **values):
+    """Geometry, integers and steps of a file by group, the values they stand for, its bits by the tables; the file."""
+    settings = method(codec__mode=mode, **values).config.codec
+    writer, again = ContainerWriter("hac", 1), ContainerWriter("hac", 1)
+    with torch.no_grad():
+        codec.encode(model, writer, settings)
+        model = copy.deepcopy(model)
+        model.fold_units()
+        round_networks(model.networks(), settings.weights)
+        geometry, rows = kept_geometry(model)
+        recorder = Recorder(model, rows, list(codec.SECTIONS.values()), mode)
+        codec.walk(recorder, predictor(model, mode), geometry)
+        recorder.write(again)
+    stored = ContainerReader(writer.to_bytes()), ContainerReader(again.to_bytes())
+    assert all(stored[0].section(name) == stored[1].section(name) for name in codec.SECTIONS.values())
+    symbols, steps = ([torch.cat(each[g]) for g in GROUPS] for each in (recorder.symbols, recorder.steps))
+    return SimpleNamespace(
+        places=geometry, symbols=symbols, steps=steps, values=model.raw(rows), bits=recorder.bits
+    ), writer

@@ -8,18 +8,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from hac_models import PLUGINS, decoded, encoded, generator, make, method
+from hac_models import PLUGINS, decoded, encoded, generator, lattice_of, make, method, predictor
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import this_machine
+from sw_anchors.sections import morton_order
+from sw_anchors.shape import GROUPS
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.runs import measuring
+from splatwizard_core.runs import measure
 from splatwizard_core.scene.scene import Protocol
 from sw_hac import codec
 from sw_hac.method import HAC
@@ -28,12 +30,13 @@ RASTERIZER = ReferenceRasterizer()
 SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "offsets"]
 
 
-def lattice_of(model, **values):
-    """What `encode` writes, and the file."""
+def test_the_header_lists_what_decoding_needs():
     writer = ContainerWriter("hac", 1)
-    with torch.no_grad():
-        found = codec.encode(model, writer, method(**values).config.codec, PLUGINS)
-    return found, writer
+    codec.encode(make(n=20), writer, method().config.codec)
+    assert list(dict.fromkeys(writer.required)) == [
+        ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
+        ("entropy model", "conditional-gaussian"),
+    ]  # fmt: skip
 
 
 def test_a_file_has_a_section_for_everything():
@@ -51,10 +54,8 @@ def test_the_decoder_has_the_encoders_integers_and_values():
     assert torch.equal(result.positions(), found.places.positions)
     assert torch.equal(result.masks, found.places.masks)
     assert result.counts() == {"num_anchors": 295, "num_gaussians": int(found.places.masks.sum())}
-    predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS)
-    _, steps = predicts.contexts(found.places.codes)
-    for name, symbols, step in zip(("features", "scales", "offsets"), found.symbols, steps, strict=True):
-        expected = torch.from_numpy((symbols * step).astype(np.float32))
+    for name, symbols, step in zip(GROUPS, found.symbols, found.steps, strict=True):
+        expected = (symbols * step).to(torch.float32)
         assert torch.equal(getattr(result, name).flatten(1), expected)
 
 
@@ -77,10 +78,8 @@ def test_the_file_renders_as_the_rounded_model():
     rounded = make()
     with torch.no_grad():
         rows = torch.nonzero(rounded.kept()).squeeze(1)
-        order = codec.morton_order(rounded.codes()[rows], PLUGINS)
-        predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS)
-        _, steps = predicts.contexts(found.places.codes)
-        values = [torch.from_numpy((s * q).astype(np.float32)) for s, q in zip(found.symbols, steps, strict=True)]
+        order = morton_order(rounded.codes()[rows])
+        values = [(s * q).to(torch.float32) for s, q in zip(found.symbols, found.steps, strict=True)]
         direct = DecodedAnchors(rounded.positions()[rows][order], values[0], values[2].view(-1, 4, 3), values[1],
                                 found.places.masks, hidden=8)  # fmt: skip
         for name in rounded.NETWORKS:
@@ -100,7 +99,7 @@ def test_another_process_decodes_the_same(tmp_path):
     code = (
         "import sys, torch\n"
         "from splatwizard_core.coding.container import ContainerReader\n"
-        "from splatwizard_core.runs.decoding import decode_model\n"
+        "from splatwizard_core.runs.decode import decode_model\n"
         "from splatwizard_core.plugins import load_plugins\n"
         "torch.set_num_threads(2)\n"
         "for path in sys.argv[1:]:\n"
@@ -120,14 +119,14 @@ def test_half_precision_weights_save_half_of_their_bytes():
 
 def test_the_bits_of_the_tables_are_the_size_of_the_file():
     found, writer = lattice_of(make(n=4000))
-    size = sum(writer.sections[name] for name in codec.SECTIONS)
+    size = sum(writer.sections[name] for name in codec.SECTIONS.values())
     assert 8 * size == pytest.approx(found.bits, rel=0.01)
 
 
 def test_the_training_estimate_is_the_size_of_the_file():
     model = make(n=6000)
     _, writer = lattice_of(model)
-    size = 8 * sum(writer.sections[name] for name in codec.SECTIONS)
+    size = 8 * sum(writer.sections[name] for name in codec.SECTIONS.values())
     model.train()
     rows = torch.nonzero(model.kept()).squeeze(1)
     numbers = len(rows) * 26
@@ -143,34 +142,30 @@ def test_the_training_estimate_is_the_size_of_the_file():
 
 def test_exact_contexts_do_not_depend_on_the_batch_or_threads():
     model = make(n=3500)
-    predicts = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS)
+    predict = predictor(model)
     codes = model.codes()
-    whole, steps = predicts.contexts(codes)
+    whole = predict(codes)
     for size in (1, 7, 3000):
         part = codes[: 40 if size == 1 else None]
-        blocks = [predicts.contexts(block) for block in part.split(size)]
-        for g in range(3):
+        blocks = [predict(block) for block in part.split(size)]
+        for g in GROUPS:
+            context, steps = whole[g]
             for field in ("mean", "scale", "step"):
-                joined = np.concatenate([np.asarray(getattr(contexts[g], field)) for contexts, _ in blocks])
-                assert np.array_equal(joined, np.asarray(getattr(whole[g], field))[: len(part)])
-            assert np.array_equal(np.concatenate([q[g] for _, q in blocks]), steps[g][: len(part)])
+                joined = torch.cat([getattr(block[g][0], field) for block in blocks])
+                assert torch.equal(joined, getattr(context, field)[: len(part)])
+            assert torch.equal(torch.cat([block[g][1] for block in blocks]), steps[: len(part)])
 
 
 def test_integers_predict_what_the_float_network_does():
     model = make(n=2000)
-    exact = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "exact", PLUGINS).contexts(
-        model.codes()
-    )
-    floats = codec.predictor(model.grid, model.mlp_grid, 8, 4, model.base_steps, "float", PLUGINS).contexts(
-        model.codes()
-    )
-    for g, base in enumerate((1.0, 0.001, 0.2)):
+    exact, floats = (predictor(model, mode)(model.codes()) for mode in ("exact", "float"))
+    for g, base in zip(GROUPS, (1.0, 0.001, 0.2), strict=True):
         for field in ("mean", "scale"):
-            ours = np.asarray(getattr(exact[0][g], field)) / 4096 * base
-            difference = np.abs(ours - np.asarray(getattr(floats[0][g], field))) / base
+            ours = np.asarray(getattr(exact[g][0], field)) / 4096 * base
+            difference = np.abs(ours - np.asarray(getattr(floats[g][0], field))) / base
             # At the border of the box renormalising magnifies the rounding of coordinates.
             assert np.quantile(difference, 0.99) < 0.02
-        ratio = exact[1][g] / floats[1][g]
+        ratio = exact[g][1] / floats[g][1]
         assert 0.85 < ratio.min() <= ratio.max() < 1.15  # steps of 1/8 in t
 
 
@@ -178,8 +173,8 @@ def test_rounding_the_context_costs_next_to_nothing():
     model = make(n=4000)
     sizes = {}
     for mode in ("exact", "float"):
-        _, writer = lattice_of(model, codec__mode=mode)
-        sizes[mode] = sum(writer.sections[name] for name in codec.SECTIONS)
+        _, writer = lattice_of(model, mode=mode)
+        sizes[mode] = sum(writer.sections[name] for name in codec.SECTIONS.values())
     assert sizes["exact"] == pytest.approx(sizes["float"], rel=0.02)
 
 
@@ -222,7 +217,7 @@ def test_outliers_come_back_clamped_about_the_mean():
     assert float(result.features[rows[0], 3].detach()) == pytest.approx(9000, abs=2)
     # The other ends 15,000 steps from the mean of all numbers; its index is the largest there is.
     step = float(result.features[rows[1], 3].detach()) / float(found.symbols[0].max())
-    mean = float(found.values[0].double().mean())
+    mean = float(found.values[0].detach().double().mean())
     assert float(result.features[rows[1], 3].detach()) == pytest.approx(mean + 15_000 * step, abs=2)
 
 
@@ -258,9 +253,9 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
 @pytest.mark.parametrize(("mode", "flags"), [("exact", []), ("float", ["device-bound"])])
 def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path):
     (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
-    bound = measuring.opener(tmp_path / "scene.swz", PLUGINS, torch.device("cpu"))().device_bound
+    bound = measure.opener(tmp_path / "scene.swz", PLUGINS, torch.device("cpu"))().device_bound
     scene, quality = SimpleNamespace(protocol=Protocol("test")), SimpleNamespace(metrics={})
-    assert measuring._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
+    assert measure._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
 
 
 def test_a_weight_that_does_not_fit_half_precision_is_named():

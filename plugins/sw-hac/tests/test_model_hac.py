@@ -4,15 +4,14 @@ import copy
 
 import pytest
 import torch
-from hac_models import PLUGINS, generator, make, method
+from hac_models import generator, make, method
 from sw_anchors.coded_anchors import ENTROPY
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_hac.model import group_widths, output_widths
 from sw_hac.stage import HACStage
 
 RASTERIZER = ReferenceRasterizer()
@@ -29,8 +28,8 @@ def test_sizes_are_the_published_ones():
     assert sum(p.numel() for network in model.networks().values() for p in network.parameters()) == 41_235
     assert model.grid.entries == 1_766_272
     assert model.mlp_grid[0].in_features == 96
-    assert sum(output_widths(50, 10)) == 175
-    assert sum(group_widths(50, 10)) == 86
+    assert sum(model.shape.outputs) == 175
+    assert sum(model.shape.widths) == 86
     assert bool((model.mask_logits == 1).all())
 
 
@@ -141,10 +140,6 @@ def test_the_state_of_grid_and_network_is_part_of_the_digest():
     other.load_state_dict_extra(model.state_dict_extra())
     assert model.digest() == other.digest()
     assert model.phase == ENTROPY
-
-
-def test_the_entropy_model_is_the_registrys():
-    assert type(make().entropy) is PLUGINS.entropy_models.load("gaussian-exact")
 
 
 @pytest.mark.parametrize("in_steps", [True, False])

@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from hac_models import PLUGINS, decoded, method
+from hac_models import PLUGINS, decoded, lattice_of, method
 from sw_anchors.coded_anchors import ENTROPY
 
-from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.dataset import SceneOptions
@@ -62,11 +62,11 @@ def psnr(model, scene, rasterizer) -> float:
     return float(torch.stack(values).mean())
 
 
-def file_of(model, made) -> tuple[bytes, codec.Lattice]:
+def file_of(model, made) -> bytes:
     writer = ContainerWriter("hac", 1)
     with torch.no_grad():
-        lattice = codec.encode(model, writer, made.config.codec, PLUGINS)
-    return writer.to_bytes(), lattice
+        made.encode(model, writer)
+    return writer.to_bytes()
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +94,7 @@ def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):
 def test_a_larger_weight_gives_a_smaller_and_worse_file(scene, rasterizer, trained):
     sizes, quality = [], []
     for model, _, made in trained.values():
-        data, _ = file_of(model, made)
+        data = file_of(model, made)
         sizes.append(len(data))
         quality.append(psnr(decoded(data), scene, rasterizer))
     assert sizes == sorted(sizes, reverse=True)
@@ -103,7 +103,7 @@ def test_a_larger_weight_gives_a_smaller_and_worse_file(scene, rasterizer, train
 
 def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
     model, _, made = trained[WEIGHTS[0]]
-    data, _ = file_of(model, made)
+    data = file_of(model, made)
     found = decoded(data)
     assert found.counts() == model.counts()
     assert psnr(found, scene, rasterizer) > psnr(model, scene, rasterizer) - 0.2
@@ -111,9 +111,10 @@ def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
 
 def test_estimates_of_a_trained_model_are_its_size(trained):
     model, _, made = trained[WEIGHTS[1]]
-    data, lattice = file_of(model, made)
-    sections = ContainerReader(data).sections
-    size = 8 * sum(sections[name] for name in codec.SECTIONS)
+    lattice, writer = lattice_of(model)
+    assert writer.to_bytes() == file_of(model, made)
+    sections = writer.sections
+    size = 8 * sum(sections[name] for name in codec.SECTIONS.values())
     assert size == pytest.approx(lattice.bits, rel=0.01)
     rows = torch.nonzero(model.kept()).squeeze(1)
     numbers = len(rows) * (8 + 6 + 15)

@@ -8,7 +8,7 @@ import torch
 from splatwizard_core.gaussians.model import GaussianModel, logit
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 
 WIDTH, HEIGHT = 48, 36
@@ -33,7 +33,7 @@ def rasterizer(plugins):
 
 
 def camera(eye, width=WIDTH, height=HEIGHT):
-    return look_at(
+    return Camera.look_at(
         torch.tensor(eye), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]), width=width, height=height, fov_x=0.9
     )
 

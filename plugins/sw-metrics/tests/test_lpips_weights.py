@@ -189,16 +189,6 @@ def test_a_folder_is_checked_before_the_work(tmp_path: Path, lpips_folder: Path)
 def test_commands_refuse_a_folder_without_weights_in_one_line(command, tmp_path: Path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "scene.ply").touch()
-    assert main([*command, "--scene", "demo:tiny", "--lpips-weights", "nowhere"]) == 2
+    assert main([*command, "--scene", "demo:tiny", "--set", "metrics.lpips.weights=nowhere"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["scene.ply"]
-
-
-def test_a_command_warns_once_and_on_one_line_unless_told_to_be_quiet(lpips_folder: Path, capsys):
-    from splatwizard_core.cli.setup import lpips_folder as option
-
-    assert option(None) is None
-    assert capsys.readouterr().err.startswith("warning: LPIPS is not available")
-    assert option(None, quiet=True) is None
-    assert option(str(lpips_folder)) == lpips_folder.resolve()
-    assert capsys.readouterr().err == ""

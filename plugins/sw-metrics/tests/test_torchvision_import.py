@@ -9,7 +9,7 @@ import pytest
 from sw_metrics.torchvision_import import import_torchvision
 
 needs_torchvision = pytest.mark.skipif(
-    importlib.util.find_spec("torchvision") is None, reason="torchvision comes with splatwizard-core[lpips]"
+    importlib.util.find_spec("torchvision") is None, reason="torchvision comes with sw-metrics[lpips]"
 )
 
 

@@ -6,7 +6,7 @@ import torch
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from sw_pup_3dgs.score import FisherScore, log_determinants
 
 pytestmark = pytest.mark.cuda
@@ -31,7 +31,7 @@ def test_scores_agree():
     ]  # fmt: skip
     eyes = torch.tensor([[3.0, 0, 1], [-3.0, 0, 1], [0, 3.0, 1], [0, -3.0, 1.5]])
     up = torch.tensor([0.0, 0, 1])
-    cameras = [look_at(eye, torch.zeros(3), up, width=130, height=90, fov_x=0.8) for eye in eyes]
+    cameras = [Camera.look_at(eye, torch.zeros(3), up, width=130, height=90, fov_x=0.8) for eye in eyes]
     found = {}
     for device in ("cpu", "cuda"):
         model = GaussianModel(*(tensor.to(device) for tensor in raw))

@@ -16,7 +16,7 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from sw_pup_3dgs.score import FLOOR, FisherScore, log_determinants, reduced, unpacked
 
 RAW = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
@@ -33,7 +33,7 @@ def views(count=6, size=64, radius=3.0, dtype=torch.float64):
     for i in range(count):
         angle = 2 * math.pi * i / count
         eye = torch.tensor([radius * math.cos(angle), radius * math.sin(angle), 1.0 + 0.3 * (i % 2)], dtype=dtype)
-        found.append(look_at(eye, target, up, width=size, height=size, fov_x=0.8))
+        found.append(Camera.look_at(eye, target, up, width=size, height=size, fov_x=0.8))
     return found
 
 

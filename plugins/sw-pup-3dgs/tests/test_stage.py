@@ -11,7 +11,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides, resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped, train_stages
@@ -64,7 +64,7 @@ def scene(rasterizer):
     made, truth, up = [], toy_model(seed=1), torch.tensor([0.0, 0.0, 1.0])
     for i, angle in enumerate(torch.arange(6) / 6 * 2 * torch.pi):
         eye = torch.stack([3 * angle.cos(), 3 * angle.sin(), torch.tensor(1.0)])
-        camera = look_at(eye, torch.zeros(3), up, width=48, height=40, fov_x=0.8)
+        camera = Camera.look_at(eye, torch.zeros(3), up, width=48, height=40, fov_x=0.8)
         with torch.no_grad():
             image = rasterizer.render(truth.gaussians(camera, rasterizer), camera, RasterOptions()).image
         pixels = (image.clamp(0, 1) * 255).round().byte().permute(1, 2, 0).contiguous().numpy()

@@ -6,10 +6,8 @@ import pytest
 import torch
 from sw_reference.testing.raster_scenes import RasterCase, draw_scene
 
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import CapabilityError, RasterOptions
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
 
 KINDS = [FlashRasterizer, TensorCoreRasterizer]

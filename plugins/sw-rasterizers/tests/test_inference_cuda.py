@@ -7,14 +7,10 @@ from dataclasses import replace
 
 import pytest
 import torch
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
-from sw_reference.testing.rasterizer_checks import front_camera, splats
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, splats
 
-from splatwizard_core.errors import CapabilityError, ConfigError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import SH, CapabilityError, ConfigError, RasterOptions
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.inference import FlashRasterizer, TensorCoreRasterizer
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.standard import StandardRasterizer

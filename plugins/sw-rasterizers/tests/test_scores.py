@@ -7,15 +7,19 @@ from dataclasses import replace
 import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, margin_scene, with_tensors
-from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
+from sw_reference.testing.raster_scenes import (
+    RasterCase,
+    cast_inputs,
+    draw_scene,
+    front_camera,
+    margin_scene,
+    splats,
+    with_tensors,
+)
+from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError, ConfigError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.api import SH, Camera, CapabilityError, ConfigError, RasterOptions, ScoreSpec
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers import scoring
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.scoring import CountRasterizer, PupRasterizer
@@ -38,7 +42,7 @@ def threads():
 
 def other_camera(width, height):
     eye, target, up = torch.tensor([[3.0, 0.5, -1.5], [0.0, 0.1, 0.0], [0.1, -1.0, 0.0]])
-    return look_at(eye, target, up, width=width, height=height, fov_x=0.8)
+    return Camera.look_at(eye, target, up, width=width, height=height, fov_x=0.8)
 
 
 def score_checks():

@@ -10,10 +10,8 @@ from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, margin_scene, with_tensors
 from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import SH, RasterOptions, ScoreSpec
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers import scoring
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.scoring import PupRasterizer

@@ -11,9 +11,7 @@ from sw_reference.testing.raster_gradients import GRADIENT_CASES, applies, check
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import SH, CapabilityError, RasterOptions
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.standard import StandardRasterizer
 

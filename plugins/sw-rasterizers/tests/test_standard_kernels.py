@@ -9,13 +9,19 @@ import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_gradients import run
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, with_tensors
-from sw_reference.testing.rasterizer_checks import front_camera, splats
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, splats, with_tensors
 
-from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.rasterizer import Feature, RasterOptions, ScoreSpec
+from splatwizard_core.api import (
+    SH,
+    CapabilityError,
+    ConfigError,
+    Feature,
+    GaussianInputs,
+    RasterOptions,
+    ScoreSpec,
+    ShapeError,
+)
+from splatwizard_core.tooling import load_plugins
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import visible_radii
 from sw_rasterizers.standard import StandardRasterizer

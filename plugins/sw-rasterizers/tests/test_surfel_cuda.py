@@ -14,15 +14,14 @@ from sw_reference.testing.raster_scenes import (
     RasterCase,
     cast_inputs,
     draw_scene,
+    front_camera,
     permute_inputs,
     with_tensors,
 )
 from sw_reference.testing.raster_surfels import surfels
-from sw_reference.testing.rasterizer_checks import checks_for, front_camera
+from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import SH, CapabilityError, RasterOptions
 from sw_rasterizers.native import unavailable_on_cuda
 from sw_rasterizers.surfel import SurfelRasterizer
 

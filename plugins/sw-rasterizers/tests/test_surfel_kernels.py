@@ -17,15 +17,12 @@ from sw_reference.testing.raster_gradients import (
     outputs,
     run,
 )
-from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, with_tensors
+from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, with_tensors
 from sw_reference.testing.raster_surfels import surfels
-from sw_reference.testing.rasterizer_checks import checks_for, front_camera
+from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import Feature, RasterOptions, ScoreSpec
+from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, ScoreSpec, ShapeError
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.surfel import SurfelRasterizer
 

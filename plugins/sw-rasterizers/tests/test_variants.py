@@ -11,11 +11,8 @@ from sw_reference.testing.raster_gradients import GRADIENT_CASES, applies, check
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.errors import CapabilityError, ShapeError
-from splatwizard_core.gaussians.inputs import SH
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions, feature_names, required_features
+from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, ShapeError
+from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.segments import Segments, Tables
 from sw_rasterizers.variants import AccelRasterizer, DepthRasterizer, IndexedRasterizer
@@ -175,6 +172,6 @@ def test_what_a_variant_does_not_declare_is_refused():
 def test_they_are_found_by_name_and_codebooks_by_what_is_asked(prefer, case, options, served):
     g, _ = draw_scene(replace(RasterCase(), **case), 1, torch.float32)
     chosen = NegotiatedRasterizer(load_plugins(), device="cpu", prefer=prefer)
-    asked = feature_names(required_features(g, options))
+    asked = Feature.asked_by(options, g).names
     assert chosen.select(asked).info.name == served
     assert asked <= chosen.select(asked).info.features

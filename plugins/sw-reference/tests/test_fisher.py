@@ -9,8 +9,7 @@ import torch
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import RasterCase, draw_scene, margin_scene
 
-from splatwizard_core.errors import CapabilityError
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import CapabilityError, RasterOptions
 
 REFERENCE = ReferenceRasterizer()
 CASE = RasterCase("fisher", n=3, width=9, height=8, spread=0.5, scale=(0.3, 0.6))

@@ -3,10 +3,9 @@
 import pytest
 import torch
 from sw_reference.rasterizer import ReferenceRasterizer
-from sw_reference.testing.rasterizer_checks import front_camera
+from sw_reference.testing.raster_scenes import front_camera
 
-from splatwizard_core.gaussians.inputs import GaussianInputs
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import GaussianInputs, RasterOptions
 
 
 @pytest.mark.pipeline

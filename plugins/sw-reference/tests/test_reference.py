@@ -1,8 +1,11 @@
 """The reference rasterizer: every fact of the public checks, finite differences, and the naive loop as an oracle."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
-from sw_reference import compositing
+from sw_reference import compositing, plugin
 from sw_reference.projection import rotation_matrices
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.naive_rasterizer import naive_render
@@ -14,13 +17,10 @@ from sw_reference.testing.raster_gradients import (
     outputs,
     run,
 )
-from sw_reference.testing.raster_scenes import RasterCase, draw_scene, margin_scene, with_tensors
-from sw_reference.testing.rasterizer_checks import checks_for, front_camera, splats
+from sw_reference.testing.raster_scenes import RasterCase, draw_scene, front_camera, margin_scene, splats, with_tensors
+from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core import builtin
-from splatwizard_core.errors import CapabilityError, ConfigError, ShapeError
-from splatwizard_core.plugins.registry import Registry
-from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_core.api import CapabilityError, ConfigError, RasterOptions, Registry, ScoreSpec, ShapeError
 
 REFERENCE = ReferenceRasterizer()
 DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})
@@ -217,5 +217,20 @@ def test_screen_gradient_without_other_gradients():
 
 def test_declared_features_are_those_of_the_registry():
     registry = Registry("rasterizer")
-    builtin.register_rasterizers(registry)
+    plugin.register_rasterizers(registry)
     assert registry.entry("reference").load().info.features == set(registry.entry("reference").declared["features"])
+
+
+def test_the_checks_are_importable_without_pytest():
+    code = """
+import sys
+sys.modules["pytest"] = None
+from sw_reference.testing import raster_gradients, rasterizer_checks
+from sw_reference.rasterizer import ReferenceRasterizer
+checks = rasterizer_checks.checks_for(ReferenceRasterizer.info)
+checks[0](ReferenceRasterizer(), "cpu")
+print(len(checks))
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert int(done.stdout) == len(checks_for(ReferenceRasterizer.info)) > 50

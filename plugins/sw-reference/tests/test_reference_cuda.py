@@ -7,7 +7,7 @@ from sw_reference.testing.raster_gradients import GRADIENT_CASES, check_against
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 from sw_reference.testing.rasterizer_checks import checks_for
 
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.api import RasterOptions
 
 pytestmark = [
     pytest.mark.cuda,

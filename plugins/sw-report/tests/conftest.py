@@ -2,14 +2,18 @@
 
 import json
 import math
+import sys
 from collections.abc import Callable
+from importlib.metadata import EntryPoint
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
 
+from splatwizard_core.plugins import PluginManager, hookimpl
 from splatwizard_core.runs.record import Record
 
 SIZE = (48, 32)  # width, height
@@ -21,6 +25,48 @@ UNKNOWN = {
     "memory.peak_reserved_bytes": "a CPU has none", "train.breakdown_s": "not profiled", "geometry": "not asked for",
     "speed.spread": "measured once",
 }  # fmt: skip
+
+
+@hookimpl
+def register_metrics(registry: Any) -> None:
+    for name, label, position in (
+        ("lpips_vgg_3dgs", "LPIPS (VGG, 3DGS)", 3), ("lpips_vgg", "LPIPS (VGG)", 4), ("lpips_alex", "LPIPS (Alex)", 5),
+    ):  # fmt: skip
+        registry.add(name, "nowhere:metric", summary="", direction="lower", label=label, digits=4, position=position)
+    registry.add("odd", "nowhere:metric", summary="", direction="lower", digits="many", position="first")
+
+
+@hookimpl
+def register_datasets(registry: Any) -> None:
+    rooms = ["room", "counter", "kitchen", "bonsai"]
+    registry.add("mipnerf360", "nowhere:family", summary="", title="Mip-NeRF 360",
+                 scenes=["bicycle", "flowers", "garden", "stump", "treehill", *rooms])  # fmt: skip
+    registry.add("tandt", "nowhere:family", summary="", title="Tanks & Temples", scenes=["train", "truck"])
+    registry.add("dtu", "nowhere:family", summary="", title="DTU", scenes=["24", "37"], prefix="scan")
+    registry.add("colmap", "nowhere:family", summary="")
+
+
+@hookimpl
+def register_methods(registry: Any) -> None:
+    for name, rank in (("hac", 1), ("lightgaussian", 2), ("3dgs", 3)):
+        registry.add(name, "nowhere:method", summary="", bd_anchor=rank)
+    registry.add("another", "nowhere:method", summary="")
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch: pytest.MonkeyPatch) -> PluginManager:
+    """The core, and beside it what the hooks above declare, whatever is installed where the tests run."""
+    plugin = ModuleType("declaring_plugin")
+    for hook in (register_metrics, register_datasets, register_methods):
+        setattr(plugin, hook.__name__, hook)
+    monkeypatch.setitem(sys.modules, plugin.__name__, plugin)
+    found = PluginManager(
+        [EntryPoint("core", "splatwizard_core.builtin", "splatwizard"),
+         EntryPoint("declaring", plugin.__name__, "splatwizard")]
+    )  # fmt: skip
+    assert not found.broken
+    monkeypatch.setattr("sw_report.declared.load_plugins", lambda: found)
+    return found
 
 
 def photograph(view: int, size: tuple[int, int] = SIZE) -> np.ndarray:

@@ -1,13 +1,19 @@
-"""What `sw run` leaves besides the record."""
+"""Pages, tables and plots that `sw run` leaves besides its records."""
 
+import io
 import os
 
 import numpy as np
+import pytest
 import torch
-from sw_report.after_run import plot_above, report_above, report_run
+from rich.console import Console
+from sw_report import after_run
+from sw_report.after_run import plot_above, report_above, report_finished, report_run
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.runs.run import OWN_FILES
+from splatwizard_core.runs.directory import OWN_FILES
+from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
+from splatwizard_core.runs.record import read_record
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 
@@ -103,3 +109,61 @@ def test_runs_of_another_protocol_are_not_in_the_plot(make_curve, make_run):
     text = plot_above(runs, print).read_text()
     assert "halved" not in text
     assert "Rate and distortion of toy on garden" in text
+
+
+def finish(directories, *, json: bool = False):
+    """(what `sw run` prints, what it says, the files that it names) for these run directories."""
+    out = Console(file=io.StringIO(), width=200, highlight=False, color_system=None)
+    console, told, written = None if json else out, [], []
+    runs = [FinishedRun(directory, read_record(directory / "metrics.json"), scene) for directory in directories]
+    for run in runs:
+        report_finished(FinishedRuns([run], False, console, told.append, written))
+    report_finished(FinishedRuns(runs, True, console, told.append, written))
+    return out.file.getvalue(), told, written
+
+
+def test_one_run_ends_in_a_table_and_names_its_page(make_run):
+    directory = make_run()
+    text, told, _ = finish([directory])
+    assert text.startswith("garden: 5 test views, protocol colmap/images")
+    assert text.splitlines()[-2:] == [f"{directory}/metrics.json", f"{directory}/report.html"]
+    assert told == []
+
+
+def test_several_runs_end_in_one_table_and_name_the_page_above_alone(make_curve, tmp_path):
+    text, _, _ = finish(make_curve())
+    above = tmp_path / "out" / "garden" / "toy"
+    assert text.count("test views") == 1
+    assert text.splitlines()[-2:] == [f"{above}/report.html", f"{above}/rd.svg"]
+    assert "r1/report.html" not in text
+    assert (above / "r1" / "report.html").is_file()
+
+
+def test_files_of_other_observers_stay_named(make_curve, tmp_path):
+    runs = [FinishedRun(d, read_record(d / "metrics.json"), scene) for d in make_curve()]
+    theirs = tmp_path / "theirs.csv"
+    written = [theirs, runs[0].directory / "report.html"]
+    report_finished(FinishedRuns(runs, True, None, print, written))
+    assert written[0] == theirs
+    assert [path.name for path in written] == ["theirs.csv", "report.html", "rd.svg"]
+    assert written[1].parent == runs[0].directory.parent
+
+
+def test_where_json_is_asked_for_no_table_is_printed(make_run):
+    text, told, written = finish([make_run()], json=True)
+    assert (text, told) == ("", [])
+    assert [path.name for path in written] == ["report.html"]
+
+
+@pytest.mark.parametrize("error", [SceneError("gone"), KeyError("nobody foresaw this")])
+def test_the_table_comes_though_no_page_could_be_made(make_curve, monkeypatch, error):
+    def fail(*_):
+        raise error
+
+    monkeypatch.setattr(after_run, "write_page", fail)
+    monkeypatch.setattr(after_run, "rd_svg", fail)
+    text, told, written = finish(make_curve())
+    assert text.startswith("garden: 5 test views")
+    assert written == []
+    assert len(told) == 6
+    assert all(line.startswith("warning: ") and "\n" not in line for line in told)

@@ -64,6 +64,21 @@ def test_a_published_data_set_needs_all_its_scenes(make_run, tmp_path):
     assert row.size is None
 
 
+def test_a_folder_named_with_the_prefix_of_its_data_set_is_the_published_scene(make_run, tmp_path):
+    for scene in ("scan24", "37", "scan99"):
+        make_run(scene=scene, change=lambda c: c.update(dataset="dtu"))
+    (table,) = dataset_tables(collect([tmp_path]).runs)
+    (row,) = table.rows
+    assert (table.title, table.published, row.scenes, row.missing) == ("DTU", True, ("24", "37"), ())
+
+
+def test_a_data_set_that_is_not_installed_has_the_scenes_that_the_runs_are_of(make_run, tmp_path):
+    for scene in ("b", "a"):
+        make_run(scene=scene, change=lambda c: c.update(dataset="theirs"))
+    (table,) = dataset_tables(collect([tmp_path]).runs)
+    assert (table.title, table.published, table.scenes) == ("theirs", False, ("a", "b"))
+
+
 def protocol(images="images", resolution=-1, name="custom"):
     def change(content):
         content["protocol"].update(
@@ -195,6 +210,12 @@ def test_the_anchor_is_the_usual_one_or_the_one_asked_for(make_run, tmp_path):
         choose_anchor(runs, "hacc")
 
 
+def test_without_a_usual_anchor_the_alphabetically_first_is_it(make_run, tmp_path):
+    for scene, method in (("a", "toy"), ("a", "another"), ("b", "aardvark")):  # not installed: toy, aardvark
+        make_run(scene=scene, method=method)
+    assert choose_anchor(collect([tmp_path]).runs, None) == "aardvark"
+
+
 def test_an_anchor_with_two_presets_must_be_named_in_full(make_run, tmp_path):
     for preset in ("paper", "quick"):
         make_run(out=tmp_path / "o" / preset, change=lambda c, p=preset: c.update(preset=p))
@@ -248,16 +269,28 @@ def test_environments_and_servants_are_told(make_run, tmp_path):
         (numbers.megabytes(734e6), "734.0"),
         (numbers.seconds(396.4), "396"),
         (numbers.seconds(0.123), "0.12"),
-        (numbers.score("psnr", 27.2049), "27.20"),
-        (numbers.score("ssim", 0.81554), "0.8155"),
         (numbers.percent(-12.34), "−12.3"),
         (numbers.counts({"num_gaussians": 1234}), "1,234"),
         (numbers.counts({"num_anchors": 12, "num_gaussians": 120}), "12 anchors / 120"),
-        (numbers.score("ssim", None), "–"),
     ],
 )
 def test_numbers_are_written_alike_everywhere(written, expected):
     assert written == expected
+
+
+def test_metrics_are_written_as_they_declare():
+    assert numbers.score("psnr", 27.2049) == "27.20"
+    assert numbers.score("ssim", 0.81554) == "0.8155"
+    assert numbers.score("ssim", None) == "–"
+    assert numbers.heading("psnr") == "PSNR dB"
+    assert numbers.heading("LPIPS-VGG") == "LPIPS (VGG)"
+
+
+@pytest.mark.parametrize("name", ["not_installed", "odd"])
+def test_a_metric_that_declares_nothing_of_use_is_shown_by_its_name(name):
+    assert numbers.heading(name) == name
+    assert numbers.score(name, 0.81554) == "0.8155"
+    assert numbers.ordered_metrics([name, "l1", "psnr"]) == ["psnr", "l1", name]
 
 
 def test_the_fields_own_lpips_comes_first():

@@ -9,10 +9,9 @@ from sw_report import results
 from splatwizard_core.runs.record import read_record
 
 
-def printed(done, width: int, monkeypatch: pytest.MonkeyPatch, *, terminal: bool = False, written=()) -> str:
+def printed(done, width: int, *, terminal: bool = False, written=()) -> str:
     out = Console(file=io.StringIO(), width=width, highlight=False, force_terminal=terminal, color_system=None)
-    monkeypatch.setattr(results, "console", lambda: out)
-    results.print_results(done, written)
+    results.print_results(done, written, out)
     return out.file.getvalue()
 
 
@@ -27,8 +26,8 @@ def rows(text: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("│").split("│")] for line in text.splitlines() if line.startswith("│")]
 
 
-def test_one_table_with_a_section_for_each_method_and_the_best_marked(done, monkeypatch):
-    text = printed(done, 160, monkeypatch)
+def test_one_table_with_a_section_for_each_method_and_the_best_marked(done):
+    text = printed(done, 160)
     table = rows(text)
     assert [row[0] for row in table] == ["toy", "", "", "", "lightgaussian", "", "", "", "other", "", "", ""]
     assert [row[1] for row in table] == ["r1", "r2", "r3", "r4"] * 3
@@ -41,21 +40,21 @@ def test_one_table_with_a_section_for_each_method_and_the_best_marked(done, monk
     assert "* best of its column" in text
 
 
-def test_rate_points_of_one_method_are_not_marked(make_curve, monkeypatch):
+def test_rate_points_of_one_method_are_not_marked(make_curve):
     done = [(read_record(d / "metrics.json"), d) for d in make_curve()]
-    text = printed(done, 160, monkeypatch)
+    text = printed(done, 160)
     assert "*" not in text
     assert "BD-rate" not in text
 
 
-def test_bd_rates_against_the_usual_anchor(done, monkeypatch):
-    text = printed(done, 160, monkeypatch)
+def test_bd_rates_against_the_usual_anchor(done):
+    text = printed(done, 160)
     assert "BD-rate against lightgaussian by PSNR (negative saves): other +300.0 %, toy +100.0 %" in text
 
 
 @pytest.mark.parametrize("width", [60, 80, 100, 120])
-def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(done, monkeypatch, width):
-    text = printed(done, width, monkeypatch)
+def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(done, width):
+    text = printed(done, width)
     assert all(len(line) <= width for line in text.splitlines() if line[:1] in "┏┃│├└")
     assert "…" not in text
     assert all(len(row[0]) in (0, 3, 5, 13) for row in rows(text))
@@ -66,24 +65,24 @@ def test_a_narrow_terminal_gets_fewer_columns_and_whole_numbers(done, monkeypatc
 
 
 def test_the_curves_are_drawn_on_a_terminal_alone(done, monkeypatch):
-    assert "●" not in printed(done, 100, monkeypatch)
+    assert "●" not in printed(done, 100)
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
-    text = printed(done, 100, monkeypatch, terminal=True)
+    text = printed(done, 100, terminal=True)
     assert "● lightgaussian   ■ other   ▲ toy" in text
     assert "file size, MB (logarithmic)" in text
     monkeypatch.setattr("sys.stdout", io.TextIOWrapper(io.BytesIO(), encoding="ascii"))
-    assert "o lightgaussian   x other   v toy" in printed(done, 100, monkeypatch, terminal=True)
+    assert "o lightgaussian   x other   v toy" in printed(done, 100, terminal=True)
 
 
-def test_many_records_are_told_in_one_line(done, monkeypatch, tmp_path):
-    text = printed(done, 160, monkeypatch, written=[tmp_path / "out/garden/rd.svg"])
+def test_many_records_are_told_in_one_line(done, tmp_path):
+    text = printed(done, 160, written=[tmp_path / "out/garden/rd.svg"])
     assert f"12 records: {tmp_path}/out/garden/<method>/<rate>/metrics.json" in text
     assert text.rstrip().endswith("rd.svg")
-    few = printed(done[:2], 160, monkeypatch)
+    few = printed(done[:2], 160)
     assert few.count("/metrics.json") == 2
 
 
-def test_the_seconds_of_what_a_method_starts_from_count_and_are_said(make_run, monkeypatch):
+def test_the_seconds_of_what_a_method_starts_from_count_and_are_said(make_run):
     scene = {"file": {}, "preset": "quick", "config": {}, "steps": 9, "train_s": 1800.0, "made_by": {}}
 
     def pruned(content):
@@ -99,8 +98,21 @@ def test_the_seconds_of_what_a_method_starts_from_count_and_are_said(make_run, m
     for method, change in (("pruned", pruned), ("given", given)):
         directory = make_run(method=method, change=change)
         done.append((read_record(directory / "metrics.json"), directory))
-    text = printed(done, 160, monkeypatch)
+    text = printed(done, 160)
     assert "1860.0" in text
     assert "train s of pruned: with that of the 3dgs scene that it starts from" in text
     assert "train s of given is not known: the 3dgs scene came from a file" in text
     assert "train s of given: with" not in text
+
+
+def test_further_forms_of_lpips_stand_behind_the_fields_own_and_l1(make_run):
+    def with_all(content):
+        scores = {"mean": 0.2, "per_view": [0.2] * 5, "direction": "lower"}
+        for name in ("l1", "lpips_alex", "lpips_vgg", "lpips_vgg_3dgs", "a_strangers"):
+            content["metrics"][name] = scores
+
+    directory = make_run(change=with_all)
+    text = printed([(read_record(directory / "metrics.json"), directory)], 200)
+    heads = " ".join(text.partition("┡")[0].split())
+    order = [heads.index(name) for name in ("PSNR", "SSIM", "3DGS", "L1", "a_strangers", "(Alex)", "MB")]
+    assert order == sorted(order)

@@ -3,13 +3,14 @@
 import pytest
 import torch
 from sw_finetuning.pruning import removal_count
+from sw_gaussians.statistics import collect_statistics
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.rasterizer import GradBuffer, RenderResult
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
@@ -17,7 +18,6 @@ from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator, StageContext
 from splatwizard_core.training.tasks import TaskContext
 from sw_speedy_splat.method import SpeedySplat
-from sw_speedy_splat.stage import collect_statistics
 
 PAPER_PLAN = """\
 Stage | Task                        | Plan
@@ -60,7 +60,7 @@ def test_inria_densifies_from_600_and_nothing_else_changes():
 @pytest.mark.parametrize("white", [False, True])
 def test_resets_come_after_the_soft_removal_also_on_white(white):
     stage = stage_of()
-    stage.base.white = white
+    stage.inner.white = white
     _, post = build_schedulers(stage, PipelineParams())
     names = [r.name for r in post.registrations]
     assert names[:3] == ["collect gradient statistics", "prune and densify", "soft prune"]
@@ -99,7 +99,7 @@ def test_removals_follow_the_end_of_densification():
 def test_every_key_of_3dgs_can_be_set_and_a_wrong_one_is_told():
     stage = stage_of(base__densify__interval="50", base__lr__opacity="0.025", base__sh_degree="1")
     assert plan_of(stage)["prune and densify"] == "range(500, 15000, 50)"
-    assert (stage.base.config.lr.opacity, stage.base.config.sh_degree) == (0.025, 1)
+    assert (stage.inner.config.lr.opacity, stage.inner.config.sh_degree) == (0.025, 1)
     with pytest.raises(ConfigError, match=r"did you mean 'densify\.start'"):
         stage_of(base__densify__strat=3)
     with pytest.raises(ConfigError, match="preset"):
@@ -174,7 +174,9 @@ def splats(n: int, seed: int = 0) -> GaussianModel:
 def scene_of(n: int = 3) -> Scene:
     up, target = torch.tensor([0.0, 1.0, 0.0]), torch.zeros(3)
     eyes = torch.tensor([[0.0, 0, -4], [3.0, 0, -3], [-3.0, 1, -3]])[:n]
-    views = [View(look_at(e, target, up, width=16, height=16, fov_x=0.6), f"{i}.png") for i, e in enumerate(eyes)]
+    views = [
+        View(Camera.look_at(e, target, up, width=16, height=16, fov_x=0.6), f"{i}.png") for i, e in enumerate(eyes)
+    ]
     return Scene("tiny", views, views[:1], None, Protocol("test"))
 
 

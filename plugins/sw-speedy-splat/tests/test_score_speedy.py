@@ -10,7 +10,7 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
-from splatwizard_core.scene.camera import Camera, look_at
+from splatwizard_core.scene.camera import Camera
 from sw_speedy_splat.score import SpeedyScore
 
 
@@ -21,7 +21,7 @@ def rasterizer():
 
 def camera(width: int = 24, height: int = 16, back: float = 4.0) -> Camera:
     eye, target, up = torch.tensor([0.0, 0, -back]), torch.zeros(3), torch.tensor([0.0, 1, 0])
-    return look_at(eye, target, up, width=width, height=height, fov_x=0.6)
+    return Camera.look_at(eye, target, up, width=width, height=height, fov_x=0.6)
 
 
 def splats(means, opacities, colors, scale: float = 0.1) -> GaussianModel:

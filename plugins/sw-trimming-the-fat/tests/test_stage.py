@@ -12,7 +12,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides, resolve
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import PipelineParams
@@ -49,7 +49,7 @@ def views_around(count=6, size=64):
     up, target = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
     angles = torch.arange(count) / count * 2 * torch.pi
     eyes = torch.stack([3 * angles.cos(), 3 * angles.sin(), torch.ones(count)], 1)
-    return [look_at(eye, target, up, width=size, height=size, fov_x=0.8) for eye in eyes]
+    return [Camera.look_at(eye, target, up, width=size, height=size, fov_x=0.8) for eye in eyes]
 
 
 def toy_model(n=300, seed=0):

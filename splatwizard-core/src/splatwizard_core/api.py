@@ -25,18 +25,17 @@ MODULES = {
     "gaussians.model": "GaussianModel",
     "gaussians.inputs": "GaussianInputs SH",
     "gaussians.ply": "load_ply to_ply from_ply",
-    "gaussians.spherical_harmonics": "eval_sh view_colors",
     "gaussians.knn": "mean_squared_neighbor_distance",
-    "rendering.rasterizer": (
-        "Rasterizer RasterizerInfo RasterOptions RenderResult RasterStats AccumOutput GradBuffer Feature ScoreSpec"
-    ),
-    "rendering.checks": "check_request checked_background",
-    "training.stage": "Stage StageContext LossPack CameraSampler CameraIterator",
+    "rendering.rasterizer": "Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec",
+    "rendering.features": "Feature",
+    "rendering.info": "RasterizerInfo",
+    "training.stage": "Stage StageContext CameraSampler CameraIterator",
+    "training.wrapped_stage": "WrappedStage",
     "training.scheduler": "Scheduler PhaseSwitch",
     "training.plan": "When",
     "training.params": "OptimizationParams PipelineParams Params InputFile",
     "training.optimizer": "SplatOptimizer ParamGroup",
-    "training.losses": "photometric_loss",
+    "training.losses": "LossPack photometric_loss",
     "training.learning_rate": "exponential_lr",
     "training.pruner": "Pruner load_pruner",
     "streams": "stream",
@@ -44,8 +43,9 @@ MODULES = {
     "coding.contracts": (
         "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
     ),
-    "evaluation.metrics": "Metric MetricSetup PreparedMetric",
-    "native": "NativeModule",
+    "evaluation.image": "ssim_map",
+    "evaluation.metrics": "MetricSetup PreparedMetric",
+    "native.loader": "NativeModule",
     "progress": "track",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""

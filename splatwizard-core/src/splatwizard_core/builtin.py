@@ -6,24 +6,13 @@ from splatwizard_core.plugins.registry import Registry
 
 @hookimpl
 def register_metrics(registry: Registry) -> None:
-    registry.add("psnr", "splatwizard_core.evaluation.image:psnr",
-                 summary="peak signal-to-noise ratio, dB, joint over channels", direction="higher")  # fmt: skip
-    registry.add("ssim", "splatwizard_core.evaluation.image:ssim",
-                 summary="structural similarity, 11x11 Gaussian window, zero padding", direction="higher")  # fmt: skip
-    registry.add("l1", "splatwizard_core.evaluation.image:l1",
-                 summary="mean absolute error", direction="lower")  # fmt: skip
-    registry.add("psnr_channel_mean", "splatwizard_core.evaluation.image:psnr_channel_mean",
-                 summary="mean of the channels' PSNRs, dB: never below psnr", direction="higher",
-                 diagnostic=True)  # fmt: skip
-    registry.add("psnr_unrounded", "splatwizard_core.evaluation.image:psnr",
-                 summary="psnr of the render before it is rounded to 8 bit, dB", direction="higher",
-                 diagnostic=True, unrounded=True)  # fmt: skip
-    registry.add("ssim_valid", "splatwizard_core.evaluation.image:ssim_valid",
-                 summary="ssim without the border, as scikit-image averages", direction="higher",
-                 diagnostic=True)  # fmt: skip
-    registry.add("ssim_reflect", "splatwizard_core.evaluation.image:ssim_reflect",
-                 summary="ssim of the picture mirrored at its edge, as torchmetrics averages", direction="higher",
-                 diagnostic=True)  # fmt: skip
+    image = "splatwizard_core.evaluation.image"
+    registry.add("psnr", f"{image}:psnr", label="PSNR", unit="dB", digits=2, position=1, direction="higher",
+                 summary="peak signal-to-noise ratio, dB, joint over channels")  # fmt: skip
+    registry.add("ssim", f"{image}:ssim", label="SSIM", digits=4, position=2, direction="higher",
+                 summary="structural similarity, 11x11 Gaussian window, zero padding")  # fmt: skip
+    registry.add("l1", f"{image}:l1", label="L1", digits=4, position=6, direction="lower",
+                 summary="mean absolute error")  # fmt: skip
 
 
 @hookimpl

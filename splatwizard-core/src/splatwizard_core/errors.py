@@ -44,18 +44,6 @@ class BitstreamError(UserInputError):
         self.section = section
 
 
-class FetchError(SplatwizardError):
-    """A data set could not be downloaded, verified or unpacked."""
-
-    def __init__(self, message: str, *, address: str | None = None) -> None:
-        super().__init__(message)
-        self.address = address
-
-
-class ArchiveError(FetchError):
-    """An archive is damaged or hostile, or does not hold what it should."""
-
-
 class ShapeError(UserInputError):
     """A tensor does not have the shape, dtype or device that a function documents."""
 

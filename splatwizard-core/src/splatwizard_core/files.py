@@ -18,7 +18,7 @@ from typing import Any
 from splatwizard_core.errors import DiskFullError
 
 TEMPORARY = r"\.(\d+)-[0-9a-f]{8}\.tmp"
-"""What stands after `.NAME` in the name of a temporary file: the process that writes it, and a random part."""
+"""The end of a temporary file's name, after `.NAME`: the process that writes it, and a random part."""
 
 FULL = {
     errno.ENOSPC: "the disk is full",
@@ -41,12 +41,13 @@ def replacing(path: str | os.PathLike[str], *, wanted: int | None = None, durabl
     """
     path = Path(path)
     _remove_leftovers(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary = _temporary(path)
     try:
         with naming_full_disk(path, wanted):
             yield temporary
             if durable:
-                _to_disk(temporary)
+                with temporary.open("rb") as file:
+                    os.fsync(file.fileno())
             os.replace(temporary, path)
     except BaseException:
         with contextlib.suppress(OSError):
@@ -84,14 +85,6 @@ def _free_bytes(path: Path, code: int) -> int | None:
     return None
 
 
-def _to_disk(path: Path) -> None:
-    descriptor = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
-
-
 @contextlib.contextmanager
 def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     """An empty folder beside `path` to fill; when the block ends, it is renamed to `path`.
@@ -104,7 +97,7 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise FileExistsError(errno.EEXIST, "is there already and not empty", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
     _remove_leftovers(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    temporary = _temporary(path)
     temporary.mkdir()
     try:
         with naming_full_disk(path):
@@ -118,10 +111,8 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 def write_atomic(path: str | os.PathLike[str], content: str | bytes) -> None:
     """Write text (UTF-8) or bytes so that `path` holds what it held before or all of it, also after a crash."""
     data = content.encode() if isinstance(content, str) else content
-    with replacing(path, wanted=len(data)) as temporary, temporary.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    with replacing(path, wanted=len(data), durable=True) as temporary:
+        temporary.write_bytes(data)
 
 
 def write_json(path: str | os.PathLike[str], content: Any) -> None:
@@ -146,7 +137,7 @@ def scratch_folder(purpose: str) -> Iterator[Path]:
     """
     base = Path(tempfile.gettempdir()) / f"sw-{purpose}"
     _remove_leftovers(base)
-    folder = base.with_name(f".{base.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    folder = _temporary(base)
     with naming_full_disk(folder):
         folder.mkdir(mode=0o700)
         try:
@@ -157,7 +148,7 @@ def scratch_folder(purpose: str) -> Iterator[Path]:
 
 def remove_folder(path: Path) -> None:
     """Remove a folder so that at no moment a part of it stands in its place."""
-    away = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    away = _temporary(path)
     os.replace(path, away)
     shutil.rmtree(away)
 
@@ -165,6 +156,11 @@ def remove_folder(path: Path) -> None:
 def sweep(folder: Path) -> None:
     """Remove the temporaries directly in `folder` that killed processes left, whatever they were to become."""
     _remove_matching(folder, re.compile(r"\..+" + TEMPORARY))
+
+
+def _temporary(path: Path) -> Path:
+    """A new name beside `path`, as `TEMPORARY` describes it."""
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
 
 
 def _remove_leftovers(path: Path) -> None:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
 from splatwizard_core.errors import SceneError
@@ -21,25 +22,37 @@ if TYPE_CHECKING:
 class GaussianMethod(Method):
     """Base of methods that leave it to a codec how their Gaussians are written, as those do that only prune.
 
-    A subclass says in `stages` how it trains; its Config has a key `codec`, the name of the codec. Its first stage
-    starts from a trained scene, or it has a `create_model` of its own.
+    A subclass says in `stages` how it trains; its Config has a key `codec`, the name of the codec, or it says in
+    `codec_choice` where the codec and its settings stand. Its first stage starts from a trained scene, or it has a
+    `create_model` of its own.
+
+    CODEC_KEY   key of the config that names the codec
     """
 
+    CODEC_KEY: ClassVar[str] = "codec"
+
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
-        """Raises ConfigError for a codec that is not installed: now, and not when all is trained."""
+        """Raise ConfigError for a codec that is not installed: now, and not when all is trained."""
         super().__init__(plugins, config)
         if config is not None:
-            check_gaussian_codec(plugins, self.config.codec)
+            check_gaussian_codec(plugins, self.codec_choice()[0], self.CODEC_KEY)
+
+    def codec_choice(self) -> tuple[str, Mapping[str, Any]]:
+        """Return the name of the codec and its settings, from the config."""
+        return self.config.codec, {}
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Nothing: it has no start of its own."""
-        raise SceneError(f"{self.name} starts from a trained 3dgs scene, not from points", path=scene.path)
+        """Raise SceneError: a stage starts from a trained scene, and there is no start from points."""
+        named = next((stage.starts_from for stage in self.stages() if stage.starts_from is not None), None)
+        start = f"a trained {named} scene" if named is not None else "a trained scene"
+        raise SceneError(f"{self.name} starts from {start}, not from points", path=scene.path)
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        """Write `model` with the codec of the config. Raises TypeError if it is no GaussianModel."""
-        encode_gaussians(self.plugins, self.config.codec, model, writer)
+        """Write `model` with the chosen codec. Raises TypeError if it is no GaussianModel."""
+        name, settings = self.codec_choice()
+        encode_gaussians(self.plugins, name, model, writer, **settings)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
-        """The model, by whichever codec has written it. Raises BitstreamError."""
+        """Return the model, by whichever codec has written it. Raises BitstreamError."""
         self.check_version(reader)
         return decode_gaussians(self.plugins, reader)

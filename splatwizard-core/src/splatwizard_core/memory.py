@@ -1,4 +1,4 @@
-"""Peak memory: of the GPU's allocator, or of the resident set of this process (flagged `rss`)."""
+"""Memory and clocks of a device: peak memory of the GPU's allocator, or of this process's resident set (`rss`)."""
 
 from __future__ import annotations
 
@@ -42,6 +42,12 @@ def reset_peak_rss() -> bool:
     except OSError:
         return False
     return True
+
+
+def synchronize(device: torch.device) -> None:
+    """Wait until a GPU has done what it was given; nothing on a CPU."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
 
 
 _UNITS = {"bytes": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
@@ -105,7 +111,7 @@ class MemoryMeter:
 
     def _reset(self) -> None:
         if self.kind == "cuda":
-            torch.cuda.synchronize(self.device)
+            synchronize(self.device)
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
             reset_peak_rss()

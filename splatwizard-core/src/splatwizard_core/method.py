@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.keys import dotted, is_beside_method
+from splatwizard_core.training.overrides import apply_overrides
 from splatwizard_core.training.params import OptimizationParams
 
 if TYPE_CHECKING:
@@ -26,7 +28,7 @@ class Method:
     Config          its hyper-parameters
     PRESETS         preset name -> values by dotted key; "paper" (the defaults) and "quick" always exist
     RATES           rate point name -> values by dotted key, r1 the smallest file
-    DEFAULT_RATE    what `--rate default` means
+    DEFAULT_RATE    the rate point that `--rate default` means
     """
 
     name: ClassVar[str]
@@ -43,17 +45,17 @@ class Method:
 
     @property
     def config(self) -> Any:
-        """The resolved hyper-parameters. Raises RuntimeError inside `decode`, which may not look at any."""
+        """Return the resolved hyper-parameters. Raises RuntimeError inside `decode`, which may not look at any."""
         if self._config is None:
             raise RuntimeError(f"{self.name}: decode() must not read the configuration; put it into the file")
         return self._config
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """The model before its first step."""
+        """Return the model before its first step."""
         raise NotImplementedError
 
     def stages(self) -> Sequence[Stage]:
-        """The training stages in order."""
+        """Return the training stages in order."""
         raise NotImplementedError
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
@@ -65,31 +67,32 @@ class Method:
         raise NotImplementedError
 
     def check_version(self, reader: ContainerReader) -> None:
-        """For `decode` of a method that reads its own layout version alone: raise BitstreamError for any other."""
+        """Raise BitstreamError for another layout version than the method's own: for a `decode` that reads no other."""
         if reader.version != self.version:
             raise BitstreamError(
                 f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade sw-{self.name}"
+                f"{self.version}: upgrade {self._distribution()}"
             )
+
+    def _distribution(self) -> str:
+        methods = self.plugins.methods
+        return methods.entry(self.name).distribution if self.name in methods else f"the package of {self.name}"
 
 
 def create_method(
     plugins: PluginManager, name: str, config: Mapping[str, Any] | None = None, *, preset: str = "paper"
 ) -> Method:
-    """Another method by name, with values for its config by dotted key: how one method borrows from another.
+    """Return another method by name, with values for its config: how one method borrows from another.
 
+    config  values by dotted key, or nested as in a TOML file
     preset  values that it sets beyond the method's config (of the run or the scene, such as clamp_render) are left to
             the run: they are the user's, and one run has one of each
 
     Raises PluginError if it is not installed, ConfigError for an unknown preset, key or value.
     """
-    from splatwizard_core.errors import ConfigError
-    from splatwizard_core.runs.config import apply_overrides
-    from splatwizard_core.runs.keys import is_beside_method
-
     cls: type[Method] = plugins.methods.load(name)
     if preset not in cls.PRESETS:
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
     borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
-    values = {**borrowed, **(config or {})}
+    values = {**borrowed, **dotted(config or {}, "")}
     return cls(plugins, apply_overrides(cls.Config(), values, source=f"config of '{name}'"))

@@ -6,6 +6,7 @@ Everything goes to stderr, so that stdout stays clean for results and `--json`.
 from __future__ import annotations
 
 import contextlib
+import itertools
 import sys
 import time
 from collections import deque
@@ -26,7 +27,7 @@ _display: ContextVar[Progress | None] = ContextVar("splatwizard_progress", defau
 
 
 class Bar:
-    """What `track` hands out. `advance` is cheap: it draws only when enough time has passed.
+    """The progress of one step, as plain lines. `advance` is cheap: it draws only when enough time has passed.
 
     label   what is being done
     total   steps in all; None if unknown
@@ -72,18 +73,9 @@ class Bar:
         """Rate and fields: `8.1 it/s · loss 0.0345 · 120,331 Gaussians`."""
         rate = self.rate
         shown = (
-            [] if rate is None else [f"{rate:.1f} {self.unit}/s" if rate >= 0.1 else f"{1 / rate:.0f} s/{self.unit}"]
+            [] if rate is None else [f"{rate:.1f} {self.unit}/s"] if rate >= 0.1 else [f"{1 / rate:.0f} s/{self.unit}"]
         )
-        for name, value in self._fields.items():
-            if name == "gaussians":
-                shown.append(f"{int(value):,} Gaussians")
-            elif isinstance(value, str):
-                shown.append(f"{name} {value}")
-            elif isinstance(value, int):
-                shown.append(f"{name} {value:,}")
-            else:
-                shown.append(f"{name} {float(value):.4g}")
-        return " · ".join(shown)
+        return " · ".join([*shown, *itertools.starmap(_shown, self._fields.items())])
 
     _interval = LINE_SECONDS
 
@@ -100,16 +92,13 @@ class Bar:
         self._lines += 1
 
     def _finish(self) -> None:
+        """Show the rate of the whole, and how long it took."""
         seconds = time.monotonic() - self._began
         if self._lines == 0 and seconds < 1.0:  # a line for each blink of an eye is noise
             return
         self._marks = deque([(self._began, self.start)])
-        facts = self.facts()
-        print(
-            f"{self.label}: {self.done:,} in {duration(seconds)}" + (f" · {facts}" if facts else ""),
-            file=self._stream,
-            flush=True,
-        )
+        parts = [f"{self.label}: {self.done:,} in {duration(seconds)}", self.facts()]
+        print(" · ".join(p for p in parts if p), file=self._stream, flush=True)
 
 
 class _RichBar(Bar):
@@ -124,20 +113,14 @@ class _RichBar(Bar):
 
     def _draw(self) -> None:
         left = self.seconds_left
-        self._progress.update(
-            self._task,
-            completed=self.done,
-            facts=self.facts(),
-            left="" if left is None else f"{duration(left)} left",
-            refresh=True,
-        )
+        self._show("" if left is None else f"{duration(left)} left")
 
     def _finish(self) -> None:
         self._marks = deque([(self._began, self.start)])
-        self._progress.update(
-            self._task, completed=self.done, facts=self.facts(), left=f"in {duration(time.monotonic() - self._began)}"
-        )
-        self._progress.refresh()
+        self._show(f"in {duration(time.monotonic() - self._began)}")
+
+    def _show(self, left: str) -> None:
+        self._progress.update(self._task, completed=self.done, facts=self.facts(), left=left, refresh=True)
 
 
 @contextmanager
@@ -170,31 +153,40 @@ def track(
         finally:
             outer.remove_task(nested._task)
         return
-    display = _make_display(out)
-    token = _display.set(display)
-    try:
-        with display:
-            bar = _RichBar(display, label, total, start, unit=unit)
-            yield bar
-            with contextlib.suppress(OSError):
-                bar._finish()
-    finally:
-        _display.reset(token)
+    with _new_display(out) as display:
+        bar = _RichBar(display, label, total, start, unit=unit)
+        yield bar
+        with contextlib.suppress(OSError):
+            bar._finish()
 
 
-def _make_display(out: TextIO) -> Progress:
+@contextmanager
+def _new_display(out: TextIO) -> Iterator[Progress]:
+    """The display that bars share until the outermost of them ends."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-    return Progress(
+    columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
         MofNCompleteColumn(),
         TextColumn("{task.fields[facts]}", markup=False),
         TextColumn("{task.fields[left]}", style="cyan", markup=False),
-        console=Console(file=out),
-        auto_refresh=False,
     )
+    with Progress(*columns, console=Console(file=out), auto_refresh=False) as display:
+        token = _display.set(display)
+        try:
+            yield display
+        finally:
+            _display.reset(token)
+
+
+def _shown(name: str, value: Any) -> str:
+    if name == "gaussians":
+        return f"{int(value):,} Gaussians"
+    if isinstance(value, str):
+        return f"{name} {value}"
+    return f"{name} {value:,}" if isinstance(value, int) else f"{name} {float(value):.4g}"
 
 
 def duration(seconds: float) -> str:

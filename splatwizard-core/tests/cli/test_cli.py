@@ -11,13 +11,17 @@ import textwrap
 import time
 from pathlib import Path
 
+import click
 import pytest
 
-from splatwizard_core.cli.docs import generate
-from splatwizard_core.cli.main import COMMANDS, main
+from splatwizard_core.cli.main import cli, main
+from splatwizard_core.plugins import catalogue, load_plugins
 
-REPOSITORY = Path(__file__).resolve().parents[3]
-DATA_COMMANDS = [["data", name] for name in ("fetch", "list", "synth", "undistort", "verify")]
+COMMANDS = (
+    "run", "train", "encode", "decode", "eval", "render", "export", "info", "list-plugins", "schedule",
+    "build-kernels", "completion",
+)  # fmt: skip
+"""Of the core."""
 
 
 def sw(*args: str, **env: str) -> subprocess.CompletedProcess[str]:
@@ -57,21 +61,15 @@ def test_help_and_list_plugins_take_under_half_a_second(arguments: list[str]):
     assert min(taken) < 0.5
 
 
-@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS), *DATA_COMMANDS])
+@pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])
 def test_every_command_explains_itself(command: list[str], capsys: pytest.CaptureFixture[str]):
     assert main([*command, "--help"]) == 0
     text = capsys.readouterr().out
     assert text.startswith(f"Usage: {' '.join(['sw', *command])}")
-    assert "--debug" in text or command == ["data"]
+    assert "--debug" in text
 
 
 def test_every_option_says_what_it_is_for():
-    from splatwizard_core.cli.docs import pages
-    from splatwizard_core.cli.main import cli
-
-    assert len(list(pages(cli, "sw", None))) == len(COMMANDS) + 1 + len(DATA_COMMANDS)  # 1: `sw` itself
-    import click
-
     context = click.Context(cli)
     for name in COMMANDS:
         command = cli.get_command(context, name)
@@ -80,11 +78,43 @@ def test_every_option_says_what_it_is_for():
             assert not isinstance(parameter, click.Option) or parameter.help, f"{name} {parameter.name}"
 
 
-def test_docs_cli_md_is_what_help_says():
-    page = REPOSITORY / "docs" / "cli.md"
-    if not page.exists():
-        pytest.skip("no docs here: the package is tested alone")
-    assert page.read_text(encoding="utf-8") == generate(), "run: python -m splatwizard_core.cli.docs docs/cli.md"
+def test_the_core_alone_has_its_own_commands():
+    listed = json.loads(sw("list-plugins", "--json", SW_PLUGINS="").stdout)
+    assert listed["commands"] == [*COMMANDS]
+
+
+def test_a_command_of_a_package_that_is_not_installed_names_the_package(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(catalogue, "catalogue", lambda: {"command": {"lorem": "sw-ipsum-dolor"}})
+    assert main(["lorem", "--ipsum"]) == 2
+    told = capsys.readouterr().err
+    assert told == "error: no command 'lorem': it comes with sw-ipsum-dolor: pip install sw-ipsum-dolor\n"
+
+
+def test_without_the_default_method_its_package_is_named(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(type(load_plugins().methods), "default", None)
+    monkeypatch.setattr(catalogue, "catalogue", lambda: {"default": {"method": "sw-ipsum-dolor"}})
+    assert main(["run"]) == 2
+    assert "no method is named, and the default one is not there: pip install sw-ipsum-dolor" in capsys.readouterr().err
+    monkeypatch.setattr(catalogue, "catalogue", lambda: {})
+    assert main(["train"]) == 2
+    assert "pip install 'splatwizard-core[all]'" in capsys.readouterr().err
+
+
+def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys):
+    pytest.importorskip("sw_3dgs", reason="needs a method")
+    monkeypatch.setattr(load_plugins().hook, "run_finished", lambda runs: None)
+    sets = ["--set", "iterations=2", "--set", "raster.prefer=reference"]
+    assert main(["run", "--scene", "demo:tiny", "--rate", "r6", "--out", str(tmp_path), *sets]) == 0
+    (line,) = capsys.readouterr().out.splitlines()
+    directory = tmp_path / "demo-tiny" / "3dgs" / "r6"
+    record = json.loads((directory / "metrics.json").read_text())
+    assert line.startswith("3dgs r6: ")
+    assert f"PSNR {record['metrics']['psnr']['mean']:.2f} dB" in line
+    assert line.endswith(f"{record['file']['bytes']:,} bytes: {directory}")
 
 
 @pytest.mark.parametrize(
@@ -103,7 +133,6 @@ def test_docs_cli_md_is_what_help_says():
         (["info", "{text}"], "{text}"),
         (["encode", "{text}"], "takes a run directory or a .ply"),
         (["export", "{text}", "x.ply"], "not a .swz file"),
-        (["data", "synth", "{folder}"], "not an empty folder"),
         (["info", "demo:tiny", "--set", "resolutoin=3"], "did you mean 'resolution'"),
         (["info", "demo:tiny", "--set", "resolution"], "--set needs key=value"),
         (["info", "demo:tiny", "--set", "iterations=3"], "of no use here"),
@@ -214,7 +243,7 @@ def test_list_plugins_as_json(capsys: pytest.CaptureFixture[str]):
     assert core["distribution"] == "splatwizard-core"
     assert core["error"] is None
     names = {(e["kind"], e["name"]) for e in core["provides"]}
-    assert {("metric", "psnr"), ("rasterizer", "reference"), ("dataset", "colmap"), ("exporter", "ply")} <= names
+    assert {("metric", "psnr"), ("command", "run"), ("importer", "ply"), ("exporter", "ply")} <= names
     assert set(COMMANDS) <= set(listed["commands"])
 
 
@@ -262,18 +291,8 @@ def test_decoding_a_file_of_a_method_that_is_not_installed_says_what_to_install(
     said = " ".join(capsys.readouterr().err.split())
     assert said == (
         "error: x.swz was written by method 'method-from-mars', which is not installed: "
-        "pip install sw-method-from-mars (or the package that provides it)"
+        "install the package that provides it (`sw list-plugins` shows what is there)"
     )
-
-
-def test_synth_writes_a_scene_that_info_reads(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    assert main(["data", "synth", str(tmp_path / "s"), "--size", "tiny", "--json"]) == 0
-    written = json.loads(capsys.readouterr().out)
-    assert main(["info", str(tmp_path / "s"), "--set", "test_every=4", "--json"]) == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["dataset"] == "colmap"
-    assert found["views"] == {"train": written["train_views"], "test": written["test_views"]}
-    assert found["points"]["count"] == written["points"]
 
 
 def test_ply_files_are_measured_drawn_and_exported(tmp_path: Path, capsys: pytest.CaptureFixture[str], ply: Path):
@@ -324,17 +343,20 @@ def ply(tmp_path: Path) -> Path:
     import torch
 
     from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.gaussians.ply import save_ply
+    from splatwizard_core.gaussians.ply import export_ply
     from splatwizard_core.scene.scene import PointCloud
 
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     path = tmp_path / "grey.ply"
-    save_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), path)
+    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), path)
     return path
 
 
 def test_progress_and_messages_leave_stdout_to_json(tmp_path: Path, ply: Path):
-    done = sw("eval", str(ply), "--scene", "demo:tiny", "--set", "raster.prefer=reference", "--json", SW_PLUGINS="")
+    for module in ("sw_datasets", "sw_reference"):
+        pytest.importorskip(module, reason="needs a scene and a rasterizer")
+    only = "sw-datasets,sw-reference"
+    done = sw("eval", str(ply), "--scene", "demo:tiny", "--set", "raster.prefer=reference", "--json", SW_PLUGINS=only)
     assert done.returncode == 0, done.stderr
     facts = json.loads(done.stdout)
     assert facts["speed"]["frames"] == 8

@@ -111,7 +111,7 @@ def test_an_interrupted_fresh_run_says_how_to_go_on(
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("splatwizard_core.cli.setup.resolve_all", interrupt)
+    monkeypatch.setattr("splatwizard_core.cli.setup.Choices.resolve", interrupt)
     assert main(["train", "--scene", "demo:tiny", "--fresh", "--out", str(tmp_path)]) == 130
     assert capsys.readouterr().err.lstrip() == "interrupted (the same command without --fresh resumes a run)\n"
 

@@ -16,6 +16,7 @@ from splatwizard_core.evaluation.evaluate import (
     render_options,
     suggested_rasterizers,
 )
+from splatwizard_core.evaluation.metrics import MetricInfo
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins.registry import Registry
@@ -117,11 +118,33 @@ def no_weights(render: torch.Tensor, truth: torch.Tensor) -> float:
 
 
 def test_a_metric_that_cannot_run_or_load_is_null_with_its_reason(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(f"{IMAGE}.psnr_channel_mean", no_weights)
-    result = run(views(0, 1), weights=f"{IMAGE}:psnr_channel_mean", gone="no_such_module:x", l1=f"{IMAGE}:l1")
+    monkeypatch.setattr(f"{IMAGE}.ssim", no_weights)
+    result = run(views(0, 1), weights=f"{IMAGE}:ssim", gone="no_such_module:x", l1=f"{IMAGE}:l1")
     assert (result.metrics["weights"].mean, result.metrics["weights"].reason) == (None, "weights missing")
     assert "no_such_module" in (result.metrics["gone"].reason or "")
     assert result.metrics["l1"].mean is not None
+
+
+def breaks(render: torch.Tensor, truth: torch.Tensor) -> float:
+    raise SystemExit("the sky fell")
+
+
+def test_a_metric_that_breaks_is_null_and_harms_no_other(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(f"{IMAGE}.ssim", breaks)
+    result = run(views(0, 1), broken=f"{IMAGE}:ssim", l1=f"{IMAGE}:l1")
+    assert result.metrics["broken"].mean is None
+    assert "metric 'broken'" in (result.metrics["broken"].reason or "")
+    assert "the sky fell" in (result.metrics["broken"].reason or "")
+    assert result.metrics["l1"].mean is not None
+
+
+def test_what_an_entry_declares_of_a_metric_is_typed_and_has_defaults():
+    registry = Registry("metric")
+    registry.add("a", "m:a", summary="", label="A", unit="dB", digits=2, direction="lower", whatever=1)
+    registry.add("b", "m:b", summary="")
+    a, b = (MetricInfo.of(entry) for entry in registry)
+    assert (a.label, a.unit, a.digits, a.direction, a.group) == ("A", "dB", 2, "lower", "a")
+    assert (b.label, b.unit, b.digits, b.direction, b.diagnostic) == ("b", "", 4, "higher", False)
 
 
 def test_renders_are_kept_as_they_were_measured(tmp_path: Path):

@@ -7,7 +7,7 @@ import torch
 from fresh_memory import fresh_memory
 
 from splatwizard_core.evaluation import speed
-from splatwizard_core.evaluation.speed import WARMUP_FRAMES, measure_speed, percentile, spread
+from splatwizard_core.evaluation.speed import WARMUP_FRAMES, measure_speed, spread
 
 
 class SleepyRenderer:
@@ -166,9 +166,3 @@ def test_on_cuda_peak_memory_is_that_of_the_measured_rounds(monkeypatch):
     assert report.frames == 200
     assert (report.memory_kind, report.peak_bytes, report.peak_reserved_bytes) == ("cuda", 1000 + gpu.frames, 5000)
     assert report.spread["fps"].std == pytest.approx(0.0, abs=1e-9)
-
-
-def test_percentiles_are_interpolated():
-    assert percentile([1.0], 95) == 1.0
-    assert percentile([0.0, 10.0], 95) == pytest.approx(9.5)
-    assert percentile([3.0, 1.0, 2.0], 50) == 2.0

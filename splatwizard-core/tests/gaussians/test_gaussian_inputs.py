@@ -5,8 +5,8 @@ import torch
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.rendering.checks import check_placement
-from splatwizard_core.rendering.rasterizer import RasterizerInfo
+from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_core.rendering.rasterizer import RasterOptions
 
 N = 4
 DENSE, DC, REST, INDICES = torch.zeros(N, 4, 3), torch.zeros(N, 1, 3), torch.zeros(N, 3, 3), torch.zeros(N).long()
@@ -74,13 +74,33 @@ def test_a_tensor_on_another_device_is_named():
 
 
 def test_a_tensor_of_another_dtype_is_named():
-    info = RasterizerInfo("some", frozenset({"cpu"}), frozenset({"float32"}), frozenset())
+    info = RasterizerInfo("some", frozenset({"cpu"}), frozenset({"float32"}), frozenset({"SPLIT_SH"}))
     g = GaussianInputs(
         means=torch.zeros(2, 3), opacities=torch.zeros(2), scales=torch.ones(2, 3),
-        quats=torch.ones(2, 4), sh=SH(dc=torch.zeros(2, 1, 3, dtype=torch.float64)),
+        quats=torch.ones(2, 4),
+        sh=SH(dc=torch.zeros(2, 1, 3, dtype=torch.float64), active_degree=0),
     )  # fmt: skip
     with pytest.raises(ShapeError, match=r"sh\.dc is float64, means float32"):
-        check_placement(info, g)
-    g = GaussianInputs(torch.zeros(2, 3).half(), torch.zeros(2).half(), colors=torch.zeros(2, 3).half())
+        info.check_request(g, RasterOptions())
+    g = GaussianInputs(
+        *(x.half() for x in (torch.zeros(2, 3), torch.zeros(2), torch.ones(2, 3), torch.ones(2, 4))),
+        colors=torch.zeros(2, 3).half(),
+    )
     with pytest.raises(ShapeError, match="of float32: means is float16"):
-        check_placement(info, g)
+        info.check_request(g, RasterOptions())
+
+
+def test_gathered_inputs_have_rows_of_their_own():
+    generator = torch.Generator().manual_seed(0)
+    table = {"scales": torch.rand(3, 3, generator=generator), "quats": torch.rand(3, 4, generator=generator)}
+    rows = torch.tensor([2, 0, 0, 1])
+    sh = SH(dc=DC, codebook=torch.rand(2, 3, 3, generator=generator), indices=torch.tensor([1, 0, 1, 1]))
+    g = inputs(**table, geom_indices=rows, scale_factors=torch.arange(1.0, 5), colors=None, sh=sh)
+    own = g.gathered()
+    assert torch.equal(own.scales, table["scales"][rows] * torch.arange(1.0, 5)[:, None])
+    assert torch.equal(own.quats, table["quats"][rows])
+    assert own.geom_indices is None and own.scale_factors is None and own.sh.codebook is None  # noqa: PT018
+    assert torch.equal(own.sh.to_dense(), sh.to_dense())
+    assert g.gathered(geometry=False).scales is table["scales"]
+    assert g.gathered(colors=False).sh is sh
+    assert g.geom_indices is rows  # the inputs themselves are left alone

@@ -10,10 +10,11 @@ import torch
 from splatwizard_core.errors import SceneError, ShapeError
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud
 
-CAMERA = look_at(
+CAMERA = Camera.look_at(
     torch.tensor([0.0, 0.0, -3.0]), torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]), width=8, height=8, fov_x=1.0
 )
 
@@ -173,3 +174,10 @@ def test_every_split_draws_from_another_stream():
     model = some_model()
     first, second = (torch.rand(4, generator=model.next_split_generator()) for _ in range(2))
     assert not torch.equal(first, second)
+
+
+def test_a_model_names_its_primitives():
+    class Anchors(SplatModel):
+        ROW_LABEL = "anchors"
+
+    assert (SplatModel.ROW_LABEL, GaussianModel.ROW_LABEL, Anchors.ROW_LABEL) == ("gaussians", "gaussians", "anchors")

@@ -13,7 +13,7 @@ from plyfile import PlyData, PlyElement
 
 from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply, from_ply, load_ply, property_names, save_ply, to_ply
+from splatwizard_core.gaussians.ply import export_ply, from_ply, load_ply, property_names, to_ply
 from splatwizard_core.gaussians.splat_model import SplatModel
 
 DATA = Path(os.environ.get("SPLATWIZARD_TEST_DATA", Path(__file__).parents[4] / "shared" / "data")) / "model"
@@ -34,7 +34,7 @@ def bits(model: GaussianModel) -> dict[str, bytes]:
 def test_a_trained_file_comes_back_bit_for_bit(tmp_path):
     for source in DATA.glob("*.ply"):
         model = load_ply(source)
-        save_ply(model, tmp_path / "copy.ply")
+        export_ply(model, tmp_path / "copy.ply")
         before, after = source.read_bytes(), (tmp_path / "copy.ply").read_bytes()
         size = 248 * model.num_rows
         assert len(after) - after.index(b"end_header\n") - 11 == size
@@ -47,7 +47,7 @@ def test_a_trained_file_comes_back_bit_for_bit(tmp_path):
 def test_round_trip_of_any_degree(tmp_path_factory, n, degree, seed):
     path = tmp_path_factory.mktemp("ply") / "model.ply"
     model = random_model(n, degree, seed)
-    save_ply(model, path)
+    export_ply(model, path)
     loaded = load_ply(path)
     assert loaded.max_sh_degree == degree
     assert bits(loaded) == bits(model)
@@ -58,13 +58,13 @@ def test_not_a_number_and_infinity_keep_their_bits(tmp_path):
     with torch.no_grad():
         model.opacity_logits[0] = math.inf
         model.means[1, 2] = math.nan
-    save_ply(model, tmp_path / "m.ply")
+    export_ply(model, tmp_path / "m.ply")
     assert bits(load_ply(tmp_path / "m.ply")) == bits(model)
 
 
 def test_layout_is_the_one_that_viewers_read(tmp_path):
     model = random_model(2, 3, 0)
-    save_ply(model, tmp_path / "m.ply")
+    export_ply(model, tmp_path / "m.ply")
     raw = (tmp_path / "m.ply").read_bytes()
     header, _, rows = raw.partition(b"end_header\n")
     lines = header.decode().splitlines()
@@ -81,7 +81,7 @@ def test_layout_is_the_one_that_viewers_read(tmp_path):
 
 def test_the_bytes_are_those_of_a_public_writer_and_can_be_made_and_read_without_a_file(tmp_path):
     model = random_model(5, 2, 7)
-    save_ply(model, tmp_path / "ours.ply")
+    export_ply(model, tmp_path / "ours.ply")
     table = PlyData.read(tmp_path / "ours.ply")["vertex"].data
     PlyData([PlyElement.describe(table, "vertex")], byte_order="<").write(str(tmp_path / "plyfile.ply"))
     assert (tmp_path / "ours.ply").read_bytes() == (tmp_path / "plyfile.ply").read_bytes() == to_ply(model)
@@ -90,7 +90,7 @@ def test_the_bytes_are_those_of_a_public_writer_and_can_be_made_and_read_without
 
 def test_ascii_double_and_any_order_are_read(tmp_path):
     model = random_model(4, 1, 3)
-    save_ply(model, tmp_path / "m.ply")
+    export_ply(model, tmp_path / "m.ply")
     vertex = PlyData.read(tmp_path / "m.ply")["vertex"].data
     names = [*reversed([n for n in vertex.dtype.names if n not in ("nx", "ny", "nz")]), "red"]
     rows = np.zeros(4, dtype=[(n, "u1" if n == "red" else "f8") for n in names])
@@ -103,7 +103,7 @@ def test_ascii_double_and_any_order_are_read(tmp_path):
 
 @pytest.fixture
 def good(tmp_path) -> bytes:
-    save_ply(random_model(6, 3, 1), tmp_path / "good.ply")
+    export_ply(random_model(6, 3, 1), tmp_path / "good.ply")
     return (tmp_path / "good.ply").read_bytes()
 
 
@@ -153,7 +153,7 @@ def test_a_missing_file_is_named(tmp_path):
 @given(position=st.integers(0, 500), value=st.integers(0, 255))
 def test_a_flipped_header_byte_never_ends_in_another_error(tmp_path_factory, position, value):
     folder = tmp_path_factory.mktemp("flip")
-    save_ply(random_model(2, 0, 1), folder / "m.ply")
+    export_ply(random_model(2, 0, 1), folder / "m.ply")
     raw = bytearray((folder / "m.ply").read_bytes())
     raw[position % len(raw)] = value
     (folder / "m.ply").write_bytes(raw)

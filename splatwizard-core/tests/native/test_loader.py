@@ -461,7 +461,7 @@ def test_build_all_builds_what_entries_declare_and_reports_what_fails(package, m
     monkeypatch.setattr(build, "CORE_MODULES", ())
     package.write(
         "native.py",
-        "from splatwizard_core.native import NativeModule\n"
+        "from splatwizard_core.api import NativeModule\n"
         f"GOOD = NativeModule('good', '{package.folder.name}', ('answer.cpp',), ('*.h',))\n"
         f"BAD = NativeModule('bad', '{package.folder.name}', ('bad.cpp',))\n"
         "NOT_ONE = 3\n",

@@ -6,14 +6,18 @@ from itertools import count
 
 import pytest
 import torch
+from sw_reference import plugin as reference_plugin
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import RasterCase, draw_scene, with_tensors
 
-from splatwizard_core import builtin
-from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError
+from splatwizard_core.errors import CapabilityError, ConfigError, NativeBuildError, PluginError
+from splatwizard_core.plugins import catalogue
 from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer, info_from_entry
-from splatwizard_core.rendering.rasterizer import Feature, RasterizerInfo, RasterOptions, ScoreSpec, check_offered
+from splatwizard_core.rendering import negotiation
+from splatwizard_core.rendering.features import Feature
+from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
 
 _UNIQUE = count()
 NOT_HERE = "needs a GPU that is not here"
@@ -75,8 +79,8 @@ def fresh_reason(monkeypatch):
 def plugins(monkeypatch):
     """A manager with the reference alone, and `install` to add fakes whose target lives in this module."""
     manager = PluginManager([])
-    registry = manager.registries["rasterizer"]
-    builtin.register_rasterizers(registry)
+    registry = manager.rasterizers
+    reference_plugin.register_rasterizers(registry)
     module = type("Holder", (), {})()
     monkeypatch.setitem(__import__("sys").modules, "negotiation_fakes", module)
     module.not_here, module.broken_probe = not_here, broken_probe
@@ -84,7 +88,7 @@ def plugins(monkeypatch):
     def install(name, *features, base=Fake, speed=5, **declared):
         known = {"devices": ["cpu"], "dtypes": ["float32"], "exactness": "tight", **declared}
         registry.add(name, f"negotiation_fakes:{name}", summary="a fake", features=list(features), speed=speed, **known)
-        fake = type(name, (base,), {"info": info_from_entry(registry.entry(name)), "calls": 0})
+        fake = type(name, (base,), {"info": RasterizerInfo.from_entry(registry.entry(name)), "calls": 0})
         setattr(module, name, fake)
         return fake
 
@@ -228,6 +232,22 @@ def test_a_failed_build_falls_back_with_one_warning(plugins, scene, caplog, base
     assert len(warnings(caplog)) == 1
     assert REASON in warnings(caplog)[0]
     assert "'reference'" in warnings(caplog)[0]
+
+
+@pytest.mark.parametrize("raised", [OSError, SystemExit])
+def test_a_rasterizer_that_cannot_be_made_harms_no_other(plugins, scene, caplog, monkeypatch, raised):
+    class Broken(Fake):
+        def __init__(self):
+            raise raised(f"libfoo.so ({REASON})")
+
+    plugins.install("broken", base=Broken)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "reference"}
+    assert [w for w in warnings(caplog) if f"{raised.__name__}: libfoo.so" in w]
+    monkeypatch.setenv("SW_RASTERIZER", "broken")
+    with pytest.raises(PluginError, match=rf"'broken' of .* cannot be made: {raised.__name__}: libfoo"):
+        NegotiatedRasterizer(plugins, device="cpu").render(*scene, RasterOptions())
 
 
 def test_a_failed_build_is_told_even_if_another_fast_one_serves(plugins, scene, caplog):
@@ -405,7 +425,7 @@ def test_unknown_declared_feature_is_an_error(plugins):
 def test_an_entry_that_cannot_be_read_harms_no_other(plugins, scene, caplog, declared):
     """A plugin made for a newer core; whoever asks for it by name hears why."""
     name = f"odd{next(_UNIQUE)}"
-    plugins.registries["rasterizer"].add(name, "negotiation_fakes:odd", summary="a fake", **declared)
+    plugins.rasterizers.add(name, "negotiation_fakes:odd", summary="a fake", **declared)
     for _ in range(2):
         rasterizer = NegotiatedRasterizer(plugins, device="cpu")
         rasterizer.render(*scene, RasterOptions())
@@ -439,6 +459,73 @@ def test_a_rasterizer_of_surfels_is_never_taken_for_anything_else(plugins, scene
     rasterizer.render(replace(g, scales=g.scales[:, :2]), cam, RasterOptions(normals=True))
     assert rasterizer.choices == {"plain": "reference", "SURFEL": "flat", "NORMALS+SURFEL": "reference"}
     with pytest.raises(CapabilityError, match="'flat' draws nothing without SURFEL"):
-        check_offered(flat.info, Feature.BACKWARD)
+        flat.info.check_offered(Feature.BACKWARD)
     with pytest.raises(CapabilityError, match=r"flat \(cpu\) draws nothing without SURFEL"):
         NegotiatedRasterizer(plugins, device="cpu", forbid=["reference"]).render(g, cam, RasterOptions())
+
+
+def test_without_any_rasterizer_the_error_names_what_to_install(scene, monkeypatch):
+    def error(known):
+        for module in (negotiation, catalogue):
+            monkeypatch.setattr(module, "catalogue", lambda: {"rasterizer": known})
+        with pytest.raises(CapabilityError) as caught:
+            NegotiatedRasterizer(PluginManager([]), device="cpu").render(*scene, RasterOptions())
+        return str(caught.value)
+
+    assert error({"quick": "sw-absent"}) == "no rasterizer is installed: pip install sw-absent"
+    several = error({"quick": "sw-absent", "slow": "sw-absent", "odd": "sw-missing"})
+    assert several == "no rasterizer is installed: install one of sw-absent, sw-missing with pip"
+    assert "`sw list-plugins`" in error({})
+
+
+def test_the_fallback_is_the_one_that_declares_no_speed(scene, caplog):
+    """By what it declares, whatever its name; another package's oracle will do."""
+    manager = PluginManager([])
+    declared = {"target": "sw_reference.rasterizer:ReferenceRasterizer", "summary": "an oracle", "devices": ["cpu"]}
+    manager.rasterizers.add("their-oracle", speed=0, **declared)
+    manager.rasterizers.add("native", speed=9, available=f"{__name__}:not_here", **declared)
+    rasterizer = NegotiatedRasterizer(manager, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.choices == {"plain": "their-oracle"}
+    assert rasterizer.served == {"reference"}  # the class says so itself
+    assert [w for w in warnings(caplog) if "rendering with 'their-oracle' instead" in w]
+
+
+def test_a_profile_must_be_declared(plugins, scene):
+    fake = plugins.install("fast", profiles=["classic"])
+    fake.info.check_request(scene[0], RasterOptions())
+    fake.info.check_request(scene[0], RasterOptions(profile="classic"))
+    with pytest.raises(ConfigError, match="'fast' knows no profile 'dgr-exact'; one of classic"):
+        fake.info.check_request(scene[0], RasterOptions(profile="dgr-exact"))
+    with pytest.raises(ConfigError, match="clamp_grad is 'never'"):
+        fake.info.check_request(scene[0], RasterOptions(clamp_grad="never"))
+
+
+def test_a_visible_filter_asks_for_the_shapes_alone(plugins):
+    g, _ = draw_scene(RasterCase(color="split", features=2), 0, torch.float32)
+    plugins.install("fast", "VISIBLE_FILTER").info.check_geometry(g)
+    with pytest.raises(CapabilityError, match="VISIBLE_FILTER"):
+        plugins.install("blind").info.check_geometry(g)
+    g.scale_factors = torch.ones(len(g))
+    with pytest.raises(CapabilityError, match="INDEXED_GEOM"):
+        plugins.rasterizers.load("fast").info.check_geometry(g)
+
+
+@pytest.mark.parametrize(
+    ("scores", "message"),
+    [
+        ((ScoreSpec("a", "hits", rule="always"),), "rule is 'always', must be 'blended' or 'tested'"),
+        ((ScoreSpec("a", "grad_sq", rule="tested"),), "must be 'blended'"),
+        ((ScoreSpec("a", "hits", torch.ones(2, 2)),), r"pixel_weight is \[2, 2\], must be \["),
+        ((ScoreSpec("a", "hits"), ScoreSpec("a", "blend")), "two scores have one name: a, a"),
+    ],
+)
+def test_scores_that_make_no_sense_are_refused(scene, scores, message):
+    with pytest.raises(ConfigError, match=message):
+        RasterOptions(scores=scores).check_scores(scene[1])
+
+
+def test_counts_are_whole_numbers_unless_they_are_weighted():
+    mask, weight = torch.ones(2, 2, dtype=torch.bool), torch.ones(2, 2)
+    assert ScoreSpec("n", "hits").dtype == ScoreSpec("n", "hits", mask).dtype == torch.int32
+    assert ScoreSpec("n", "hits", weight).dtype == ScoreSpec("n", "blend").dtype == torch.float32

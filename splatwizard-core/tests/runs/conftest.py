@@ -139,6 +139,7 @@ class Secret(Toy):
 HELPER = '''
 """What another distribution lends: a stage, a task, a pruner, a coder. And `borrower`, a method made of such."""
 
+import torch
 import toy_method
 from splatwizard_core.method import create_method
 from splatwizard_core.plugins import hookimpl
@@ -159,6 +160,31 @@ def register_pruners(registry):
 def register_coders(registry):
     registry.add("toy-coder", "toy_helper:ToyPruner", summary="for tests")
     registry.add("fixed-coder", "toy_helper:ToyPruner", summary="imported, not asked for")
+
+
+NOTES = []
+WATCH = False
+FAILS_AT = 0
+
+
+@hookimpl
+def run_started(training):
+    if WATCH:
+        NOTES.append(f"started {training.method} {training.directory.name} {training.scene.name}")
+        return Watcher()
+
+
+class Watcher:
+    """Draws random numbers, which the training must not notice."""
+
+    def after_step(self, model, record):
+        if record.step == FAILS_AT:
+            raise OSError("no screen")
+        torch.rand(3)
+        NOTES.append(f"step {record.step} of {model.num_rows}")
+
+    def finished(self):
+        NOTES.append("finished")
 
 
 class ToyPruner:
@@ -277,6 +303,10 @@ def absent(render, truth):
 """
 
 
+OURS = "datasets,metrics,reference"
+"""Packages that a run on the procedural scene needs beside the toy: no kernels, so that nothing is compiled."""
+
+
 @pytest.fixture(scope="session")
 def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder for PYTHONPATH that holds the distributions sw-toy and sw-helper."""
@@ -296,13 +326,13 @@ def toy_site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def toy_plugins(toy_site: Path):
     """The plugin manager with the core and sw-toy alone, here and in every process started from here."""
-    yield from _restricted(toy_site, "toy")
+    yield from _restricted(toy_site, f"toy,{OURS}")
 
 
 @pytest.fixture(scope="module")
 def helped_plugins(toy_site: Path):
     """The same with sw-helper."""
-    yield from _restricted(toy_site, "toy,helper")
+    yield from _restricted(toy_site, f"toy,helper,{OURS}")
 
 
 def _restricted(toy_site: Path, only: str):

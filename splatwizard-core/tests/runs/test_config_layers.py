@@ -2,6 +2,7 @@
 
 from enum import Enum
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Annotated, Any, Literal
 
 import pytest
@@ -11,9 +12,10 @@ from pydantic import Field
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.method import Method, create_method
+from splatwizard_core.plugins.registry import Registry
 from splatwizard_core.runs.config import apply_overrides, parse_set, rate_points, resolve
-from splatwizard_core.runs.values import parse_text
 from splatwizard_core.training.params import OptimizationParams, Params
+from splatwizard_core.training.values import parse_text
 
 
 class Densify(Params):
@@ -301,3 +303,52 @@ def test_a_method_says_which_fields_only_its_encoder_reads():
     for sets in ({"file.mode": "quantized"}, {"order": "hilbert"}):
         assert resolve(Borrower, sets=sets).training_hash() == plain.training_hash()
     assert resolve(Borrower, sets={"base.densify.start": "600"}).training_hash() != plain.training_hash()
+
+
+class LpipsLike(Params):
+    weights: Path | None = None
+    layers: int = Field(5, ge=1)
+
+
+@pytest.fixture
+def with_settings(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """Plugins with two metrics of one group of settings, and a scene that is made on the spot."""
+    metrics, datasets = Registry("metric"), Registry("dataset")
+    for name in ("deep_a", "deep_b"):
+        metrics.add(name, "nowhere:x", summary="", group="deep", settings=f"{__name__}:LpipsLike")
+    datasets.add("clouds", "nowhere:x", summary="", procedural=True)
+    return SimpleNamespace(metrics=metrics, datasets=datasets)
+
+
+def test_settings_of_metrics_come_by_key_and_file_and_are_checked(with_settings: SimpleNamespace, tmp_path: Path):
+    file = tmp_path / "c.toml"
+    file.write_text(f'[metrics.deep]\nweights = "{tmp_path}"\nlayers = 2\n')
+    found = resolved("metrics.deep.layers=3", file=file, scene="x", plugins=with_settings)
+    assert found.metrics == {"deep": {"weights": str(tmp_path), "layers": 3}}
+    assert found.provenance["metrics.deep.layers"] == "--set"
+    file.write_text(found.toml())
+    assert resolve(Toy, config_file=file, plugins=with_settings).metrics == found.metrics
+    assert found.as_dict()["metrics"] == found.metrics
+    for wrong, told in {
+        "metrics.deep.layer=1": "did you mean 'metrics.deep.layers'",
+        "metrics.deep.layers=0": "'metrics.deep.layers'",
+        "metrics.shallow.x=1": "unknown key 'metrics.shallow.x'",
+        "metrics.deep=1": "unknown key 'metrics.deep'",
+    }.items():
+        with pytest.raises(ConfigError, match=told):
+            resolved(wrong, scene="x", plugins=with_settings)
+
+
+def test_settings_of_metrics_leave_the_hash_of_a_run_as_it_is(with_settings: SimpleNamespace):
+    plain = resolved(scene="x", plugins=with_settings)
+    assert "metrics" not in plain.as_dict()
+    assert "metrics" not in plain.toml()
+    tuned = resolved("metrics.deep.layers=3", scene="x", plugins=with_settings)
+    assert (tuned.config_hash(), tuned.training_hash()) == (plain.config_hash(), plain.training_hash())
+
+
+def test_a_scene_that_is_made_on_the_spot_is_one_by_declaration(with_settings: SimpleNamespace):
+    clouds = resolved(scene="clouds:small", plugins=with_settings)
+    assert (clouds.procedural, clouds.preset, clouds.absolute_scene) == (True, "quick", "clouds:small")
+    assert not resolved(scene="demo", plugins=with_settings).procedural
+    assert resolved(plugins=with_settings).scene_spec == "", "no package of ours declares a default"

@@ -40,13 +40,19 @@ class Toy(GaussianMethod):
     name = "toy"
     Config = ToyConfig
 
+    def stages(self):
+        return [SimpleNamespace(starts_from="gaussians-of-old")]
+
 
 @pytest.fixture
 def plugins():
     coders = Registry("coder")
     coders.add("toy-codec", f"{__name__}:ToyCodec", summary="", codes="gaussians")
     coders.add("range", f"{__name__}:NoSuchClass", summary="an entropy coder")
-    return SimpleNamespace(gaussian_codecs=Coders(coders, "gaussians"))
+    methods = Registry("method")
+    methods._owner = ("sw-of-toys", "1.0")
+    methods.add("toy", f"{__name__}:Toy", summary="")
+    return SimpleNamespace(coders=coders, gaussian_codecs=Coders(coders, "gaussians"), methods=methods)
 
 
 @pytest.fixture
@@ -79,7 +85,7 @@ def test_a_codec_that_is_not_one_of_gaussians_is_told_before_anything_is_trained
 def test_another_layout_version_is_refused(plugins, model):
     reader = written(plugins, model)
     reader.version = 7
-    with pytest.raises(BitstreamError, match=r"version 7.*upgrade sw-toy"):
+    with pytest.raises(BitstreamError, match=r"version 7.*upgrade sw-of-toys"):
         Toy(plugins, None).decode(reader)
 
 
@@ -89,5 +95,5 @@ def test_what_is_no_set_of_gaussians_is_no_file(plugins):
 
 
 def test_a_method_without_a_start_of_its_own_refuses_points(plugins):
-    with pytest.raises(SceneError, match="toy starts from a trained 3dgs scene"):
+    with pytest.raises(SceneError, match="toy starts from a trained gaussians-of-old scene"):
         Toy(plugins, ToyConfig()).create_model(SimpleNamespace(path="somewhere"), None)

@@ -8,10 +8,11 @@ import torch
 from lpips_backbones import write_backbones
 
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.asked import Asked
 from splatwizard_core.runs.config import parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.measure import Scope
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import RunRequest, run
+from splatwizard_core.runs.run import run
 from splatwizard_core.runs.session import Session
 
 pytestmark = pytest.mark.pipeline
@@ -23,20 +24,20 @@ LPIPS = ("lpips_vgg_3dgs", "lpips_vgg", "lpips_alex")
 def runs(toy_plugins: PluginManager, tmp_path_factory: pytest.TempPathFactory):
     """One run, given three times: plain, with weights and repeats, plain again."""
     if importlib.util.find_spec("lpips") is None:
-        pytest.skip("LPIPS is the extra splatwizard-core[lpips]")
+        pytest.skip("LPIPS is the extra sw-metrics[lpips]")
     root = tmp_path_factory.mktemp("measured")
     weights = write_backbones(tmp_path_factory.mktemp("weights"), "alex")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TORCH_HOME", str(tmp_path_factory.mktemp("torch-home")))
 
-        def once(**options: object) -> tuple[Record, list[str]]:
+        def once(*sets: str, **options: object) -> tuple[Record, list[str]]:
             said: list[str] = []
             session = Session(toy_plugins, torch.device("cpu"), said.append)
             method = toy_plugins.methods.load("toy")
-            resolved = resolve(method, rate="r1", sets=parse_set(["eval_every=3"]), scene="demo:tiny")
+            resolved = resolve(method, rate="r1", sets=parse_set(["eval_every=3", *sets]), scene="demo:tiny")
             return run(session, RunRequest(resolved, root, **options))[0], said
 
-        yield SimpleNamespace(plain=once(), asked=once(lpips_weights=weights, repeats=4), again=once())
+        yield SimpleNamespace(plain=once(), asked=once(f"metrics.lpips.weights={weights}", repeats=4), again=once())
 
 
 def test_without_weights_lpips_is_null_with_its_reason(runs):
@@ -101,13 +102,13 @@ def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):
 
 
 def test_an_earlier_measurement_counts_if_it_holds_all_that_is_asked():
-    asked = Asked(2, {"psnr": "core 1", "lpips_vgg": None})
+    asked = Scope(2, {"psnr": "core 1", "lpips_vgg": None})
     held = {"repeats": 3, "metrics": {"psnr": "core 1", "lpips_vgg": "weights a"}}
     assert asked.is_held_by(held)
     assert asked.is_held_by(asked.as_dict())
     assert not asked.is_held_by({**held, "repeats": 1})
     assert not asked.is_held_by({**held, "metrics": {"psnr": "core 0"}})
-    assert not Asked(1, {"lpips_vgg": "weights b"}).is_held_by(held)
+    assert not Scope(1, {"lpips_vgg": "weights b"}).is_held_by(held)
     for damaged in (None, [], {}, {"repeats": "3", "metrics": {}}, {"repeats": 3, "metrics": None}):
         assert not asked.is_held_by(damaged)
 

@@ -11,10 +11,10 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.runs.config import parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
 from splatwizard_core.runs.lock import directory_lock
-from splatwizard_core.runs.run import RunRequest, run, run_directory, train_in
+from splatwizard_core.runs.run import run, train_in
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.steps import StepLog
 from splatwizard_core.training.stage import Stage
 
 pytestmark = pytest.mark.pipeline

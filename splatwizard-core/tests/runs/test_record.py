@@ -7,8 +7,16 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from splatwizard_core.errors import UserInputError
-from splatwizard_core.runs.record import Record, missing_reasons, read_record
+from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.runs.record import (
+    MemoryBlock,
+    Record,
+    SpeedBlock,
+    complete_record,
+    missing_reasons,
+    picked,
+    read_record,
+)
 
 
 def content(**changes: Any) -> dict[str, Any]:
@@ -160,3 +168,22 @@ def test_a_damaged_record_of_schema_2_is_refused(tmp_path: Path, damage: dict[st
     path.write_text(json.dumps({**as_schema_2(content()), **damage}))
     with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
         read_record(path)
+
+
+def test_a_block_takes_its_fields_from_whoever_measured_them():
+    measured = picked(MemoryBlock, {"model_bytes": 1, "kind": "rss", "of no block": 2}, {"model_bytes": 3})
+    assert measured == {"kind": "rss", "model_bytes": 3, "peak_load_bytes": None, "peak_render_bytes": None}
+    assert set(picked(SpeedBlock)) == set(SpeedBlock.model_fields)
+
+
+def test_nulls_get_the_reasons_of_their_fields_and_keep_better_ones():
+    values = content(unknown={"geometry": "no mesh"})
+    values["speed"]["spread"] = values["train"]["breakdown_s"] = None
+    record = complete_record({**values, "phases": None})
+    assert record.unknown["geometry"] == "no mesh"
+    assert record.unknown["speed.spread"] == "measured once (--repeats N)"
+    assert record.unknown["train.breakdown_s"].startswith("not profiled")
+    assert "older" in record.unknown["phases"] or "release" in record.unknown["phases"]
+    values["codec"]["encode_s"] = None
+    with pytest.raises(SplatwizardError, match=r"null without a reason: codec\.encode_s"):
+        complete_record({**values, "phases": None})

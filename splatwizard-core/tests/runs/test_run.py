@@ -10,14 +10,15 @@ import torch
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, RunLockedError, SplatwizardError, UserInputError
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.cache import trained_scene
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
-from splatwizard_core.runs.decoding import open_model, save_decoded, timed_decode
+from splatwizard_core.runs.decode import open_model, save_decoded, timed_decode
+from splatwizard_core.runs.directory import RunRequest, run_directory
 from splatwizard_core.runs.fresh import FreshProcessError, decode_fresh, run_fresh
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.record import Record, read_record
-from splatwizard_core.runs.run import RunRequest, run, run_directory, train_in, train_only
+from splatwizard_core.runs.run import run, train_in, train_only
 from splatwizard_core.runs.session import Session
+from splatwizard_core.runs.training import trained_scene
 
 pytestmark = pytest.mark.pipeline
 

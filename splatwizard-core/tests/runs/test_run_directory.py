@@ -16,10 +16,10 @@ import pytest
 
 from splatwizard_core.errors import RunLockedError, SceneError
 from splatwizard_core.runs import lock
-from splatwizard_core.runs.cache import FOLDER
+from splatwizard_core.runs.directory import OWN_FILES, RunRequest, StepLog
 from splatwizard_core.runs.lock import directory_lock
-from splatwizard_core.runs.run import OWN_FILES, RunRequest, run
-from splatwizard_core.runs.steps import StepLog
+from splatwizard_core.runs.run import run
+from splatwizard_core.runs.training import CACHE
 from splatwizard_core.training.params import PipelineParams
 
 HOLD = """
@@ -188,7 +188,7 @@ def test_the_page_about_run_directories_says_what_is():
     if not page.exists():
         pytest.skip("no docs here: the package is tested alone")
     text = page.read_text(encoding="utf-8")
-    for name in (*OWN_FILES, lock.NAME, FOLDER):
+    for name in (*OWN_FILES, lock.NAME, CACHE):
         assert name in text, name
     for step in ("train", "encode", "decode", "evaluate", "record"):
         assert f"\n| {step} |" in text
@@ -198,7 +198,7 @@ def test_the_page_about_run_directories_says_what_is():
 
 
 def test_a_scene_that_no_record_can_name_is_refused_before_anything_is_written(tmp_path: Path):
-    resolved = SimpleNamespace(scene_spec=str(tmp_path / "caf\udce9"), method="toy", rate="r1")
+    resolved = SimpleNamespace(absolute_scene=str(tmp_path / "caf\udce9"), method="toy", rate="r1")
     with pytest.raises(SceneError, match="is not UTF-8"):
         run(None, RunRequest(resolved, tmp_path / "out"))
     assert not (tmp_path / "out").exists()

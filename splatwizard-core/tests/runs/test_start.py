@@ -13,15 +13,16 @@ import torch
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import save_ply
+from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs.cache import trained_scene
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
+from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.pretrained import check_model, checked_start, training_key
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import RunRequest, run, train_only
+from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.start import check_model, settled, training_key
+from splatwizard_core.runs.training import trained_scene
 from splatwizard_core.scene.scene import PointCloud
 
 pytestmark = pytest.mark.pipeline
@@ -37,7 +38,7 @@ class Run:
 
     def resolved(self, *sets: str, method: str = "toy-student", preset: str | None = None) -> ResolvedConfig:
         cls = self.plugins.methods.load(method)
-        return settled(self.plugins, resolve(cls, preset, sets=parse_set(sets), scene="demo:tiny"))
+        return checked_start(self.plugins, resolve(cls, preset, sets=parse_set(sets), scene="demo:tiny"))
 
     def train(self, *sets: str, **options: str):
         return train_only(self.session, RunRequest(self.resolved(*sets, **options), self.out))
@@ -49,7 +50,7 @@ class Run:
 def write_ply(path: Path, count: int = 90, seed: int = 0) -> Path:
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(count, 3, generator=generator) - 0.5
-    save_ply(GaussianModel.from_points(PointCloud(points, torch.full((count, 3), 0.5)), max_sh_degree=1), path)
+    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((count, 3), 0.5)), max_sh_degree=1), path)
     return path
 
 
@@ -158,7 +159,7 @@ def test_wrong_files(tmp_path, ply):
     damaged = GaussianModel.from_points(PointCloud(torch.rand(4, 3), torch.rand(4, 3)), max_sh_degree=0)
     with torch.no_grad():
         damaged.means[1, 2] = float("nan")
-    save_ply(damaged, tmp_path / "nan.ply")
+    export_ply(damaged, tmp_path / "nan.ply")
     (tmp_path / "x.swz").write_bytes(b"SPWZ....")
     (tmp_path / "cut.ply").write_bytes(ply.read_bytes()[:-9])
     for name, told in {
@@ -188,12 +189,11 @@ def test_rate_points_and_teachers_do_not_read_it_again(toy_plugins, tmp_path):
 
 
 def test_of_several_methods_those_that_start_from_nothing_leave_it_to_the_others(toy_plugins, tmp_path, ply, capsys):
-    from splatwizard_core.cli.setup import resolve_all
+    from splatwizard_core.cli.setup import Choices
 
     def resolved(*methods: str, **values: str) -> list[ResolvedConfig]:
-        return resolve_all(
-            toy_plugins, methods, None, preset=None, config_file=None, values=values, scene="demo:tiny"
-        )  # fmt: skip
+        sets = tuple(f"{key}={value}" for key, value in values.items())
+        return Choices(methods=methods, sets=sets, scene="demo:tiny").resolve(toy_plugins)
 
     plain, student = resolved("toy", "toy-student", init=str(ply))
     assert (plain.init, student.init) == ("", str(ply))
@@ -213,16 +213,15 @@ def test_a_teacher_is_trained_as_asked(toy_plugins, tmp_path):
 
 
 def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
-    from splatwizard_core.runs.cache import cached_directory
-    from splatwizard_core.runs.start import base_config
-    from splatwizard_core.runs.training_run import train
+    from splatwizard_core.runs.pretrained import base_config
+    from splatwizard_core.runs.training import cached_directory, train
 
     invocation = Run(toy_plugins, tmp_path)
     resolved = invocation.resolved()
     base = base_config(toy_plugins, "toy", resolved)
     directory = cached_directory(invocation.session, base, tmp_path, training_key(invocation.session, base))
     with pytest.raises(KeyboardInterrupt), directory_lock(directory):
-        train(invocation.session, base, directory, trained=lambda name: pytest.fail(name), stop_after=2)
+        train(invocation.session, RunRequest(base, tmp_path), directory, stop_after=2)
     trained_scene(invocation.session, "toy", resolved, tmp_path)
     assert "the trained toy scene for this configuration is not finished yet: going on with it first" in invocation.said
 

@@ -20,18 +20,18 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, SceneError
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs import file_digests, identity
+from splatwizard_core.runs import file_digests
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
+from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
 from splatwizard_core.runs.file_digests import FileDigests
-from splatwizard_core.runs.identity import picture_files, scene_digest
-from splatwizard_core.runs.keys import input_files
-from splatwizard_core.runs.run import RunRequest, run, run_directory, train_only
+from splatwizard_core.runs.run import run, train_only
+from splatwizard_core.runs.scene_digest import picture_files, scene_digest
 from splatwizard_core.runs.session import Session
-from splatwizard_core.runs.steps import StepLog
 from splatwizard_core.runs.versions import changes, installed
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
+from splatwizard_core.training.keys import input_files
 from splatwizard_core.training.params import InputFile, OptimizationParams, Params
 
 pytestmark = pytest.mark.pipeline
@@ -340,5 +340,5 @@ def test_a_child_ends_with_the_process_that_started_it(toy_plugins: PluginManage
 def test_identity_and_run_directory_stay_what_they_are(toy_plugins: PluginManager, tmp_path: Path):
     """Two digests of one drawn scene are equal, and the directory is named by scene, method and rate."""
     scenes = [load_scene("demo:tiny", SceneOptions(), toy_plugins) for _ in range(2)]
-    assert len({identity.scene_digest(scene) for scene in scenes}) == 1
+    assert len({scene_digest(scene) for scene in scenes}) == 1
     assert run_directory(Invocation(toy_plugins, tmp_path).request()) == tmp_path / "demo-tiny" / "toy" / "r2"

@@ -10,7 +10,7 @@ import torch
 
 from splatwizard_core.errors import SceneError, ShapeError
 from splatwizard_core.scene.assemble import assemble_scene
-from splatwizard_core.scene.camera import Camera, look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, View
 
 CAMERA = Camera(32, 24, 30.0, 31.0, 16.0, 12.0, torch.eye(3), torch.zeros(3))
@@ -77,7 +77,7 @@ def test_a_view_without_picture_says_so():
 
 def test_look_at_puts_the_target_in_the_middle_and_up_upwards():
     eye, target, up = torch.tensor([[3.0, 1, 2], [0.5, 0, 0], [0, 0, 1]])
-    camera = look_at(eye, target, up, width=40, height=30, fov_x=1.0)
+    camera = Camera.look_at(eye, target, up, width=40, height=30, fov_x=1.0)
     torch.testing.assert_close(camera.center, eye)
     for point, u, v in ((target, 20, 15), (target + 0.1 * up, 20, None)):
         x = camera.R @ point + camera.tau
@@ -99,3 +99,20 @@ def test_a_resized_camera_keeps_its_field_of_view():
 def test_a_camera_of_the_wrong_shape_is_refused():
     with pytest.raises(ShapeError, match=r"R \[3,3\] and tau \[3\]"):
         Camera(4, 4, 1.0, 1.0, 2.0, 2.0, torch.eye(4), torch.zeros(3))
+
+
+def test_a_camera_is_moved_once_and_keeps_its_pose():
+    moved = CAMERA.to(dtype=torch.float64)
+    assert moved is CAMERA.to(dtype=torch.float64)
+    assert moved.R.dtype == torch.float64
+    assert CAMERA.to("cpu") is CAMERA
+    assert replace(CAMERA, width=64).to(dtype=torch.float64) is not moved
+
+
+def test_a_camera_that_is_trained_is_moved_anew_each_time():
+    tau = torch.zeros(3, requires_grad=True)
+    camera = replace(CAMERA, tau=tau)
+    for _ in range(2):
+        camera.to(dtype=torch.float64).tau.sum().backward()
+    assert tau.grad is not None
+    assert tau.grad.tolist() == [2.0, 2.0, 2.0]

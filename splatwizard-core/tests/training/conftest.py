@@ -7,15 +7,19 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians import density
+from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.rendering.rasterizer import GradBuffer, RasterizerInfo, RasterOptions, RenderResult
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_core.rendering.rasterizer import GradBuffer, RasterOptions, RenderResult
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer, exponential_lr
+from splatwizard_core.training.learning_rate import exponential_lr
+from splatwizard_core.training.losses import LossPack
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.scheduler import PhaseSwitch
-from splatwizard_core.training.stage import LossPack, Stage
+from splatwizard_core.training.stage import Stage
 
 WIDTH, HEIGHT = 12, 10
 
@@ -60,7 +64,7 @@ def make_scene(views=6, rgba=False, points=40, radius=3.0):
     made = []
     for i in range(views):
         angle = 2 * math.pi * i / views
-        camera = look_at(
+        camera = Camera.look_at(
             torch.tensor([radius * math.cos(angle), radius * math.sin(angle), 1.0]),
             torch.zeros(3),
             torch.tensor([0.0, 0.0, 1.0]),
@@ -104,7 +108,7 @@ class UpdateRate:
 
 
 def collect(model: GaussianModel, result: RenderResult) -> None:
-    density.accumulate_statistics(model, result.grad2d.value, result.radii)
+    accumulate_statistics(model, result.grad2d.value, result.radii)
 
 
 def densify(model: GaussianModel, optimizer: SplatOptimizer, step: int) -> None:

@@ -8,8 +8,12 @@ import torch
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.training import adam
-from splatwizard_core.training.adam import adam_step
 from splatwizard_core.training.native import TRAINING
+
+
+def adam_step(*tensors: torch.Tensor, **options) -> None:
+    adam.adam_steps([adam.AdamUpdate(*tensors, **options)])
+
 
 OPTIONS = {"beta1": 0.9, "beta2": 0.999, "eps": 1e-15}
 

@@ -8,7 +8,7 @@ import signal
 import numpy as np
 import pytest
 import torch
-from sw_gaussians import density
+from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.errors import CheckpointError, NothingToDo, TaskError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -101,7 +101,7 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(toy, whole, tmp_path):
     class Killed(BaseException):
         pass
 
-    def kill(record):
+    def kill(_, record):
         if record.step == 137:
             raise Killed
 
@@ -109,13 +109,13 @@ def test_a_killed_run_goes_on_from_its_last_checkpoint(toy, whole, tmp_path):
     with pytest.raises(Killed):
         toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=kill)
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=lambda r: steps.append(r.step))
+    resumed = toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
     assert steps == list(range(101, 201))
     assert resumed.model.digest() == whole.model.digest()
 
 
 def test_the_log_of_a_resumed_run_has_each_step_once(toy, tmp_path):
-    def fail(record):
+    def fail(_, record):
         if record.step == 137:
             raise RuntimeError
 
@@ -136,37 +136,37 @@ def test_ctrl_c_finishes_the_step_and_saves_it(toy, whole, tmp_path):
 
     done = []
     with pytest.raises(KeyboardInterrupt):
-        toy.train(iterations=200, directory=tmp_path, rasterizer=Interrupted(), on_step=lambda r: done.append(r.step))
+        toy.train(iterations=200, directory=tmp_path, rasterizer=Interrupted(), on_step=lambda _, r: done.append(r.step))
     assert done[-1] == 121
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 122
     assert resumed.model.digest() == whole.model.digest()
 
 
 def test_ctrl_c_between_steps_saves_too(toy, whole, tmp_path):
-    def interrupt(record):
+    def interrupt(_, record):
         if record.step == 77:
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         toy.train(iterations=200, directory=tmp_path, on_step=interrupt)
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    resumed = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 78
     assert resumed.model.digest() == whole.model.digest()
 
 
 def test_ctrl_c_after_the_last_step_leaves_a_finished_stage(toy, tmp_path):
-    def interrupt(record):
+    def interrupt(_, record):
         if record.step == 20:
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
         toy.train(iterations=20, directory=tmp_path, on_step=interrupt)
     steps = []
-    resumed = toy.train(iterations=20, directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    resumed = toy.train(iterations=20, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert resumed.model.digest() == toy.train(iterations=20).model.digest()
 
@@ -181,7 +181,7 @@ def test_a_second_ctrl_c_stops_at_once(toy, tmp_path):
 
     done = []
     with pytest.raises(KeyboardInterrupt):
-        toy.train(iterations=200, directory=tmp_path, rasterizer=Impatient(), on_step=lambda r: done.append(r.step))
+        toy.train(iterations=200, directory=tmp_path, rasterizer=Impatient(), on_step=lambda _, r: done.append(r.step))
     assert done[-1] == 20
     assert not list(tmp_path.glob("*.safetensors"))
 
@@ -193,7 +193,7 @@ def test_a_handler_of_someone_else_is_left_in_place(toy):
     previous = signal.signal(signal.SIGINT, handler)
     try:
         toy.train(
-            iterations=3, on_step=lambda r: pytest.fail("replaced") if signal.getsignal(2) is not handler else None
+            iterations=3, on_step=lambda _, r: pytest.fail("replaced") if signal.getsignal(2) is not handler else None
         )
     finally:
         signal.signal(signal.SIGINT, previous)
@@ -210,7 +210,7 @@ def test_training_works_outside_the_main_thread(toy):
 def test_a_finished_run_is_only_loaded(toy, whole, tmp_path):
     first = toy.train(iterations=200, directory=tmp_path)
     steps = []
-    again = toy.train(iterations=200, directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    again = toy.train(iterations=200, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert again.model.digest() == first.model.digest() == whole.model.digest()
     assert (again.steps, again.train_s, again.stage_seconds) == (first.steps, first.train_s, first.stage_seconds)
@@ -225,7 +225,7 @@ def test_without_resuming_a_run_starts_again(toy, whole, tmp_path):
     with pytest.raises(TrainingStopped):
         toy.train(iterations=200, directory=tmp_path, stop_after=100)
     steps = []
-    outcome = toy.train(iterations=200, directory=tmp_path, resume=False, on_step=lambda r: steps.append(r.step))
+    outcome = toy.train(iterations=200, directory=tmp_path, resume=False, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 1
     assert outcome.model.digest() == whole.model.digest()
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
@@ -245,7 +245,7 @@ def test_a_finished_run_can_be_made_longer(toy, tmp_path):
     steps = []
     longer = toy.train(
         iterations=150, directory=tmp_path, identity={"iterations": 150}, allow_changed_plan=True,
-        on_step=lambda r: steps.append(r.step),
+        on_step=lambda _, r: steps.append(r.step),
     )  # fmt: skip
     assert steps == list(range(101, 151))
     assert longer.steps == 150
@@ -314,7 +314,7 @@ def test_a_damaged_checkpoint_costs_only_the_steps_since_the_one_before(toy, who
     data[-5] ^= 1
     newest.write_bytes(data)
     steps = []
-    resumed = toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=lambda r: steps.append(r.step))
+    resumed = toy.train(iterations=200, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
     assert steps[0] == 81
     assert resumed.model.digest() == whole.model.digest()
     assert "resuming from 00-0000080.json instead" in caplog.text
@@ -329,7 +329,7 @@ def test_stop_by_a_task_finishes_the_stage_for_good(toy, tmp_path):
     first = toy.train(stages, directory=tmp_path)
     assert first.steps == 33
     steps = []
-    again = toy.train(stages, directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    again = toy.train(stages, directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert again.model.digest() == first.model.digest()
 
@@ -345,7 +345,7 @@ class LateStage:
 
 
 def collect(model: GaussianModel, result: RenderResult):
-    density.accumulate_statistics(model, result.grad2d.value, result.radii)
+    accumulate_statistics(model, result.grad2d.value, result.radii)
 
 
 def register_later(scheduler: Scheduler):
@@ -380,7 +380,7 @@ def test_times_and_steps_add_up_over_processes(toy, tmp_path):
     outcome = toy.train(iterations=60, directory=tmp_path, ppl=PipelineParams(profile="stages"))
     assert part["stage_steps"] == {"toy": 30}
     assert outcome.train_s > part["stage_seconds"]["toy"] > 0
-    assert outcome.stage_breakdown["toy"]["render"] > part["breakdown"]["toy"]["render"] > 0
+    assert outcome.breakdown["toy"]["render"] > part["breakdown"]["toy"]["render"] > 0
     assert outcome.steps == 60
     assert outcome.peak_memory >= part["peak_memory"] >= 0
 

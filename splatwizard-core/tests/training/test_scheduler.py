@@ -162,6 +162,26 @@ def test_a_logging_task_writes_a_line(context, caplog):
     assert told == [(2, "grow")]
 
 
+class Grow:
+    def __call__(self) -> None:
+        pass
+
+
+class GrowMore(Grow):
+    pass
+
+
+def test_tasks_of_a_class_can_be_given_another_priority():
+    scheduler = Scheduler("post")
+    for name, task in (("a", Grow()), ("b", lambda: None), ("c", GrowMore()), ("d", Grow())):
+        scheduler.register_task(5, task, name=name)
+    scheduler.reprioritise(Grow, 2)
+    scheduler.register_task(5, lambda: None, name="between", priority=1)
+    assert [(r.name, r.priority) for r in scheduler.registrations] == [
+        ("b", 0), ("between", 1), ("a", 2), ("c", 2), ("d", 2),
+    ]  # fmt: skip
+
+
 class Counter:
     def __call__(self):
         pass

@@ -8,7 +8,8 @@ from torch import nn
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer, exponential_lr
+from splatwizard_core.training.learning_rate import exponential_lr
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 
 
 class Rows(SplatModel):

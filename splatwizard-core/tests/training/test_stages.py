@@ -7,10 +7,13 @@ import torch
 from torch import nn
 
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams
+from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped
-from splatwizard_core.training.stage import CameraSampler, LossPack, Stage
+from splatwizard_core.training.scheduler import build_schedulers
+from splatwizard_core.training.stage import CameraSampler, Stage
+from splatwizard_core.training.wrapped_stage import WrappedStage
 
 
 class Masked(SplatModel):
@@ -134,7 +137,7 @@ def test_resuming_in_any_stage_equals_one_go(make, tmp_path, stop):
 def test_a_finished_run_of_several_stages_is_only_loaded(make, tmp_path):
     first = make(directory=tmp_path)
     steps = []
-    again = make(directory=tmp_path, on_step=lambda r: steps.append(r.step))
+    again = make(directory=tmp_path, on_step=lambda _, r: steps.append(r.step))
     assert steps == []
     assert again.model.digest() == first.model.digest()
 
@@ -142,7 +145,7 @@ def test_a_finished_run_of_several_stages_is_only_loaded(make, tmp_path):
 def test_a_later_stage_does_not_repeat_the_draws_of_the_first(toy):
     views = []
     stages = [toy.Stage(OptimizationParams(iterations=12)) for _ in range(2)]
-    toy.train(stages, on_step=lambda r: views.append(r.view))
+    toy.train(stages, on_step=lambda _, r: views.append(r.view))
     assert views[:12] != views[12:]
 
 
@@ -194,3 +197,41 @@ def test_a_borrowed_stage_brings_its_own_options(toy):
 def test_a_training_needs_a_stage(toy):
     with pytest.raises(ValueError, match="at least one stage"):
         toy.train([])
+
+
+class Louder(WrappedStage):
+    """The stage inside with twice its loss."""
+
+    def loss(self, *arguments):
+        pack = super().loss(*arguments)
+        return LossPack(2 * pack.total, pack.parts)
+
+
+def test_a_wrapped_stage_trains_as_the_stage_inside_but_for_what_it_overrides(toy):
+    opt = OptimizationParams(iterations=40)
+    plain, losses = toy.train([toy.Stage(opt)]), {}
+    wrapped = toy.train([WrappedStage(toy.Stage(opt))], on_step=lambda r: losses.setdefault(r.step, float(r.total)))
+    assert wrapped.model.digest() == plain.model.digest()
+    louder = {}
+    toy.train([Louder(toy.Stage(opt))], on_step=lambda r: louder.setdefault(r.step, float(r.total)))
+    assert louder[1] == pytest.approx(2 * losses[1])
+
+
+def test_every_member_of_a_stage_is_that_of_the_stage_inside(toy):
+    class Inner(toy.Stage):
+        iterations, starts_from, taught_by, prefer = 7, "base", ("teacher",), ("quick",)
+
+    stage = WrappedStage(Inner(OptimizationParams(iterations=9)))
+    for member in ("name", "opt", "iterations", "starts_from", "taught_by", "prefer"):
+        assert getattr(stage, member) == getattr(stage.inner, member)
+    forwarded = {name for name in vars(Stage) if not name.startswith("_")} - {"name", "when"}
+    assert forwarded <= set(vars(WrappedStage))
+    plans = [[r.name for s in build_schedulers(each, PipelineParams()) for r in s.registrations]
+             for each in (stage, stage.inner)]  # fmt: skip
+    assert plans[0] == plans[1]
+
+
+def test_a_plan_is_scaled_by_the_stage():
+    stage = Stage(OptimizationParams(iterations=3000, scale_schedule=True))
+    assert stage.when(range(500, 15_000, 100)) == range(50, 1500, 10)
+    assert Stage(OptimizationParams(iterations=3000)).when(7) == 7

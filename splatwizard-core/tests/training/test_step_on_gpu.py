@@ -14,11 +14,11 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.device import device_reason
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.training import trainer as trainer_module
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scalars import Verdict, read_scalars
-from splatwizard_core.training.stage import LossPack
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
 
 TWO_GIB = 2 << 30
@@ -121,7 +121,7 @@ def test_out_of_memory_names_the_figures_and_leaves_the_run_resumable(toy, tmp_p
             [Fails(OptimizationParams(iterations=60))], directory=directory, ppl=PipelineParams(checkpoint_every=20)
         )
 
-    with pytest.raises(DeviceMemoryError, match=r"step 25 .* Gaussians at 12x10 .*2,147,483,648 bytes wanted") as info:
+    with pytest.raises(DeviceMemoryError, match=r"step 25 .* gaussians at 12x10 .*2,147,483,648 bytes wanted") as info:
         train(tmp_path / "run")
     assert info.value.wanted == TWO_GIB
     assert info.value.exit_status == 1

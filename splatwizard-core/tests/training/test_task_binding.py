@@ -12,10 +12,11 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
 from splatwizard_core.scene.scene import Scene
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.scheduler import Scheduler
-from splatwizard_core.training.stage import CameraIterator, LossPack
+from splatwizard_core.training.stage import CameraIterator
 from splatwizard_core.training.tasks import TaskContext
 
 

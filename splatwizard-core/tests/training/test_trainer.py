@@ -9,11 +9,11 @@ import torch
 from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import STOP
-from splatwizard_core.training.stage import LossPack
 from splatwizard_core.training.trainer import Trainer
 
 
@@ -254,9 +254,9 @@ def test_a_step_leaves_no_graph_behind(toy):
 
 
 def test_stage_times_are_opt_in_and_add_up(toy):
-    assert toy.train(iterations=5).stage_breakdown is None
+    assert toy.train(iterations=5).breakdown == {}
     outcome = toy.train(iterations=20, ppl=PipelineParams(profile="stages"))
-    breakdown = outcome.stage_breakdown["toy"]
+    breakdown = outcome.breakdown["toy"]
     assert list(breakdown) == ["pre", "render", "loss", "backward", "post", "optimize"]
     assert all(seconds > 0 for seconds in breakdown.values())
     assert sum(breakdown.values()) <= outcome.train_s
@@ -277,7 +277,7 @@ def test_housekeeping_is_no_part_of_the_training_time(toy):
 
 def test_a_record_has_what_the_log_shows(toy, tmp_path):
     records = []
-    toy.train(iterations=30, on_step=records.append, directory=tmp_path, ppl=PipelineParams(log_every=7))
+    toy.train(iterations=30, on_step=lambda _, r: records.append(r), directory=tmp_path, ppl=PipelineParams(log_every=7))
     assert [r.step for r in records] == list(range(1, 31))
     assert all(not r.total.requires_grad for r in records)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]

@@ -1,4 +1,4 @@
-"""What this package provides: the method 3dgs."""
+"""Registers the method 3dgs."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -8,4 +8,4 @@ def register_methods(registry: Registry) -> None:
     registry.add("3dgs", "sw_3dgs.method:ThreeDGS",
                  summary="3D Gaussian Splatting (Kerbl et al. 2023), float32 or quantised",
                  default=True, presets=["paper", "inria", "inria2024", "absgrad", "mcmc", "quick"],
-                 rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"], bd_anchor=3)  # fmt: skip

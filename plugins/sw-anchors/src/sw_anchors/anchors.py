@@ -21,7 +21,8 @@ from splatwizard_core.api import (
     SplatModel,
     mean_squared_neighbor_distance,
 )
-from sw_anchors.decoding import GEOMETRY, spawn
+from sw_anchors.neural_gaussians import GEOMETRY, spawn
+from sw_anchors.shape import AnchorShape
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
@@ -52,7 +53,7 @@ class AnchorAttributes:
 
 @dataclass(frozen=True)
 class AnchorSelection:
-    """Which anchors and which of their Gaussians a view drew; `RenderResult.extras["anchors"]`.
+    """Anchors and Gaussians that one view drew; `RenderResult.extras["anchors"]`.
 
     rows        [V] int64, visible anchors
     opacities   [V,k] in (-1,1), all offsets of the visible anchors, detached
@@ -70,13 +71,14 @@ class AnchorSelection:
 
 
 class AnchorSplats(SplatModel):
-    """Anchors whose Gaussians exist only for a camera: how they are chosen and decoded. A subclass says what is stored.
+    """Base of all anchor models: choice of the visible anchors, decoding into Gaussians. A subclass stores attributes.
 
     mlp_opacity, mlp_cov, mlp_color     from (feature, direction, distance) to k values, 7 k, 3 k; one hidden layer
 
     Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530).
     """
 
+    ROW_LABEL = "anchors"
     NETWORKS: tuple[str, ...] = ("mlp_opacity", "mlp_cov", "mlp_color")
 
     mlp_opacity: nn.Sequential
@@ -86,7 +88,7 @@ class AnchorSplats(SplatModel):
     _opaque: tuple[Any, Tensor, Tensor] | None = None
 
     def make_networks(self, features: int, offsets: int, hidden: int, generator: torch.Generator, like: Tensor) -> None:
-        """The three networks, at random from `generator`, with device and dtype of `like`."""
+        """Make the three networks, at random from `generator`, with device and dtype of `like`."""
         for name, outputs in zip(self.NETWORKS, (1, GEOMETRY, 3), strict=True):
             setattr(self, name, two_layers(features + 4, hidden, outputs * offsets, generator).to(like))
 
@@ -96,20 +98,20 @@ class AnchorSplats(SplatModel):
         raise NotImplementedError
 
     def positions(self) -> Tensor:
-        """[N,3] where the anchors are taken to be, in rendering and growth alike."""
+        """[N,3] positions of the anchors, in rendering and growth alike."""
         raise NotImplementedError
 
     def reach(self) -> Tensor:
-        """[N,3] world units: the ball about an anchor within which its offsets lie, for the test of visibility."""
+        """[N,3] radii of the ball about an anchor that its offsets lie in, world units; for the visibility test."""
         raise NotImplementedError
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
-        """What the networks see of the anchors `rows` [V]; differentiable."""
+        """Attributes of the anchors `rows` [V] as the networks see them; differentiable."""
         raise NotImplementedError
 
     @torch.no_grad()
     def balls(self) -> GaussianInputs:
-        """What the rasterizer's test of visibility is given: an opaque ball for every anchor."""
+        """An opaque ball for every anchor, for the rasterizer's visibility test."""
         positions = self.positions()
         key = (len(positions), positions.dtype, positions.device)
         if self._opaque is None or self._opaque[0] != key:
@@ -146,7 +148,7 @@ class AnchorSplats(SplatModel):
 
 
 class AnchorModel(AnchorSplats):
-    """N anchors with k offsets each; Gaussians exist only for a camera.
+    """N anchors with k offsets each: the model of Scaffold-GS, to be used as it is or subclassed.
 
     anchors         [N,3] world units, on a lattice of `voxel_size` when made from points
     features        [N,F]
@@ -225,7 +227,7 @@ class AnchorModel(AnchorSplats):
         generator: torch.Generator,
         **kwargs: Any,
     ) -> AnchorModel:
-        """One anchor for every cell of the lattice that holds a point.
+        """Make one anchor for every cell of size `voxel_size` that holds a point.
 
         voxel_size  world units; <= 0: the median over points of the mean *squared* distance to three neighbours
                     (as published: the square is kept)
@@ -258,8 +260,13 @@ class AnchorModel(AnchorSplats):
     def num_offsets(self) -> int:
         return self.offsets.shape[1]
 
+    @property
+    def shape(self) -> AnchorShape:
+        """Features and offsets of an anchor."""
+        return AnchorShape(self.features.shape[1], self.num_offsets)
+
     def counts(self) -> dict[str, int]:
-        """Anchors, and the Gaussians that they could spawn."""
+        """Numbers of anchors, and of Gaussians that they could spawn."""
         return {"num_anchors": self.num_rows, "num_gaussians": self.num_rows * self.num_offsets}
 
     def positions(self) -> Tensor:
@@ -284,7 +291,7 @@ class AnchorModel(AnchorSplats):
         }
 
     def state_dict_extra(self) -> dict[str, Any]:
-        """The size of a cell, which may come from the points."""
+        """Voxel size, which may come from the points."""
         return {"voxel_size": self.voxel_size}
 
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
@@ -293,7 +300,7 @@ class AnchorModel(AnchorSplats):
 
 
 def two_layers(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
-    """inputs -> hidden, ReLU -> outputs; weights and biases uniform within 1/sqrt(fan-in), as torch's default."""
+    """Network inputs -> hidden, ReLU -> outputs; all weights uniform within 1/sqrt(fan-in), as torch's default."""
     # skip_init: torch's own initialisation would draw from the global generator.
     layers: list[nn.Linear] = [
         nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
@@ -305,3 +312,11 @@ def two_layers(inputs: int, hidden: int, outputs: int, generator: torch.Generato
             with torch.no_grad():
                 parameter.copy_(torch.rand(parameter.shape, generator=generator) * 2 * bound - bound)
     return nn.Sequential(layers[0], nn.ReLU(), layers[1])
+
+
+def linear_layers(network: nn.Sequential) -> tuple[nn.Linear, nn.Linear]:
+    """Both layers of a network Linear, ReLU, Linear."""
+    first, _, last = network
+    assert isinstance(first, nn.Linear)
+    assert isinstance(last, nn.Linear)
+    return first, last

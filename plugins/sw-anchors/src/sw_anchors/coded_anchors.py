@@ -1,12 +1,12 @@
-"""Anchors as methods train them that code each attribute under a distribution predicted from the anchor's position.
+"""Anchors whose attributes are coded under distributions predicted from their positions: the model with a rate.
 
-What HAC (arXiv 2403.14530) and CAT-3DGS (arXiv 2503.00357) share: 16-bit positions, learned offset masks, three phases
-of quantisation, and the rate of a sample of the visible anchors. A method adds the model that predicts.
+As in HAC (arXiv 2403.14530) and CAT-3DGS (arXiv 2503.00357): 16-bit positions, learned offset masks, three phases of
+quantisation, and the rate of a sample of the visible anchors. A method adds the context model that predicts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,26 +14,24 @@ import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
+from sw_anchors.fused_ops import anchor_values, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
-from sw_anchors.values import anchor_values, take_rows, widen
+from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.quantizers.binary import SteMask
+from sw_codecs.quantizers.rounding import SteRound, add_noise
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
 
-GROUPS = ("features", "scales", "offsets")
-"""Coded attributes of an anchor, [F], [6] (linear, world units) and [3k]; the order of every triple below."""
-
 MASK_THRESHOLD = 0.01
 INITIAL_MASK_LOGIT = 1.0
-INDEX_CLAMP = 15_000
-"""Values are coded within this many steps of the mean over all kept anchors."""
 
 Triple = tuple[Tensor, Tensor, Tensor]
 
 
 @dataclass(frozen=True)
 class AnchorContext:
-    """What a context model predicts for V anchors, for each of GROUPS, in the units of the values.
+    """Prediction of a context model for V anchors: a triple for each of `shape.GROUPS`, in the units of the values.
 
     means, scales   [V,C] of each group: mean and standard deviation of every number; scales may be <= 0 (see `rate`)
     steps           [V,1] of each group: quantiser step of the anchor
@@ -48,7 +46,7 @@ class AnchorContext:
 
 @dataclass(frozen=True)
 class AnchorForecast:
-    """An AnchorContext for training: steps of all V anchors now, distributions of a sample once it is drawn.
+    """Prediction of a context model in training: steps of all V anchors, distributions of a sample once it is drawn.
 
     steps       [V,3] quantiser step of each group; differentiable
     own_bits    as in AnchorContext
@@ -65,7 +63,7 @@ class AnchorForecast:
 
 @dataclass(frozen=True)
 class AnchorRate:
-    """The rate of one view's anchors; `RenderResult.extras["rate"]` in the entropy phase.
+    """Rate of the anchors of one view; `RenderResult.extras["rate"]` in the entropy phase.
 
     bits        scalar, differentiable: bits a number over a sample of visible, kept anchors, times the share of visible
                 anchors that are kept; 0 for an empty sample
@@ -102,7 +100,6 @@ class CodedAnchors(AnchorModel):
         offsets: Tensor,
         log_scales: Tensor,
         *,
-        entropy: Any,
         margin: Margin = "none",
         base_steps: tuple[float, float, float] = (1.0, 0.001, 0.2),
         noise_factor: float = 1.0,
@@ -112,8 +109,7 @@ class CodedAnchors(AnchorModel):
     ) -> None:
         """As AnchorModel, whose other arguments are `kwargs`.
 
-        entropy         entropy model with `bits` and `FloatContext` ("gaussian-exact" of the registry)
-        margin          of the bounds, see `anchor_lattice.bounds_of`
+        margin          of the bounds, see `lattice.bounds_of`
         noise_factor    multiplies the base steps in the phase QUANTIZED
         sample          share of the visible anchors whose rate is computed
         smallest_probability    floor of the probability of a value, in training
@@ -127,7 +123,7 @@ class CodedAnchors(AnchorModel):
         self.margin: Margin = margin
         self.base_steps, self.noise_factor = base_steps, noise_factor
         self.sample, self.smallest_probability = sample, smallest_probability
-        self.entropy = entropy
+        self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._groups: tuple[tuple[Any, ...], Tensor, Tensor, Tensor] | None = None
 
@@ -163,77 +159,77 @@ class CodedAnchors(AnchorModel):
         return None
 
     def soft_masks(self) -> Tensor:
-        """[N,k] what is compared with the threshold; differentiable."""
+        """[N,k] values that the threshold of the masks applies to; differentiable."""
         soft, weights = torch.sigmoid(self.mask_logits), self.mask_weights()
         return soft if weights is None else soft * weights
 
     def masks(self, rows: Tensor | None = None) -> Tensor:
         """[V,k] 0 or 1, with the gradient of `soft_masks`; None: all rows."""
-        soft = self.soft_masks()
-        soft = soft if rows is None else soft[rows]
-        return soft + ((soft > MASK_THRESHOLD).to(soft) - soft).detach()
+        weights = self.mask_weights()
+        masks = self._mask.forward(self.mask_logits, 1.0 if weights is None else weights)
+        return masks if rows is None else masks[rows]
 
     @torch.no_grad()
     def kept(self) -> Tensor:
-        """[N] bool: anchors with a Gaussian left; others are not in the file."""
+        """[N] bool: anchors that keep a Gaussian; others are not in the file."""
         return (self.soft_masks() > MASK_THRESHOLD).any(dim=1)
 
     @torch.no_grad()
     def counts(self) -> dict[str, int]:
-        """Anchors and Gaussians that the file will have."""
+        """Numbers of anchors and Gaussians that the file will have."""
         masks = self.soft_masks() > MASK_THRESHOLD
         return {"num_anchors": int(masks.any(dim=1).sum()), "num_gaussians": int(masks.sum())}
 
     # Attributes
 
     def raw(self, rows: Tensor) -> Triple:
-        """Values of GROUPS as they are, [V,C] each."""
+        """Full-precision values of the groups, [V,C] each."""
         return self.features[rows], self.log_scales[rows].exp(), self.offsets[rows].flatten(1)
 
     def predict(self, rows: Tensor) -> AnchorContext:
-        """The context of the anchors `rows`, from their positions; differentiable."""
+        """Predict steps and distributions of the anchors `rows` from their positions; differentiable."""
         raise NotImplementedError
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
-        """The context once (noisy or rounded) features [V,F] are known; here it stays as it is."""
+        """Refine the context by (noisy or rounded) features [V,F]; by default it stays as it is."""
         return context
 
     def forecast(self, rows: Tensor) -> AnchorForecast:
-        """`predict` and `refine` for training, where only a sample of the anchors `rows` is asked for distributions.
+        """Predict for training: `predict`, then `refine` for a sample of the anchors `rows` alone.
 
-        A method whose network can do with less overrides it.
+        A method whose network need not compute all distributions for it overrides it.
         """
         context = self.predict(rows)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             parts = (*context.means, *context.scales, *context.steps)
             taken = [part.index_select(0, drawn) for part in parts]
-            known = AnchorContext(_triple(taken[:3]), _triple(taken[3:6]), _triple(taken[6:]))
+            known = AnchorContext(triple(taken[:3]), triple(taken[3:6]), triple(taken[6:]))
             known = self.refine(known, values[:, : self.features.shape[1]])
             return torch.cat(known.means, dim=1), torch.cat(known.scales, dim=1)
 
         return AnchorForecast(torch.cat(context.steps, dim=1), context.own_bits, None, sample)
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
-        """Raw, noisy or rounded, by phase and mode; each of `rows` at most once."""
+        """Full-precision, noisy or rounded attributes, by phase and mode; each of `rows` at most once."""
         values, masks = anchor_values(
             rows, self.features, self.log_scales, self.offsets, self.mask_logits, self.mask_weights(), MASK_THRESHOLD
         )
         extras: dict[str, Any] = {}
         if self.phase != FULL and not self.training:
-            groups = _triple(torch.split(values, self._widths(), dim=1))
+            groups = triple(torch.split(values, list(self.shape.widths), dim=1))
             steps = self.base_steps_like(values) if self.phase == QUANTIZED else self.predict(rows).steps
             values = torch.cat(self._rounded(groups, steps), dim=1)
         elif self.phase == QUANTIZED:
             group, _ = self._columns(values)
             base = self.base_steps_like(values).index_select(0, group) * self.noise_factor
-            values = torch.addcmul(values, self._draws(values), base)
+            values = add_noise(values, base, self.uniform(*values.shape))
         elif self.phase == ENTROPY:
             forecast = self.forecast(rows)
             wide = widen(forecast.steps, *self._columns(values))
-            values = torch.addcmul(values, self._draws(values), wide)
+            values = add_noise(values, wide, self.uniform(*values.shape))
             extras["rate"] = self.rate(values, wide, forecast, masks)
-        features, scales, offsets = torch.split(values, self._widths(), dim=1)
+        features, scales, offsets = torch.split(values, list(self.shape.widths), dim=1)
         return AnchorAttributes(
             self.positions().index_select(0, rows),
             features,
@@ -243,15 +239,12 @@ class CodedAnchors(AnchorModel):
             extras=extras,
         )
 
-    def _widths(self) -> list[int]:
-        """Numbers of an anchor by group."""
-        return [self.features.shape[1], 6, 3 * self.num_offsets]
-
     def _columns(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The group of each number of an anchor [C], and the same as zeros and ones [C,3]; kept on the device."""
-        key = (like.device, like.dtype, *self._widths())
+        widths = self.shape.widths
+        key = (like.device, like.dtype, *widths)
         if self._groups is None or self._groups[0] != key:
-            group = torch.arange(3).repeat_interleave(torch.tensor(self._widths()))
+            group = torch.arange(3).repeat_interleave(torch.tensor(widths))
             one_hot = torch.nn.functional.one_hot(group, 3).to(like)
             self._groups = (key, group.to(like.device), one_hot, like.new_tensor(self.base_steps))
         return self._groups[1], self._groups[2]
@@ -267,33 +260,28 @@ class CodedAnchors(AnchorModel):
         own = self.noise is not None and self.noise.device.type == self.device.type
         return torch.rand(shape, generator=self.noise if own else None, device=self.device)
 
-    def _draws(self, values: Tensor) -> Tensor:
-        return self.uniform(*values.shape).sub_(0.5)
-
     def _sample(self, count: int) -> Tensor:
-        """[S] int64: which of `count` anchors are drawn. On the host: to count them, one would wait for a GPU."""
+        """[S] int64: a sample of `count` anchors, drawn on the host: to count it, one would wait for a GPU."""
         on_host = self.noise is None or self.noise.device.type == "cpu"
         where = "cpu" if on_host else self.device
         drawn = torch.rand(count, generator=self.noise, device=where) < self.sample
         return torch.nonzero(drawn).squeeze(1).to(self.device, non_blocking=True)
 
     @torch.no_grad()
-    def _rounded(self, values: Triple, steps: Any) -> Triple:
-        centres = self.centres()
-        features, scales, offsets = (
-            rounded_indices(v, step, centre) * step for v, step, centre in zip(values, steps, centres, strict=True)
+    def _rounded(self, values: Triple, steps: Iterable[Tensor]) -> Triple:
+        return triple(
+            self._round.forward(v, step, mean=centre)
+            for v, step, centre in zip(values, steps, self.centres(), strict=True)
         )
-        return features, scales, offsets
 
     @torch.no_grad()
     def centres(self) -> Triple:
-        """Mean of each group over all numbers of the kept anchors; where indices are clamped to (INDEX_CLAMP)."""
-        features, scales, offsets = (v.double().mean() if v.numel() else v.new_zeros(()).double()
-                                     for v in self.raw(torch.nonzero(self.kept()).squeeze(1)))  # fmt: skip
-        return features, scales, offsets
+        """Mean of each group over all numbers of the kept anchors: the index of a value is limited about it."""
+        kept = self.raw(torch.nonzero(self.kept()).squeeze(1))
+        return triple(v.double().mean() if v.numel() else v.new_zeros(()).double() for v in kept)
 
     def rate(self, values: Tensor, steps: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
-        """Bits of a sample of V anchors, each drawn with probability `sample`, if it is kept.
+        """Estimate the bits of V anchors by a sample: each is drawn with probability `sample` and counts if it is kept.
 
         values, steps   [V,C] noisy numbers of all groups, and the quantiser step of each
         masks           [V,k], with gradient: the bits of a masked offset do not count, its numbers do
@@ -309,15 +297,12 @@ class CodedAnchors(AnchorModel):
         else:
             x, step, mask, hidden = take_rows(drawn, values, steps, masks, forecast.hidden)
         mean, scale = forecast.sample(drawn, hidden, x)
-        distribution = self.entropy.FloatContext(
-            mean, scale.clamp(min=1e-9), step, smallest_probability=self.smallest_probability
-        )
         # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
         counted = kept.index_select(0, drawn)
-        widths = self._widths()
+        widths = self.shape.widths
         alone = counted[:, None].expand(-1, widths[0] + widths[1])
         factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
-        bits = self.entropy.bits(x, distribution) * factors
+        bits = gaussian_bits(x, mean, scale.clamp(min=1e-9), step, p_min=self.smallest_probability) * factors
         numbers = counted.sum() * sum(widths)
         by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
         return AnchorRate(bits.sum() * (kept.mean() / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
@@ -337,12 +322,7 @@ class CodedAnchors(AnchorModel):
         self.phase = str(extra["phase"])
 
 
-def _triple(parts: Any) -> Triple:
+def triple(parts: Iterable[Tensor]) -> Triple:
+    """Tensors of the three groups in their order."""
     first, second, third = parts
     return first, second, third
-
-
-def rounded_indices(values: Tensor, steps: Tensor, centre: Tensor) -> Tensor:
-    """Indices round(x / step), within INDEX_CLAMP of that of `centre`; the dtype of `values`."""
-    index, middle = torch.round(values / steps), torch.round(centre.to(steps) / steps)
-    return torch.minimum(torch.maximum(index, middle - INDEX_CLAMP), middle + INDEX_CLAMP)

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorSplats
+
+if TYPE_CHECKING:
+    from sw_anchors.sections import AnchorGeometry
+    from sw_anchors.shape import AnchorShape
 
 
 class DecodedAnchors(AnchorSplats):
@@ -34,6 +40,15 @@ class DecodedAnchors(AnchorSplats):
         for name in self.NETWORKS:
             for parameter in getattr(self, name).parameters():
                 nn.init.zeros_(parameter)
+
+    @classmethod
+    def zeros(cls, geometry: AnchorGeometry, shape: AnchorShape, *, hidden: int) -> DecodedAnchors:
+        """Anchors where `geometry` has them; attributes and networks are zero until they are read."""
+        n, k = len(geometry.codes), shape.offsets
+        return cls(
+            geometry.positions, torch.zeros(n, shape.features), torch.zeros(n, k, 3), torch.zeros(n, 6), geometry.masks,
+            hidden=hidden,
+        )  # fmt: skip
 
     @property
     def num_offsets(self) -> int:

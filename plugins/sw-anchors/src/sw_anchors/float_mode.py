@@ -1,34 +1,41 @@
-"""What a file is tied to whose decoder must get the very floats of its encoder: networks evaluated as trained.
+"""Coder mode `float`: distributions from networks evaluated in floats, so that the file is bound to its machine.
 
-The other way, exact integers (docs/bitstream.md), decodes anywhere; methods offer this one for comparison.
+Encoder and decoder must get the very same floats. The other mode, `exact`, evaluates the networks in integers and
+decodes anywhere (docs/bitstream.md); methods offer `float` for comparison with published sizes.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 
 from splatwizard_core.api import BitstreamError
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader
+    from splatwizard_core.api import ContainerReader, ContainerWriter
+
+Mode = Literal["exact", "float"]
+MODES: tuple[Mode, ...] = ("exact", "float")
 
 
 def this_machine() -> dict[str, str]:
-    """Files are always encoded and decoded on the CPU."""
+    """CPU capability and torch version, on which floats of a network depend; files are coded on the CPU."""
     return {"device": f"cpu {torch.backends.cpu.get_cpu_capability()}", "torch": str(torch.__version__)}
 
 
-def is_device_bound(reader: ContainerReader) -> bool:
-    """Whether a file decodes on the machine alone that made it."""
-    return "made_on" in reader.static
+def add_machine(writer: ContainerWriter, mode: Mode) -> None:
+    """Note in the header (`made_on`) which machine a file of mode `float` is bound to."""
+    if mode == "float":
+        writer.static["made_on"] = this_machine()
 
 
-def check_machine(reader: ContainerReader) -> None:
-    """Raise BitstreamError if a file of mode `float` was made elsewhere."""
+def read_mode(reader: ContainerReader) -> Mode:
+    """The header value `mode`. Raises BitstreamError if it is unknown, or `float` and the file was made elsewhere."""
+    if reader.text("mode", choices=MODES) == "exact":
+        return "exact"
     theirs, ours = reader.static.get("made_on"), this_machine()
     if theirs != ours:
         shown = " with torch ".join(str(v)[:40] for v in theirs.values()) if isinstance(theirs, dict) else "unknown"
@@ -37,11 +44,12 @@ def check_machine(reader: ContainerReader) -> None:
             f"torch {ours['torch']}: encode with codec.mode=exact",
             section="header",
         )
+    return "float"
 
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Matrix products of floats may depend on the number of threads."""
+    """Compute a block without gradients in one thread: products of float matrices may depend on their number."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

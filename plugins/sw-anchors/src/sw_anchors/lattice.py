@@ -17,17 +17,18 @@ BITS = 16
 TOP = (1 << BITS) - 1
 SMALLEST_STEP = 1e-6
 
-Margin = Literal["hac", "extent", "none"]
+Margin = Literal["origin", "extent", "none"]
+"""Room around the anchors on their lattice, see `bounds_of`."""
 
 
 def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
-    """[2,3] float32 low and high end of positions [N,3], N > 0.
+    """[2,3] float32: low and high end of the lattice for positions [N,3], N > 0.
 
-    margin  "none"; "extent": 10 % of the extent at each end; "hac": a fifth of each end's distance from the *origin*,
-            as published, which is none where an end is 0 and much where the scene lies far out
+    margin  "none"; "extent": 10 % of the extent at each end; "origin": a fifth of each end's distance from the origin,
+            as HAC has it, which is none where an end is 0 and much where the scene lies far out
     """
     low, high = positions.detach().amin(dim=0), positions.detach().amax(dim=0)
-    if margin == "hac":
+    if margin == "origin":
         low = torch.where(low < 0, low * 1.2, low * 0.8)
         high = torch.where(high > 0, high * 1.2, high * 0.8)
     elif margin == "extent":
@@ -37,17 +38,18 @@ def bounds_of(positions: Tensor, margin: Margin = "none") -> Tensor:
 
 def position_codes(positions: Tensor, bounds: Tensor) -> Tensor:
     """[N,3] int64 in 0..65535; what lies outside the bounds is moved onto them."""
-    low, step = _low_and_step(bounds)
+    low, step = low_and_step(bounds)
     return torch.floor((positions.detach().to(torch.float64) - low) / step).clamp(0, TOP).to(torch.int64)
 
 
 def coded_positions(codes: Tensor, bounds: Tensor) -> Tensor:
     """[N,3] float32, world units."""
-    low, step = _low_and_step(bounds)
+    low, step = low_and_step(bounds)
     return (codes.to(torch.float64) * step + low).to(torch.float32)
 
 
-def _low_and_step(bounds: Tensor) -> tuple[Tensor, Tensor]:
+def low_and_step(bounds: Tensor) -> tuple[Tensor, Tensor]:
+    """Low end [3] and step [3] of the lattice, float64 world units; an axis without extent has SMALLEST_STEP."""
     low, high = bounds.to(torch.float64).unbind(0)
     step = (high - low) / TOP
     return low, torch.where(step > 0, step, torch.full_like(step, SMALLEST_STEP))

@@ -1,8 +1,6 @@
-"""Hyper-parameters that methods on anchors share. Defaults are those of Scaffold-GS as HAC trains it."""
+"""Hyper-parameters of methods on anchors. Defaults are those of Scaffold-GS as HAC trains it."""
 
 from __future__ import annotations
-
-from typing import Literal
 
 from pydantic import Field
 
@@ -15,8 +13,6 @@ class AnchorLearningRates(Params):
     max_steps: int = Field(30_000, ge=1, description="steps over which the rates decay")
     offsets_init: float = Field(0.01, gt=0, description="of the offsets at step 0, times the scene extent")
     offsets_final: float = Field(1e-4, gt=0, description="of the offsets at step `max_steps`, times the scene extent")
-    masks_init: float = Field(0.01, gt=0, description="of the mask logits at step 0, times the scene extent")
-    masks_final: float = Field(1e-4, gt=0, description="of the mask logits at `max_steps`, times the scene extent")
     features: float = Field(0.0075, ge=0, description="of the anchor features, constant")
     scales: float = Field(0.007, ge=0, description="of the log scales, constant")
     mlp_opacity_init: float = Field(0.002, gt=0, description="of the opacity network at step 0")
@@ -27,8 +23,15 @@ class AnchorLearningRates(Params):
     mlp_color_final: float = Field(5e-5, gt=0, description="of the colour network at `max_steps`")
 
 
+class CodedAnchorLearningRates(AnchorLearningRates):
+    """Adam step sizes, with those of the offset masks."""
+
+    masks_init: float = Field(0.01, gt=0, description="of the mask logits at step 0, times the scene extent")
+    masks_final: float = Field(1e-4, gt=0, description="of the mask logits at `max_steps`, times the scene extent")
+
+
 class AnchorGrowth(Params):
-    """Where anchors appear and which go."""
+    """Growing and pruning of anchors."""
 
     start: int = Field(1_500, ge=0, description="first step that adjusts anchors (authors' code: 1600)")
     pause_start: int = Field(3_000, ge=0, description="no adjustment from this step on ...")
@@ -47,22 +50,25 @@ class AnchorGrowth(Params):
 
 
 class AnchorLoss(Params):
-    """What is minimised besides the rate."""
+    """Distortion and regularisers of the loss."""
 
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM; the rest is the weight of L1")
     volume: float = Field(0.01, ge=0, description="weight of the mean volume of a drawn Gaussian (product of scales)")
 
 
 class AnchorParams(OptimizationParams):
-    """Hyper-parameters of a method on anchors; each subclasses it."""
+    """Hyper-parameters of a method on anchors, to be subclassed."""
 
     voxel_size: float = Field(0.001, description="edge of an anchor's cell, world units; <= 0: from the points")
     num_offsets: int = Field(10, ge=1, le=64, description="Gaussians an anchor can spawn")
     feature_dim: int = Field(50, ge=1, le=256, description="numbers in an anchor's feature")
     hidden: int = Field(50, ge=1, le=256, description="width of the networks that decode Gaussians")
-    bound_margin: Literal["hac", "extent", "none"] = Field(
-        "none", description="room around the anchors on their 16-bit lattice; hac: as published; extent: 10 %"
-    )
     lr: AnchorLearningRates = Field(AnchorLearningRates(), description="step sizes")
     growth: AnchorGrowth = Field(AnchorGrowth(), description="growing and pruning of anchors")
     loss: AnchorLoss = Field(AnchorLoss(), description="distortion and regularisers")
+
+
+class CodedAnchorParams(AnchorParams):
+    """Hyper-parameters of a method whose anchors have masks and a rate, to be subclassed."""
+
+    lr: CodedAnchorLearningRates = Field(CodedAnchorLearningRates(), description="step sizes")

@@ -1,4 +1,4 @@
-"""Sections that files of anchor methods share: where the anchors are, which Gaussians they keep, and the networks.
+"""Sections of an anchor file for geometry and networks: where anchors are, which Gaussians they keep, all weights.
 
 Section `anchors`: six little-endian float32 (bounds: low x y z, high x y z), then the 16-bit codes of the
 positions by the position codec `octree`, which fixes the order of all rows. Section `masks`: one symbol per offset,
@@ -18,9 +18,12 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
 from sw_anchors.lattice import BITS, TOP, coded_positions
+from sw_codecs.entropy.bernoulli import Bernoulli
+from sw_codecs.positions.octree import Octree
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from sw_anchors.coded_anchors import CodedAnchors
 
 WeightType = Literal["float32", "float16"]
 WEIGHT_TYPES: tuple[WeightType, ...] = ("float32", "float16")
@@ -28,8 +31,8 @@ BOUNDS_BYTES = 24
 
 
 @dataclass(frozen=True)
-class AnchorPlaces:
-    """What the sections `anchors` and `masks` say, all on the CPU.
+class AnchorGeometry:
+    """Positions and masks of the anchors of a file: its sections `anchors` and `masks`, on the CPU.
 
     bounds      [2,3] float32
     codes       [N,3] int64, in Morton order
@@ -46,24 +49,33 @@ class AnchorPlaces:
         return coded_positions(self.codes, self.bounds)
 
 
-def morton_order(codes: Tensor, plugins: PluginManager) -> Tensor:
-    """[N] int64: the order of rows in the file."""
-    return torch.from_numpy(np.ascontiguousarray(plugins.coders.load("octree").sort(codes.cpu().numpy())))
+def morton_order(codes: Tensor) -> Tensor:
+    """[N] int64: the order of rows in the file, for position codes [N,3]."""
+    return torch.from_numpy(np.ascontiguousarray(Octree.sort(codes.cpu().numpy())))
 
 
-def add_places(writer: ContainerWriter, places: AnchorPlaces, plugins: PluginManager) -> None:
-    """Sections `anchors` and `masks`; header values num_anchors, num_gaussians and num_offsets."""
-    masks = places.masks.numpy()
+def kept_geometry(model: CodedAnchors) -> tuple[AnchorGeometry, Tensor]:
+    """The anchors of a model that its file has, in the order of the file; and their rows [N] in the model."""
+    kept = torch.nonzero(model.kept()).squeeze(1)
+    rows = kept[morton_order(model.codes()[kept]).to(kept.device)]
+    geometry = AnchorGeometry(model.bounds.cpu(), model.codes()[rows].cpu(), model.masks(rows).detach().cpu() > 0.5)
+    return geometry, rows
+
+
+def add_geometry(writer: ContainerWriter, geometry: AnchorGeometry) -> None:
+    """Add the sections `anchors` and `masks`, and the header values num_anchors, num_gaussians and num_offsets."""
+    masks = geometry.masks.numpy()
     writer.static["num_anchors"], writer.static["num_offsets"] = map(int, masks.shape)
     writer.static["num_gaussians"] = int(masks.sum())
-    octree = plugins.coders.load("octree")()
-    bounds = places.bounds.numpy().astype("<f4").tobytes()
-    writer.add("anchors", bounds + octree.encode(places.codes.numpy(), BITS))
-    writer.add("masks", plugins.entropy_models.load("bernoulli")().encode(masks.reshape(-1)))
+    writer.require("coder", "octree")
+    bounds = geometry.bounds.numpy().astype("<f4").tobytes()
+    writer.add("anchors", bounds + Octree().encode(geometry.codes.numpy(), BITS))
+    writer.require("entropy model", "bernoulli")
+    writer.add("masks", Bernoulli().encode(masks.reshape(-1)))
 
 
-def read_places(reader: ContainerReader, plugins: PluginManager, *, bytes_per_anchor: int) -> AnchorPlaces:
-    """Inverse of `add_places`.
+def read_geometry(reader: ContainerReader, *, bytes_per_anchor: int) -> AnchorGeometry:
+    """Inverse of `add_geometry`.
 
     bytes_per_anchor    of the decoded model, held against the size of the file before anything is allocated
 
@@ -77,23 +89,23 @@ def read_places(reader: ContainerReader, plugins: PluginManager, *, bytes_per_an
         bounds = torch.from_numpy(np.frombuffer(data[:BOUNDS_BYTES], "<f4").astype(np.float32).reshape(2, 3))
         if not bool(torch.isfinite(bounds).all() and (bounds[0] <= bounds[1]).all()):
             raise BitstreamError("the bounds of the anchors are not finite or end before they start")
-        codes = torch.from_numpy(plugins.coders.load("octree")(max_points=n).decode(data[BOUNDS_BYTES:]))
+        codes = torch.from_numpy(Octree(max_points=n).decode(data[BOUNDS_BYTES:]))
         if codes.shape != (n, 3):
             raise BitstreamError(f"holds {len(codes):,} anchors, header says {n:,}")
         if n and not 0 <= int(codes.min()) <= int(codes.max()) <= TOP:
             raise BitstreamError(f"an anchor leaves the lattice of {BITS} bits")
     with reader.decoding("masks") as data:
-        symbols = plugins.entropy_models.load("bernoulli")().decode(data, n * k)
+        symbols = Bernoulli().decode(data, n * k)
         masks = torch.from_numpy(symbols.reshape(n, k) > 0)
         if int(masks.sum()) != gaussians:
             raise BitstreamError(f"keeps {int(masks.sum()):,} Gaussians, header says {gaussians:,}")
         if not bool(masks.any(dim=1).all()):
             raise BitstreamError("an anchor has no Gaussian")
-    return AnchorPlaces(bounds, codes, masks)
+    return AnchorGeometry(bounds, codes, masks)
 
 
 def add_networks(writer: ContainerWriter, networks: Mapping[str, nn.Module], weights: WeightType) -> None:
-    """Section `networks`, and the header value `weights`. Raises ValueError if a weight does not fit."""
+    """Add the section `networks` and the header value `weights`. Raises ValueError if a weight does not fit."""
     writer.static["weights"] = weights
     arrays = [p.detach().cpu().numpy().astype(weights) for _, p in _parameters(networks)]
     if not all(np.isfinite(array).all() for array in arrays):

@@ -1,4 +1,4 @@
-"""How methods on anchors train: one stage that they subclass, adding phases, a rate and their own networks.
+"""Training stages of methods on anchors: `AnchorStage` for a plain model, `CodedAnchorStage` for one with a rate.
 
 Source: Scaffold-GS (arXiv 2312.00109) as trained by HAC (arXiv 2403.14530); the plan is that of the Splatwizard paper.
 """
@@ -17,15 +17,14 @@ from splatwizard_core.api import (
     SplatOptimizer,
     Stage,
     StageContext,
-    When,
     exponential_lr,
     photometric_loss,
 )
-from splatwizard_core.training.plan import scaled
+from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.fused_ops import mean_product
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
-from sw_anchors.params import AnchorParams
-from sw_anchors.values import mean_product
+from sw_anchors.params import AnchorParams, CodedAnchorParams
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -36,28 +35,33 @@ log = logging.getLogger(__name__)
 
 
 class AnchorStage(Stage):
-    """Trains a CodedAnchors. A method overrides `learning_rates`, the two register methods and `extra_loss`."""
+    """Trains an AnchorModel: photometric loss, volume regulariser, growing and pruning of anchors.
+
+    A method overrides `learning_rates` (its own networks), the two register methods (its own tasks) and `extra_loss`.
+    """
 
     name = "anchors"
+    opt: AnchorParams
+    trains: type[AnchorModel] = AnchorModel
 
     def __init__(self, opt: AnchorParams) -> None:
         super().__init__(opt)
-        self.config = opt
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
-    def when(self, when: When) -> When:
-        """A plan of the full run, in steps of this one."""
-        return scaled(when, self.config.schedule_scale)
-
     def steps(self, steps: int) -> int:
-        """A number of steps likewise, which a task keeps to itself."""
-        return max(1, round(steps * self.config.schedule_scale)) if steps > 0 else 0
+        """Scale a number of steps of the full run, for a task that counts by itself."""
+        return max(1, round(steps * self.opt.schedule_scale)) if steps > 0 else 0
+
+    def at(self, step: int) -> int:
+        """Scale one step of the full run, as `when` does."""
+        found = self.when(step)
+        assert isinstance(found, int)
+        return found
 
     def begin(self, context: StageContext) -> SplatModel:
         model = context.model
-        if not isinstance(model, CodedAnchors):
-            raise TypeError(f"stage '{self.name}' trains anchors, not a {type(model).__name__}")
-        model.noise = context.generator("noise")
+        if not isinstance(model, self.trains):
+            raise TypeError(f"stage '{self.name}' trains a {self.trains.__name__}, not a {type(model).__name__}")
         self.growth_draws = context.generator("growth")
         self.extent = context.scene.extent
         return model
@@ -65,16 +69,15 @@ class AnchorStage(Stage):
     # Optimizer
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:
-        """From `init` at step 0 to `final` at `max_steps` of the full run (None: lr.max_steps)."""
-        last = self.config.lr.max_steps if max_steps is None else max_steps
+        """Decay exponentially from `init` at step 0 to `final` at `max_steps` of the full run (None: lr.max_steps)."""
+        last = self.opt.lr.max_steps if max_steps is None else max_steps
         return exponential_lr(step, init=init, final=final, max_steps=self.steps(last))
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
-        """Parameter or submodule -> learning rate; the names are the optimizer's groups and the same at every step."""
-        lr = self.config.lr
+        """Learning rate of each parameter or submodule, by name: the optimizer's groups, the same at every step."""
+        lr = self.opt.lr
         return {
             "offsets": self.decay(step, lr.offsets_init, lr.offsets_final) * self.extent,
-            "mask_logits": self.decay(step, lr.masks_init, lr.masks_final) * self.extent,
             "features": lr.features,
             "log_scales": lr.scales,
             "mlp_opacity": self.decay(step, lr.mlp_opacity_init, lr.mlp_opacity_final),
@@ -89,30 +92,29 @@ class AnchorStage(Stage):
     # Plan
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        scheduler.register_task(self.when(range(self.config.lr.max_steps)), self.update_lr)
-        scheduler.register_task(1, self.update_anchor_bound)
+        scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_lr)
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        growth = self.config.growth
+        growth = self.opt.growth
         scheduler.register_task(self.when(range(growth.stop)), self.collect_gradient_statistics)
         for start, stop in ((growth.start, growth.pause_start), (growth.pause_end, growth.stop)):
             if start < stop:
                 scheduler.register_task(self.when(range(start, stop, growth.interval)), self.adjust_anchor)
 
     def update_lr(self, optimizer: SplatOptimizer, step: int) -> None:
+        """Set the learning rates of this step."""
         for name, lr in self.learning_rates(step).items():
             optimizer.set_lr(name, lr)
 
-    def update_anchor_bound(self, model: CodedAnchors) -> None:
-        model.update_bounds()
-
-    def collect_gradient_statistics(self, model: CodedAnchors, result: RenderResult, step: int) -> None:
-        if step > self.steps(self.config.growth.start_stat):
+    def collect_gradient_statistics(self, model: AnchorModel, result: RenderResult, step: int) -> None:
+        """Add this view to the statistics that growing and pruning go by."""
+        if step > self.steps(self.opt.growth.start_stat):
             assert result.grad2d is not None
             accumulate_anchor_statistics(model, result.extras["anchors"], result.grad2d.value, result.radii)
 
-    def adjust_anchor(self, model: CodedAnchors, optimizer: SplatOptimizer, step: int) -> None:
-        growth = self.config.growth
+    def adjust_anchor(self, model: AnchorModel, optimizer: SplatOptimizer, step: int) -> None:
+        """Grow and prune anchors."""
+        growth = self.opt.growth
         report = adjust_anchors(
             model, optimizer, step=step, generator=self.growth_draws, interval=self.steps(growth.interval),
             success=growth.success, grad_threshold=growth.grad_threshold, min_opacity=growth.min_opacity,
@@ -130,10 +132,42 @@ class AnchorStage(Stage):
         return {}
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        settings, inputs = self.config.loss, result.inputs
+        settings, inputs = self.opt.loss, result.inputs
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
         assert inputs.scales is not None
         terms = {"volume": settings.volume * mean_product(inputs.scales), **self.extra_loss(model, result, step)}
         total = sum(terms.values(), start=found.total)
         return LossPack(total, found.parts | {name: term.detach() for name, term in terms.items()})
+
+
+class CodedAnchorStage(AnchorStage):
+    """Trains a CodedAnchors: also its masks, and the lattice of its positions is fitted at step 1.
+
+    A method adds the switches of phase (`PhaseSwitch(step, QUANTIZED)`, ...), its context model and the rate term.
+    """
+
+    opt: CodedAnchorParams
+    trains = CodedAnchors
+
+    def __init__(self, opt: CodedAnchorParams) -> None:
+        super().__init__(opt)
+
+    def begin(self, context: StageContext) -> SplatModel:
+        model = super().begin(context)
+        assert isinstance(model, CodedAnchors)
+        model.noise = context.generator("noise")
+        return model
+
+    def learning_rates(self, step: int) -> Mapping[str, float]:
+        lr, rates = self.opt.lr, super().learning_rates(step)
+        masks = self.decay(step, lr.masks_init, lr.masks_final) * self.extent
+        return {"offsets": rates["offsets"], "mask_logits": masks, **rates}
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        super().register_pre_task(scheduler, ppl, opt)
+        scheduler.register_task(1, self.update_anchor_bound)
+
+    def update_anchor_bound(self, model: CodedAnchors) -> None:
+        """Fit the lattice of the positions to the anchors of now."""
+        model.update_bounds()

@@ -1,28 +1,29 @@
-"""The file: places of the anchors, networks, planes, then the attributes under what all of those predict.
+"""The file of CAT-3DGS: geometry, networks, planes, then the attributes under what all of those predict.
 
-Sections: `anchors`, `masks` and `networks` (see sw_anchors.sections), `frame` and `triplane`, and
-the integers of `features.1`, ... (a section a slice), `scalings` and `offsets`, block by block of anchors.
-Encoder and decoder walk over the rows in the same way (`walk`); only what happens to a block of symbols differs.
+Sections: `anchors`, `masks` and `networks` (see sw_anchors.sections), `frame` and `triplane`, and the integers of
+`features.1`, ... (a section a slice), `scalings` and `offsets`, block by block of anchors. Encoder and decoder walk
+over the rows in the same way (`walk`); only what happens to a block of symbols differs.
 """
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from sw_anchors.coded_anchors import GROUPS, MASK_THRESHOLD, rounded_indices
+from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
+from sw_anchors.coded_anchors import triple
 from sw_anchors.decoded_anchors import DecodedAnchors
-from sw_anchors.float_mode import check_machine, one_thread, this_machine
+from sw_anchors.float_mode import add_machine, one_thread, read_mode
+from sw_anchors.header import read_base_steps, read_integers
 from sw_anchors.sections import (
-    AnchorPlaces,
+    AnchorGeometry,
+    add_geometry,
     add_networks,
-    add_places,
-    morton_order,
+    kept_geometry,
+    read_geometry,
     read_networks,
-    read_places,
     round_networks,
 )
 from torch import Tensor, nn
@@ -30,11 +31,14 @@ from torch import Tensor, nn
 from splatwizard_core.api import BitstreamError
 from sw_cat_3dgs.context import PLANES, CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
-from sw_cat_3dgs.predictors import PREDICTORS
+from sw_cat_3dgs.predictors import PREDICTORS, Predictor
 from sw_cat_3dgs.stage import base_resolution
+from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context.triplane import GAIN
+from sw_codecs.entropy.conditional import RowContext
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter
     from sw_cat_3dgs.config import CatConfig
 
 LIMITS = {
@@ -42,129 +46,90 @@ LIMITS = {
     "resolution": 1 << 14,
 }  # fmt: skip
 
-Code = Callable[[str, str, slice, slice, Any, Any], Tensor]
-"""(section, group, rows, columns of the group, distribution, which are there) -> symbols int64 [n,C]."""
 
-
-def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig, plugins: PluginManager) -> None:
-    """All sections. The model stays as it is."""
-    kept = torch.nonzero(model.kept()).squeeze(1)
-    rows = kept[morton_order(model.codes()[kept], plugins).to(kept.device)]
-    masks = (model.soft_masks()[rows] > MASK_THRESHOLD).cpu()
-    places = AnchorPlaces(model.bounds.cpu(), model.codes()[rows].cpu(), masks)
-    values = dict(zip(GROUPS, (v.detach().cpu() for v in model.raw(rows)), strict=True))
-    centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
-
-    context = _settled_context(model, places, config)
+def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> None:
+    """Write all sections; the model stays as it is."""
+    geometry, rows = kept_geometry(model)
+    mode = config.codec.mode
+    context = _settled_context(model, geometry, config)
     networks = {name: copy.deepcopy(getattr(model, name)).cpu() for name in model.NETWORKS} | _networks(context)
     round_networks(networks, config.codec.weights)
     _write_shape(writer, context.shape, config, context.resolution)
-    add_places(writer, places, plugins)
+    add_geometry(writer, geometry)
     add_networks(writer, networks, config.codec.weights)
     writer.add_array("frame", context.frame.numpy().astype("<f4"))
     planes = [plane.numpy() for plane in context.triplane.integers()]
-    spatial = plugins.context_models.load("spatial-ar")
-    writer.add("triplane", spatial.encode(planes, [arm.exact(arm.state()) for arm in context.arms]))
+    writer.require("context model", "spatial-ar")
+    writer.add("triplane", SpatialAr.encode(planes, [arm.exact(arm.state()) for arm in context.spatial_models]))
     _use_integers(context, planes)
 
-    conditional = plugins.entropy_models.load("conditional-gaussian")
-    coder = conditional(config.codec.mode)
-    predictor: Any = PREDICTORS[config.codec.mode](context, plugins)
-    blocks: dict[str, list[bytes]] = {name: [] for name in sections(context.shape)}
-
-    def code(section: str, group: str, part: slice, columns: slice, distribution: Any, there: Any) -> Tensor:
-        step = predictor.quantum(group, distribution.step)
-        symbols = rounded_indices(values[group][part, columns].double(), step, centres[group]).to(torch.int64)
-        blocks[section].append(coder.encode(symbols.numpy(), distribution, there))
-        return symbols
-
+    attributes = AttributeEncoder(model, rows, sections(context.shape), mode)
+    predictor = PREDICTORS[mode](context)
     if len(rows):
         with one_thread():
-            walk(predictor, context.places(places.codes, places.bounds), masks, conditional, code)
-    for name, found in blocks.items():
-        writer.add(name, conditional.join(found))
+            walk(attributes, predictor, context.places(geometry.codes, geometry.bounds), geometry.masks)
+    attributes.write(writer)
+    if mode == "exact":
+        writer.require("context model", "integer-mlp")
     writer.allow(decoded_bytes(len(rows), context.shape, context.resolution), f"a model of {len(rows):,} anchors")
 
 
-def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedAnchors:
-    """The model that the file holds. Raises BitstreamError for damage, and for a `float` file of another machine."""
-    mode = reader.text("mode", choices=tuple(PREDICTORS))
-    if mode == "float":
-        check_machine(reader)
+def decode(reader: ContainerReader) -> DecodedAnchors:
+    """Raises BitstreamError for damage, and for a file of mode `float` that another machine wrote."""
+    mode = read_mode(reader)
     shape, hidden, resolution = _read_shape(reader)
     n = reader.integer("num_anchors", low=0, high=(1 << 32) - 1)
     reader.allow(decoded_bytes(n, shape, resolution), f"a model of {n:,} anchors and planes of base {resolution}")
     if (n > 0) != (resolution > 0):
         raise BitstreamError(f"{reader.name}: header gives {n:,} anchors planes of {resolution}", section="header")
-    places = read_places(reader, plugins, bytes_per_anchor=_row_bytes(shape))
-    found = {name: torch.zeros(n, width) for name, width in zip(GROUPS, shape.widths, strict=True)}
-    model = DecodedAnchors(
-        places.positions, found["features"], found["offsets"].view(n, shape.offsets, 3), found["scales"], places.masks,
-        hidden=hidden,
-    )  # fmt: skip
-    context = CatContext(plugins, shape, torch.Generator())
+    geometry = read_geometry(reader, bytes_per_anchor=shape.decoded_bytes)
+    model = DecodedAnchors.zeros(geometry, shape, hidden=hidden)
+    context = CatContext(shape, torch.Generator())
     read_networks(reader, {name: getattr(model, name) for name in model.NETWORKS} | _networks(context))
     context.frame = torch.from_numpy(reader.array("frame", dtype="<f4", shape=(7, 3), finite=True))
     with reader.decoding("networks"):
-        arms = [arm.exact(arm.state()) for arm in context.arms]
+        arms = [arm.exact(arm.state()) for arm in context.spatial_models]
     with reader.decoding("triplane") as data:
         shapes = [(shape.channels, m * resolution, m * resolution) for m in shape.multiples]
-        _use_integers(context, plugins.context_models.load("spatial-ar").decode(data, shapes, arms))
+        _use_integers(context, SpatialAr.decode(data, shapes, arms))
     with reader.decoding("networks"):
-        predictor: Any = PREDICTORS[mode](context, plugins)
+        predictor = PREDICTORS[mode](context)
 
-    conditional = plugins.entropy_models.load("conditional-gaussian")
-    coder = conditional(mode)
-    count = len(row_blocks(n, shape, conditional))
-    stored = {name: _blocks(reader, name, conditional, count) for name in sections(shape)}
-
-    def code(section: str, group: str, part: slice, columns: slice, distribution: Any, there: Any) -> Tensor:
-        block = next(stored[section])
-        with reader.decoding(section):
-            symbols = torch.from_numpy(coder.decode(block, distribution, there))
-        found[group][part, columns] = (symbols * predictor.quantum(group, distribution.step)).to(torch.float32)
-        return symbols
-
+    attributes = AttributeDecoder(reader, model, sections(shape), mode)
     if n:
         with reader.decoding("frame"):
-            spots = context.places(places.codes, places.bounds)
+            places = context.places(geometry.codes, geometry.bounds)
         with one_thread():
-            walk(predictor, spots, places.masks, conditional, code)
-    for blocks in stored.values():
-        next(blocks, None)  # what follows the last block is noticed
-    for name, value in found.items():
-        if not bool(torch.isfinite(value).all()):
-            raise BitstreamError(f"{reader.name}: decoded {name} are not finite: the file is damaged or hostile")
+            walk(attributes, predictor, places, geometry.masks)
+    attributes.finish()
     return model
 
 
-def walk(predictor: Any, places: Tensor, masks: Tensor, conditional: Any, code: Code) -> None:
-    """Call `code` for each block of rows: features slice by slice, then scales, then the offsets that masks keep."""
-    shape: ContextShape = predictor.context.shape
-    for part in row_blocks(len(places), shape, conditional):
-        first = predictor.first(places[part])
-        mean, scale, step = first["features"]
-        known = predictor.known(torch.zeros(len(mean), 0, dtype=torch.int64), step)
-        for i in range(len(shape.slices)):
-            columns = predictor.context.slices.part(i)
-            found = [mean[:, columns], scale[:, columns]]
+def walk(attributes: AttributeCoder, predictor: Predictor, places: Tensor, masks: Tensor) -> None:
+    """Code each block of rows: features slice by slice, then scales, then the offsets that masks keep."""
+    slices, refine = predictor.context.slices, predictor.context.shape.refine
+    for rows in attributes.rows:
+        first = predictor.first(places[rows])
+        alone = first["features"]
+        steps = predictor.steps("features", alone)
+        known = predictor.known(torch.zeros(len(steps), 0, dtype=torch.int64), alone)
+        for i in range(len(slices.slices)):
+            columns = slices.part(i)
+            mean, scale = alone.mean[:, columns], alone.scale[:, columns]
             if i > 0:
-                found = [a + b for a, b in zip(found, predictor.shift(f"slice{i}", known), strict=True)]
-            symbols = code(f"features.{i + 1}", "features", part, columns, conditional.Context(*found, step), None)
-            known = torch.cat([known, predictor.known(symbols, step)], dim=1)
-        for group, section in (("scales", "scalings"), ("offsets", "offsets")):
-            mean, scale, step = first[group]
-            if shape.refine:
-                shift, widening = predictor.shift(group, known)
+                shift, widening = predictor.shift(f"slice{i}", known)
                 mean, scale = mean + shift, scale + widening
-            there = masks[part].repeat_interleave(3, dim=1) if group == "offsets" else None
-            code(section, group, part, slice(None), conditional.Context(mean, scale, step), there)
-
-
-def row_blocks(rows: int, shape: ContextShape, conditional: Any) -> list[slice]:
-    """The blocks in which rows are predicted and coded."""
-    found: list[slice] = conditional.blocks(rows, max(shape.widths))
-    return found
+            context = RowContext(mean, scale, alone.step)
+            symbols = attributes.code(Block(f"features.{i + 1}", "features", rows, columns), context, steps)
+            known = torch.cat([known, predictor.known(symbols, alone)], dim=1)
+        for group, section in (("scales", "scalings"), ("offsets", "offsets")):
+            context = first[group]
+            steps = predictor.steps(group, context)
+            if refine:
+                shift, widening = predictor.shift(group, known)
+                context = RowContext(context.mean + shift, context.scale + widening, context.step)
+            present = masks[rows].repeat_interleave(3, dim=1) if group == "offsets" else None
+            attributes.code(Block(section, group, rows), context, steps, present)
 
 
 def sections(shape: ContextShape) -> list[str]:
@@ -173,30 +138,25 @@ def sections(shape: ContextShape) -> list[str]:
 
 
 def decoded_bytes(anchors: int, shape: ContextShape, resolution: int) -> int:
-    """Of the model in float32, with the planes that its decoder holds meanwhile."""
+    """Bytes of the model in float32, with the planes that its decoder holds meanwhile."""
     latents = sum(PLANES * shape.channels * (m * resolution) ** 2 for m in shape.multiples)
-    return anchors * _row_bytes(shape) + 4 * latents
-
-
-def _row_bytes(shape: ContextShape) -> int:
-    return 4 * (3 + sum(shape.widths)) + shape.offsets
+    return anchors * shape.decoded_bytes + 4 * latents
 
 
 def _networks(context: CatContext) -> dict[str, nn.Module]:
     return {"context": context.network, "slices": context.slices, "arms": context.arms}
 
 
-def _settled_context(model: CatAnchors, places: AnchorPlaces, config: CatConfig) -> CatContext:
+def _settled_context(model: CatAnchors, geometry: AnchorGeometry, config: CatConfig) -> CatContext:
     """A copy of the model's context on the CPU; of a training that ended before there was one, a plain one."""
     context = copy.deepcopy(model.context).cpu()
-    if not len(places.codes):
+    if not len(geometry.codes):
         _use_integers(context, [plane.numpy() for plane in context.triplane.initial(0, None)])
     elif context.resolution == 0:
         settings = config.context
-        context.fit_frame(places.positions, neighbors=settings.neighbors, contamination=settings.contamination)
-        features, scales, offsets = (v.cpu() for v in model.raw(torch.nonzero(model.kept()).squeeze(1)))
-        context.start_at((features, scales, offsets))
-        resolution = base_resolution(len(places.codes), settings.anchors_per_cell)
+        context.fit_frame(geometry.positions, neighbors=settings.neighbors, contamination=settings.contamination)
+        context.start_at(triple(v.cpu() for v in model.raw(torch.nonzero(model.kept()).squeeze(1))))
+        resolution = base_resolution(len(geometry.codes), settings.anchors_per_cell)
         shapes = [plane.shape for plane in context.triplane.initial(resolution, torch.Generator())]
         _use_integers(context, [np.zeros(each, np.int64) for each in shapes])
     context.fold_units()
@@ -206,7 +166,7 @@ def _settled_context(model: CatAnchors, places: AnchorPlaces, config: CatConfig)
 def _use_integers(context: CatContext, planes: list[np.ndarray]) -> None:
     """Give the triplane the values of the file."""
     for i, plane in enumerate(planes):
-        values = torch.from_numpy(plane.astype(np.float32)) / 16
+        values = torch.from_numpy(plane.astype(np.float32)) / GAIN
         setattr(context.triplane.planes, str(i), nn.Parameter(values, requires_grad=False))
     context.rounded = True
 
@@ -218,8 +178,7 @@ def _write_shape(writer: ContainerWriter, shape: ContextShape, config: CatConfig
         slice_hidden=shape.slice_hidden, refine=int(shape.refine),
         base_steps=list(shape.base_steps),
     )  # fmt: skip
-    if config.codec.mode == "float":
-        writer.static["made_on"] = this_machine()
+    add_machine(writer, config.codec.mode)
 
 
 def _read_shape(reader: ContainerReader) -> tuple[ContextShape, int, int]:
@@ -227,40 +186,16 @@ def _read_shape(reader: ContainerReader) -> tuple[ContextShape, int, int]:
     sizes = {
         name: reader.integer(name, low=0 if name == "resolution" else 1, high=high) for name, high in LIMITS.items()
     }
-    slices = _sizes(reader, "slices", longest=64, high=LIMITS["feature_dim"])
+    slices = read_integers(reader, "slices", low=1, high=LIMITS["feature_dim"], longest=64)
     if sum(slices) != sizes["feature_dim"]:
         raise BitstreamError(f"{reader.name}: the slices of the header do not sum to its features", section="header")
+    base_steps = read_base_steps(reader, low=1e-9, high=1e9)
+    if base_steps[0] != 1:
+        raise BitstreamError(f"{reader.name}: the base step of the features must be 1", section="header")
     shape = ContextShape(
         features=sizes["feature_dim"], offsets=reader.integer("num_offsets", low=1, high=64),
-        channels=sizes["channels"], multiples=_sizes(reader, "multiples", longest=4, high=16),
+        channels=sizes["channels"], multiples=read_integers(reader, "multiples", low=1, high=16, longest=4),
         hidden=sizes["context_hidden"], slices=slices, slice_hidden=sizes["slice_hidden"],
-        refine=bool(reader.integer("refine", low=0, high=1)), base_steps=_read_steps(reader),
+        refine=bool(reader.integer("refine", low=0, high=1)), base_steps=base_steps,
     )  # fmt: skip
     return shape, sizes["hidden"], sizes["resolution"]
-
-
-def _read_steps(reader: ContainerReader) -> tuple[float, float, float]:
-    steps: Any = reader.static.get("base_steps")
-    usable = isinstance(steps, list) and len(steps) == 3 and all(type(q) in (int, float) for q in steps)
-    if not usable or steps[0] != 1 or not all(1e-9 <= q <= 1e9 for q in steps):
-        raise BitstreamError(
-            f"{reader.name}: header value 'base_steps' must be 1 and two numbers in 1e-9..1e9", section="header"
-        )
-    return 1.0, float(steps[1]), float(steps[2])
-
-
-def _sizes(reader: ContainerReader, name: str, *, longest: int, high: int) -> tuple[int, ...]:
-    """A list of the header."""
-    value: Any = reader.static.get(name)
-    fits = isinstance(value, list) and 1 <= len(value) <= longest
-    if not fits or any(type(v) is not int or not 1 <= v <= high for v in value):
-        raise BitstreamError(
-            f"{reader.name}: header value '{name}' must be 1..{longest} integers in 1..{high}", section="header"
-        )
-    return tuple(value)
-
-
-def _blocks(reader: ContainerReader, name: str, conditional: Any, count: int) -> Iterator[bytes]:
-    """The blocks of a section one by one; what is wrong with their framing is blamed on it."""
-    with reader.decoding(name) as data:
-        yield from conditional.split(data, count)

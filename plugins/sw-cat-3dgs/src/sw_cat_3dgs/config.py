@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import ClassVar, Literal
 
 from pydantic import Field
-from sw_anchors.params import AnchorLearningRates, AnchorParams
+from sw_anchors.lattice import Margin
+from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
 
 from splatwizard_core.api import Params
 
@@ -14,7 +15,7 @@ FULL_RUN = 40_000
 
 
 class Phases(Params):
-    """When what is trained begins; steps."""
+    """First steps of the phases of training."""
 
     quantize: int = Field(3_000, ge=1, description="attributes get noise of fixed steps, masks a regulariser")
     triplane: int = Field(
@@ -38,7 +39,7 @@ class Steps(Params):
 
 
 class Context(Params):
-    """The models that predict attributes."""
+    """Sizes of the models that predict attributes."""
 
     channels: int = Field(72, ge=1, le=512, description="channels of each plane")
     multiples: list[int] = Field(
@@ -80,7 +81,7 @@ class RateTerm(Params):
 
     @property
     def weight(self) -> float:
-        """Of the bits per number."""
+        """Weight of the bits per number."""
         return self.lambda_ * self.scale
 
 
@@ -94,7 +95,7 @@ class ContextLearningRates(Params):
 
 
 class Codec(Params):
-    """What the file holds."""
+    """Settings of the file."""
 
     mode: Literal["exact", "float"] = Field(
         "exact", description="exact: integers, decodes anywhere; float: only where networks give the same floats"
@@ -102,16 +103,24 @@ class Codec(Params):
     weights: Literal["float32", "float16"] = Field("float32", description="how weights of networks are stored")
 
 
-class CatConfig(AnchorParams):
+class CatConfig(CodedAnchorParams):
     """Everything that can be set for CAT-3DGS."""
 
     FULL_ITERATIONS: ClassVar[int] = FULL_RUN
 
     iterations: int = Field(FULL_RUN, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
-    lr: AnchorLearningRates = Field(AnchorLearningRates(max_steps=FULL_RUN), description="step sizes")
+    bound_margin: Literal["hac", "extent", "none"] = Field(
+        "none", description="room around the anchors on their 16-bit lattice; hac: as HAC has it; extent: 10 %"
+    )
+    lr: CodedAnchorLearningRates = Field(CodedAnchorLearningRates(max_steps=FULL_RUN), description="step sizes")
     context_lr: ContextLearningRates = Field(ContextLearningRates(), description="step sizes of the context")
     phases: Phases = Field(Phases(), description="what is trained when")
     steps: Steps = Field(Steps(), description="base steps of the quantisers")
     context: Context = Field(Context(), description="the models that predict attributes")
     rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what the file holds")
+
+    @property
+    def margin(self) -> Margin:
+        """Margin of the lattice in the words of sw_anchors."""
+        return "origin" if self.bound_margin == "hac" else self.bound_margin

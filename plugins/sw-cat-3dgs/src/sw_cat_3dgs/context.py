@@ -1,4 +1,4 @@
-"""What predicts the attributes of an anchor from its position: triplane, context network, channel slices.
+"""Context model of CAT-3DGS: triplane, context network and channel slices predict attributes from positions.
 
 The float form is trained. `places` are integers in training and file alike: both look at the very same spots.
 """
@@ -7,16 +7,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from sw_anchors.coded_anchors import AnchorContext, AnchorForecast
+from sw_anchors.anchors import linear_layers
+from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, Triple, triple
+from sw_anchors.lattice import low_and_step
+from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
-if TYPE_CHECKING:
-    from splatwizard_core.api import PluginManager
+from sw_codecs.context.channel_ar import ChannelAr
+from sw_codecs.context.principal_frame import PrincipalFrame
+from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context.triplane import GAIN, PlaneSites, Triplane
+from sw_codecs.quantizers.rounding import add_noise
 
 STEP_OFFSET = 1.1
 """A step is its base times (1.1 + tanh t): never zero."""
@@ -25,14 +31,12 @@ FRAME_ROWS = {"mean": slice(0, 1), "axes": slice(1, 4), "std": slice(4, 5), "low
 
 
 @dataclass(frozen=True)
-class ContextShape:
-    """What sizes the networks: features F and offsets k of an anchor, and the fields of `config.Context`.
+class ContextShape(AnchorShape):
+    """Sizes of all networks: those of an anchor, and the fields of `config.Context`.
 
     base_steps  quantiser steps of features (1), scales and offsets that predicted ones multiply
     """
 
-    features: int
-    offsets: int
     channels: int
     multiples: tuple[int, ...]
     hidden: int
@@ -41,59 +45,53 @@ class ContextShape:
     refine: bool
     base_steps: tuple[float, float, float]
 
-    @property
-    def widths(self) -> tuple[int, int, int]:
-        """Numbers of an anchor by group."""
-        return self.features, 6, 3 * self.offsets
-
-    @property
-    def splits(self) -> list[int]:
-        """Outputs of the context network: mean and scale of each group, then three step logits."""
-        return [width for width in self.widths for _ in range(2)] + [PLANES]
-
 
 class CatContext(nn.Module):
-    """The context of all anchors.
+    """Context model of all anchors.
 
-    frame       [7,3] buffer: constants of the triplane's frame; zeros until `set_up`
-    triplane    planes of the registry's `triplane`, resolution 0 until `set_up`
+    frame       [7,3] buffer: constants of the triplane's frame; zeros until `fit_frame`
+    triplane    planes of resolution 0 until the stage sets them up
     network     feature of a place -> means, scales, step logits
-    slices      the registry's `channel-ar`
-    arms        one of the registry's `spatial-ar` for each plane orientation
+    slices      refine each slice of the features by those before it
+    arms        spatial model of each plane orientation
     rounded     planes are used (and trained) as the file will have them
     in_steps    the network gives means and scales as multiples of base steps, not in the units of the values
     """
 
     frame: Tensor
-    triplane: Any
+    triplane: Triplane
     network: nn.Sequential
-    slices: Any
-    arms: Any
+    slices: ChannelAr
+    arms: nn.ModuleList
 
-    def __init__(self, plugins: PluginManager, shape: ContextShape, generator: torch.Generator) -> None:
+    def __init__(self, shape: ContextShape, generator: torch.Generator) -> None:
         super().__init__()
-        models = plugins.context_models
         self.shape = shape
-        self.triplane = models.load("triplane")(0, shape.channels, shape.multiples)
-        self.network = _network(self.triplane.width, shape.hidden, sum(shape.splits), generator)
+        self.triplane = Triplane(0, shape.channels, shape.multiples)
+        self.network = _network(self.triplane.width, shape.hidden, sum(shape.outputs), generator)
         refined = {"scales": 6, "offsets": 3 * shape.offsets} if shape.refine else {}
-        self.slices = models.load("channel-ar")(shape.slices, refined, hidden=shape.slice_hidden, generator=generator)
-        self.arms = nn.ModuleList(models.load("spatial-ar")(generator) for _ in range(PLANES))
+        self.slices = ChannelAr(shape.slices, refined, hidden=shape.slice_hidden, generator=generator)
+        self.arms = nn.ModuleList(SpatialAr(generator) for _ in range(PLANES))
         self.register_buffer("frame", torch.zeros(7, 3))
         self.rounded = False
         self.in_steps = False
 
     @property
     def resolution(self) -> int:
-        """Of the coarsest planes; 0 before they are set up."""
+        """Resolution of the coarsest planes; 0 before they are set up."""
         return int(self.triplane.planes[0].shape[-1]) // self.shape.multiples[0]
+
+    @property
+    def spatial_models(self) -> list[SpatialAr]:
+        """The models `arms`, one for each plane orientation."""
+        return [arm for arm in self.arms if isinstance(arm, SpatialAr)]
 
     # Set-up
 
     def fit_frame(self, positions: Tensor, *, neighbors: int = 50, contamination: float = 0.05) -> None:
         """Lay the axes through the anchors [N,3] of now, N > 0."""
         xyz = positions.detach().cpu().numpy()
-        state = self.triplane.Frame.fit(xyz, neighbors=neighbors, contamination=contamination).state()
+        state = PrincipalFrame.fit(xyz, neighbors=neighbors, contamination=contamination).state()
         rows = np.concatenate([np.atleast_2d(state[name]) for name in FRAME_ROWS])
         self.frame = torch.from_numpy(rows.astype(np.float32)).to(self.frame)
 
@@ -101,16 +99,15 @@ class CatContext(nn.Module):
         """Integer places [N,3] of position codes on the lattice `bounds`. Raises ValueError for a senseless frame."""
         rows = self.frame.detach().cpu().numpy()
         state = {name: rows[part] if name == "axes" else rows[part][0] for name, part in FRAME_ROWS.items()}
-        low, high = bounds.detach().cpu().numpy().astype(np.float64)
-        step = (high - low) / 65535
-        return self.triplane.Frame.from_state(state).unit(codes, low, np.where(step > 0, step, 1e-6))
+        low, step = low_and_step(bounds.detach().cpu())
+        return PrincipalFrame.from_state(state).unit(codes, low.numpy(), step.numpy())
 
     @torch.no_grad()
     def start_at(self, values: tuple[Tensor, Tensor, Tensor]) -> None:
         """Let the network predict mean and deviation of each column of the groups, wherever an anchor is."""
         if not len(values[0]):
             return
-        bias: Any = self.network[-1].bias
+        bias = linear_layers(self.network)[1].bias
         start = 0
         for value, base, unit in zip(values, self.shape.base_steps, self.units, strict=True):
             for column in (value.mean(dim=0), value.std(dim=0, unbiased=False).clamp(min=base)):
@@ -120,14 +117,13 @@ class CatContext(nn.Module):
 
     @property
     def units(self) -> tuple[float, float, float]:
-        """Of the network's means and scales by group."""
+        """Units of the network's means and scales by group."""
         return self.shape.base_steps if self.in_steps else (1.0, 1.0, 1.0)
 
     @torch.no_grad()
     def fold_units(self) -> None:
         """Let the network predict in the units of the values, which is what the file has."""
-        last, start = self.network[-1], 0
-        assert isinstance(last, nn.Linear)
+        (_, last), start = linear_layers(self.network), 0
         for width, unit in zip(self.shape.widths, self.units, strict=True):
             rows = slice(start, start + 2 * width)
             last.weight[rows] *= unit
@@ -138,29 +134,27 @@ class CatContext(nn.Module):
     # Prediction in training
 
     def forward(self, places: Tensor) -> AnchorContext:
-        """Of anchors at places [V,3]; differentiable."""
-        out = self.network(self.triplane(places, rounded=self.rounded)).split(self.shape.splits, dim=1)
+        """Predict steps and distributions of anchors at places [V,3]; differentiable."""
+        out = self.network(self.triplane(places, rounded=self.rounded)).split(self.shape.outputs, dim=1)
         steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
-        means, scales = (tuple(out[2 * i + second] * unit for i, unit in enumerate(self.units)) for second in (0, 1))
-        return AnchorContext(means, scales, tuple(steps.split(1, dim=1)))
+        means, scales = ([out[2 * i + second] * unit for i, unit in enumerate(self.units)] for second in (0, 1))
+        return AnchorContext(triple(means), triple(scales), triple(steps.split(1, dim=1)))
 
-    def forecast(self, sites: Any, base_steps: Tensor) -> AnchorForecast:
-        """The same for training: of V anchors at `sites` of the triplane; base_steps [3] of the shape.
+    def forecast(self, sites: PlaneSites, base_steps: Tensor) -> AnchorForecast:
+        """Predict for training: V anchors at `sites` of the triplane; base_steps [3] of the shape.
 
         All anchors have noise of their own steps; means and scales are computed for the sample alone.
         """
-        first, last = self.network[0], self.network[2]
-        assert isinstance(first, nn.Linear)
-        assert isinstance(last, nn.Linear)
+        first, last = linear_layers(self.network)
         hidden = torch.relu(first(self.triplane.at_sites(sites, rounded=self.rounded)))
-        widths = self.shape.splits[:-1]
-        weights = last.weight.split([sum(widths), PLANES])
-        biases = last.bias.split([sum(widths), PLANES])
+        widths = self.shape.outputs[:-1]
+        weights = torch.split(last.weight, [sum(widths), PLANES])
+        biases = torch.split(last.bias, [sum(widths), PLANES])
         steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
-            out = nn.functional.linear(hidden, weights[0], biases[0]).split(widths, dim=1)
+            out = torch.split(nn.functional.linear(hidden, weights[0], biases[0]), widths, dim=1)
             if self.in_steps:
                 out = tuple(
                     part * unit for part, unit in zip(out, (u for u in self.units for _ in (0, 1)), strict=True)
@@ -171,20 +165,20 @@ class CatContext(nn.Module):
         return AnchorForecast(steps, None, hidden, sample)
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
-        """The context once features [V,F] are known: each slice sees those before it."""
+        """Refine the context by features [V,F]: each slice by those before it."""
         means, scales = self._refined(context.means, context.scales, features)
         return dataclasses.replace(context, means=means, scales=scales)
 
-    def _refined(self, means: Any, scales: Any, features: Tensor) -> tuple[Any, Any]:
-        """Means and scales by group."""
+    def _refined(self, means: Sequence[Tensor], scales: Sequence[Tensor], features: Tensor) -> tuple[Triple, Triple]:
+        """Refine means and scales of the groups."""
         found = [self.slices(features, means[0], scales[0])]
         for name, mean, scale in zip(("scales", "offsets"), means[1:], scales[1:], strict=True):
             found.append(self.slices.refine(name, features, mean, scale) if self.shape.refine else (mean, scale))
         first, second = zip(*found, strict=True)
-        return first, second
+        return triple(first), triple(second)
 
-    def triplane_bits(self, noise: Any, share: float = 1.0) -> Tensor:
-        """Bits of the planes with noise in place of rounding; symbols and their neighbours alike.
+    def triplane_bits(self, noise: Callable[..., Tensor], share: float = 1.0) -> Tensor:
+        """Estimate the bits of the planes with noise in place of rounding; symbols and their neighbours alike.
 
         noise   (*shape) -> U(0,1)
         share   of the channels that are looked at, drawn anew each time; the sum is scaled up
@@ -193,14 +187,17 @@ class CatContext(nn.Module):
         count = max(1, round(share * channels))
         chosen = torch.argsort(noise(channels))[:count] if count < channels else None
         planes = [plane if chosen is None else plane.index_select(1, chosen) for plane in self.triplane.planes]
-        values = [noise(*plane.shape).sub_(0.5).add(plane, alpha=16) for plane in planes]
-        total: Tensor = self.arms[0].joint_bits(list(self.arms), values)
+        values = [add_noise(GAIN * plane, plane.new_ones(()), noise(*plane.shape)) for plane in planes]
+        total = SpatialAr.joint_bits(self.spatial_models, values)
         return total * (channels / count)
 
 
 def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
     """inputs -> hidden, ReLU -> outputs; Xavier-uniform weights, no biases at first."""
-    layers = [nn.utils.skip_init(nn.Linear, *size) for size in ((inputs, hidden), (hidden, outputs))]
+    layers: list[nn.Linear] = [
+        nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
+        for size in ((inputs, hidden), (hidden, outputs))
+    ]
     for layer in layers:
         bound = math.sqrt(6 / (layer.in_features + layer.out_features))
         with torch.no_grad():

@@ -1,4 +1,4 @@
-"""CAT-3DGS: anchors whose attributes are coded under a triplane along the cloud's principal axes."""
+"""CAT-3DGS as a method: its model of a scene, its training stage, its file."""
 
 from __future__ import annotations
 
@@ -35,23 +35,22 @@ class Cat3DGS(Method):
     DEFAULT_RATE: ClassVar[str] = "r6"
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Anchors at the start points of the scene."""
+        """Put an anchor into every voxel with a start point of the scene."""
         config: CatConfig = self.config
         if scene.points is None or len(scene.points) == 0:
             raise SceneError(
                 f"scene '{scene.name}' has no start points: anchors need SfM points, or random ones", path=scene.path
             )
-        context = CatContext(self.plugins, self.shape(), generator)
+        context = CatContext(self.shape(), generator)
         context.in_steps = config.context.units == "steps"
         return CatAnchors.from_points(
             scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets, feature_dim=config.feature_dim,
-            hidden=config.hidden, generator=generator, margin=config.bound_margin, sample=config.rate_term.sample,
-            entropy=self.plugins.entropy_models.load("gaussian-exact")(), view_factor=config.rate_term.view_factor,
-            context=context,
+            hidden=config.hidden, generator=generator, margin=config.margin, sample=config.rate_term.sample,
+            view_factor=config.rate_term.view_factor, context=context,
         )  # fmt: skip
 
     def shape(self) -> ContextShape:
-        """What sizes the context. Raises ConfigError if the slices do not make up the features."""
+        """Sizes of the context model. Raises ConfigError if the slices do not make up the features."""
         config: CatConfig = self.config
         c = config.context
         if sum(c.slices) != config.feature_dim or min(c.slices) < 1:
@@ -72,8 +71,8 @@ class Cat3DGS(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CatAnchors):
             raise TypeError(f"cat-3dgs encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config, self.plugins)
+        codec.encode(model, writer, self.config)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader, self.plugins)
+        return codec.decode(reader)

@@ -1,4 +1,4 @@
-"""The anchors of CAT-3DGS as they are trained: masks weighted by how often an anchor is seen, and the context."""
+"""The model of CAT-3DGS: anchors with masks weighted by how often an anchor is seen, and their context model."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
+from sw_codecs.context.triplane import PlaneSites
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
 
@@ -20,8 +21,8 @@ class CatAnchors(CodedAnchors):
 
     view_weights    [N] buffer: views that see an anchor over their mean, times `view_factor`; multiplies its masks
     views_stale     anchors came or went since the views were counted
-    context         what predicts attributes
-    trained         which parameters get gradients
+    context         predicts attributes
+    trained         parameters that get gradients
     """
 
     ROWS = (*CodedAnchors.ROWS, "view_weights")
@@ -36,7 +37,7 @@ class CatAnchors(CodedAnchors):
         self.views_stale = True
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
-        self._places: tuple[tuple[Any, ...], Tensor, Any] | None = None
+        self._places: tuple[tuple[Any, ...], Tensor, PlaneSites] | None = None
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -54,7 +55,7 @@ class CatAnchors(CodedAnchors):
         """[N,3] integer places of the anchors in the triplane, kept until anchors or frame are others."""
         return self._kept_places()[0]
 
-    def _kept_places(self) -> tuple[Tensor, Any]:
+    def _kept_places(self) -> tuple[Tensor, PlaneSites]:
         """The places, and their sites on the planes."""
         codes, context = self.codes(), self.context
         key = (codes, context.frame, context.frame._version, context.resolution)
@@ -71,8 +72,7 @@ class CatAnchors(CodedAnchors):
 
     def forecast(self, rows: Tensor) -> AnchorForecast:
         sites = self._kept_places()[1].rows(rows)
-        found: AnchorForecast = self.context.forecast(sites, self.base_steps_like(sites.weights))
-        return found
+        return self.context.forecast(sites, self.base_steps_like(sites.weights))
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
         return self.context.refine(context, features)

@@ -1,4 +1,4 @@
-"""How CAT-3DGS trains: the anchors' stage, with the phases of the triplane and of its spatial models."""
+"""Training stage of CAT-3DGS: that of anchors with a rate, and the phases of the triplane and its spatial models."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
-from sw_anchors.stage import AnchorStage
+from sw_anchors.stage import CodedAnchorStage
 
 from splatwizard_core.api import CameraIterator, LossPack, PhaseSwitch, Rasterizer, SplatOptimizer
 from sw_cat_3dgs.config import CatConfig
@@ -32,27 +32,21 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-class CatStage(AnchorStage):
+class CatStage(CodedAnchorStage):
     """One stage of 40,000 steps."""
 
     name = "cat-3dgs"
-    config: CatConfig
+    opt: CatConfig
 
     def begin(self, context: StageContext) -> SplatModel:
         self.plane_draws = context.generator("triplane")
         self._cameras: list[Camera] | None = None
         return super().begin(context)
 
-    def at(self, step: int) -> int:
-        """A step of the full plan, in those of this run."""
-        found = self.when(step)
-        assert isinstance(found, int)
-        return found
-
     # Optimizer
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
-        rates, phases = self.config.context_lr, self.config.phases
+        rates, phases = self.opt.context_lr, self.opt.phases
         since_triplane, since_warmup = step - self.at(phases.triplane), step - self.at(phases.warmup)
         network = self.decay(max(since_triplane, 0), rates.init, rates.final)
         return {
@@ -68,9 +62,9 @@ class CatStage(AnchorStage):
     # Plan
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        phases = self.config.phases
-        scheduler.register_task(self.when(range(self.config.lr.max_steps)), self.update_lr)
-        scheduler.register_task(self.when(range(self.config.lr.max_steps)), self.update_cam_mask)
+        phases = self.opt.phases
+        scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_lr)
+        scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_cam_mask)
         scheduler.register_task(1, self.update_anchor_bound)
         PhaseSwitch(self.at(phases.quantize), QUANTIZED).register(scheduler)
         scheduler.register_task(self.at(phases.triplane), self.update_anchor_bound)
@@ -94,7 +88,7 @@ class CatStage(AnchorStage):
         model.views_stale = True  # also if as many came as went
 
     def setup_triplane(self, model: CatAnchors, optimizer: SplatOptimizer) -> None:
-        settings, context = self.config.context, model.context
+        settings, context = self.opt.context, model.context
         resolution = base_resolution(model.num_rows, settings.anchors_per_cell)
         context.fit_frame(model.positions(), neighbors=settings.neighbors, contamination=settings.contamination)
         for i, plane in enumerate(context.triplane.initial(resolution, self.plane_draws)):
@@ -103,7 +97,7 @@ class CatStage(AnchorStage):
         log.debug("triplane of base resolution %d for %d anchors", resolution, model.num_rows)
 
     def train_spatial_models(self, model: CatAnchors) -> None:
-        alone: Trained = "nothing" if self.config.phases.official_warmup else "spatial models"
+        alone: Trained = "nothing" if self.opt.phases.official_warmup else "spatial models"
         model.train_only(alone)
 
     def round_planes(self, model: CatAnchors) -> None:
@@ -118,8 +112,8 @@ class CatStage(AnchorStage):
     # Loss
 
     def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Tensor]:
-        rate, terms = self.config.rate_term, {}
-        if step >= self.at(self.config.phases.quantize):
+        rate, terms = self.opt.rate_term, {}
+        if step >= self.at(self.opt.phases.quantize):
             weight = max(rate.mask_floor, rate.mask_factor * rate.weight)
             terms["masks"] = weight * torch.sigmoid(model.mask_logits).mean()
         if "rate" in result.extras:
@@ -129,10 +123,9 @@ class CatStage(AnchorStage):
         return terms
 
     def _plane_bits(self, model: CatAnchors) -> Tensor:
-        """Of the planes, per number of all anchors."""
+        """Bits of the planes per number of all anchors."""
         numbers = model.num_rows * sum(model.context.shape.widths)
-        bits: Tensor = model.context.triplane_bits(model.uniform, self.config.rate_term.triplane_sample) / numbers
-        return bits
+        return model.context.triplane_bits(model.uniform, self.opt.rate_term.triplane_sample) / numbers
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         assert isinstance(model, CatAnchors)
@@ -147,5 +140,5 @@ class CatStage(AnchorStage):
 
 
 def base_resolution(anchors: int, anchors_per_cell: float) -> int:
-    """Of a triplane for so many anchors."""
+    """Base resolution of a triplane for so many anchors."""
     return max(1, round(math.sqrt(anchors / anchors_per_cell)))

@@ -104,7 +104,7 @@ def _arrays(model: MaskedGaussians) -> Arrays:
 
 
 def _rounded(arrays: Arrays, steps: Steps) -> Arrays:
-    """What the file holds in float16 on coarser lattices, where a step is given."""
+    """Round what the file holds in float16 to coarser lattices, where a step is given."""
     found = dict(arrays)
     if steps.quats > 0:
         quats = arrays["quats"]

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.api import ConfigError, Method, create_method, load_pruner
-from splatwizard_core.runs.keys import dotted
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
 from sw_chimerags.model import MaskedGaussians
@@ -49,7 +48,7 @@ class ChimeraGS(Method):
             values["iterations"] = max(1, round(full * config.schedule_scale))
         if name == "speedy-splat":
             values |= {f"prune.{key}": getattr(config.train, key) for key in ("soft", "hard", "stop")}
-        values |= dotted(config.student, "")
+        values |= config.student
         preset = str(values.pop("preset", "paper"))
         return create_method(self.plugins, name, values, preset=preset)
 

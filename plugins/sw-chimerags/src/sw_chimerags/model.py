@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
+from sw_finetuning.importance import ScoredGaussians
 from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel
@@ -29,22 +30,20 @@ class MaskQuantizer(Protocol):
     def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]: ...
 
 
-class MaskedGaussians(GaussianModel):
-    """Gaussians of degree 3 and what ChimeraGS learns of each.
+class MaskedGaussians(ScoredGaussians):
+    """Gaussians of degree 3 with a mask that ChimeraGS learns.
 
     mask_logits [N]; the mask is on where the sigmoid is above the threshold, and its gradient is the sigmoid's
-    importance  [N] buffer; what the file keeps best is high here. Zeros until it is computed
+    importance  [N] buffer, of any sign; the file keeps best what is high here
     """
 
     ROWS = (*GaussianModel.ROWS, "mask_logits", "importance")
 
     mask_logits: nn.Parameter
-    importance: Tensor
 
     def __init__(self, *tensors: Tensor, quantizer: MaskQuantizer, init: float) -> None:
         super().__init__(*tensors, active_sh_degree=DEGREE)
         self.mask_logits = nn.Parameter(torch.full_like(self.opacity_logits, init))
-        self.register_buffer("importance", torch.zeros_like(self.opacity_logits))
         self._quantizer = quantizer
         self._scored = ""  # digest of the means that `importance` belongs to
 
@@ -72,7 +71,7 @@ class MaskedGaussians(GaussianModel):
 
     @torch.no_grad()
     def set_importance(self, scores: Tensor) -> None:
-        """Keep the scores [N] of the Gaussians as they are now."""
+        """Keep the scores [N], also negative ones, of the Gaussians at the places where they are now."""
         # A score of -inf (never seen) would not survive arithmetic on it.
         self.importance.copy_(scores.clamp_min(torch.finfo(self.importance.dtype).min))
         self._scored = self._digest()

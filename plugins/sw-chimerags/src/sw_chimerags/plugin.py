@@ -1,4 +1,4 @@
-"""What this package provides: the method chimerags. Its parts are asked for by name, from whoever has them."""
+"""Registers the method chimerags; its parts are asked for by name from the packages that have them."""
 
 from splatwizard_core.api import Registry, hookimpl
 

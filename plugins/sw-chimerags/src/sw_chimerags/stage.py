@@ -6,7 +6,7 @@ import copy
 from typing import TYPE_CHECKING
 
 from sw_finetuning.distillation import DistillationStage, PseudoViewSampler
-from sw_finetuning.pruning import scores_of
+from sw_finetuning.importance import KeepImportance
 
 from splatwizard_core.api import (
     CameraIterator,
@@ -15,8 +15,6 @@ from splatwizard_core.api import (
     LossPack,
     ParamGroup,
     Pruner,
-    Rasterizer,
-    Scene,
     SplatOptimizer,
 )
 from sw_chimerags.model import MaskedGaussians, MaskQuantizer
@@ -30,6 +28,7 @@ if TYPE_CHECKING:
         OptimizationParams,
         PipelineParams,
         RenderResult,
+        Scene,
         Scheduler,
         SplatModel,
         StageContext,
@@ -108,7 +107,6 @@ class MaskedDistillation(DistillationStage):
             super().register_pre_task(scheduler, ppl, opt)
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        # The last step makes no update, so the scores belong to the parameters that are encoded.
         scheduler.register_task(self.iterations, KeepImportance(self.pruner), name="calculate importance score")
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
@@ -117,17 +115,7 @@ class MaskedDistillation(DistillationStage):
         return LossPack(pack.total + self.config.mask.weight * mask, {**pack.parts, "mask": mask.detach()})
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        """The model with the importance of the Gaussians that it has: computed now if a task changed them since."""
+        """Return the model with the importance of its Gaussians, computed now if a task changed them since."""
         if isinstance(model, MaskedGaussians) and not model.has_importance():
             KeepImportance(self.pruner)(model, CameraIterator(scene.train), self._rasterizer, scene)
         return model
-
-
-class KeepImportance:
-    """Schedule task: scores every Gaussian over the training views, and the model keeps that."""
-
-    def __init__(self, pruner: Pruner) -> None:
-        self.pruner = pruner
-
-    def __call__(self, model: MaskedGaussians, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
-        model.set_importance(scores_of(self.pruner, model, cameras, rasterizer, scene))

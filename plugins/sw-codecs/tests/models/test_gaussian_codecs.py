@@ -10,7 +10,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
 from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import save_ply
+from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import load_plugins
 
 
@@ -79,7 +79,7 @@ def rows(model):
 
 
 def test_ply_is_the_file_that_is_exported(plugins, model, tmp_path):
-    save_ply(model, tmp_path / "model.ply")
+    export_ply(model, tmp_path / "model.ply")
     reader = ContainerReader(written(plugins, "gaussians-ply", model).to_bytes(), "file.swz")
     assert reader.section("ply") == (tmp_path / "model.ply").read_bytes()
     assert len(reader.section("ply")) == pytest.approx(248 * model.num_rows, abs=1600)

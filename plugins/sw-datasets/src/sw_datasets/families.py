@@ -22,7 +22,7 @@ INDOOR = ("room", "counter", "kitchen", "bonsai")
 
 @dataclass(frozen=True)
 class Pictures:
-    """Which pictures of a scene are used, and how large.
+    """The picture folder and the size at which a scene is used.
 
     folder      picture folder; None: the layout has none to choose
     resolution  -1 (1600 px rule), 1, 2, 4, 8, or a width in pixels
@@ -40,23 +40,28 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Family:
-    """One dataset family: what a folder of it is read with unless the user says otherwise.
+    """One dataset family and the rules its scenes are read by unless the user says otherwise.
 
     name            registry name, and the dataset in protocol ids
     title           as papers write it
+    summary         one line for lists
     scenes          published scenes, by folder name; empty: any scene
+    not_in_tables   those of `scenes` that the tables of the field leave out
     folders         names that the folder above the scenes has in the wild, besides `name`
     split           "every8", "lod:30", "file", "all"
     background      "black" or "white"
     pictures        protocol name -> pictures
     views           (train, test) views of every published scene, where all have the same number
     prefix          what may stand before a scene's name in its folder's name ("scan" before DTU's "24")
+    looks_for       file of a layout that only this family has, for messages
     signs           files and folders that lie in every scene of the family and seldom elsewhere
     """
 
     name: str
     title: str
+    summary: str
     scenes: tuple[str, ...] = ()
+    not_in_tables: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()
     split: str = "every8"
     background: Literal["black", "white"] = "black"
@@ -65,7 +70,13 @@ class Family:
     )
     views: tuple[int, int] | None = None
     prefix: str = ""
+    looks_for: str = ""
     signs: tuple[str, ...] = ()
+
+    @property
+    def table_scenes(self) -> tuple[str, ...]:
+        """The published scenes that the tables of the field report."""
+        return tuple(scene for scene in self.scenes if scene not in self.not_in_tables)
 
     def scene_of(self, folder: str) -> str | None:
         """The published scene that a folder of this name is; None if it is none of them."""
@@ -93,6 +104,7 @@ BENCHMARKS: Mapping[str, Family] = MappingProxyType(
             Family(
                 "mipnerf360",
                 "Mip-NeRF 360",
+                "Mip-NeRF 360: COLMAP, nine scenes, every 8th view tested",
                 scenes=OUTDOOR + INDOOR,
                 folders=("360_v2", "mip-nerf360", "mip-nerf-360", "mip_nerf_360", "nerf_real_360"),
                 pictures=MappingProxyType(
@@ -108,18 +120,34 @@ BENCHMARKS: Mapping[str, Family] = MappingProxyType(
                 ),
                 signs=("images_2", "images_4", "images_8"),
             ),
-            Family("tandt", "Tanks & Temples", scenes=("train", "truck"), folders=("tanks_and_temples",)),
-            Family("db", "Deep Blending", scenes=("drjohnson", "playroom"), folders=("deep_blending",)),
+            Family(
+                "tandt",
+                "Tanks & Temples",
+                "Tanks & Temples: COLMAP, train and truck, every 8th view tested",
+                scenes=("train", "truck"),
+                folders=("tanks_and_temples",),
+            ),
+            Family(
+                "db",
+                "Deep Blending",
+                "Deep Blending: COLMAP, drjohnson and playroom, every 8th view tested",
+                scenes=("drjohnson", "playroom"),
+                folders=("deep_blending",),
+            ),
             Family(
                 "bungee",
                 "BungeeNeRF",
+                "BungeeNeRF: COLMAP or poses_enu.json, the first 31 views tested",
                 scenes=("amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome", "56Leonard", "Transamerica"),
+                not_in_tables=("56Leonard", "Transamerica"),  # the two of the original BungeeNeRF release
                 folders=("bungeenerf", "bungee_nerf", "bungee-nerf", "bungee_original"),
+                looks_for="poses_enu.json (BungeeNeRF)",
                 split="lod:30",  # as Scaffold-GS, HAC and CAT-3DGS run it: the first 31 views are tested
             ),
             Family(
                 "nerf_synthetic",
                 "NeRF Synthetic",
+                "NeRF Synthetic: Blender, eight scenes, own split, white",
                 scenes=("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship"),
                 folders=("nerf-synthetic", "nerfsynthetic"),
                 split="file",
@@ -131,6 +159,7 @@ BENCHMARKS: Mapping[str, Family] = MappingProxyType(
             Family(
                 "dtu",
                 "DTU",
+                "DTU: COLMAP with masks and cameras.npz, half size, all views",
                 scenes=tuple(str(n) for n in (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)),
                 split="all",
                 pictures=_both(Pictures(resolution=2)),
@@ -141,6 +170,18 @@ BENCHMARKS: Mapping[str, Family] = MappingProxyType(
 )
 """The six families that published tables use, by registry name."""
 
-COLMAP = Family("colmap", "COLMAP")
-BLENDER = Family("blender", "Blender", split="file", background="white", pictures=_both(Pictures(folder=None)))
-DEMO = Family("demo", "the procedural scene", pictures=_both(Pictures(folder=None)))
+COLMAP = Family("colmap", "COLMAP", "COLMAP reconstruction, binary or text, pinhole cameras")
+BLENDER = Family(
+    "blender",
+    "Blender",
+    "transforms_train.json / transforms_test.json with RGBA pictures",
+    split="file",
+    background="white",
+    pictures=_both(Pictures(folder=None)),
+)
+DEMO = Family(
+    "demo",
+    "the procedural scene",
+    "procedural scene with exact geometry, made on the spot",
+    pictures=_both(Pictures(folder=None)),
+)

@@ -1,29 +1,34 @@
-"""What this package provides: loaders, the six published data sets, the demo scene, and the command `sw data`."""
+"""Registers the readers of scenes, the six published data sets, the demo scene, and the command `sw data`."""
 
 from splatwizard_core.api import Registry, hookimpl
+from sw_datasets.families import BENCHMARKS, BLENDER, COLMAP, DEMO
+
+LOADERS = "sw_datasets.loaders"
 
 
 @hookimpl
 def register_datasets(registry: Registry) -> None:
-    registry.add("colmap", "sw_datasets.colmap:ColmapDataset",
-                 summary="COLMAP reconstruction, binary or text, pinhole cameras")  # fmt: skip
-    registry.add("blender", "sw_datasets.blender:BlenderDataset",
-                 summary="transforms_train.json / transforms_test.json with RGBA pictures")  # fmt: skip
-    registry.add("demo", "sw_datasets.demo.dataset:DemoDataset",
-                 default=True, summary="procedural scene with exact geometry, made on the spot")  # fmt: skip
-    collections = "sw_datasets.collections"
-    registry.add("mipnerf360", f"{collections}:MIPNERF360",
-                 summary="Mip-NeRF 360: COLMAP, nine scenes, every 8th view tested")  # fmt: skip
-    registry.add("tandt", f"{collections}:TANDT",
-                 summary="Tanks & Temples: COLMAP, train and truck, every 8th view tested")  # fmt: skip
-    registry.add("db", f"{collections}:DB",
-                 summary="Deep Blending: COLMAP, drjohnson and playroom, every 8th view tested")  # fmt: skip
-    registry.add("bungee", f"{collections}:BUNGEE",
-                 summary="BungeeNeRF: COLMAP or poses_enu.json, the first 31 views tested")  # fmt: skip
-    registry.add("nerf_synthetic", f"{collections}:NERF_SYNTHETIC",
-                 summary="NeRF Synthetic: Blender, eight scenes, own split, white")  # fmt: skip
-    registry.add("dtu", f"{collections}:DTU_SCANS",
-                 summary="DTU: COLMAP with masks and cameras.npz, half size, all views")  # fmt: skip
+    registry.add(COLMAP.name, f"{LOADERS}.colmap:ColmapDataset",
+                 looks_for="sparse/0/cameras.bin or .txt (COLMAP)",
+                 without_poses="run COLMAP on them first "
+                 "(colmap automatic_reconstructor --image_path ... --workspace_path {path})",
+                 summary=COLMAP.summary)  # fmt: skip
+    registry.add(BLENDER.name, f"{LOADERS}.blender:BlenderDataset",
+                 looks_for="transforms_train.json (Blender)",
+                 summary=BLENDER.summary)  # fmt: skip
+    registry.add(DEMO.name, "sw_datasets.demo.dataset:DemoDataset", default=True, procedural=True,
+                 summary=DEMO.summary)  # fmt: skip
+    for family in BENCHMARKS.values():
+        looks_for = {"looks_for": family.looks_for} if family.looks_for else {}
+        registry.add(family.name, f"{LOADERS}.collections:{family.name.upper()}", summary=family.summary,
+                     title=family.title, scenes=list(family.scenes), table_scenes=list(family.table_scenes),
+                     folders=list(family.folders), prefix=family.prefix, **looks_for)  # fmt: skip
+
+
+@hookimpl
+def register_downloads(registry: Registry) -> None:
+    registry.add("public", "sw_datasets.downloads.registry:public_data",
+                 summary="the published data sets: addresses and sizes")  # fmt: skip
 
 
 @hookimpl

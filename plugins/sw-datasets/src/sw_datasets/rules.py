@@ -1,4 +1,4 @@
-"""From a family's table and what the user asked for to the rules one scene is read by, every value decided."""
+"""The rules that one scene is read by, decided from the family's table and from the user's options."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sw_datasets.families import PROTOCOLS, Family
 
 @dataclass(frozen=True)
 class Rules:
-    """How one scene is read.
+    """Rules that one scene is read by.
 
     family      row of the table
     scene       its published scene, None for any other folder
@@ -46,7 +46,7 @@ class Rules:
         return "custom"
 
     def protocol(self, label: str | None = None) -> Protocol:
-        """What the record keeps.
+        """The protocol that the record keeps.
 
         label   stands for the picture folder where the layout has none
         """
@@ -63,8 +63,8 @@ class Rules:
         )
 
 
-def settle(family: Family, folder: str, options: SceneOptions) -> Rules:
-    """The rules for a scene folder: what the user gave, else what the family's table says.
+def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
+    """Decide the rules for a scene folder: the user's options, else the values of the family's table.
 
     folder  name of the scene's folder
 
@@ -101,8 +101,8 @@ def settle(family: Family, folder: str, options: SceneOptions) -> Rules:
     )
 
 
-def of_no_use(options: SceneOptions, keys: Iterable[str], family: Family) -> list[str]:
-    """A warning for each of `keys` that was given a value although scenes of the family have no use for it.
+def unused_option_warnings(options: SceneOptions, keys: Iterable[str], family: Family) -> list[str]:
+    """Warn of each of `keys` that was given a value although scenes of the family have no use for it.
 
     A named protocol is of no use where nothing is published.
     """

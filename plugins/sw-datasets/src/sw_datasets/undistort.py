@@ -1,5 +1,6 @@
-"""A COLMAP scene with lens distortion becomes a pinhole one: pictures resampled by pycolmap, poses and points as they
-are, and no black border, not one pixel of it.
+"""Copies a COLMAP scene with lens distortion to a pinhole one.
+
+Pictures are resampled by pycolmap and cut so that no pixel of a black border is left; poses and points stay.
 """
 
 from __future__ import annotations
@@ -18,10 +19,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatwizard_core.api import CapabilityError, SceneError, track
-from splatwizard_core.scene.images import FORMATS, find_pictures, load_mask, load_picture, picture_header
 from splatwizard_core.tooling import new_folder
-from sw_datasets.colmap import MAX_SIDE, PLAIN_FOCALS, RADIAL_FOCALS, mask_files, model_folder
-from sw_datasets.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model, write_model
+from sw_datasets.loaders.colmap import MAX_SIDE, PLAIN_FOCALS, RADIAL_FOCALS, mask_files, model_folder
+from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapModel, read_model, write_model
+from sw_datasets.pictures import FORMATS, find_pictures, load_mask, load_picture, picture_header
 
 SMALLEST_SHARE = 0.5
 """Of the undistorted picture that must survive when black corners are cut off; less means broken coefficients."""
@@ -31,7 +32,7 @@ Size = tuple[int, int]
 
 @dataclass(frozen=True)
 class Undistorted:
-    """What was written: images in all, how many of them were resampled, masks, cameras, points."""
+    """Counts of what was written: images in all, how many of them were resampled, masks, cameras, points."""
 
     images: int
     undistorted: int
@@ -42,7 +43,7 @@ class Undistorted:
 
 @dataclass(frozen=True)
 class _Lens:
-    """How pictures of one size by one camera are undistorted.
+    """Undistortion of the pictures of one size by one camera.
 
     distorted   pycolmap.Camera of the file's size
     camera      the pinhole camera of the result
@@ -118,12 +119,12 @@ def is_pinhole(camera: ColmapCamera) -> bool:
 
 
 def load_pycolmap() -> Any:
-    """The module. Raises CapabilityError that says how to install it."""
+    """Import pycolmap. Raises CapabilityError that says how to install it."""
     try:
         return importlib.import_module("pycolmap")
     except ImportError as error:
         raise CapabilityError(
-            f"undistorting needs the package pycolmap ({error}): pip install 'splatwizard-core[pycolmap]'",
+            f"undistorting needs the package pycolmap ({error}): pip install 'sw-datasets[pycolmap]'",
             missing=["pycolmap"],
         ) from error
 

@@ -1,4 +1,4 @@
-"""Whether a scene on disk is whole: it loads, every picture has a readable header, nothing changed since it came."""
+"""Checks that a scene on disk is whole: it loads, its pictures are readable, its files are those that were unpacked."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.api import PluginManager, Scene, SceneError, SceneOptions, SplatwizardError, View, track
-from splatwizard_core.scene.images import find_pictures, is_inside, picture_header
 from splatwizard_core.tooling import file_sha256, load_scene
+from sw_datasets.pictures import find_pictures, is_inside, picture_header
 
 MAX_PROBLEMS = 5
 """Of one kind; more are counted."""
@@ -18,7 +18,7 @@ MAX_PROBLEMS = 5
 
 @dataclass
 class Verdict:
-    """What was found in one scene.
+    """Result of checking one scene.
 
     cameras     different intrinsics
     pictures    picture folder -> pictures whose header was read
@@ -55,7 +55,7 @@ def verify_scene(
     checksums: bool = False,
     decode: bool = False,
 ) -> Verdict:
-    """Check one scene folder; what is wrong is in the verdict, never raised.
+    """Check one scene folder; faults stand in the verdict and are never raised.
 
     family      dataset family that reads it; None: whichever recognises it
     needs       files and folders that must be there
@@ -131,7 +131,7 @@ def _decode(name: str, views: Sequence[View]) -> list[str]:
 
 
 def _changed(path: Path, recorded: Mapping[str, Any], *, checksums: bool) -> list[str]:
-    """What differs from the record of the unpacked files."""
+    """Differences from the record of the unpacked files, a line each."""
     problems = []
     with track(f"checksums of {path.name}", total=len(recorded), unit="files") as bar:
         for name, noted in recorded.items():

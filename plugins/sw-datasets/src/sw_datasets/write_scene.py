@@ -1,4 +1,4 @@
-"""Writes a scene as a folder that the loaders, and other programs, read."""
+"""Writes a scene as a folder in a layout that the loaders and other programs read."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from splatwizard_core.api import Camera, ConfigError, PointCloud, Scene, SceneError, View, track
-from splatwizard_core.scene.images import is_inside
 from splatwizard_core.tooling import write_atomic
-from sw_datasets.colmap_model import (
+from sw_datasets.loaders.colmap_model import (
     ColmapCamera,
     ColmapImage,
     ColmapModel,
     ColmapPoints,
     write_model,
 )
+from sw_datasets.pictures import is_inside
 
 FORMATS = ("colmap", "blender")
 

@@ -1,6 +1,5 @@
-"""What works on this machine, found out by trying it, and the line that mends what does not."""
+"""Diagnosis of a machine: each part is tried, and what does not work comes with the line that mends it."""
 
-from sw_doctor.check import Check, State
 from sw_doctor.diagnosis import Diagnosis, examine
 
-__all__ = ["Check", "Diagnosis", "State", "examine"]
+__all__ = ["Diagnosis", "examine"]

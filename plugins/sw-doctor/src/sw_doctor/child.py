@@ -1,4 +1,4 @@
-"""Tests that may take their process down, or hang, run in a process of its own that reports one JSON line a test."""
+"""A process for steps that may take it down, or hang; it reports one JSON line a step."""
 
 from __future__ import annotations
 
@@ -10,17 +10,18 @@ import sys
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from sw_doctor.check import Check, one_line
+from splatwizard_core.tooling import Check
+from sw_doctor.text import one_line
 
 Step = Callable[[], list[Check]]
 
 
 @dataclass(frozen=True)
 class Answer:
-    """What a child process told before it ended.
+    """Findings of a child process.
 
     checks      of the steps that ended
-    died_in     name of the step that it died in, and how; None if it ended by itself
+    died_in     name of the step that it died in, and how; None if all steps ended
     """
 
     checks: list[Check]
@@ -28,19 +29,20 @@ class Answer:
 
 
 def serve(steps: Iterable[tuple[str, Step]]) -> None:
-    """In the child: run the steps one by one and report each on what was stdout.
+    """Run the steps one by one, in the child, and report each on what was stdout.
 
-    An exception of a step is its caller's to turn into a finding; one that gets here is a broken check in its name.
+    A step turns its exceptions into findings of its own; one that gets here is a broken check in its name.
     """
     report = os.fdopen(os.dup(1), "w", encoding="utf-8")
     os.dup2(2, 1)  # what imported packages print must not stand between the lines
     for name, step in steps:
         print(json.dumps({"begin": name}), file=report, flush=True)
         try:
-            found = step()
-        except Exception as error:
-            found = [Check(name, name, "broken", one_line(f"{type(error).__name__}: {error}"))]
-        print(json.dumps({"checks": [c.as_dict() for c in found]}), file=report, flush=True)
+            told = json.dumps({"checks": [check.as_dict() for check in step()]}, allow_nan=False)
+        except (Exception, SystemExit) as error:
+            found = Check(name, name, "broken", one_line(f"{type(error).__name__}: {error}"))
+            told = json.dumps({"checks": [found.as_dict()]})
+        print(told, file=report, flush=True)
 
 
 def ask(module: str, arguments: Sequence[str] = (), *, timeout: float) -> Answer:
@@ -60,14 +62,17 @@ def ask(module: str, arguments: Sequence[str] = (), *, timeout: float) -> Answer
 
 def _answer(output: bytes, end: str | None) -> Answer:
     checks: list[Check] = []
-    begun = "its start"
+    begun, answered = "its start", True
     for line in output.decode("utf-8", errors="replace").splitlines():
         try:
             told = json.loads(line)
         except ValueError:  # the line in which it died
             break
         if "begin" in told:
-            begun = told["begin"]
+            begun, answered = told["begin"], False
         else:
             checks += [Check(**content) for content in told["checks"]]
+            answered = True
+    if end is None and not answered:
+        end = "ended before it had answered"
     return Answer(checks, None if end is None else (begun, end))

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.cli.setup import DEFAULT_METHOD
 from splatwizard_core.tooling import debug_option, json_option, options, print_json
 
 if TYPE_CHECKING:
@@ -25,7 +24,7 @@ def doctor(as_json: bool) -> None:
     """
     from sw_doctor import examine
 
-    found = examine(DEFAULT_METHOD)
+    found = examine()
     if as_json:
         print_json(found.as_dict())
     else:
@@ -35,7 +34,7 @@ def doctor(as_json: bool) -> None:
 
 
 def _print(found: Diagnosis) -> None:
-    """No table: the lines that mend are to be copied whole."""
+    """Print the findings, not as a table: the lines that mend are to be copied whole."""
     width = max(len(c.name) for c in found.checks if c.group != "main job")
     group = ""
     for check in found.checks:

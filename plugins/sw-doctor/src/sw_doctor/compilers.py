@@ -1,4 +1,4 @@
-"""The C++ and the CUDA compiler, each asked to compile a few lines."""
+"""Checks of the C++ and the CUDA compiler: each compiles a few lines."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.tooling import NativeBuildError, find_compiler, find_nvcc, nvcc_version
-from sw_doctor.check import Check, one_line
+from splatwizard_core.tooling import Check, installed_compilers
+from sw_doctor.text import one_line
 
 GROUP = "compilers"
 SECONDS = 30.0
@@ -34,11 +34,11 @@ CUDA_LINES = "__global__ void doctor(float *x) { x[threadIdx.x] += 1.0f; }\n"
 
 def check_cxx() -> Check:
     """Compile and link a shared library of a few lines, with the flags that kernels need."""
-    try:
-        command = find_compiler()
-    except NativeBuildError as error:
+    found = installed_compilers()
+    command = found.cxx
+    if command is None:
         if os.environ.get("CXX", "").strip():
-            return Check(GROUP, "C++", "broken", one_line(error), "unset CXX, or set it to a compiler")
+            return Check(GROUP, "C++", "broken", one_line(found.problem), "unset CXX, or set it to a compiler")
         return Check(GROUP, "C++", "missing", "no g++, c++ or clang++ on the PATH", how_to_get_a_compiler())
     flags = ["-std=c++20", "-O1", "-fPIC", "-shared", *(["-fopenmp"] if sys.platform != "darwin" else [])]
     problem = _compile(command, flags, CXX_LINES, "doctor.cpp")
@@ -57,10 +57,10 @@ def check_nvcc() -> Check:
 
     Whether the release fits torch is for `judge_nvcc` to say.
     """
-    nvcc = find_nvcc()
+    found = installed_compilers()
+    nvcc, version = found.nvcc, found.nvcc_release
     if nvcc is None:
         return Check(GROUP, "nvcc", "missing", "no CUDA compiler on the PATH, in $CUDA_HOME or in /usr/local/cuda")
-    version = nvcc_version(nvcc)
     release = None if version is None else f"{version[0]}.{version[1]}"
     facts = {"path": nvcc, "release": release}
     problem = None if _torch_is_cpu_build() else _compile([nvcc], ["-c"], CUDA_LINES, "doctor.cu")
@@ -71,7 +71,7 @@ def check_nvcc() -> Check:
 
 
 def judge_nvcc(nvcc: Check, torch_cuda: str | None) -> Check:
-    """`nvcc` again, knowing for which CUDA torch is built (None: for none): what it is good for, and if it fits.
+    """Judge the finding about nvcc, knowing for which CUDA torch is built (None: for none).
 
     Kernels and torch must be of one major release: the runtime libraries of two do not mix in a process.
     """
@@ -99,7 +99,7 @@ def _torch_is_cpu_build() -> bool:
 
 
 def how_to_get_a_compiler() -> str:
-    """One line for this system."""
+    """Line that installs a compiler on this system."""
     if sys.platform == "darwin":
         return "xcode-select --install"
     if shutil.which("apt-get") is not None:
@@ -110,7 +110,7 @@ def how_to_get_a_compiler() -> str:
 
 
 def _compile(command: list[str], flags: list[str], lines: str, name: str) -> str | None:
-    """Why these lines do not compile, in one line; None if they do."""
+    """Compile these lines; return in one line why they do not compile, or None."""
     with tempfile.TemporaryDirectory(prefix="sw-doctor-") as folder:
         source, output = Path(folder) / name, Path(folder) / "out"
         source.write_text(lines)

@@ -1,4 +1,4 @@
-"""All checks, run side by side, in the order in which they are read."""
+"""Runs all checks side by side, and puts their findings into the order in which they are read."""
 
 from __future__ import annotations
 
@@ -9,88 +9,81 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-from splatwizard_core.tooling import PluginError
+from splatwizard_core.tooling import Check, Entry, PluginError, load_plugins
 from sw_doctor import child, compilers, packages, system
-from sw_doctor.check import SLOWLY, Check, one_line
+from sw_doctor.registered import MAIN_JOB, SECONDS, needs_of, run_registered
+from sw_doctor.text import SLOWLY, one_line
 
-DIED_IN = {"torch": ("torch", "CUDA"), "metrics": ("LPIPS",), "rasterizers": ("rasterizers",), "main job": ("sw run",)}
+DIED_IN = {"torch": ("torch", "CUDA"), "rasterizers": ("rasterizers",), MAIN_JOB: ("sw run",)}
 PROBE = "sw_doctor.probe"
-METRICS = "sw_metrics.check"
-PROBE_SECONDS = 120.0  # torch from a slow network disk takes long; a hang has to end all the same
 GROUPS = (
-    "main job", "system", "torch", "compilers", "kernels", "rasterizers", "plugins", "packages", "metrics", "data",
+    MAIN_JOB, "system", "torch", "compilers", "kernels", "rasterizers", "plugins", "packages", "metrics", "data",
 )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """What was found, in reading order.
-
-    ok  `sw run` on the demo scene can run: no needed check is missing or broken
-    """
+    """Findings in reading order, and the seconds that they took."""
 
     checks: list[Check]
     seconds: float
 
     @property
     def ok(self) -> bool:
+        """Whether `sw run` on the demo scene can run: no needed check is missing or broken."""
         return all(c.state == "ok" for c in self.checks if c.needed)
 
     def as_dict(self) -> dict[str, Any]:
-        """What `sw doctor --json` prints."""
+        """Plain values, as `sw doctor --json` prints them."""
         return {"ok": self.ok, "seconds": round(self.seconds, 2), "checks": [c.as_dict() for c in self.checks]}
 
 
-def examine(method: str) -> Diagnosis:
-    """Try everything; `method` is what `sw run` trains unless told otherwise.
+def examine() -> Diagnosis:
+    """Try everything that `sw run` and the installed packages need.
 
-    What torch is needed for, what packages do when imported and what compilers do happens in other processes at the
+    Whatever imports torch or a package, runs a compiler or was registered by a plugin does so in other processes at the
     same time, so a crash there is a finding here.
     """
     started = time.monotonic()
     with ThreadPoolExecutor(max_workers=5) as pool:
-        probe = pool.submit(child.ask, PROBE, [method], timeout=PROBE_SECONDS)
-        metrics = pool.submit(child.ask, METRICS, timeout=PROBE_SECONDS)
+        probe = pool.submit(child.ask, PROBE, timeout=SECONDS)
         cxx = pool.submit(_guarded, "C++", compilers.check_cxx)
         nvcc = pool.submit(_guarded, "nvcc", compilers.check_nvcc)
         checks, distributions = plugin_checks()
+        registered = [(entry, pool.submit(run_registered, entry)) for entry in registered_entries()]
         needs = packages.collect_needs(distributions)
         problems = pool.submit(packages.try_imports, needs.names())
         for check in (system.check_python, system.check_memory, system.check_cores, system.check_cache,
                       system.check_working_folder):  # fmt: skip
             checks.append(_guarded(check.__name__, check))
         checks += probed(probe.result())
-        if any(c.name == "torch" and c.state == "ok" for c in checks):  # without it that process can only fail
-            checks += probed(metrics.result(), needed=False)
         torch_cuda = next((c.facts.get("cuda") for c in checks if c.name == "torch"), None)
         checks += [cxx.result(), compilers.judge_nvcc(nvcc.result(), torch_cuda)]
         checks += packages.package_checks(needs, problems.result())
+        works = {check.name for check in checks if check.state == "ok"}
+        theirs = [check for entry, found in registered if needs_of(entry) <= works for check in found.result()]
     obstacle = next((c for c in checks if c.name in ("C++", "cache folder") and c.state != "ok"), None)
     if obstacle is not None:
         checks = [_without_builds(c, obstacle) for c in checks]
+    checks += theirs
     order = {group: place for place, group in enumerate(GROUPS)}
     checks.sort(key=lambda c: order.get(c.group, len(order)))
     return Diagnosis(checks, time.monotonic() - started)
 
 
-def probed(answer: child.Answer, *, needed: bool = True) -> list[Check]:
-    """The checks of a process; what it died in, if it died, is broken, and with it the main job if that does the same.
-
-    needed  the main job does what this process did
-    """
+def probed(answer: child.Answer) -> list[Check]:
+    """Findings of the probe; the step that it died in, if it died, is broken, and with it the main job."""
     checks = list(answer.checks)
     if answer.died_in is not None:
         step, how = answer.died_in
         group = next((g for g, steps in DIED_IN.items() if step in steps), "kernels" if ":" in step else "plugins")
         mend = "sw build-kernels --force" if group == "kernels" else "pip install --force-reinstall torch"
-        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, needed))
+        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, True))
     return checks
 
 
 def plugin_checks() -> tuple[list[Check], list[str]]:
-    """(one check a plugin and one a clash of names, names of the distributions)."""
-    from splatwizard_core.tooling import load_plugins
-
+    """Check every plugin, and every name that several claim; also return the names of the distributions."""
     try:
         plugins = load_plugins()
     except PluginError as error:
@@ -115,6 +108,14 @@ def plugin_checks() -> tuple[list[Check], list[str]]:
             checks.append(Check("plugins", f"{kind} {name}", "broken", f"claimed by {' and '.join(owners)}",
                                 f"pip uninstall {owners[-1]}"))  # fmt: skip
     return checks, [info.distribution for info in plugins.plugins]
+
+
+def registered_entries() -> list[Entry]:
+    """Checks that the installed plugins register."""
+    try:
+        return list(load_plugins().checks)
+    except PluginError:  # told by `plugin_checks`
+        return []
 
 
 def _guarded(name: str, check: Callable[[], Check]) -> Check:

@@ -7,9 +7,10 @@ import importlib
 import importlib.metadata
 import sys
 
-from sw_doctor.check import Check, one_line
+from splatwizard_core.tooling import Check
 from sw_doctor.child import serve
 from sw_doctor.packages import import_names
+from sw_doctor.text import one_line
 
 
 def import_distribution(name: str) -> list[Check]:

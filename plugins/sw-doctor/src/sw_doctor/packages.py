@@ -1,4 +1,4 @@
-"""What the installed packages of the workspace and of third parties need, and what they can use besides."""
+"""Requirements and extras of the installed packages of the workspace and of third parties."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from importlib.metadata import Distribution, PackageNotFoundError
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.utils import canonicalize_name
 
+from splatwizard_core.tooling import Check, State
 from sw_doctor import child
-from sw_doctor.check import Check, State, one_line
+from sw_doctor.text import one_line
 
 IMPORTS = "sw_doctor.imports"
 SECONDS = 60.0  # for all imports together; a package that hangs is cut off
@@ -66,7 +67,7 @@ def collect_needs(distributions: Iterable[str]) -> Needs:
 
 
 def installed(requirement: Requirement) -> str | None:
-    """What is wrong with the installed version, in one line; None if it is there and new enough."""
+    """Say in one line what is wrong with the installed version; None if it is there and new enough."""
     try:
         version = importlib.metadata.version(requirement.name)
     except PackageNotFoundError:
@@ -77,7 +78,7 @@ def installed(requirement: Requirement) -> str | None:
 
 
 def import_names(dist: Distribution) -> list[str]:
-    """The top-level modules that a distribution brings, leaving out private and test ones; [] if it does not tell."""
+    """Top-level modules that a distribution brings, leaving out private and test ones; [] if it does not tell."""
     told = (dist.read_text("top_level.txt") or "").split()
     if not told:
         paths = [p for p in dist.files or [] if p.suffix in (".py", ".so", ".pyd") and ".." not in p.parts]

@@ -1,4 +1,4 @@
-"""What this package provides: the command `sw doctor`."""
+"""Registers the command `sw doctor`."""
 
 from splatwizard_core.api import Registry, hookimpl
 

@@ -1,4 +1,4 @@
-"""`python -m sw_doctor.probe METHOD`: everything that needs torch, tried in this process.
+"""`python -m sw_doctor.probe`: everything that needs torch, tried in this process.
 
 Kernels are loaded and pictures drawn here, so that a crash takes this process and not the one that reports it. Nothing
 is compiled.
@@ -10,31 +10,35 @@ import contextlib
 import importlib
 import logging
 import os
+import pkgutil
 import re
-import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from splatwizard_core.api import PluginManager, SplatwizardError
 from splatwizard_core.tooling import (
+    Check,
     Entry,
     NativeBuildError,
     PluginError,
+    State,
     declared_modules,
     load_plugins,
-    resolve_module,
 )
-from sw_doctor.check import SLOWLY, Check, State, one_line
 from sw_doctor.child import Step, serve
+from sw_doctor.text import SLOWLY, one_line
 
+if TYPE_CHECKING:
+    from splatwizard_core.api import Rasterizer
+
+METHOD, SCENES, RASTERIZERS = "sw-3dgs", "sw-datasets", "sw-rasterizers"
+"""Packages that `sw run` needs besides the core: what it trains, on which scene, drawn by what."""
 MOST_FOLDERS = 500  # a data folder may be a file server; who has more scenes sees how many were looked at
 
 
-def steps(method: str) -> Iterator[tuple[str, Step]]:
-    """All of them, in order; the later ones need torch, and without it there are none.
-
-    method  what `sw run` trains unless told otherwise
-    """
+def steps() -> Iterator[tuple[str, Step]]:
+    """Yield (name, step) in order; the later ones need torch, and without it there are none."""
     yield "torch", check_torch
     if not _imports("torch"):
         return
@@ -48,7 +52,7 @@ def steps(method: str) -> Iterator[tuple[str, Step]]:
     yield "entries", lambda: check_entries(plugins)
     yield "rasterizers", lambda: check_rasterizers(plugins)
     yield "scenes", lambda: [check_scenes(plugins)]
-    yield "sw run", lambda: [check_main_job(plugins, method)]
+    yield "sw run", lambda: [check_main_job(plugins)]
 
 
 def _imports(module: str) -> bool:
@@ -131,10 +135,16 @@ def nvidia_driver() -> str | None:
 
 def check_kernels(target: str) -> Check:
     """Load a native module if it is built; it compiles nothing."""
+    from splatwizard_core.api import NativeModule
+
     try:
-        module = resolve_module(target)
-    except NativeBuildError as error:
-        return Check("kernels", target, "broken", one_line(error), "install the package again")
+        module = pkgutil.resolve_name(target)
+    except Exception as error:
+        why = one_line(f"cannot be imported: {type(error).__name__}: {error}")
+        return Check("kernels", target, "broken", why, "install the package again")
+    if not isinstance(module, NativeModule):
+        detail = f"it is not a NativeModule but {type(module).__name__}"
+        return Check("kernels", target, "broken", detail, "install the package again")
     build = "sw build-kernels"
     try:
         state = module.state()
@@ -161,7 +171,7 @@ def check_entries(plugins: PluginManager) -> list[Check]:
         for entry in registry:
             try:
                 entry.load()
-            except PluginError as error:
+            except (PluginError, SystemExit) as error:
                 mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
                 checks.append(Check("plugins", f"{entry.kind} {entry.name}", "broken", one_line(error), mend))
             else:
@@ -171,13 +181,16 @@ def check_entries(plugins: PluginManager) -> list[Check]:
 
 def check_rasterizers(plugins: PluginManager) -> list[Check]:
     """Let every rasterizer that can run here without a compiler draw a small picture, forward and backward."""
+    if not len(plugins.rasterizers):
+        return [Check("rasterizers", "none", "missing", "none is installed", _how_to_get([RASTERIZERS]))]
     return [_check_rasterizer(entry, plugins) for entry in plugins.rasterizers]
 
 
 def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
     import torch
 
-    from splatwizard_core.tooling import NegotiatedRasterizer, info_from_entry, obstacle
+    from splatwizard_core.api import RasterizerInfo
+    from splatwizard_core.tooling import NegotiatedRasterizer
 
     device = "cpu" if "cpu" in entry.declared.get("devices", ("cpu",)) else "cuda"
     where = ", ".join(entry.declared.get("devices", ("cpu",)))
@@ -188,7 +201,7 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         detail = f"its kernels '{lacking.name}' are not loaded"
         return Check("rasterizers", entry.name, lacking.state, detail, lacking.mend)
     try:
-        why = obstacle(info_from_entry(entry).on(device), torch.device(device))
+        why = RasterizerInfo.from_entry(entry).obstacle(device)
         if why is not None:
             what, mend = _with_command_apart(why)
             return Check("rasterizers", entry.name, "missing", one_line(what), mend)
@@ -210,13 +223,13 @@ def _with_command_apart(why: str) -> tuple[str, str | None]:
 
 
 def _lacking_kernels(entry: Entry) -> Check | None:
-    """The check of a native module that this rasterizer needs and that did not load."""
+    """Finding about a native module that this rasterizer needs and that did not load; None if all did."""
     native = entry.declared.get("native") or ()
     checks = [check_kernels(target) for target in ((native,) if isinstance(native, str) else native)]
     return next((check for check in checks if check.state != "ok"), None)
 
 
-def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> None:
+def _draw(rasterizer: Rasterizer, device: str, *, backward: bool, axes: int = 3) -> None:
     """Sixteen splats (two axes: surfels) on 32 x 24 pixels. Raises if the picture is empty, a gradient not finite."""
     import torch
 
@@ -236,7 +249,7 @@ def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> 
         32, 24, 30.0, 30.0, 16.0, 12.0, torch.eye(3, device=device), torch.tensor([0.0, 0, 2], device=device)
     )
     with torch.set_grad_enabled(backward):
-        image = rasterizer.render(splats, camera, RasterOptions()).image  # type: ignore[attr-defined]
+        image = rasterizer.render(splats, camera, RasterOptions()).image
     if not bool(torch.isfinite(image).all()) or float(image.detach().max()) < 0.5:
         raise SplatwizardError("drew a wrong picture of sixteen white splats")
     if backward:
@@ -246,7 +259,7 @@ def _draw(rasterizer: object, device: str, *, backward: bool, axes: int = 3) -> 
 
 
 def check_scenes(plugins: PluginManager) -> Check:
-    """Scenes below $SPLATWIZARD_DATA, recognised as `--scene dataset/scene` would."""
+    """Count the scenes below $SPLATWIZARD_DATA, recognised as `--scene dataset/scene` would."""
     root = os.environ.get("SPLATWIZARD_DATA")
     if not root:
         mend = "export SPLATWIZARD_DATA=/path/to/datasets  (the demo scene needs none)"
@@ -258,6 +271,8 @@ def check_scenes(plugins: PluginManager) -> Check:
     except OSError as error:
         mend = "set SPLATWIZARD_DATA to the folder that holds the data sets"
         return Check("data", "SPLATWIZARD_DATA", "broken", f"{error.filename}: {error.strerror}", mend)
+    if not len(plugins.datasets):
+        return Check("data", "SPLATWIZARD_DATA", "missing", "no loader is installed", _how_to_get([SCENES]))
     families = [entry.load() for entry in plugins.datasets]
     detectors = [target() if isinstance(target, type) else target for target in families]
     found: dict[str, int] = {}
@@ -272,22 +287,28 @@ def check_scenes(plugins: PluginManager) -> Check:
     return Check("data", "SPLATWIZARD_DATA", "ok", f"{folder}: {shown}{more}", facts={"scenes": found})
 
 
-def check_main_job(plugins: PluginManager, method: str) -> Check:
-    """Resolve `sw run` on the demo scene, and draw as its trainer would with what is built."""
+def check_main_job(plugins: PluginManager) -> Check:
+    """Resolve `sw run` of the default method on the default scene, and draw as its trainer would with what is built."""
     from splatwizard_core.tooling import NegotiatedRasterizer, choose_device, resolve
 
-    name = f"sw run --method {method} --scene demo"
+    method, scene = plugins.methods.default, plugins.datasets.default
+    if method is None or scene is None or not len(plugins.rasterizers):
+        parts = (("a method", METHOD, method), ("a scene", SCENES, scene),
+                 ("a rasterizer", RASTERIZERS, plugins.rasterizers.names))  # fmt: skip
+        absent = {what: package for what, package, found in parts if not found}
+        detail, mend = f"not installed: {', '.join(absent)}", _how_to_get(absent.values())
+        return Check("main job", "sw run", "broken", detail, mend, needed=True)
+    name = f"sw run --method {method} --scene {scene}"
     try:
-        resolved = resolve(plugins.methods.load(method), scene="demo")
-        plugins.datasets.load("demo")
+        resolved = resolve(plugins.methods.load(method), scene=scene)
+        plugins.datasets.load(scene)
         device = choose_device(resolved.ppl.device, plugins)
         lacking = {e.name: check for e in plugins.rasterizers if (check := _lacking_kernels(e)) is not None}
         rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=lacking)
         _draw(rasterizer, str(device), backward=True)
     except Exception as error:
-        mend = None if method in plugins.methods else _how_to_get(f"sw-{method}")
         why = str(error) if isinstance(error, SplatwizardError) else f"{type(error).__name__}: {error}"
-        return Check("main job", name, "broken", one_line(why), mend, needed=True)
+        return Check("main job", name, "broken", one_line(why), None, needed=True)
     drawn_by = next(iter(rasterizer.choices.values()))
     fast = plugins.rasterizers.entry(drawn_by).declared.get("speed", 0) > 0
     compiled_first = [] if fast else [n for n, c in lacking.items() if c.mend is not None and "build-kernels" in c.mend]
@@ -297,14 +318,14 @@ def check_main_job(plugins: PluginManager, method: str) -> Check:
         return Check("main job", name, "ok", detail, None, True, facts)
     if fast:
         return Check("main job", name, "ok", f"on {device}, drawn by '{drawn_by}'", None, True, facts)
-    mend = next((c.mend for c in lacking.values() if c.mend), _how_to_get("sw-rasterizers"))
+    mend = next((c.mend for c in lacking.values() if c.mend), _how_to_get([RASTERIZERS]))
     return Check("main job", name, "ok", f"on {device}, but {SLOWLY}", mend, True, facts)
 
 
-def _how_to_get(distribution: str) -> str:
-    return f"pip install {distribution}" if os.environ.get("SW_PLUGINS") is None else "unset SW_PLUGINS"
+def _how_to_get(distributions: Iterable[str]) -> str:
+    return f"pip install {' '.join(distributions)}" if os.environ.get("SW_PLUGINS") is None else "unset SW_PLUGINS"
 
 
 if __name__ == "__main__":
     logging.disable(logging.WARNING)  # what negotiation warns of is in the checks
-    serve(steps(sys.argv[1]))
+    serve(steps())

@@ -11,8 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.tooling import available_cores, cache_root
-from sw_doctor.check import Check, gigabytes, one_line
+from splatwizard_core.tooling import Check, available_cores, cache_root
+from sw_doctor.text import gigabytes, one_line
 
 GROUP = "system"
 OLDEST_PYTHON = (3, 10)
@@ -22,6 +22,7 @@ NEEDED_DISK = 0.1e9
 
 
 def check_python() -> Check:
+    """Compare the release of Python with the oldest that works."""
     found = f"{platform.python_version()}, {sys.platform}-{platform.machine()}, {sys.prefix}"
     if sys.version_info[:2] < OLDEST_PYTHON:
         return Check(GROUP, "Python", "broken", f"{found}: too old", "install Python 3.10 or newer", needed=True)
@@ -29,7 +30,7 @@ def check_python() -> Check:
 
 
 def check_memory() -> Check:
-    """What this process may use: of the machine, or of its container."""
+    """Measure the memory that this process may use: of the machine, or of its container."""
     import psutil
 
     machine = psutil.virtual_memory()
@@ -45,7 +46,7 @@ def check_memory() -> Check:
 
 
 def container_limit() -> int | None:
-    """Bytes that the control group of this process grants; None: no limit, or none that can be read."""
+    """Bytes that the control group of this process grants; None if there is no limit, or none that can be read."""
     for path in ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes"):
         with contextlib.suppress(OSError, ValueError):
             return int(Path(path).read_text())
@@ -53,6 +54,7 @@ def container_limit() -> int | None:
 
 
 def check_cores() -> Check:
+    """Count the cores that this process may use."""
     cores = available_cores()
     threads = os.environ.get("OMP_NUM_THREADS")
     said = f", OMP_NUM_THREADS={threads}" if threads else ""
@@ -60,13 +62,13 @@ def check_cores() -> Check:
 
 
 def check_cache() -> Check:
-    """Where compiled kernels go. Without it they cannot be built, and rendering is slow."""
+    """Write where compiled kernels go. Without it they cannot be built, and rendering is slow."""
     mend = "point SPLATWIZARD_CACHE to a writable folder: export SPLATWIZARD_CACHE=..."
     return _check_folder("cache folder", cache_root(), mend, False)
 
 
 def check_working_folder() -> Check:
-    """Where `sw run` writes unless --out says otherwise."""
+    """Write where `sw run` writes unless --out says otherwise."""
     return _check_folder("working folder", Path.cwd(), "change to a writable folder, or name one with --out", True)
 
 

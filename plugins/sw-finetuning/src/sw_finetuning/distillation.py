@@ -1,4 +1,4 @@
-"""Learning from a frozen teacher instead of photographs: a trained scene's renders, also from poses nobody stood at.
+"""Learning from a frozen teacher instead of photographs: a trained scene's renders, also from poses without a photograph.
 
 Source: LightGaussian (arXiv 2311.17245), distillation with pseudo views.
 """
@@ -29,7 +29,7 @@ DistillLoss = Literal["l1_ssim", "l2"]
 
 
 class PseudoViewSampler(CameraSampler):
-    """Training poses, most of them moved a little: views without a picture, for whoever has a teacher to ask.
+    """Training poses, most of them moved a little: those are views without a picture, for a teacher to draw.
 
     std     standard deviation of the camera centre's displacement along each axis, world units
     every   each `every`-th step keeps the training view as it is, the others move it; 1: none is moved
@@ -73,8 +73,7 @@ class DistillationStage(FineTuningStage):
     rates           step sizes of the student
     distill_loss    see `distillation_loss`
     pseudo_view_std, pseudo_view_every  see PseudoViewSampler
-    teacher         what teaches, set by `begin`: nobody's part and in no checkpoint, since `begin` finds the same one
-                    again on resume
+    teacher         the model that teaches, set by `begin`; in no checkpoint, since `begin` finds the same one on resume
     """
 
     name = "distill"
@@ -94,19 +93,10 @@ class DistillationStage(FineTuningStage):
         self.distill_loss = distill_loss
         self.pseudo_view_std, self.pseudo_view_every = pseudo_view_std, pseudo_view_every
 
-    @property
-    def starts_from(self) -> str | None:
-        return None
-
-    @property
-    def taught_by(self) -> tuple[str, ...]:
-        """Names of the methods whose trained scenes `find_teacher` asks for."""
-        return ("3dgs",)
-
     def find_teacher(self, context: StageContext) -> SplatModel:
-        """The frozen model that teaches: the trained scene of `taught_by`.
+        """Return the frozen model that teaches: the trained scene of `taught_by`, which a subclass names.
 
-        Override it for another one, and then `taught_by` too. It must be the same on resume: made from
+        Override it for a teacher that is no method's trained scene. It must be the same on resume: made from
         `context.trained(...)`, or a copy of `context.model`, which is what the stage before left.
         """
         return context.trained(self.taught_by[0])

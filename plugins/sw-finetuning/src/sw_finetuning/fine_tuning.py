@@ -1,11 +1,11 @@
-"""Training on from a trained 3DGS scene without densification: what pruning methods do between and after removals."""
+"""Training on from a trained scene of Gaussians without densification, as pruning methods do between removals."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
 from pydantic import Field
-from sw_gaussians.statistics import accumulate_statistics
+from sw_gaussians.statistics import clear_statistics, collect_statistics
 from torch import Tensor
 
 from splatwizard_core.api import (
@@ -28,9 +28,7 @@ from splatwizard_core.api import (
     exponential_lr,
     photometric_loss,
 )
-from splatwizard_core.training.plan import scaled
 
-GRADIENT_STATISTICS = ("grad_accum", "denom")
 CLEAR = -1  # before the same step's statistics are added
 
 
@@ -83,19 +81,6 @@ class UpdateRates:
                 optimizer.set_lr(name, rate)
 
 
-def collect_statistics(model: GaussianModel, result: RenderResult) -> None:
-    """Schedule task: adds this view's screen-space gradients (RasterOptions.grad2d) to the model's statistics."""
-    if result.grad2d is None:
-        raise ValueError("gradient statistics need RasterOptions(grad2d=True)")
-    accumulate_statistics(model, result.grad2d.value, result.radii)
-
-
-def clear_statistics(model: GaussianModel) -> None:
-    """Schedule task: forgets the screen-space gradients that were added up so far."""
-    for name in GRADIENT_STATISTICS:
-        getattr(model, name).zero_()
-
-
 def windows_before(removals: Iterable[int], length: int) -> list[range]:
     """The steps over which gradients are averaged for each of `removals` (steps, ascending): the `length` before it.
 
@@ -115,9 +100,10 @@ def collect_anew(scheduler: Scheduler, windows: Sequence[range]) -> None:
 
 
 class FineTuningStage(Stage):
-    """Goes on from a trained 3DGS scene: all SH bands active, fresh Adam, L1 + SSIM, nothing added.
+    """Goes on from trained Gaussians: all SH bands active, fresh Adam, L1 + SSIM, nothing added.
 
-    A method subclasses it and registers in `register_post_task` what removes Gaussians.
+    A method subclasses it, says in `starts_from` whose trained scene that is, and registers in `register_post_task`
+    what removes Gaussians.
 
     rates           step sizes
     lambda_dssim    weight of 1 - SSIM in the loss
@@ -132,14 +118,6 @@ class FineTuningStage(Stage):
         super().__init__(opt)
         self.rates, self.lambda_dssim = rates, lambda_dssim
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
-
-    @property
-    def starts_from(self) -> str | None:
-        return "3dgs"
-
-    def when(self, when: When) -> When:
-        """A plan of the full run, in steps of this one."""
-        return scaled(when, self.opt.schedule_scale)
 
     def begin(self, context: StageContext) -> SplatModel:
         model = context.model

@@ -51,7 +51,7 @@ def up_to(scores: Tensor, fraction: float) -> Tensor:
     """[N] bool, True for at most the score at index int(fraction (N - 1)) of the sorted `scores` [N].
 
     How the authors of PUP 3D-GS and of LightGaussian count: one more than the fraction, and all of many equal ones
-    (those that nobody sees).
+    (those that no view shows).
     """
     if len(scores) == 0:
         return torch.zeros(0, dtype=torch.bool, device=scores.device)

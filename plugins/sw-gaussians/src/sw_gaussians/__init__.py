@@ -1,1 +1,1 @@
-"""Training explicit Gaussians: the 3DGS stage, density control and MCMC of Splatwizard."""
+"""Training explicit Gaussians: the stage of 3DGS, its density control, and that of 3DGS-MCMC."""

@@ -76,7 +76,7 @@ class Loss(Params):
 
 
 class GaussianTraining(OptimizationParams):
-    """What the 3DGS stage reads; a method that trains Gaussians adds its own keys."""
+    """Hyper-parameters of the 3DGS stage; a method that trains Gaussians adds its own keys."""
 
     sh_interval: int = Field(1_000, ge=1, description="steps between increases of the active SH degree")
     sparse_adam: Literal["off", "none", "per_row"] = Field(

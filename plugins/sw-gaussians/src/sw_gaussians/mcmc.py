@@ -1,6 +1,6 @@
 """Densification as Markov chain Monte Carlo: dead Gaussians move to live ones, a few more join them, all are shaken.
 
-Functions on a model and on whatever edits its rows; schedule tasks around them are the business of plugins.
+Functions on a model and the optimizer that edits its rows; `mcmc_tasks` makes schedule tasks of them.
 Source: 3D Gaussian Splatting as Markov Chain Monte Carlo (arXiv 2404.09591).
 """
 

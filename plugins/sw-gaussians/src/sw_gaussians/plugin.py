@@ -1,4 +1,4 @@
-"""What this package provides: the tasks of 3DGS and of 3DGS-MCMC, and a pruner, for any method that wants them."""
+"""Registers the tasks of 3DGS and of 3DGS-MCMC, and a pruner, for any method that wants them."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -9,9 +9,10 @@ def register_tasks(registry: Registry) -> None:
                  summary="exponential decay of the means' step size, times the scene extent", factory=True)  # fmt: skip
     registry.add("increase-sh-degree", "sw_gaussians.tasks:increase_sh_degree",
                  summary="activate one more band of spherical harmonics", factory=False)  # fmt: skip
-    registry.add("collect-gradient-statistics", "sw_gaussians.tasks:collect_gradient_statistics",
-                 summary="add up screen-space gradients (needs grad2d)", factory=False)  # fmt: skip
-    registry.add("collect-absgrad-statistics", "sw_gaussians.tasks:collect_absgrad_statistics",
+    registry.add("collect-gradient-statistics", "sw_gaussians.statistics:collect_statistics",
+                 summary="add up screen-space gradients (needs grad2d, or absgrad)", factory=False,
+                 native="sw_gaussians.native:GAUSSIANS")  # fmt: skip
+    registry.add("collect-absgrad-statistics", "sw_gaussians.statistics:collect_statistics",
                  summary="add up absolute screen-space gradients (needs absgrad)", factory=False)  # fmt: skip
     registry.add("prune-and-densify", "sw_gaussians.tasks:PruneAndDensify",
                  summary="clone, split and prune Gaussians by those statistics", factory=True)  # fmt: skip

@@ -12,13 +12,13 @@ from splatwizard_core.api import (
     SplatOptimizer,
     Stage,
     StageContext,
-    When,
     photometric_loss,
 )
-from splatwizard_core.training.plan import scaled
 from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians import tasks
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.sparse_adam import SparseSplatOptimizer
+from sw_gaussians.statistics import collect_statistics
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -50,12 +50,8 @@ class ThreeDGSStage(Stage):
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
-    def when(self, when: When) -> When:
-        """A plan of the full run, in steps of this one."""
-        return scaled(when, self.config.schedule_scale)
-
     def steps(self, steps: int) -> int:
-        """A number of steps likewise, which a task keeps to itself."""
+        """Return a number of steps of the full run in steps of this one, for what a task counts itself."""
         return max(1, round(steps * self.config.schedule_scale)) if steps > 0 else 0
 
     def begin(self, context: StageContext) -> SplatModel:
@@ -67,18 +63,17 @@ class ThreeDGSStage(Stage):
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         lr = self.config.lr
-        return SplatOptimizer(
-            model,
-            [
-                ParamGroup("means", lr=lr.position_init * scene.extent),
-                ParamGroup("sh_dc", lr=lr.sh_dc),
-                ParamGroup("sh_rest", lr=lr.sh_rest),
-                ParamGroup("opacity_logits", lr=lr.opacity),
-                ParamGroup("log_scales", lr=lr.scales),
-                ParamGroup("quats", lr=lr.quats),
-            ],
-            sparse=None if self.config.sparse_adam == "off" else self.config.sparse_adam,
-        )
+        groups = [
+            ParamGroup("means", lr=lr.position_init * scene.extent),
+            ParamGroup("sh_dc", lr=lr.sh_dc),
+            ParamGroup("sh_rest", lr=lr.sh_rest),
+            ParamGroup("opacity_logits", lr=lr.opacity),
+            ParamGroup("log_scales", lr=lr.scales),
+            ParamGroup("quats", lr=lr.quats),
+        ]
+        if self.config.sparse_adam == "off":
+            return SplatOptimizer(model, groups)
+        return SparseSplatOptimizer(model, groups, bias_correction=self.config.sparse_adam)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         lr, chain = self.config.lr, self.config.mcmc
@@ -107,7 +102,7 @@ class ThreeDGSStage(Stage):
         densify = self.config.densify
         scheduler.register_task(
             self.when(range(densify.stop)),
-            tasks.collect_absgrad_statistics if densify.absgrad else tasks.collect_gradient_statistics,
+            collect_statistics,
             name="collect gradient statistics",
         )
         prune_and_densify = tasks.PruneAndDensify(
@@ -158,7 +153,7 @@ class ThreeDGSStage(Stage):
         return self._regularised(loss, result) if self.config.mcmc.enabled else loss
 
     def _regularised(self, loss: LossPack, result: RenderResult) -> LossPack:
-        """Plus what makes Gaussians fade and shrink unless a picture needs them, so that they can be relocated."""
+        """Add what makes Gaussians fade and shrink unless a picture needs them, so that they can be relocated."""
         chain, inputs = self.config.mcmc, result.inputs
         if inputs.scales is None:
             raise TypeError("mcmc.enabled needs a model with scales: that of 3dgs has them")

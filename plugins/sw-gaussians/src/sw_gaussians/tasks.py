@@ -1,4 +1,4 @@
-"""The schedule tasks of 3DGS, as other methods may ask for them by name.
+"""The schedule tasks of 3DGS, for its stage and, by name, for other methods.
 
 Tasks without settings are plain functions; the others are made with their settings as keywords, so that a
 method of another package needs no class of ours: `plugins.tasks.load("prune-and-densify")(grad_threshold=4e-4)`.
@@ -11,9 +11,8 @@ short runs are taken before the densification of their last step, too.
 
 import logging
 
-from splatwizard_core.api import GaussianModel, OptimizationParams, RenderResult, Scene, SplatOptimizer, exponential_lr
+from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, exponential_lr
 from sw_gaussians import density
-from sw_gaussians.statistics import accumulate_statistics
 
 log = logging.getLogger(__name__)
 
@@ -49,22 +48,8 @@ class UpdateLearningRate:
 
 
 def increase_sh_degree(model: GaussianModel) -> None:
-    """Activates one more SH band."""
+    """Activate one more SH band."""
     density.increase_sh_degree(model)
-
-
-def collect_gradient_statistics(model: GaussianModel, result: RenderResult) -> None:
-    """Adds this view's screen-space gradients (RasterOptions.grad2d) to the model's statistics."""
-    if result.grad2d is None:
-        raise ValueError("collect-gradient-statistics needs RasterOptions(grad2d=True)")
-    accumulate_statistics(model, result.grad2d.value, result.radii)
-
-
-def collect_absgrad_statistics(model: GaussianModel, result: RenderResult) -> None:
-    """The same of absolute pixel gradients (RasterOptions.absgrad). Source: AbsGS (arXiv 2404.10484)."""
-    if result.absgrad2d is None:
-        raise ValueError("collect-absgrad-statistics needs RasterOptions(absgrad=True)")
-    accumulate_statistics(model, result.absgrad2d.value, result.radii)
 
 
 class PruneAndDensify:

@@ -6,7 +6,7 @@ import importlib.util
 
 
 def unavailable() -> str | None:
-    """Why gsplat cannot draw here, or None."""
+    """The reason why gsplat cannot draw here, or None."""
     if importlib.util.find_spec("gsplat") is None:
         return "gsplat is not installed (pip install 'sw-gsplat[gsplat]')"
     import torch

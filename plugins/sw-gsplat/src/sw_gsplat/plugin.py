@@ -1,4 +1,4 @@
-"""What this package provides."""
+"""Registration of the rasterizer `gsplat`."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -16,6 +16,7 @@ def register_rasterizers(registry: Registry) -> None:
             "TIGHT_TILES",
         ],
         available="sw_gsplat.availability:unavailable",
+        profiles=["3dgs"],
         exactness="tight",
         speed=40,
     )  # fmt: skip

@@ -17,6 +17,7 @@ from torch import Tensor
 from splatwizard_core.api import (
     AccumOutput,
     Camera,
+    CapabilityError,
     ConfigError,
     Feature,
     GaussianInputs,
@@ -24,39 +25,29 @@ from splatwizard_core.api import (
     RasterizerInfo,
     RasterOptions,
     RenderResult,
-    check_request,
-    checked_background,
 )
-from splatwizard_core.rendering.checks import check_placement
-from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import check_offered, option_features
-from splatwizard_core.tooling import PluginError
 from sw_gsplat import plugin
 
 
 class GsplatRasterizer:
     """Standard 3DGS through gsplat, float32 on CUDA. The first use compiles gsplat's kernels (minutes)."""
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "gsplat")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "gsplat")
 
     def __init__(self) -> None:
         try:
             from gsplat import rasterization
         except ImportError as error:
-            raise PluginError(
+            raise CapabilityError(
                 f"rasterizer 'gsplat' needs the package gsplat ({error}): pip install 'sw-gsplat[gsplat]'"
             ) from error
         self._rasterization = rasterization
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        check_request(self.info, g, opt)
-        check_placement(self.info, g)
-        if opt.profile != "3dgs" or opt.clamp_grad != "exact":
-            raise ConfigError(
-                "rasterizer 'gsplat' draws by its own rules: neither profile 'dgr-exact' nor clamp_grad 'pass'",
-                key="raster.profile",
-            )
+        self.info.check_request(g, opt)
+        if opt.clamp_grad != "exact":
+            raise ConfigError("rasterizer 'gsplat' stops gradients at the clamp of alpha: clamp_grad cannot be 'pass'")
         drawn, alphas, meta = self._rasterization(
             **self._gaussians(g, opt), **_camera(cam, g.means), packed=False, eps2d=opt.eps2d, absgrad=opt.absgrad,
             rasterize_mode="antialiased" if opt.antialias else "classic",
@@ -65,7 +56,7 @@ class GsplatRasterizer:
         drawn, alpha = drawn[0].permute(2, 0, 1), alphas[0].permute(2, 0, 1)
         channels = 3 if g.colors is None else g.colors.shape[1]
         image = drawn[:channels]
-        background = checked_background(opt, channels, cam, g.means)
+        background = opt.background_of(channels, cam, g.means)
         if background is not None:
             image = image + (1 - alpha) * background.reshape(channels, *(background.shape[1:] or (1, 1)))
         depth = {}
@@ -87,13 +78,13 @@ class GsplatRasterizer:
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Not declared: gsplat has no pass that looks at geometry alone. Raises CapabilityError."""
-        check_offered(self.info, Feature.VISIBLE_FILTER)
+        self.info.check_offered(Feature.VISIBLE_FILTER)
         raise AssertionError("not declared")
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
         """No score is declared: raises CapabilityError for any that is asked for."""
-        check_offered(self.info, option_features(replace(opt, grad2d=False)))
+        self.info.check_offered(Feature.asked_by(replace(opt, grad2d=False)))
         return AccumOutput({})
 
     def _gaussians(self, g: GaussianInputs, opt: RasterOptions) -> dict[str, Any]:

@@ -3,7 +3,8 @@
 from typing import Annotated, Literal
 
 from pydantic import Field
-from sw_anchors.params import AnchorLearningRates, AnchorParams
+from sw_anchors.lattice import Margin
+from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
 
 from splatwizard_core.api import Params
 
@@ -31,7 +32,7 @@ class Grid(Params):
     hidden: int = Field(100, ge=1, le=256, description="width of the network that predicts distributions")
 
 
-class LearningRates(AnchorLearningRates):
+class LearningRates(CodedAnchorLearningRates):
     """Adam step sizes; from `init` to `final` exponentially over `max_steps`."""
 
     grid_init: float = Field(0.005, gt=0, description="of the hash grid at step 0")
@@ -41,7 +42,7 @@ class LearningRates(AnchorLearningRates):
 
 
 class Phases(Params):
-    """When training turns to noise, and to a rate."""
+    """Steps at which training turns to noise, and to a rate."""
 
     quantized: int = Field(3_000, ge=1, description="after this step values get noise of fixed steps")
     rebound: int = Field(10_000, ge=1, description="step after which the 16-bit lattice is fitted once more")
@@ -72,12 +73,12 @@ class Steps(Params):
 
     @property
     def triple(self) -> tuple[float, float, float]:
-        """In the order of the groups."""
+        """Steps in the order of the groups."""
         return self.features, self.scales, self.offsets
 
 
 class Codec(Params):
-    """What the file holds."""
+    """Settings of the file."""
 
     mode: Literal["exact", "float"] = Field(
         "exact", description="exact: decodes on any machine; float: as published, decodes on this one"
@@ -85,7 +86,7 @@ class Codec(Params):
     weights: Literal["float32", "float16"] = Field("float32", description="type of the networks' weights")
 
 
-class HACConfig(AnchorParams):
+class HACConfig(CodedAnchorParams):
     """Everything that can be set for HAC."""
 
     bound_margin: Literal["hac", "extent", "none"] = Field(
@@ -97,3 +98,8 @@ class HACConfig(AnchorParams):
     rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
     codec: Codec = Field(Codec(), description="what the file holds")
+
+    @property
+    def margin(self) -> Margin:
+        """Margin of the lattice in the words of sw_anchors."""
+        return "origin" if self.bound_margin == "hac" else self.bound_margin

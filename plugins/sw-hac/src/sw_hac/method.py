@@ -1,4 +1,4 @@
-"""HAC as a method: what it starts from, how it trains, and what its file is."""
+"""HAC as a method: its model of a scene, its training stage, its file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.api import Method, SceneError
+from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors
@@ -32,21 +33,20 @@ class HAC(Method):
     DEFAULT_RATE: ClassVar[str] = "r4"
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """An anchor for every voxel with a start point of the scene."""
+        """Put an anchor into every voxel with a start point of the scene."""
         if scene.points is None or len(scene.points) == 0:
             raise SceneError(
                 f"scene '{scene.name}' has no start points: HAC needs SfM points or random ones", path=scene.path
             )
         c: HACConfig = self.config
-        grid = self.plugins.context_models.load("hash-grid")(
+        grid = MixedHashGrid(
             c.grid.space, c.grid.planes, features=c.grid.features, log2_space=c.grid.log2_space,
             log2_planes=c.grid.log2_planes, generator=generator,
         )  # fmt: skip
         return HACAnchors.from_points(
             scene.points, voxel_size=c.voxel_size, num_offsets=c.num_offsets, feature_dim=c.feature_dim,
-            hidden=c.hidden, margin=c.bound_margin, sample=c.rate_term.sample, base_steps=c.steps.triple,
-            generator=generator, entropy=self.plugins.entropy_models.load("gaussian-exact")(), grid=grid,
-            grid_hidden=c.grid.hidden, in_steps=c.rate_term.units == "steps",
+            hidden=c.hidden, margin=c.margin, sample=c.rate_term.sample, base_steps=c.steps.triple,
+            generator=generator, grid=grid, grid_hidden=c.grid.hidden, in_steps=c.rate_term.units == "steps",
         )  # fmt: skip
 
     def stages(self) -> Sequence[Stage]:
@@ -55,8 +55,8 @@ class HAC(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACAnchors):
             raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec, self.plugins)
+        codec.encode(model, writer, self.config.codec)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return codec.decode(reader, self.plugins)
+        return codec.decode(reader)

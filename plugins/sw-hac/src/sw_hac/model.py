@@ -1,4 +1,4 @@
-"""The model: anchors, a binary hash grid over their positions, and a network that makes distributions of both.
+"""The model of HAC: anchors, a binary hash grid over their positions, and a network that predicts distributions.
 
 For an anchor at u in [0,1]^3 the network gives mean and deviation of its F features, 6 scales and 3k coordinates of
 offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t); Q0 = 1, 0.001 and 0.2 as published.
@@ -11,10 +11,13 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from sw_anchors.anchors import two_layers
+from sw_anchors.anchors import linear_layers, two_layers
 from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from sw_anchors.lattice import TOP
+from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
+
+from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
 
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
@@ -23,23 +26,14 @@ PLACES_LIMIT = 1 << 30
 """Bytes that the places of all anchors in the grid may take to be kept, 1,152 an anchor in the published one."""
 
 
-def group_widths(feature_dim: int, num_offsets: int) -> tuple[int, int, int]:
-    """Numbers an anchor has in each group."""
-    return feature_dim, 6, 3 * num_offsets
-
-
-def output_widths(feature_dim: int, num_offsets: int) -> list[int]:
-    """Outputs of the network in order: mean and deviation of each group, then the three steps; 175 as published."""
-    return [w for width in group_widths(feature_dim, num_offsets) for w in (width, width)] + [1, 1, 1]
-
-
 class HACAnchors(CodedAnchors):
     """CodedAnchors with the grid and its network.
 
     grid        hash grid over the box of the anchors, signs
-    mlp_grid    from its features to `output_widths`
+    mlp_grid    from its features to the outputs of `AnchorShape`
     """
 
+    grid: MixedHashGrid
     mlp_grid: nn.Sequential
 
     units: Tensor
@@ -47,7 +41,7 @@ class HACAnchors(CodedAnchors):
     def __init__(
         self,
         *tensors: Tensor,
-        grid: Any,
+        grid: MixedHashGrid,
         grid_hidden: int,
         in_steps: bool = False,
         generator: torch.Generator,
@@ -55,17 +49,16 @@ class HACAnchors(CodedAnchors):
     ) -> None:
         """As CodedAnchors.
 
-        grid        a MixedHashGrid of the registry's context model `hash-grid`
         grid_hidden width of the network behind it
         in_steps    the network gives means and deviations in base steps: scales are some hundredths, which one update
                     of a network that gives them as they are can overturn
         """
         super().__init__(*tensors, generator=generator, **kwargs)
-        widths = output_widths(self.features.shape[1], self.num_offsets)
+        widths = self.shape.outputs
         self.grid = grid.to(self.features)
-        self._places: tuple[Tensor, Any] | None = None
+        self._places: tuple[Tensor, GridPlaces | None] | None = None
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
-        units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0] * 3
+        units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0]
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
 
     def __getstate__(self) -> dict[str, Any]:
@@ -73,11 +66,11 @@ class HACAnchors(CodedAnchors):
         return {**self.__dict__, "_places": None}
 
     def networks(self) -> dict[str, nn.Module]:
-        """What the file holds besides the grid, in its order."""
+        """Networks that the file holds, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
     def _looked_up(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of the grid at anchors `rows`, and the bits of its signs."""
+        """Look up features of the grid at anchors `rows`; and the bits of its signs."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
             fits = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
@@ -88,24 +81,23 @@ class HACAnchors(CodedAnchors):
             places = self.grid.places(codes.index_select(0, rows).to(self.features) / TOP)
         else:
             places = places.rows(rows)
-        features, bits = self.grid.at_places(places)
-        return features, bits
+        return self.grid.at_places(places)
 
     def forecast(self, rows: Tensor) -> AnchorForecast:
         features, bits = self._looked_up(rows)
-        first, last = self.mlp_grid[0], self.mlp_grid[2]
+        first, last = linear_layers(self.mlp_grid)
         hidden = torch.relu(first(features))
         # All anchors have noise of their own steps; the rest of the last layer is for the sample.
-        widths = output_widths(self.features.shape[1], self.num_offsets)
-        count = sum(widths[:6])
-        weights, biases = last.weight.split([count, 3]), last.bias.split([count, 3])
+        widths = self.shape.outputs[:6]
+        count = sum(widths)
+        weights, biases = torch.split(last.weight, [count, 3]), torch.split(last.bias, [count, 3])
         steps = torch.tanh(torch.nn.functional.linear(hidden, weights[1], biases[1]))
         steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
             outputs = torch.nn.functional.linear(hidden, weights[0], biases[0]) * self.units[:count]
-            parts = outputs.split(widths[:6], dim=1)
+            parts = torch.split(outputs, widths, dim=1)
             return torch.cat(parts[0::2], dim=1), torch.cat(parts[1::2], dim=1)
 
         return AnchorForecast(steps, bits, hidden, sample)
@@ -113,12 +105,12 @@ class HACAnchors(CodedAnchors):
     def predict(self, rows: Tensor) -> AnchorContext:
         features, bits = self._looked_up(rows)
         outputs = self.mlp_grid(features) * self.units
-        return context_of(outputs, self.features.shape[1], self.num_offsets, self.base_steps, own_bits=bits)
+        return context_of(outputs, self.shape, self.base_steps, own_bits=bits)
 
     @torch.no_grad()
     def fold_units(self) -> None:
-        """Let the network itself give values, as it does in the file."""
-        last = self.mlp_grid[2]
+        """Let the network predict in the units of the values, as it does in the file."""
+        _, last = linear_layers(self.mlp_grid)
         last.weight.mul_(self.units[:, None])
         last.bias.mul_(self.units)
         self.units.fill_(1)
@@ -132,7 +124,7 @@ class HACAnchors(CodedAnchors):
         rows = torch.nonzero(self.kept()).squeeze(1)
         if len(rows) < 2:
             return
-        last = self.mlp_grid[2]
+        _, last = linear_layers(self.mlp_grid)
         last.weight.mul_(0.01)
         found = []
         for values, step in zip(self.raw(rows), self.base_steps, strict=True):
@@ -141,16 +133,12 @@ class HACAnchors(CodedAnchors):
 
 
 def context_of(
-    outputs: Tensor,
-    feature_dim: int,
-    num_offsets: int,
-    base_steps: Sequence[float],
-    *,
-    own_bits: Tensor | None = None,
+    outputs: Tensor, shape: AnchorShape, base_steps: Sequence[float], *, own_bits: Tensor | None = None
 ) -> AnchorContext:
-    """The context in float outputs [V, sum of output_widths]."""
-    parts: Sequence[Tensor] = torch.split(outputs, output_widths(feature_dim, num_offsets), dim=1)
-    steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(base_steps, parts[6:], strict=True)]
+    """Read the float outputs [V, sum(shape.outputs)] of the network as means, deviations and steps."""
+    parts: Sequence[Tensor] = torch.split(outputs, shape.outputs, dim=1)
+    logits = torch.split(parts[6], 1, dim=1)
+    steps = [base * (1 + torch.tanh(t)).clamp(min=SMALLEST_STEP) for base, t in zip(base_steps, logits, strict=True)]
     return AnchorContext(
         (parts[0], parts[2], parts[4]), (parts[1], parts[3], parts[5]), (steps[0], steps[1], steps[2]), own_bits
     )

@@ -75,7 +75,7 @@ class Distill(Params):
 
 
 class Codec(Params):
-    """What the file holds."""
+    """The codec of the file."""
 
     name: str = Field("vectree", description="which codec for Gaussians; the keys below are those of vectree")
     vq_ratio: float = Field(0.6, ge=0, le=1, description="share of the Gaussians whose colours are vector-quantised")

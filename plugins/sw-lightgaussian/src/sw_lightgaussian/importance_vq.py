@@ -49,7 +49,7 @@ class PartError(BitstreamError):
 
 @dataclass(frozen=True)
 class CodedVectors:
-    """What a file holds of n vectors of d numbers.
+    """The form in which a file holds n vectors of d numbers.
 
     codes       [n] int64: entry of the codebook, -1 for a vector that keeps its own
     codebook    [K, d] float16
@@ -180,7 +180,7 @@ class ImportanceVQ:
         }
 
     def unpack(self, parts: Mapping[str, bytes], n: int, d: int) -> CodedVectors:
-        """What the parts hold, checked. Raises PartError, a BitstreamError."""
+        """Read the parts and check what they hold. Raises PartError, a BitstreamError."""
         with _part(parts, "header") as data:
             form, size, own = _header(data, n)
         load = self.plugins.coders.load

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import Method, create_method, load_pruner
-from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
+from splatwizard_core.api import ConfigError, GaussianModel, Method, create_method, load_pruner
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.presets import PRESETS, RATES
 from sw_lightgaussian.significance import Significance
@@ -32,24 +31,33 @@ class LightGaussian(Method):
     DEFAULT_RATE: ClassVar[str] = "r3"
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Of no use to the first stage, which starts from a trained 3DGS scene: the start of such a scene."""
+        """Return the start of a 3DGS scene; the first stage trains a finished one instead."""
         return create_method(self.plugins, "3dgs").create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
-        check_gaussian_codec(self.plugins, self.config.codec.name, "codec.name")
+        name, known = self.config.codec.name, self.plugins.gaussian_codecs
+        if name not in known:
+            raise ConfigError(
+                f"no codec for Gaussians is called '{name}'; installed: {', '.join(known.names)}", key="codec.name"
+            )
         score = self.config.score.model_dump()
         pruner = load_pruner(self.plugins, self.config.prune.pruner, {"lightgaussian": score})
         return [PruneStage(self.config, pruner), DistillStage(self.config, Significance(**score))]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
         codec = self.config.codec
-        settings = {
+        settings: dict[str, Any] = {
             "ratio": codec.vq_ratio, "size": codec.codebook_size, "rows_per_code": codec.rows_per_code,
             "iterations": codec.vq_iterations, "batch": codec.vq_batch, "decay": codec.vq_decay,
             "reseed": codec.vq_reseed, "training": codec.vq_training,
         }  # fmt: skip
-        encode_gaussians(self.plugins, codec.name, model, writer, **(settings if codec.name == "vectree" else {}))
+        writer.static["codec"] = codec.name
+        make = self.plugins.gaussian_codecs.load(codec.name)
+        make(self.plugins, **(settings if codec.name == "vectree" else {})).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)
-        return decode_gaussians(self.plugins, reader)
+        codecs = self.plugins.gaussian_codecs
+        return codecs.load(reader.text("codec", choices=codecs.names))(self.plugins).decode(reader)

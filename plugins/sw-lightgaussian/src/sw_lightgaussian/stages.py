@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 from typing import TYPE_CHECKING
 
-import torch
 from sw_finetuning.distillation import DistillationStage
-from sw_finetuning.fine_tuning import FineTuningStage, collect_statistics
-from sw_finetuning.pruning import PruneByScore, scores_of
-from torch import Tensor
+from sw_finetuning.fine_tuning import FineTuningStage
+from sw_finetuning.importance import KeepImportance, ScoredGaussians
+from sw_finetuning.pruning import PruneByScore
+from sw_gaussians.statistics import collect_statistics
 
-from splatwizard_core.api import CameraIterator, ConfigError, GaussianModel, Pruner, Rasterizer, Scene
+from splatwizard_core.api import ConfigError, GaussianModel, Pruner
 from sw_lightgaussian.config import LightGaussianConfig
 
 if TYPE_CHECKING:
     from splatwizard_core.api import OptimizationParams, PipelineParams, Scheduler, SplatModel, StageContext
-
-log = logging.getLogger(__name__)
 
 
 class PruneStage(FineTuningStage):
     """Removes the least significant Gaussians of a trained 3DGS scene at its first step, and trains the others on."""
 
     name = "prune"
+    starts_from = "3dgs"
     rates_plan = range(5_000)
 
     def __init__(self, config: LightGaussianConfig, pruner: Pruner) -> None:
@@ -58,36 +56,10 @@ class PruneStage(FineTuningStage):
         scheduler.register_task(when, task, name="prune")
 
 
-class ScoredGaussians(GaussianModel):
-    """Gaussians that know how significant each one is.
-
-    importance  [N] buffer, >= 0; zeros until it is computed
-    """
-
-    ROWS = (*GaussianModel.ROWS, "importance")
-
-    importance: Tensor
-
-    def __init__(self, *tensors: Tensor, active_sh_degree: int | None = None) -> None:
-        super().__init__(*tensors, active_sh_degree=active_sh_degree)
-        self.register_buffer("importance", torch.zeros_like(self.opacity_logits))
-
-
-class KeepImportance:
-    """Schedule task: scores every Gaussian over the training views and lets the model keep it."""
-
-    def __init__(self, pruner: Pruner) -> None:
-        self.pruner = pruner
-
-    def __call__(self, model: GaussianModel, cameras: CameraIterator, rasterizer: Rasterizer, scene: Scene) -> None:
-        found = scores_of(self.pruner, model, cameras, rasterizer, scene)
-        assert isinstance(model, ScoredGaussians)
-        model.importance.copy_(found.clamp_min(0))
-
-
 class DistillStage(DistillationStage):
     """Drops the highest SH bands and learns from the renders of the unpruned scene, also from moved poses."""
 
+    taught_by = ("3dgs",)
     rates_plan = range(5_000)
 
     def __init__(self, config: LightGaussianConfig, significance: Pruner) -> None:
@@ -103,7 +75,7 @@ class DistillStage(DistillationStage):
         self.sh_degree, self.significance = distill.sh_degree, significance
 
     def begin(self, context: StageContext) -> SplatModel:
-        """The model with its lower bands, before there is an optimizer: what is cut later is never trained."""
+        """Return the model with its lower bands, before there is an optimizer: what is cut later is never trained."""
         model = super().begin(context)
         assert isinstance(model, GaussianModel)
         return truncated(model, self.sh_degree)

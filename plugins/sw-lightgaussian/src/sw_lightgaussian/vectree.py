@@ -30,7 +30,7 @@ ATTRIBUTES = 8  # opacity logit, three log scales, four components of the quater
 
 
 class CodedGaussians(GaussianModel):
-    """What a file held, with the codes of its colours: `encode_from_decoded` writes it again without training.
+    """Decoded Gaussians with the codes of their colours: `encode_from_decoded` writes it again without training.
 
     code        [N] int32 buffer: entry of the codebook, -1 for a Gaussian with colours of its own
     codebook    [K, D] float32 buffer

@@ -1,14 +1,11 @@
-"""`python -m sw_metrics.check`: what LPIPS needs besides torch, in a process of its own."""
+"""Check of what LPIPS needs besides torch: its package, and the weights of its networks."""
 
 from __future__ import annotations
 
 import importlib
 
-from sw_doctor.check import Check, one_line
-from sw_doctor.child import serve
-
 from splatwizard_core.api import CapabilityError
-from splatwizard_core.tooling import file_sha256
+from splatwizard_core.tooling import Check, file_sha256
 from sw_metrics.lpips_weights import BACKBONES, find_weights, hub_folder
 from sw_metrics.perceptual import EXTRA, package_version
 from sw_metrics.torchvision_import import import_torchvision
@@ -26,7 +23,7 @@ def check_lpips() -> list[Check]:
         checks = [Check(GROUP, "LPIPS package", "missing", "lpips is not installed", f"pip install '{EXTRA}'")]
     except Exception as error:
         mend = f"pip install --force-reinstall --no-deps torchvision '{EXTRA}'"
-        checks = [Check(GROUP, "LPIPS package", "broken", one_line(f"{type(error).__name__}: {error}"), mend)]
+        checks = [Check(GROUP, "LPIPS package", "broken", f"{type(error).__name__}: {error}", mend)]
     else:
         checks = [Check(GROUP, "LPIPS package", "ok", f"lpips {version}")]
     for net, backbone in BACKBONES.items():
@@ -34,14 +31,11 @@ def check_lpips() -> list[Check]:
         get = f"curl -L --create-dirs -o {hub_folder() / backbone.file_name} {backbone.address}"
         path = find_weights(net, None)
         if path is None:
-            detail = f"{backbone.file_name} is not in {hub_folder()} (sw eval --lpips-weights DIR names another folder)"
+            other = "--set metrics.lpips.weights=DIR names another folder"
+            detail = f"{backbone.file_name} is not in {hub_folder()} ({other})"
             checks.append(Check(GROUP, name, "missing", detail, get))
         elif not file_sha256(path).startswith(backbone.sha256_prefix):
             checks.append(Check(GROUP, name, "broken", f"{path} is not the published file: its checksum differs", get))
         else:
             checks.append(Check(GROUP, name, "ok", str(path)))
     return checks
-
-
-if __name__ == "__main__":
-    serve([("LPIPS", check_lpips)])

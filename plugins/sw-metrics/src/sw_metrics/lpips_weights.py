@@ -105,7 +105,7 @@ def load_weights(net: str, folder: Path | None) -> Weights:
     if path is None:
         raise CapabilityError(
             f"weights-missing: {backbone.file_name} is needed: get it from {backbone.address} and name its folder with "
-            "--lpips-weights, or put it into the checkpoints folder of torch.hub",
+            "--set metrics.lpips.weights=DIR, or put it into the checkpoints folder of torch.hub",
             missing=[backbone.file_name],
         )
     try:
@@ -166,9 +166,11 @@ def check_folder(folder: Path) -> None:
     """Refuse a folder for weights before any work. Raises UserInputError if it holds none, or a damaged file."""
     names = [backbone.file_name for backbone in BACKBONES.values()]
     if not folder.is_dir():
-        raise UserInputError(f"--lpips-weights {folder}: there is no such folder; it is to hold {' or '.join(names)}")
+        raise UserInputError(
+            f"metrics.lpips.weights: {folder}: there is no such folder; it is to hold {' or '.join(names)}"
+        )
     found = [backbone for backbone in BACKBONES.values() if (folder / backbone.file_name).is_file()]
     if not found:
-        raise UserInputError(f"--lpips-weights {folder} holds neither {' nor '.join(names)}")
+        raise UserInputError(f"metrics.lpips.weights: {folder} holds neither {' nor '.join(names)}")
     for backbone in found:
         read_weights(folder / backbone.file_name, backbone)

@@ -17,14 +17,27 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from pydantic import BaseModel, Field, field_validator
 from torch import Tensor
 
-from splatwizard_core.api import CapabilityError, MetricSetup, PreparedMetric, ShapeError
-from sw_metrics.lpips_weights import BACKBONES, Weights, find_weights, load_weights
+from splatwizard_core.api import CapabilityError, MetricSetup, PreparedMetric
+from sw_metrics.conventions import check_pair
+from sw_metrics.lpips_weights import BACKBONES, Weights, check_folder, find_weights, load_weights
 from sw_metrics.torchvision_import import import_torchvision
 
-EXTRA = "splatwizard-core[lpips]"
+EXTRA = "sw-metrics[lpips]"
 SMALLEST = {"vgg": 16, "alex": 31}  # pixels; below, a pooling layer is left with nothing
+
+
+class LpipsSettings(BaseModel):
+    """The settings `metrics.lpips.KEY`, for all three forms."""
+
+    weights: Path | None = Field(None, description="folder with the backbones, searched before torch.hub's cache")
+
+    @field_validator("weights")
+    @classmethod
+    def _absolute(cls, folder: Path | None) -> Path | None:
+        return None if folder is None else folder.resolve()  # another process may work in another folder
 
 
 @dataclass(frozen=True)
@@ -54,7 +67,7 @@ class Lpips:
 
     def identity(self, setup: MetricSetup) -> str | None:
         """The package's version and which file would be read; None if one is missing."""
-        path = find_weights(self.net, setup.lpips_weights)
+        path = find_weights(self.net, _folder(setup))
         try:
             version = package_version()
         except CapabilityError:
@@ -64,13 +77,18 @@ class Lpips:
         facts = path.stat()
         return f"lpips {version}, {path.resolve()}, {facts.st_size}, {facts.st_mtime_ns}"
 
+    def unavailable(self, setup: MetricSetup) -> str | None:
+        """One line for the user if a form of LPIPS cannot be computed here, else None.
+
+        Raises UserInputError for a folder in the settings without weights, or with damaged ones.
+        """
+        folder = _folder(setup)
+        if folder is not None:
+            check_folder(folder)
+        return not_available(folder)
+
     def _distance(self, network: torch.nn.Module, render: Tensor, truth: Tensor) -> float:
-        if render.dim() != 3 or render.shape[0] != 3 or render.shape != truth.shape:
-            raise ShapeError(
-                f"image metrics need two [3,H,W] images, got {list(render.shape)} and {list(truth.shape)}",
-                actual=render.shape,
-                expected=(3, "H", "W"),
-            )
+        check_pair(render, truth)
         smallest = SMALLEST[self.net]
         if min(render.shape[1:]) < smallest:
             raise CapabilityError(f"too-small: LPIPS ({self.net}) needs pictures of at least {smallest} pixels a side")
@@ -81,6 +99,10 @@ class Lpips:
 VGG_3DGS = Lpips("vgg", to_signed=False)
 VGG = Lpips("vgg", to_signed=True)
 ALEX = Lpips("alex", to_signed=True)
+
+
+def _folder(setup: MetricSetup) -> Path | None:
+    return setup.read(LpipsSettings, "lpips").weights
 
 
 def package_version() -> str:
@@ -102,13 +124,13 @@ def not_available(folder: Path | None) -> str | None:
         return None
     return (
         f"LPIPS is not available without its weights, its values will be null: bring {' and '.join(absent)} from "
-        f"{BACKBONES['vgg'].address.rpartition('/')[0]}/ and give --lpips-weights DIR"
+        f"{BACKBONES['vgg'].address.rpartition('/')[0]}/ and give --set metrics.lpips.weights=DIR"
     )
 
 
 def _network(net: str, setup: MetricSetup) -> tuple[torch.nn.Module, Weights]:
     """The network with the weights of a backbone, on the device, in eval mode."""
-    weights = load_weights(net, setup.lpips_weights)
+    weights = load_weights(net, _folder(setup))
     lpips = _import_lpips()
     # pnet_rand keeps the package from downloading; what it draws instead is replaced below, and no stream is moved.
     with torch.random.fork_rng(devices=[]), warnings.catch_warnings():

@@ -1,13 +1,34 @@
-"""What this package provides: LPIPS in three forms."""
+"""Registers LPIPS in three forms, PSNR and SSIM in other codes' conventions, and the check of what LPIPS needs."""
 
 from splatwizard_core.api import Registry, hookimpl
 
 
 @hookimpl
 def register_metrics(registry: Registry) -> None:
-    for name, target, summary in (
-        ("lpips_vgg_3dgs", "VGG_3DGS", "LPIPS, VGG16 fed with 0..1 as the 3DGS code does: the one in most tables"),
-        ("lpips_vgg", "VGG", "LPIPS, VGG16, images mapped to -1..1"),
-        ("lpips_alex", "ALEX", "LPIPS, AlexNet, images mapped to -1..1"),
-    ):
-        registry.add(name, f"sw_metrics.perceptual:{target}", summary=summary, direction="lower", slow=True)
+    for name, form, label, position, summary in (
+        ("lpips_vgg_3dgs", "VGG_3DGS", "LPIPS (VGG, 3DGS)", 3,
+         "LPIPS, VGG16 fed with 0..1 as the 3DGS code does: the one in most tables"),
+        ("lpips_vgg", "VGG", "LPIPS (VGG)", 4, "LPIPS, VGG16, images mapped to -1..1"),
+        ("lpips_alex", "ALEX", "LPIPS (Alex)", 5, "LPIPS, AlexNet, images mapped to -1..1"),
+    ):  # fmt: skip
+        registry.add(name, f"sw_metrics.perceptual:{form}", summary=summary, label=label, digits=4, direction="lower",
+                     slow=True, group="lpips", settings="sw_metrics.perceptual:LpipsSettings",
+                     position=position)  # fmt: skip
+    conventions = "sw_metrics.conventions"
+    registry.add("psnr_channel_mean", f"{conventions}:psnr_channel_mean", label="PSNR, mean of channels", unit="dB",
+                 digits=2, direction="higher", diagnostic=True,
+                 summary="mean of the channels' PSNRs, dB: never below psnr")  # fmt: skip
+    registry.add("psnr_unrounded", f"{conventions}:psnr_unrounded", label="PSNR, unrounded", unit="dB", digits=2,
+                 direction="higher", diagnostic=True, unrounded=True,
+                 summary="psnr of the render before it is rounded to 8 bit, dB")  # fmt: skip
+    registry.add("ssim_valid", f"{conventions}:ssim_valid", label="SSIM, no border", digits=4, direction="higher",
+                 diagnostic=True, summary="ssim without the border, as scikit-image averages")  # fmt: skip
+    registry.add("ssim_reflect", f"{conventions}:ssim_reflect", label="SSIM, mirrored", digits=4, direction="higher",
+                 diagnostic=True,
+                 summary="ssim of the picture mirrored at its edge, as torchmetrics averages")  # fmt: skip
+
+
+@hookimpl
+def register_checks(registry: Registry) -> None:
+    registry.add("LPIPS", "sw_metrics.check:check_lpips", group="metrics", needs="torch",
+                 summary="the package lpips and its weights")  # fmt: skip

@@ -25,6 +25,7 @@ class PupStage(FineTuningStage):
     """
 
     name = "pup-3dgs"
+    starts_from = "3dgs"
 
     def __init__(self, config: Pup3DGSConfig, plugins: PluginManager) -> None:
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)

@@ -9,14 +9,13 @@ from __future__ import annotations
 import torch
 
 from splatwizard_core.api import Camera, CapabilityError, ConfigError, GaussianInputs, RasterizerInfo, RasterOptions
-from splatwizard_core.rendering.negotiation import declared_info
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag
 from sw_rasterizers.standard import StandardRasterizer
 
 
 class InferenceRasterizer(StandardRasterizer):
-    """What both share. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
+    """Base of the two. Images are [3,H,W], float32, or uint8 with `dtype_out="uint8"`: round(255 clamp(x, 0, 1)).
 
     A pixel draws the splat that brings its transmittance below 1e-4 (the standard rasterizers leave it out) and goes on
     until all 32 pixels of its warp are below. Alpha is still clamped at 0.99 and cut below 1/255.
@@ -41,7 +40,7 @@ class InferenceRasterizer(StandardRasterizer):
 class FlashRasterizer(InferenceRasterizer):
     """FlashGS-style: a base-2 exponent with the opacity folded in, a polynomial about the tile's middle."""
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "flash")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "flash")
     method = Flag.FLASH
 
 
@@ -51,7 +50,7 @@ class TensorCoreRasterizer(InferenceRasterizer):
     Raises ConfigError for a low-pass below 0.1 px^2: the exponents of sharper splats leave the range of a half.
     """
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "tcgs")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "tcgs")
     method = Flag.TENSOR_CORES
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:

@@ -56,10 +56,10 @@ MODULE = NativeModule(
 
 
 def unavailable() -> str | None:
-    """Why the compiled rasterizers cannot run on this CPU, or None; compiles nothing."""
+    """The reason why the compiled rasterizers cannot run on this CPU, or None; compiles nothing."""
     return MODULE.available()
 
 
 def unavailable_on_cuda() -> str | None:
-    """Why the compiled rasterizers cannot run on a GPU here, or None; compiles nothing."""
+    """The reason why the compiled rasterizers cannot run on a GPU here, or None; compiles nothing."""
     return MODULE.available(cuda=True)

@@ -44,7 +44,7 @@ class Flag(enum.IntFlag):
 
 @dataclass
 class _Drawn:
-    """What the forward op returns; `saved` is for the backward pass."""
+    """Results of the forward op; `saved` is for the backward pass."""
 
     image: Tensor
     radii: Tensor

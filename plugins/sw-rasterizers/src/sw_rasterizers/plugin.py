@@ -1,6 +1,9 @@
-"""What this package provides."""
+"""Registration of the compiled rasterizers."""
 
 from splatwizard_core.api import Registry, hookimpl
+
+PROFILES = ["3dgs", "dgr-exact"]
+"""Exact support of every splat; or the original's tiles and gradients."""
 
 STANDARD_FEATURES = [
     "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",
@@ -87,6 +90,7 @@ def register_rasterizers(registry: Registry) -> None:
             features=features,
             available="sw_rasterizers.native:unavailable",
             on={"cuda": ON_CUDA},
+            profiles=PROFILES,
             exactness="exact",
             speed=speed,
             native="sw_rasterizers.native:MODULE",
@@ -101,6 +105,7 @@ def register_rasterizers(registry: Registry) -> None:
         needs=["SURFEL"],
         available="sw_rasterizers.native:unavailable",
         on={"cuda": {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}},
+        profiles=PROFILES,
         exactness="exact",
         speed=50,
         native="sw_rasterizers.native:MODULE",
@@ -114,6 +119,7 @@ def register_rasterizers(registry: Registry) -> None:
             dtypes=["float32"],
             features=INFERENCE_FEATURES,
             available="sw_rasterizers.native:unavailable_on_cuda",
+            profiles=PROFILES,
             exactness=exactness,
             speed=speed,
             min_cc=[8, 0],  # copies past the registers and products of tensor cores
@@ -130,6 +136,7 @@ def register_rasterizers(registry: Registry) -> None:
             combos_forbidden=[combo for combo in SCORING_FORBIDDEN if combo[1] in scores],
             available="sw_rasterizers.native:unavailable",
             on={"cuda": ON_CUDA},
+            profiles=PROFILES,
             exactness="exact",
             speed=speed,
             native="sw_rasterizers.native:MODULE",

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 import torch
-from sw_reference.scores import check_scores, score_dtype
 from torch import Tensor
 
 from splatwizard_core.api import (
@@ -14,14 +13,12 @@ from splatwizard_core.api import (
     Camera,
     CapabilityError,
     GaussianInputs,
+    RasterizerInfo,
     RasterOptions,
     RenderResult,
     ScoreSpec,
     ShapeError,
-    check_request,
 )
-from splatwizard_core.rendering.checks import check_placement
-from splatwizard_core.rendering.negotiation import declared_info
 from sw_rasterizers import plugin
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.standard import StandardRasterizer
@@ -44,10 +41,10 @@ class _Totals:
         self.fisher = like.new_zeros(len(g), FISHER, dtype=torch.float64) if opt.fisher else None
 
     def result(self) -> AccumOutput:
-        """What the contract returns: counts as int32, all else as float32."""
+        """The sums in the dtypes of the contract: counts as int32, all else as float32."""
         limit = torch.iinfo(torch.int32).max
         scores = {
-            spec.name: (row.clamp(max=limit) if score_dtype(spec) == torch.int32 else row).to(score_dtype(spec))
+            spec.name: (row.clamp(max=limit) if spec.dtype == torch.int32 else row).to(spec.dtype)
             for spec, row in zip(self.specs, self.scores, strict=True)
         }
         return AccumOutput(scores, None if self.fisher is None else self.fisher.float())
@@ -64,7 +61,7 @@ class ScoreRasterizer(StandardRasterizer):
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
         self._check(g, opt)
-        check_scores(opt.scores, cam.height, cam.width)
+        opt.check_scores(cam)
         result = super().render(g, cam, replace(opt, scores=(), fisher=False))
         if not opt.scores and not opt.fisher:
             return result
@@ -79,13 +76,12 @@ class ScoreRasterizer(StandardRasterizer):
         self._check(g, opt)
         totals = _Totals(g, opt)
         for cam in cams:
-            check_scores(opt.scores, cam.height, cam.width)
+            opt.check_scores(cam)
             self._add(g, cam, opt, totals)
         return totals.result()
 
     def _check(self, g: GaussianInputs, opt: RasterOptions) -> None:
-        check_request(self.info, g, opt)
-        check_placement(self.info, g)
+        self.info.check_request(g, opt)
         if len(opt.scores) > MAX_SCORES:
             raise CapabilityError(
                 f"rasterizer '{self.info.name}' forms at most {MAX_SCORES} scores at once, got {len(opt.scores)}",
@@ -129,28 +125,28 @@ def _pixel_weights(specs: tuple[ScoreSpec, ...], like: Tensor) -> tuple[Tensor |
 class CountRasterizer(ScoreRasterizer):
     """All sums of contributions (LightGaussian's are "hits" and "opacity_T"; also those of MesonGS and FastGS)."""
 
-    info = declared_info(plugin.register_rasterizers, "count")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "count")
 
 
 class SpeedyRasterizer(ScoreRasterizer):
     """Squared derivatives of the image by a Gaussian's value: Speedy-Splat's score."""
 
-    info = declared_info(plugin.register_rasterizers, "speedy")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "speedy")
 
 
 class PupRasterizer(ScoreRasterizer):
     """Fisher blocks of mean and log scale (PUP 3D-GS), and every other score."""
 
-    info = declared_info(plugin.register_rasterizers, "pup")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "pup")
 
 
 class MesonRasterizer(ScoreRasterizer):
     """MesonGS' importance: the sum of alpha T."""
 
-    info = declared_info(plugin.register_rasterizers, "mesongs")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "mesongs")
 
 
 class TrimRasterizer(ScoreRasterizer):
     """TrimGS' contribution, rule "tested", and its maps: features that leave the geometry alone, median depth."""
 
-    info = declared_info(plugin.register_rasterizers, "trimgs")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "trimgs")

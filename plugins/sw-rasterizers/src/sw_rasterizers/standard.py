@@ -20,12 +20,7 @@ from splatwizard_core.api import (
     RasterStats,
     RenderResult,
     ShapeError,
-    check_request,
-    checked_background,
 )
-from splatwizard_core.rendering.checks import check_placement
-from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import check_offered, option_features
 from sw_rasterizers import plugin
 from sw_rasterizers.ops import Call, Flag, camera_numbers, rasterize, visible_radii
 
@@ -44,15 +39,14 @@ class StandardRasterizer:
             slow, for benchmarks
     """
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "standard")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "standard")
 
     def __init__(self, *, count: bool = False) -> None:
         self.count = count
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        check_request(self.info, g, opt)
-        check_placement(self.info, g)
+        self.info.check_request(g, opt)
         call = self._call(g, cam, opt)
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
             raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
@@ -111,20 +105,13 @@ class StandardRasterizer:
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
-        g.validate()
-        if g.geom_indices is not None or g.scale_factors is not None:
-            check_offered(self.info, Feature.INDEXED_GEOM)
-        if g.scales is not None and g.scales.shape[1] == 2:
-            check_offered(self.info, Feature.SURFEL)
-        if g.means.dtype == torch.float64:
-            check_offered(self.info.on(g.means.device.type), Feature.FLOAT64)
-        check_placement(self.info, g)
+        self.info.check_geometry(g)
         return visible_radii(g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam)
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
         """No score is declared: raises CapabilityError for any that is asked for."""
-        check_offered(self.info, option_features(opt))
+        self.info.check_offered(Feature.asked_by(opt))
         return AccumOutput({})
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
@@ -133,7 +120,7 @@ class StandardRasterizer:
             opt.features_detach_geometry, opt.absgrad, opt.alpha, self.count,
         )  # fmt: skip
         watch = torch.is_grad_enabled()
-        background = checked_background(opt, 3 if g.colors is None else g.colors.shape[1], cam, g.means)
+        background = opt.background_of(3 if g.colors is None else g.colors.shape[1], cam, g.means)
         return Call(
             camera_numbers(cam),
             cam.width,

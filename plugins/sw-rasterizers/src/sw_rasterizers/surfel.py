@@ -18,12 +18,7 @@ from splatwizard_core.api import (
     RasterOptions,
     RasterStats,
     RenderResult,
-    check_request,
-    checked_background,
 )
-from splatwizard_core.rendering.checks import check_placement
-from splatwizard_core.rendering.negotiation import declared_info
-from splatwizard_core.rendering.rasterizer import check_offered, option_features
 from sw_rasterizers import plugin
 from sw_rasterizers.native import MODULE
 from sw_rasterizers.ops import BACKWARD_STAGES, FORWARD_STAGES, Call, Flag, camera_numbers
@@ -49,15 +44,14 @@ class SurfelRasterizer:
             CUDA also the only way to the seconds of the stages, which wait for the device
     """
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "2dgs")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "2dgs")
 
     def __init__(self, *, count: bool = False) -> None:
         self.count = count
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        check_request(self.info, g, opt)
-        check_placement(self.info, g)
+        self.info.check_request(g, opt)
         call, flags = self._call(g, cam, opt)
         sh = g.sh
         image, radii, alpha, maps = _draw(
@@ -101,14 +95,7 @@ class SurfelRasterizer:
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means, scales and quats (opacities and colours are not looked at); 0 = culled."""
-        g.validate()
-        required = Feature.SURFEL if g.scales is not None and g.scales.shape[1] == 2 else Feature(0)
-        if g.cov3d is not None:
-            required |= Feature.COV3D
-        if g.geom_indices is not None or g.scale_factors is not None:
-            required |= Feature.INDEXED_GEOM
-        check_offered(self.info, required)
-        check_placement(self.info, g)
+        self.info.check_geometry(g)
         MODULE.load()
         geometry = [None if x is None else x.detach().contiguous() for x in (g.means, g.scales, g.quats)]
         found: Tensor = torch.ops.sw_rasterizers.visible_surfel_radii(
@@ -119,7 +106,7 @@ class SurfelRasterizer:
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
         """No score is declared: raises CapabilityError for any that is asked for."""
-        check_offered(self.info, option_features(opt) | Feature.SURFEL)
+        self.info.check_offered(Feature.asked_by(opt) | Feature.SURFEL)
         return AccumOutput({})
 
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> tuple[Call, int]:
@@ -134,7 +121,7 @@ class SurfelRasterizer:
         ):
             if asked:
                 flags |= flag
-        background = checked_background(opt, 3, cam, g.means)
+        background = opt.background_of(3, cam, g.means)
         call = Call(
             camera_numbers(cam),
             cam.width,

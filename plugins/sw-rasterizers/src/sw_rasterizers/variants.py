@@ -7,8 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions, RenderResult, check_request
-from splatwizard_core.rendering.negotiation import declared_info
+from splatwizard_core.api import Camera, GaussianInputs, RasterizerInfo, RasterOptions, RenderResult
 from sw_rasterizers import plugin
 from sw_rasterizers.segments import Tables
 from sw_rasterizers.standard import StandardRasterizer
@@ -21,7 +20,7 @@ class AccelRasterizer(StandardRasterizer):
     from the final transmittance.
     """
 
-    info = declared_info(plugin.register_rasterizers, "accel")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "accel")
 
 
 class DepthRasterizer(StandardRasterizer):
@@ -30,7 +29,7 @@ class DepthRasterizer(StandardRasterizer):
     Source: hierarchical 3DGS (arXiv 2406.12080) for the inverse depth, Mip-Splatting (arXiv 2311.16493) for the factor.
     """
 
-    info = declared_info(plugin.register_rasterizers, "depth")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "depth")
 
 
 class IndexedRasterizer(StandardRasterizer):
@@ -41,7 +40,7 @@ class IndexedRasterizer(StandardRasterizer):
     Source: C3DGS (arXiv 2401.02436).
     """
 
-    info = declared_info(plugin.register_rasterizers, "c3dgs")
+    info = RasterizerInfo.declared(plugin.register_rasterizers, "c3dgs")
 
     def __init__(self, *, count: bool = False) -> None:
         super().__init__(count=count)
@@ -49,26 +48,11 @@ class IndexedRasterizer(StandardRasterizer):
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """As `standard`; `RenderResult.inputs` are the inputs as they came. Raises ShapeError for a wrong index too."""
-        check_request(self.info, g, opt)
-        return replace(super().render(self._gathered(g), cam, opt), inputs=g)
+        self.info.check_request(g, opt)
+        return replace(super().render(g.gathered(lookup=self._tables.lookup), cam, opt), inputs=g)
 
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from geometry alone; 0 = culled."""
-        g.validate()
-        return super().visible_filter(self._gathered(g), cam)
-
-    def _gathered(self, g: GaussianInputs) -> GaussianInputs:
-        """A shallow copy in which every Gaussian has its own scales, quaternion and colours; differentiable."""
-        lookup, scales, quats, sh = self._tables.lookup, g.scales, g.quats, g.sh
-        if g.geom_indices is not None and scales is not None and quats is not None:
-            scales, quats = lookup(scales, g.geom_indices), lookup(quats, g.geom_indices)
-        if g.scale_factors is not None and scales is not None:
-            scales = scales * g.scale_factors[:, None]
-        if sh is not None and sh.codebook is not None and sh.indices is not None:
-            rest = lookup(sh.codebook, sh.indices)
-            if sh.dc is None:
-                sh = SH(dense=rest, active_degree=sh.active_degree)
-            else:
-                sh = SH(dc=sh.dc, rest=rest, active_degree=sh.active_degree)
-        return replace(g, scales=scales, quats=quats, sh=sh, geom_indices=None, scale_factors=None)
+        self.info.check_geometry(g)
+        return super().visible_filter(g.gathered(lookup=self._tables.lookup), cam)

@@ -98,7 +98,7 @@ def box_rectangles(low: Tensor, high: Tensor, drawn: Tensor, width: int, height:
 
 @dataclass
 class Splats:
-    """What is composited, in depth order: one row of `packed` a splat, so that a chunk is one gather.
+    """The splats to composite, in depth order: one row of `packed` a splat, so that a chunk is one gather.
 
     packed      [V, 8 + D]: u (2), conic (3), opacity, absgrad probe (2, zeros), channels (D)
     detached    the last so many channels do not influence the geometry
@@ -257,7 +257,7 @@ def evaluated(splats: Splats, lists: TileLists, batch: Batch) -> Iterator[tuple[
 
 
 State = tuple[Tensor | None, ...]
-"""What a pixel accumulates, each [B,P] or [B,P,D]; all zero in front of the first splat."""
+"""Sums of a pixel, each [B,P] or [B,P,D]; all zero in front of the first splat."""
 Blend = Callable[..., tuple[Tensor, ...]]
 """(packed, ids, valid, centres, T, done, *state) -> (T, done, number of blended pairs, *state): one chunk."""
 

@@ -1,4 +1,4 @@
-"""What this package provides: the rasterizer `reference`."""
+"""Registration of the rasterizer `reference`."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -26,6 +26,7 @@ def register_rasterizers(registry: Registry) -> None:
                 "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_GRAD_SQ", "FISHER",
             )
         ] + [["COV3D", "FISHER"]],
+        profiles=["3dgs", "dgr-exact"],
         exactness="exact",
         speed=0,
     )  # fmt: skip

@@ -20,13 +20,11 @@ from splatwizard_core.api import (
     RasterOptions,
     RasterStats,
     RenderResult,
-    check_request,
 )
-from splatwizard_core.rendering.negotiation import declared_info
 from sw_reference import plugin
 from sw_reference.compositing import Splats, composite, support_rectangles, tile_lists
 from sw_reference.projection import CLASSIC_TILE, Projection, project, visible_radii
-from sw_reference.scores import merge_scores, score_dtype, view_fisher, view_scores
+from sw_reference.scores import merge_scores, view_fisher, view_scores
 from sw_reference.shading import background_image, splat_colors
 from sw_reference.surfels import are_surfels, check_ellipsoids, draw_surfels, visible_surfel_radii
 
@@ -42,7 +40,7 @@ class ReferenceRasterizer:
     In both cases a Gaussian is culled where the original culls it (radii == 0).
     """
 
-    info: RasterizerInfo = declared_info(plugin.register_rasterizers, "reference")
+    info: RasterizerInfo = RasterizerInfo.declared(plugin.register_rasterizers, "reference")
 
     def __init__(self, *, classic_tiles: bool = False, tile: int = 8) -> None:
         self.classic_tiles = classic_tiles
@@ -50,7 +48,8 @@ class ReferenceRasterizer:
 
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
-        check_request(self.info, g, opt)
+        self.info.check_request(g, opt)
+        opt.check_scores(cam)
         cam = cam.to(g.means.device, g.means.dtype)
         quirks = opt.profile == "dgr-exact"
         classic = self.classic_tiles or quirks
@@ -96,7 +95,7 @@ class ReferenceRasterizer:
             for spec in opt.scores:
                 full = torch.zeros(len(g), dtype=torch.float64, device=g.means.device)
                 full[p.rows[order]] = per_splat[spec.name]
-                scores[spec.name] = full.to(score_dtype(spec))
+                scores[spec.name] = full.to(spec.dtype)
         return RenderResult(
             image=drawn.channels[:num_colors] + drawn.T * background,
             radii=p.radii,
@@ -121,15 +120,15 @@ class ReferenceRasterizer:
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
-        g.validate()
+        self.info.check_geometry(g)
         cam = cam.to(g.means.device, g.means.dtype)
         return visible_surfel_radii(g, cam) if are_surfels(g) else visible_radii(g, cam, RasterOptions())
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
         """Sum scores and Fisher blocks over views ("blend_max": their maximum)."""
-        check_request(self.info, g, opt)
-        totals = {s.name: torch.zeros(len(g), dtype=score_dtype(s), device=g.means.device) for s in opt.scores}
+        self.info.check_request(g, opt)
+        totals = {s.name: torch.zeros(len(g), dtype=s.dtype, device=g.means.device) for s in opt.scores}
         fisher = g.means.new_zeros(len(g), 21, dtype=torch.float64) if opt.fisher else None
         for cam in cams:
             if opt.scores:

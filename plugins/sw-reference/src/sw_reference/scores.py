@@ -8,7 +8,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import ConfigError, GaussianInputs, ScoreSpec
+from splatwizard_core.api import GaussianInputs, ScoreSpec
 from sw_reference.compositing import (
     T_MIN,
     Batch,
@@ -20,29 +20,9 @@ from sw_reference.compositing import (
 )
 
 
-def score_dtype(spec: ScoreSpec) -> torch.dtype:
-    """int32 for counts (also under a mask), float32 for everything else."""
-    whole = spec.pixel_weight is None or not spec.pixel_weight.is_floating_point()
-    return torch.int32 if spec.kind == "hits" and whole else torch.float32
-
-
 def merge_scores(spec: ScoreSpec, total: Tensor, view: Tensor) -> Tensor:
     """Add one view's score to the running total (the maximum for "blend_max")."""
     return torch.maximum(total, view) if spec.kind == "blend_max" else total + view
-
-
-def check_scores(specs: tuple[ScoreSpec, ...], height: int, width: int) -> None:
-    """Raise ConfigError for an unknown rule, a pixel weight of the wrong size, or two scores of one name."""
-    for spec in specs:
-        rules = ("blended",) if spec.kind == "grad_sq" else ("blended", "tested")
-        if spec.rule not in rules:
-            raise ConfigError(f"score '{spec.name}': rule is '{spec.rule}', must be {' or '.join(map(repr, rules))}")
-        if spec.pixel_weight is not None and spec.pixel_weight.shape != (height, width):
-            raise ConfigError(
-                f"score '{spec.name}': pixel_weight is {list(spec.pixel_weight.shape)}, must be [{height}, {width}]"
-            )
-    if len({s.name for s in specs}) < len(specs):
-        raise ConfigError(f"two scores have one name: {', '.join(s.name for s in specs)}")
 
 
 @torch.no_grad()
@@ -56,10 +36,8 @@ def view_scores(
     Over blended pairs: hits 1; opacity o; opacity_T o T; blend alpha T; blend_max its maximum;
     gamma alpha^(2g) T^(2-2g); dist |d| in pixels; grad_sq (o dL/dalpha)^2 for L = sum of all pixels and channels
     (Speedy-Splat, arXiv 2412.00578). Rule "tested" also counts the splat that triggers the stop.
-    Raises ConfigError as `check_scores` does.
     """
     height, width = background.shape[1:]
-    check_scores(specs, height, width)
     packed = splats.packed
     totals = {s.name: torch.zeros(len(packed), dtype=torch.float64, device=packed.device) for s in specs}
     if not len(packed):
@@ -137,18 +115,15 @@ def view_fisher(draw: Callable[[GaussianInputs], Tensor], g: GaussianInputs) -> 
     Returns [N,21] float64, the upper triangle row by row of F = sum over pixels and channels of g g^T,
     g = d image / d (mean, log scale): mean, projected covariance and viewing direction (PUP 3D-GS, arXiv 2406.10219).
     """
+    with torch.no_grad():
+        g = g.gathered(colors=False)
     assert g.scales is not None
     assert g.quats is not None
-    scales, quats = g.scales.detach(), g.quats.detach()
-    if g.geom_indices is not None:
-        scales, quats = scales[g.geom_indices], quats[g.geom_indices]
-    if g.scale_factors is not None:
-        scales = scales * g.scale_factors.detach()[:, None]
     first, second = torch.triu_indices(6, 6, device=g.means.device)
     blocks = torch.zeros(len(g), len(first), dtype=torch.float64, device=g.means.device)
     with torch.enable_grad():
-        means, scales = g.means.detach().requires_grad_(), scales.requires_grad_()
-        image = draw(replace(g, means=means, scales=scales, quats=quats, geom_indices=None, scale_factors=None))
+        means, scales = g.means.detach().requires_grad_(), g.scales.detach().requires_grad_()
+        image = draw(replace(g, means=means, scales=scales, quats=g.quats.detach()))
         if not image.requires_grad:
             return blocks
         for value in image.flatten():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, checked_background, view_colors
+from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
 
 
 def splat_colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) -> Tensor:
@@ -12,12 +12,12 @@ def splat_colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOption
     if g.colors is not None:
         return g.colors[rows]
     assert g.sh is not None
-    return view_colors(g.sh.to_dense()[rows], g.means[rows], cam.center, g.sh.active_degree, clamp=opt.clamp_color)
+    return g.sh.colors_from(cam.center, g.means, rows=rows, clamp=opt.clamp_color)
 
 
 def background_image(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor:
     """[C,H,W]."""
-    background = checked_background(opt, channels, cam, like)
+    background = opt.background_of(channels, cam, like)
     if background is None:
         return like.new_zeros(channels, cam.height, cam.width)
     if background.ndim == 1:

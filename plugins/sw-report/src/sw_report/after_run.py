@@ -1,5 +1,7 @@
-"""What `sw run` leaves besides the record: the photographs that its page shows, and the page; also above its folder,
-there with rate and distortion as a file of its own."""
+"""Reports that `sw run` leaves: a page in each run directory, with the photographs that it shows, and the table.
+
+Several runs also have a page above their directories, and beside it rate and distortion as a file of its own.
+"""
 
 from __future__ import annotations
 
@@ -27,13 +29,16 @@ def report_finished(runs: FinishedRuns) -> None:
         runs.written.extend(page for page in pages if page is not None)
         return
     above = [report_above(directories, runs.say), plot_above(directories, runs.say)]
+    if any(above):  # the pages of single runs lie beside their records
+        own = {directory / FILE_NAME for directory in directories}
+        runs.written[:] = [path for path in runs.written if path not in own]
     runs.written.extend(path for path in above if path is not None)
     if runs.console is not None:
         print_results([(run.record, run.directory) for run in runs.runs], runs.written, runs.console)
 
 
 def report_run(directory: Path, open_scene: Callable[[], Scene], say: Callable[[str], None]) -> Path | None:
-    """Write the page of a finished run, unless it is there and newer than its record; its path.
+    """Write the page of a finished run, unless it is there and newer than its record, and return its path.
 
     A page that cannot be made is told in one line (and None): it never makes a finished run fail.
     """
@@ -87,18 +92,20 @@ def plot_above(directories: Sequence[Path], say: Callable[[str], None]) -> Path 
 
 
 def folder_above(directories: Sequence[Path]) -> Path:
-    """The folder right above all these run directories."""
+    """Folder right above all these run directories."""
     parents = {directory.parent for directory in directories}
     return parents.pop() if len(parents) == 1 else directories[0].parent.parent
 
 
 @contextlib.contextmanager
 def _told(page: Path, say: Callable[[str], None]) -> Iterator[list[Path]]:
-    """Turn what keeps a page from being made into a line."""
+    """Turn any error into one line: the run is finished, and its table follows."""
     try:
         yield []
-    except (SplatwizardError, OSError, ValueError) as error:
-        say(f"warning: {page} was not written: {error} (the results are whole; `sw report` makes pages, too)")
+    except Exception as error:
+        foreseen = isinstance(error, (SplatwizardError, OSError, ValueError))
+        why = str(error) if foreseen else f"{type(error).__name__}: {error}"
+        say(f"warning: {page} was not written: {why} (the results are whole; `sw report` makes pages, too)")
 
 
 def _is_newer(page: Path, directories: Sequence[Path]) -> bool:

@@ -1,4 +1,4 @@
-"""From scenes to data sets: plain means, and nothing where a scene is missing.
+"""Means over the scenes of a data set: plain, and none where a scene is missing.
 
 Source: evaluation protocol, aggregation. A mean over what happens to exist would compare different scenes.
 """
@@ -8,13 +8,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from sw_datasets.families import BENCHMARKS
-
+from sw_report.declared import dataset_facts
 from sw_report.numbers import ordered_metrics
 from sw_report.runs import Run, natural
-
-# The scenes that tables of the field report; the family also names the two of the original BungeeNeRF release.
-TABLE_SCENES = {"bungee": ("amsterdam", "bilbao", "hollywood", "pompidou", "quebec", "rome")}
 
 
 @dataclass(frozen=True)
@@ -63,7 +59,7 @@ def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[Datase
 
 
 def comparable(runs: Sequence[Run]) -> list[list[Run]]:
-    """The runs that may share a mean over scenes: one data set, one set of rules.
+    """Group the runs that may share a mean over scenes: of one data set, by one set of rules.
 
     Only the picture folder may differ between scenes, and then only within one named protocol: `survey` and `inria`
     read the same scenes of Mip-NeRF 360 from different folders.
@@ -96,25 +92,19 @@ def _one_protocol_a_scene(group: Sequence[Run]) -> list[list[Run]]:
 
 
 def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
-    dataset = runs[0].facts.dataset
-    family = BENCHMARKS.get(dataset)
-    published = TABLE_SCENES.get(dataset, family.scenes) if family is not None else ()
-
-    def scene_of(run: Run) -> str:
-        known = family.scene_of(run.facts.scene) if family is not None else None
-        return known or run.facts.scene
-
-    scenes = published or tuple(sorted({scene_of(run) for run in runs}, key=natural))
+    dataset = dataset_facts(runs[0].facts.dataset)
+    scene_of = {run: dataset.scene_of(run.facts.scene) for run in runs}
+    scenes = dataset.scenes or tuple(sorted(set(scene_of.values()), key=natural))
     rows: dict[tuple[str, str | None], dict[str, Run]] = {}
-    for run in runs:
-        if scene_of(run) in scenes:
-            rows.setdefault((run.variant, run.facts.rate), {})[scene_of(run)] = run
+    for run, scene in scene_of.items():
+        if scene in scenes:
+            rows.setdefault((run.variant, run.facts.rate), {})[scene] = run
     names = ordered_metrics(name for run in runs for name in run.facts.metrics)
     return DatasetTable(
-        dataset,
-        family.title if family is not None else dataset,
+        runs[0].facts.dataset,
+        dataset.title,
         scenes,
-        bool(published),
+        bool(dataset.scenes),
         tuple(dict.fromkeys(run.facts.protocol.id for run in runs)),
         sorted(
             (_row(variant, rate, by_scene, scenes, names, partial) for (variant, rate), by_scene in rows.items()),
@@ -144,7 +134,7 @@ def _row(
 
 
 def mean(values: Sequence[float | None], *, partial: bool = False) -> float | None:
-    """The plain mean; None if one is unknown (partial: those are left out) or there is none."""
+    """Plain mean; None if one is unknown (partial: those are left out) or there is none."""
     known = [value for value in values if value is not None]
     if not known or (len(known) < len(values) and not partial):
         return None

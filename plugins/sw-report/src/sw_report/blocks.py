@@ -1,4 +1,4 @@
-"""What a page is made of: tables, groups of charts, galleries, under headings. The template draws them."""
+"""Parts of a page: tables, groups of charts, galleries, under headings. The template draws them."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """The first column names the rows."""
+    """Table whose first column names the rows."""
 
     title: str
     columns: list[Column]

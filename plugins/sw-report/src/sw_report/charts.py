@@ -59,7 +59,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Chart:
-    """What is drawn.
+    """Contents of one chart.
 
     title       says what the chart shows, for those who do not see it
     levels      (y, what it is): horizontal lines across
@@ -75,7 +75,7 @@ class Chart:
     borders: Sequence[tuple[float, str]] = field(default=())
 
     def draw(self) -> Markup:
-        """The SVG element. Raises ValueError if no series has a point."""
+        """Return the SVG element. Raises ValueError if no series has a point."""
         points = [p for s in self.series for p in s.points]
         if not points:
             raise ValueError("a chart needs at least one point")
@@ -158,12 +158,12 @@ def _series(series: Series, x: Axis, y: Axis) -> Markup:
 
 
 def _marker(style: int) -> str:
-    """The shape of a series: colours repeat after STYLES series, then each has another shape than before."""
+    """Shape of a series: colours repeat after STYLES series, then each has another shape than before."""
     return MARKERS[(style + style // STYLES) % len(MARKERS)]
 
 
 def swatch(style: int, *, dashed: bool = False, marks: bool = True) -> Markup:
-    """The key of a series in a legend."""
+    """Key of a series in a legend."""
     marker = Markup('<g class="point" transform="translate(14,7)"><path d="{}"/></g>').format(_marker(style))
     return Markup(
         '<svg class="swatch s{}" viewBox="0 0 28 14" width="28" height="14" aria-hidden="true">'
@@ -209,7 +209,7 @@ def stacked_bars(title: str, rows: Sequence[Bar]) -> Markup:
 
 
 def square(style: int) -> Markup:
-    """The key of a part of a bar."""
+    """Key of a part of a bar."""
     return Markup(
         '<svg class="swatch bars" viewBox="0 0 14 14" width="14" height="14" aria-hidden="true">'
         '<rect class="s{}{}" x="1" y="1" width="12" height="12"/></svg>'

@@ -7,23 +7,31 @@ from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.tooling import console, debug_option, options, output_file, output_folder, print_json, say
+from splatwizard_core.tooling import (
+    complete_files,
+    complete_folders,
+    complete_names,
+    console,
+    debug_option,
+    options,
+    output_file,
+    output_folder,
+    print_json,
+    say,
+)
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
     from sw_report.blocks import Table
     from sw_report.runs import Run
 
-FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
-
 
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
-@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete.folders)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete_folders)
 @options(
-    click.option("--html", metavar="FILE", shell_complete=complete.files,
+    click.option("--html", metavar="FILE", shell_complete=complete_files,
                  help="Write one self-contained page there.  [default: none]"),
-    click.option("--survey", metavar="FOLDER", shell_complete=complete.folders,
+    click.option("--survey", metavar="FOLDER", shell_complete=complete_folders,
                  help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
                  "[default: none]"),
     click.option("--csv", "form", flag_value="csv",
@@ -32,9 +40,9 @@ FORMATS = ("csv", "json", "jsonl", "latex", "markdown")
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
-    click.option("--anchor", metavar="METHOD", shell_complete=complete.names("method"),
-                 help="What BD-rates compare against.  [default: hac, lightgaussian, "
-                 "3dgs, or the first]"),
+    click.option("--anchor", metavar="METHOD", shell_complete=complete_names("method"),
+                 help="What BD-rates compare against.  [default: the most usual "
+                 "of the methods, or the first]"),
     click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),
     click.option("--partial", is_flag=True, help="Means over the scenes that are there, the missing ones named; "
                  "without it, one missing scene leaves no mean."),
@@ -57,12 +65,7 @@ def report(
     Results are comparable inside one protocol only; runs of different protocols stand in different tables. Without an
     option that prints something else, tables are printed as text.
     """
-    from splatwizard_core.api import CapabilityError
-
-    try:
-        from sw_report import exports
-    except ModuleNotFoundError as error:
-        raise CapabilityError("sw report needs jinja2: pip install 'splatwizard-core[report]'") from error
+    from sw_report import exports
     from sw_report.distortion import choose_anchor
     from sw_report.runs import collect
 
@@ -97,19 +100,15 @@ def report(
 
 
 def open_scene(run: Run) -> Scene:
-    """The scene of a run, read as the run read it. Raises what reading a scene raises."""
-    from splatwizard_core.api import SceneError
+    """Read the scene of a run as the run read it. Raises what reading a scene raises."""
     from splatwizard_core.tooling import existing_file, load_plugins, load_scene, resolve_run_options
 
-    config = existing_file(str(run.directory / "config.toml"))
-    _, scene_options, spec = resolve_run_options(str(config), {})
-    if spec is None:
-        raise SceneError(f"{config} names no scene")
-    return load_scene(spec, scene_options, load_plugins())
+    resolved = resolve_run_options(str(existing_file(str(run.directory / "config.toml"))), {})
+    return load_scene(resolved.scene_spec, resolved.scene, load_plugins())
 
 
 def print_tables(tables: list[tuple[str, Table]], notes: list[str]) -> None:
-    """As text on stdout."""
+    """Print tables as text on stdout."""
     from rich.markup import escape
     from rich.table import Table as Drawn
 

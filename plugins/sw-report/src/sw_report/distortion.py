@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 from splatwizard_core.api import UserInputError
 from sw_report.aggregate import comparable, mean
+from sw_report.declared import bd_anchor_rank
 from sw_report.numbers import main_lpips
 from sw_report.rate_distortion import BdResult, bd_quality, bd_rate
-from sw_report.runs import Run
+from sw_report.runs import Run, natural
 
-# The anchors of tables, most usual first; else whatever comes first.
-USUAL_ANCHORS = ("hac", "lightgaussian", "3dgs")
 FLAG_TEXTS = {
     "low_overlap": "the curves share less than a quarter of their range",
     "few_points": "fewer than 4 points, joined by straight lines",
@@ -41,7 +40,7 @@ class BdRow:
 
 @dataclass(frozen=True)
 class BdTable:
-    """All methods against one anchor by one metric, in one protocol group."""
+    """BD values of all methods against one anchor, by one metric, in one protocol group."""
 
     metric: str
     anchor: str
@@ -50,7 +49,13 @@ class BdTable:
 
 
 def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
-    """The variant that is compared against; None if there is only one. Raises UserInputError for an unknown one."""
+    """Choose the variant that others are compared against; None if there is only one.
+
+    wanted  a variant or a method; None: the method that declares the smallest `bd_anchor`, else the alphabetically
+            first variant
+
+    Raises UserInputError for a name that no run is of, or that several variants share.
+    """
     variants = list(dict.fromkeys(run.variant for run in runs))
     if wanted is not None:
         matches = [v for v in variants if v == wanted] or [r.variant for r in runs if r.facts.method == wanted]
@@ -61,12 +66,12 @@ def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
         return matches[0]
     if len(variants) < 2:
         return None
-    methods = {run.facts.method: run.variant for run in reversed(runs)}
-    return next((methods[name] for name in USUAL_ANCHORS if name in methods), variants[0])
+    methods = {run.variant: run.facts.method for run in runs}
+    return min(variants, key=lambda variant: (bd_anchor_rank(methods[variant]), natural(variant)))
 
 
 def bd_metrics(runs: Sequence[Run]) -> list[str]:
-    """The metrics that curves are compared by: PSNR, SSIM and one LPIPS, as far as they are there."""
+    """Metrics that curves are compared by: PSNR, SSIM and one LPIPS, as far as they are there."""
     known = {name for run in runs for name, metric in run.facts.metrics.items() if metric.mean is not None}
     lpips = main_lpips(known)
     return [name for name in ("psnr", "ssim", lpips) if name in known]

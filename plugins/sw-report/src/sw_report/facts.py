@@ -1,4 +1,4 @@
-"""What a report reads of a result record: whatever release of this software, or other software, wrote it.
+"""Reader of result records that any release of this software, or other software, wrote.
 
 `record.Record` is what is written, strictly. A report reads also what older and newer releases wrote, and files that
 strangers sent: it takes what it understands, says what it does not, and invents nothing.
@@ -31,13 +31,13 @@ Text = Annotated[str, AfterValidator(clean)]
 
 
 class Facts(BaseModel):
-    """Base of the blocks: what is not known here is passed over."""
+    """Base of the blocks: unknown keys are passed over."""
 
     model_config = ConfigDict(extra="ignore", frozen=True, allow_inf_nan=False)
 
 
 class ProtocolFacts(Facts):
-    """Only results of equal ids are comparable; the other rules stand beside it."""
+    """Protocol of a result. Only results of equal ids are comparable; the other rules stand beside it."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -48,7 +48,7 @@ class ProtocolFacts(Facts):
         return {clean(name): value for name, value in self.model_dump().items() if name != "id"}
 
     def without_folder(self) -> str:
-        """The id of all rules but the picture folder, which may differ between the scenes of one data set."""
+        """Id of all rules but the picture folder, which may differ between the scenes of one data set."""
         images = self.rules().get("images")
         parts = self.id.split("/")
         return "/".join("*" if part == images else part for part in parts) if isinstance(images, str) else self.id
@@ -64,7 +64,7 @@ class MetricFacts(Facts):
 
 
 class FileFacts(Facts):
-    """The encoded file; `sections` is bytes by section."""
+    """Encoded file; `sections` is bytes by section."""
 
     bytes: int = Field(gt=0)
     sha256: Text | None = None
@@ -111,7 +111,7 @@ class TrainFacts(Facts):
     trained_in: Text | None = None
 
     def started_from(self) -> str:
-        """What the training started from, in words; empty: nothing that was trained."""
+        """Trained scenes that the training started from, in words; empty if there are none."""
         found = []
         for name, scene in (self.pretraining or {}).items():
             steps = "" if scene.steps is None else f", {numbers.count(scene.steps)} steps"
@@ -123,7 +123,7 @@ class TrainFacts(Facts):
 
 
 class PartFacts(Facts):
-    """One that served: a rasterizer, a stage, a coder, ..., and the distribution that it comes from."""
+    """Part that served a phase (a rasterizer, a stage, a coder, ...), and the distribution that it comes from."""
 
     kind: Text
     name: Text
@@ -136,7 +136,7 @@ class PhaseFacts(Facts):
     provided_by: list[PartFacts] = []
 
     def by_distribution(self) -> dict[str, list[str]]:
-        """`sw-codecs 0.1` -> what of it served, such as `coder octree`."""
+        """Distribution -> its parts that served: `sw-codecs 0.1` -> `coder octree`."""
         found: dict[str, list[str]] = {}
         for part in self.provided_by:
             owner = f"{part.distribution} {part.version}".strip() or "no distribution"
@@ -182,7 +182,7 @@ INDISPENSABLE = ("schema_version", "method", "scene", "protocol", "file", "metri
 
 
 def read_facts(path: Path) -> tuple[RunFacts, list[str]]:
-    """What a record says, and notes on what of it could not be understood.
+    """Read a record; return its facts, and notes on parts of it that could not be understood.
 
     Raises UserInputError that names the first thing wrong, if an indispensable part is missing or makes no sense.
     """

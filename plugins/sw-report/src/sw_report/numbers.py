@@ -1,47 +1,47 @@
-"""How numbers and metric names are written, the same in every kind of report."""
+"""Spelling of numbers and metric names, the same in every kind of report."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
+
+from sw_report.declared import metric_key, metric_style
 
 MISSING = "–"
 FIELD_LPIPS = "lpips_vgg_3dgs"  # the form that the field's tables, the survey's among them, print
-_ORDER = ("psnr", "ssim", FIELD_LPIPS, "lpips_vgg", "lpips_alex", "l1")
-_HEADINGS = {
-    "psnr": "PSNR dB",
-    "ssim": "SSIM",
-    "l1": "L1",
-    "lpips_vgg_3dgs": "LPIPS (VGG, 3DGS)",
-    "lpips_vgg": "LPIPS (VGG)",
-    "lpips_alex": "LPIPS (Alex)",
-}
-
-
-def _key(metric: str) -> str:
-    return metric.lower().replace("-", "_")
 
 
 def ordered_metrics(names: Iterable[str]) -> list[str]:
-    """Metric names without repetition, the field's usual ones first."""
-    return sorted(dict.fromkeys(names), key=lambda n: (_ORDER.index(_key(n)) if _key(n) in _ORDER else 99, n))
+    """Metric names without repetition, by the positions that they declare; those without one last, by name."""
+    return sorted(dict.fromkeys(names), key=lambda name: (metric_style(name).position, name))
+
+
+def order_after_run(metric: str) -> float:
+    """Place of a metric in the table that `sw run` prints: further forms of LPIPS have none, like unknown metrics."""
+    further = is_lpips(metric) and metric_key(metric) != FIELD_LPIPS
+    return math.inf if further else metric_style(metric).position
+
+
+def is_lpips(metric: str) -> bool:
+    """Whether a metric is a form of LPIPS, which are never compared with each other."""
+    return metric_key(metric).startswith("lpips")
 
 
 def main_lpips(names: Iterable[str]) -> str | None:
-    """The LPIPS that tables of the field use, or whichever is there."""
-    found = [name for name in ordered_metrics(names) if _key(name).startswith("lpips")]
-    return found[0] if found else None
+    """Name of the LPIPS that tables of the field use, else of the first that is there; None without any."""
+    return next((name for name in ordered_metrics(names) if is_lpips(name)), None)
 
 
 def heading(metric: str) -> str:
-    return _HEADINGS.get(_key(metric), metric)
+    """A metric with its unit, as the head of a column."""
+    return metric_style(metric).heading
 
 
 def score(metric: str, value: float | None, *, digits: int | None = None) -> str:
-    """A value of a metric: decibels with 2 decimals, the others with 4."""
+    """A value of a metric, with as many decimals as the metric declares unless told otherwise."""
     if value is None:
         return MISSING
-    decibel = "psnr" in _key(metric)
-    return f"{value:.{(2 if decibel else 4) if digits is None else digits}f}"
+    return f"{value:.{metric_style(metric).digits if digits is None else digits}f}"
 
 
 def megabytes(size: float | None) -> str:
@@ -53,12 +53,14 @@ def megabytes(size: float | None) -> str:
 
 
 def seconds(value: float | None) -> str:
+    """Seconds without their unit, three significant digits or so."""
     if value is None:
         return MISSING
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}" if value >= 10 else f"{value:.2f}"
 
 
 def count(value: float | None) -> str:
+    """A whole number with separators."""
     return MISSING if value is None else f"{value:,.0f}"
 
 
@@ -82,9 +84,10 @@ def rate(value: float | None) -> str:
 
 
 def percent(value: float | None) -> str:
-    """Signed, one decimal, with a real minus sign."""
+    """A percentage without its sign: one decimal, plus or a real minus before it."""
     return MISSING if value is None else f"{value:+.1f}".replace("-", "−")
 
 
 def signed(value: float | None, digits: int = 2) -> str:
+    """A difference, with a real minus sign."""
     return MISSING if value is None else f"{value:+.{digits}f}".replace("-", "−")

@@ -1,9 +1,10 @@
-"""The page: one self-contained HTML file about one run or many."""
+"""Composition of the page: one self-contained HTML file about one run or many."""
 
 from __future__ import annotations
 
 import base64
 import hashlib
+import importlib.metadata
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -12,12 +13,12 @@ from pathlib import Path
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-import splatwizard_core
 from splatwizard_core.tooling import write_atomic
 from sw_report import numbers, plots
 from sw_report import results_tables as tables
 from sw_report.aggregate import dataset_tables
 from sw_report.blocks import Part, Section, Table
+from sw_report.declared import metric_style
 from sw_report.distortion import bd_tables, choose_anchor
 from sw_report.pictures import (
     GAIN,
@@ -41,7 +42,7 @@ SHORT = {PICTURES: "Pictures", BYTES: "Bytes", VIEWS: "Views"}
 
 @dataclass(frozen=True)
 class PageOptions:
-    """What a page shows.
+    """Contents of a page.
 
     anchor      variant or method that BD-rates compare against; None: the usual one
     partial     means also where scenes are missing
@@ -63,7 +64,7 @@ def write_page(collection: Collection, path: Path, options: PageOptions | None =
 
 
 def render_page(collection: Collection, options: PageOptions) -> str:
-    """The HTML text. Raises UserInputError for an anchor that no run is of."""
+    """Return the HTML text. Raises UserInputError for an anchor that no run is of."""
     runs = collection.runs
     single = len(runs) == 1
     sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
@@ -80,7 +81,7 @@ def render_page(collection: Collection, options: PageOptions) -> str:
         title=_title(runs),
         lede=_lede(runs),
         date=datetime.now(timezone.utc).strftime("%d %B %Y").lstrip("0"),
-        version=splatwizard_core.__version__,
+        version=importlib.metadata.version("splatwizard-core"),
         figures=_key_figures(runs[0]) if single else [],
         notes=collection.notes,
         contents=[(section.id, section.short or section.title) for section in sections],
@@ -132,11 +133,8 @@ def _key_figures(run: Run) -> list[dict[str, str]]:
     facts = run.facts
     found = []
     for name in tables.metric_names([run]):
-        head = numbers.heading(name)
-        decibel = head.endswith(" dB")
-        found.append(
-            {"name": head.removesuffix(" dB"), "value": numbers.score(name, run.mean(name)), "unit": "dB" * decibel}
-        )
+        style = metric_style(name)
+        found.append({"name": style.label, "value": numbers.score(name, run.mean(name)), "unit": style.unit})
     found.append({"name": "file size", "value": numbers.megabytes(facts.file.bytes), "unit": "MB"})
     for name, n in facts.counts.items():
         found.append({"name": numbers.unit(name), "value": f"{n:,}", "unit": ""})
@@ -220,7 +218,7 @@ def _as_sections(parts: Sequence[Part], title: str, text: str) -> list[Section]:
 def _place_parts(
     runs: Sequence[Run], style_of: dict[str, int], views: int, budget: PictureBudget, options: PageOptions
 ) -> list[Part]:
-    """All about the runs of one scene under one protocol."""
+    """Compose the parts about the runs of one scene under one protocol."""
     parts = [Part(table=tables.runs_table(runs))]
     charts = plots.distortion_charts(runs, style_of)
     if charts is not None and len(runs) > 1:

@@ -57,7 +57,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class ViewRow:
-    """One view: the photograph, and what each run makes of it.
+    """Pictures of one view: the photograph and the render of each run.
 
     remark  why this view is shown, where it is not by even choice
     """
@@ -77,21 +77,21 @@ class ViewRow:
 
 @dataclass
 class Gallery:
-    """The pictures of one scene; `notes` says what is missing and what was left out."""
+    """Pictures of one scene; `notes` says what is missing and what was left out."""
 
     rows: list[ViewRow]
     notes: list[str] = field(default_factory=list)
 
 
 class PictureBudget:
-    """How many pictures and bytes the page may still hold."""
+    """Count of the pictures and bytes that the page may still hold."""
 
     def __init__(self, pictures: int = MOST_PICTURES, size: int = MOST_BYTES) -> None:
         self.pictures, self.size = pictures, size
         self.used = 0
 
     def take(self, picture: Picture | None) -> Picture | None:
-        """The picture if there is room for it, else None."""
+        """Return the picture if there is room for it, else None."""
         if picture is None or self.pictures <= 0 or self.used + len(picture.uri) * 3 // 4 > self.size:
             return None
         self.pictures -= 1
@@ -100,17 +100,18 @@ class PictureBudget:
 
     @property
     def spent(self) -> bool:
+        """Whether there is room for no further picture."""
         return self.pictures <= 0 or self.used >= 0.97 * self.size
 
 
 def views_per_scene(runs_by_scene: Sequence[int], most: int) -> int:
-    """How many views of each scene fit onto a page, at most `most`, at least 1."""
+    """Number of views of each scene that fit onto a page, at most `most`, at least 1."""
     pictures = sum(1 + 2 * min(runs, MOST_RUNS) for runs in runs_by_scene) or 1
     return max(1, min(most, MOST_PICTURES // pictures))
 
 
 def single_gallery(run: Run, truth: Truth, budget: PictureBudget, side: int = LONGEST_SIDE) -> Gallery:
-    """The pictures of one run: views spread evenly, the worst and the best."""
+    """Pictures of one run: views spread evenly, the worst and the best."""
     indices = shown_views(run.facts)
     even = set(even_views(len(run.facts.views)))
     scores = _scores(run)
@@ -128,7 +129,7 @@ def single_gallery(run: Run, truth: Truth, budget: PictureBudget, side: int = LO
 def scene_gallery(
     runs: Sequence[Run], views: int, truth: Truth, budget: PictureBudget, side: int = LONGEST_SIDE_OF_MANY
 ) -> Gallery:
-    """The pictures of several runs of one scene and protocol: the same views of each."""
+    """Pictures of several runs of one scene and protocol: the same views of each."""
     common = [name for name in runs[0].facts.views if all(name in run.facts.views for run in runs)]
     chosen = [common[i] for i in even_views(len(common))]
     chosen = [chosen[i] for i in even_views(len(chosen), min(views, len(chosen)))] if chosen else []

@@ -1,4 +1,4 @@
-"""The charts of a report: rate and distortion, bytes by section, training, scores view by view."""
+"""Charts of a report: rate and distortion, bytes by section, training, scores view by view."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from sw_report import numbers
 from sw_report.blocks import Cell, Charts, Figure, Table, columns, row
 from sw_report.charts import STYLES, Bar, Chart, Point, Series, square, stacked_bars, swatch
+from sw_report.declared import MetricStyle, metric_style
 from sw_report.distortion import bd_metrics
 from sw_report.pictures import pick_evenly
 from sw_report.results_tables import metric_names
@@ -20,11 +21,12 @@ MOST_BARS = 24
 
 
 def variants_of(runs: Sequence[Run]) -> list[str]:
+    """Names of the methods, in the order of the runs."""
     return list(dict.fromkeys(run.variant for run in runs))
 
 
 def counts_anchors(run: Run) -> bool:
-    """Whether its primitives are anchors, whose number is not comparable: drawn dashed, as in the field."""
+    """Whether a run stores anchors, whose number is not comparable with Gaussians: its line is dashed."""
     return "num_anchors" in run.facts.counts
 
 
@@ -33,6 +35,7 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
     variants = variants_of(runs)
     figures = []
     for metric in bd_metrics(runs):
+        style = metric_style(metric)
         lines = []
         for variant in variants:
             own = sorted((r for r in runs if r.variant == variant), key=lambda r: r.facts.file.bytes)
@@ -40,7 +43,7 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
                 Point(
                     run.facts.file.bytes / 1e6,
                     value,
-                    f"{run.label}: {numbers.score(metric, value)}{' dB' if metric == 'psnr' else ''} "
+                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} "
                     f"at {numbers.megabytes(run.facts.file.bytes)} MB",
                     run.facts.rate or "" if len(variants) <= 2 else "",
                 )
@@ -49,16 +52,19 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
             ]
             dashed = any(counts_anchors(run) for run in own)
             lines.append(Series(variant, points, style_of[variant], dashed))
-        name = numbers.heading(metric)
         lower = any(run.facts.metrics[metric].direction == "lower" for run in runs if metric in run.facts.metrics)
-        title = f"{name} against file size for {', '.join(variants)}"
+        title = f"{style.heading} against file size for {', '.join(variants)}"
         chart = Chart(title, lines, "file size, MB (logarithmic)", x_log=True)
-        figures.append(Figure(f"{name.replace(' dB', ', dB')}{' (lower is better)' if lower else ''}", chart.draw()))
+        figures.append(Figure(f"{_caption(style)}{' (lower is better)' if lower else ''}", chart.draw()))
     if not figures:
         return None
     legend = [(swatch(style_of[v], dashed=any(counts_anchors(r) for r in runs if r.variant == v)), v) for v in variants]
     notes = ["Dashed: anchors, not Gaussians, are stored."] if any(map(counts_anchors, runs)) else []
     return Charts(figures, legend if len(variants) > 1 else [], notes)
+
+
+def _caption(style: MetricStyle) -> str:
+    return ", ".join(filter(None, (style.label, style.unit)))
 
 
 def section_styles(runs: Sequence[Run]) -> dict[str, int]:
@@ -168,7 +174,8 @@ def _training_figures(curves: Sequence[tuple[str, TrainingCurves]]) -> list[Figu
     if any(len(s.points) > 1 for s in losses):
         chart = Chart("Training loss over steps", losses, "step", y_log=True, borders=borders)
         figures.append(Figure("Training loss (logarithmic, means of neighbouring steps)", chart.draw()))
-    for key in ("num_gaussians", "num_anchors"):
+    units = {key for _, c in curves for key in c.counts}
+    for key in sorted(units, key=lambda key: (key != "num_gaussians", key)):
         lines = [
             Series(name, [Point(x, y) for x, y in c.counts.get(key, [])], i, marks=False)
             for i, (name, c) in enumerate(curves)
@@ -198,13 +205,9 @@ def view_charts(runs: Sequence[Run]) -> Charts | None:
             continue
         average = shown[0].mean(metric) if len(shown) == 1 else None
         levels = [(average, f"mean {numbers.score(metric, average)}")] if average is not None else []
-        name = numbers.heading(metric)
-        figures.append(
-            Figure(
-                name.replace(" dB", ", dB"),
-                Chart(f"{name} of every test view", lines, "test view", levels=levels).draw(),
-            )
-        )
+        style = metric_style(metric)
+        chart = Chart(f"{style.heading} of every test view", lines, "test view", levels=levels)
+        figures.append(Figure(_caption(style), chart.draw()))
     if not figures:
         return None
     legend = [(swatch(i), run.label) for i, run in enumerate(shown)] if len(shown) > 1 else []

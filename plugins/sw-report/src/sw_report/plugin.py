@@ -1,4 +1,4 @@
-"""What this package provides: the command `sw report`, and the tables and pages that `sw run` ends with."""
+"""Registers the command `sw report`, and makes the tables and pages that `sw run` ends with."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ def register_commands(registry: Registry) -> None:
 
 @hookimpl
 def run_finished(runs: FinishedRuns) -> None:
+    # Imported here: every `sw` command loads this module.
     from sw_report.after_run import report_finished
 
     report_finished(runs)

@@ -25,7 +25,7 @@ LOW_OVERLAP = 0.25  # of either curve's range
 
 @dataclass(frozen=True)
 class BdResult:
-    """One curve against another.
+    """Mean distance of one curve from another.
 
     value       percent (BD-rate; negative: the test curve saves rate) or units of quality (BD-PSNR; positive: better);
                 None where the curves share no range
@@ -50,7 +50,7 @@ def bd_rate(
     method: Method = "pchip",
     pareto: bool = False,
 ) -> BdResult:
-    """How much more rate, in percent, `test` takes than `anchor` for the same quality, on average.
+    """Mean additional rate, in percent, that `test` takes against `anchor` for the same quality.
 
     anchor, test    (bytes, quality) of the points, in any order; quality is higher for better (PSNR, SSIM, -LPIPS)
     method          "pchip": monotone piecewise cubic; "cubic": one polynomial, for exactly 4 points a curve
@@ -84,7 +84,7 @@ def bd_quality(
     method: Method = "pchip",
     pareto: bool = False,
 ) -> BdResult:
-    """How much better `test` is than `anchor` at the same rate, on average: BD-PSNR if the quality is PSNR in dB.
+    """Mean gain in quality of `test` over `anchor` at the same rate: BD-PSNR if the quality is PSNR in dB.
 
     Arguments as of `bd_rate`. Quality is interpolated as a function of r over the rates that both curves cover; it may
     fall. Raises UserInputError for fewer than 2 points.
@@ -94,7 +94,7 @@ def bd_quality(
 
 
 def pareto_front(rates: Sequence[float], quality: Sequence[float]) -> tuple[list[float], list[float]]:
-    """The points that no smaller (or equally large) file equals or beats, by rate."""
+    """Points that no smaller (or equally large) file equals or beats, by rate."""
     kept: list[tuple[float, float]] = []
     for rate, value in sorted(zip(rates, quality, strict=True), key=lambda p: (p[0], -p[1])):
         if not kept or value > kept[-1][1]:
@@ -152,7 +152,7 @@ class _Pieces:
 
 
 class _Cubic:
-    """The polynomial of third degree through 4 points; x is centred, which keeps the fit well conditioned."""
+    """Polynomial of third degree through 4 points; x is centred, which keeps the fit well conditioned."""
 
     def __init__(self, x: Floats, y: Floats) -> None:
         self._centre = float(x.mean())

@@ -1,4 +1,4 @@
-"""The rate-distortion charts of a page as one SVG file of their own: for a README, a slide, a message."""
+"""Rate-distortion charts of a page as one SVG file of their own: for a README, a slide, a message."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def rd_svg(runs: Sequence[Run], title: str) -> str | None:
 
 
 def _style() -> str:
-    """The rules with the colours of the page, in its two themes; without variables, which few drawing programs know."""
+    """Style rules with the colours of the page, in both themes; no variables, which few drawing programs know."""
     sheet = resources.files("sw_report").joinpath("templates/style.css").read_text("utf-8")
     blocks = re.findall(r"\{\s*color-scheme: (?:light|dark);([^}]*)\}", sheet)
     light, dark = (_coloured(dict(re.findall(r"(--\w+): (#\w+);", block))) for block in blocks[:2])

@@ -1,4 +1,4 @@
-"""What `sw run` prints at its end: one table, the rate-distortion curves on a terminal, and where everything lies."""
+"""Output at the end of `sw run`: one table, the rate-distortion curves on a terminal, and where everything lies."""
 
 from __future__ import annotations
 
@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 
     from splatwizard_core.tooling import Record
 
-FIRST = ("psnr", "ssim", "lpips_vgg_3dgs", "l1")
-"""Metrics that stand first in the table, in this order."""
 SHOWN_RECORDS = 3  # paths that are printed one by one
 COLOURS = ("blue", "dark_orange", "green", "magenta", "yellow", "red", "cyan", "bright_black")
 PLOT_WIDTH = 72
@@ -45,14 +43,14 @@ def print_results(done: Sequence[tuple[Record, Path]], written: Sequence[Path], 
 
 
 def print_table(records: Sequence[Record], out: Console) -> None:
-    """One row a run, the rows of a method together; the best value of a column is marked if there is a choice.
+    """Print one row a run, the rows of a method together; the best value of a column is marked if there is a choice.
 
     Columns that do not fit are left out, and named.
     """
     from rich.markup import escape
     from rich.table import Table
 
-    from sw_report.numbers import heading
+    from sw_report.numbers import heading, order_after_run
 
     first = records[0]
     # A metric that nobody could compute has its reason below, and no column.
@@ -60,7 +58,7 @@ def print_table(records: Sequence[Record], out: Console) -> None:
         name for record in records for name, metric in record.metrics.items()
         if not metric.diagnostic and (metric.mean is not None or metric.per_view)
     ))  # fmt: skip
-    names.sort(key=lambda n: (FIRST.index(n) if n in FIRST else len(FIRST), n))
+    names.sort(key=lambda name: (order_after_run(name), name))
     best = _best(records, names) if len({record.method for record in records}) > 1 else {}
     columns: dict[str, list[str]] = {}
     digits = 3 if min(record.file.bytes for record in records) >= 100_000 else 4
@@ -115,7 +113,7 @@ def _cells(record: Record, names: Sequence[str], digits: int) -> dict[str, str]:
 def _too_wide(
     fixed: dict[str, list[str]], columns: dict[str, list[str]], heads: dict[str, str], names: Sequence[str], room: int
 ) -> set[str]:
-    """The columns to leave out so that the rest fits: metrics after the first three, then times, and so on."""
+    """Choose the columns to leave out so that the rest fits: metrics after the first three, then times, and so on."""
     needed = 1 + sum(3 + _content(name, cells) for name, cells in fixed.items())
     needed += sum(3 + _content(heads[name], cells) for name, cells in columns.items())
     found: set[str] = set()
@@ -154,7 +152,7 @@ def _best(records: Sequence[Record], names: Sequence[str]) -> dict[str, set[int]
 
 
 def notes(records: Sequence[Record]) -> list[str]:
-    """What a reader of the table must know: what times hold, and why values are missing."""
+    """Lines under the table: which times include another training, and why values are missing."""
     found = []
     before: dict[str, dict[str, None]] = {}
     for record in records:
@@ -174,8 +172,8 @@ def notes(records: Sequence[Record]) -> list[str]:
 
 
 def reasons_of_metrics(records: Sequence[Record]) -> dict[str, list[str]]:
-    """Why metrics have no mean -> which ones."""
-    from splatwizard_core.evaluation.metrics import short_reason
+    """Reason -> metrics that have no mean for it."""
+    from splatwizard_core.tooling import short_reason
 
     found: dict[str, dict[str, None]] = {}
     for record in records:
@@ -187,7 +185,7 @@ def reasons_of_metrics(records: Sequence[Record]) -> dict[str, list[str]]:
 
 
 def print_plot(directories: Sequence[Path], out: Console) -> None:
-    """PSNR against bytes, in characters."""
+    """Print PSNR against bytes, in characters."""
     from rich.text import Text
 
     from sw_report.runs import collect
@@ -239,9 +237,13 @@ def bd_lines(directories: Sequence[Path]) -> list[str]:
 
 
 def _number(metric: str, value: float | None) -> str:
+    from sw_report.declared import metric_style
+
     if value is None:
         return "-"
-    return f"{value:.3f}" if metric == "psnr" else f"{value:.4f}"
+    style = metric_style(metric)
+    # Rate points of one scene may lie less than 0.01 dB apart.
+    return f"{value:.{style.digits + (style.unit == 'dB')}f}"
 
 
 def _seconds(value: float | None) -> str:

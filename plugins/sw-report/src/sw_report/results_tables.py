@@ -1,4 +1,4 @@
-"""The tables of numbers: runs of one scene, means over data sets, BD values, settings."""
+"""Tables of numbers: runs of one scene, means over data sets, BD values, settings."""
 
 from __future__ import annotations
 
@@ -8,13 +8,14 @@ from typing import Any
 from sw_report import numbers
 from sw_report.aggregate import DatasetTable
 from sw_report.blocks import Cell, Row, Table, columns, row
+from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
 from sw_report.facts import RunFacts, clean
 from sw_report.runs import Run, machine
 
 
 def metric_names(runs: Iterable[Run], *, diagnostic: bool = False) -> list[str]:
-    """The metrics that some run has values of; those that only tell conventions apart if asked for."""
+    """Names of the metrics that some run has values of; diagnostic ones, which tell conventions apart, if asked for."""
     return numbers.ordered_metrics(
         name
         for run in runs
@@ -24,7 +25,7 @@ def metric_names(runs: Iterable[Run], *, diagnostic: bool = False) -> list[str]:
 
 
 def missing_metrics(runs: Iterable[Run]) -> list[str]:
-    """Why metrics have no value, one line for each reason."""
+    """One line for each reason why metrics have no value."""
     reasons: dict[str, dict[str, None]] = {}
     for run in runs:
         for name in numbers.ordered_metrics(run.facts.metrics):
@@ -71,7 +72,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
 
 
 def means_table(table: DatasetTable) -> Table:
-    """The data set's plain means over scenes."""
+    """Plain means over the scenes of a data set."""
     names = list(dict.fromkeys(name for r in table.rows for name in r.metrics))
     heads = ["method", "rate", "scenes", *map(numbers.heading, names), "MB", "primitives"]
     rows = []
@@ -94,7 +95,7 @@ def means_table(table: DatasetTable) -> Table:
 
 
 def means_notes(table: DatasetTable) -> list[str]:
-    """What a reader of the means must know: what is missing, and which protocols they come from."""
+    """Lines under the means: which scenes are missing, and which protocols differ."""
     lacking: dict[tuple[str, tuple[str, ...], bool], list[str]] = {}
     for r in table.rows:
         if r.missing:
@@ -115,24 +116,23 @@ def _some(names: Sequence[str], most: int = 6) -> str:
 
 def bd_table(table: BdTable) -> Table:
     """BD-rate and BD-quality of every method against the anchor."""
-    unit = "dB" if table.metric == "psnr" else numbers.heading(table.metric)
-    digits = 2 if table.metric == "psnr" else 4
+    style = metric_style(table.metric)
     rows = []
     for r in table.rows:
         rows.append(
             row(
                 [r.variant, r.scene or "mean", _bd(r.rate, numbers.percent(r.rate.value)),
-                 _bd(r.quality, numbers.signed(r.quality.value, digits))],
+                 _bd(r.quality, numbers.signed(r.quality.value, style.digits))],
                 emphasis=r.scene is None,
             )
         )  # fmt: skip
-    heads = ["method", "scene", f"BD-rate ({numbers.heading(table.metric).replace(' dB', '')}) %", f"BD gain, {unit}"]
+    heads = ["method", "scene", f"BD-rate ({style.label}) %", f"BD gain, {style.unit or style.label}"]
     marks = dict.fromkeys(
         f"* {c.reason}" if c.value is not None else f"{numbers.MISSING} {r.variant}, {r.scene or 'mean'}: {c.reason}"
         for r in table.rows for c in (r.rate, r.quality) if c.reason
     )  # fmt: skip
     return Table(
-        f"Against {table.anchor} by {numbers.heading(table.metric)}", columns(heads, text=("method", "scene")), rows,
+        f"Against {table.anchor} by {style.heading}", columns(heads, text=("method", "scene")), rows,
         f"Against {table.anchor}: rate at equal quality (negative saves), quality at equal rate (positive is better).",
         list(marks),
     )  # fmt: skip
@@ -143,7 +143,7 @@ def _bd(cell: BdCell, text: str) -> Cell:
 
 
 def protocol_table(runs: Sequence[Run]) -> Table:
-    """The rules of each protocol, one column a protocol; rows in which they differ are marked."""
+    """Rules of each protocol, one column a protocol; rows in which they differ are marked."""
     protocols = {run.facts.protocol.id: run.facts.protocol.rules() for run in runs}
     names = list(dict.fromkeys(name for rules in protocols.values() for name in rules))
     several = len(protocols) > 1
@@ -174,7 +174,7 @@ def plain(value: Any) -> str:
 
 
 def environment_table(runs: Sequence[Run]) -> Table:
-    """Where it was measured: one column for each different environment."""
+    """Environments of the runs, one column for each different one."""
     groups: dict[str, list[Run]] = {}
     for run in runs:
         groups.setdefault(plain(dict(sorted(run.facts.environment.items(), key=lambda i: str(i[0])))), []).append(run)
@@ -202,7 +202,7 @@ def _who(group: Sequence[Run], total: int) -> str:
 
 
 def served_table(runs: Sequence[Run]) -> Table:
-    """Which rasterizer served which phase, and which distribution the method came from."""
+    """Rasterizers that served the phases, and the distribution of each method."""
     groups: dict[tuple[str, ...], list[Run]] = {}
     for run in runs:
         facts = run.facts
@@ -219,7 +219,7 @@ def served_table(runs: Sequence[Run]) -> Table:
 
 
 def phases_table(runs: Sequence[Run]) -> Table | None:
-    """Who served each phase, by distribution; None if no record says so."""
+    """Parts that served each phase, by distribution; None if no record holds them."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in runs:
         for phase in run.facts.phases:
@@ -268,7 +268,7 @@ def cost_table(facts: RunFacts) -> Table:
 
 
 def breakdown_table(facts: RunFacts) -> Table | None:
-    """Where the training time went, if it was profiled."""
+    """Training time by part of a step, if it was profiled."""
     parts = facts.train.breakdown_s
     if not parts:
         return None

@@ -1,4 +1,4 @@
-"""The runs that a report is about: found, read, named apart, and in an order."""
+"""Collection of the runs of a report: found, read, told apart by name, and put in order."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Collection:
-    """What was found.
+    """Runs that were found.
 
     runs        by scene, protocol, method and size
     notes       one line each: what could not be read, and what a reader must know before comparing
@@ -56,7 +56,7 @@ class Collection:
 
 
 def collect(paths: Sequence[Path]) -> Collection:
-    """Every run under these folders. Raises UserInputError if there is none that can be read."""
+    """Read every run under these folders. Raises UserInputError if there is none that can be read."""
     found: dict[Path, tuple[Path, Path]] = {}
     for root in paths:
         if not root.exists():
@@ -90,7 +90,7 @@ def collect(paths: Sequence[Path]) -> Collection:
 
 
 def record_paths(root: Path) -> list[Path]:
-    """Every record at or below a path; a run directory holds one, and nothing below it is looked at."""
+    """Paths of all records at or below a path; a run directory holds one, and nothing below it is looked at."""
     if root.is_file():
         return [root]
     own = root / FILE_NAME

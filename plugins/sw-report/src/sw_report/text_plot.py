@@ -26,7 +26,7 @@ class Curve:
 def text_plot(
     curves: Sequence[Curve], title: str, x_label: str, *, width: int = 64, height: int = 14, unicode: bool = True
 ) -> list[list[Segment]]:
-    """The lines of the chart, each as its segments, and a legend under it.
+    """Draw the lines of the chart, each as its segments, and a legend under it.
 
     width, height   characters inside the axes
 

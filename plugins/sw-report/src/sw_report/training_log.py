@@ -18,7 +18,7 @@ MOST_LINES = 2_000_000
 
 @dataclass(frozen=True)
 class TrainingCurves:
-    """What a training's log says.
+    """Curves of a training, from its log.
 
     loss        (step, mean loss of the logged steps since the point before), at most POINTS points
     counts      unit -> (step, number of them)
@@ -37,7 +37,7 @@ class TrainingCurves:
 
 
 def log_path(run: Run) -> Path:
-    """The log of a run's training, which may lie with the rate point beside it whose training it shares."""
+    """Path of the log of a run's training, which may lie with the rate point beside it whose training it shares."""
     own = run.directory / "log.jsonl"
     home = run.facts.train.trained_in
     if home is None or own.is_file() or home == run.facts.rate or Path(home).name != home:
@@ -46,7 +46,7 @@ def log_path(run: Run) -> Path:
 
 
 def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
-    """The curves of a log; a damaged line is counted and passed over, a missing file is said."""
+    """Read the curves of a log; a damaged line is counted and passed over, a missing file is said."""
     losses: list[tuple[float, float]] = []
     counts: dict[str, list[tuple[float, float]]] = {}
     stages: list[tuple[int, int]] = []
@@ -69,8 +69,8 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
                 last = before + step
                 if _is_number(entry.get("loss")):
                     losses.append((float(last), float(entry["loss"])))
-                for key in ("num_gaussians", "num_anchors"):
-                    if _is_number(entry.get(key)):
+                for key in entry:
+                    if key.startswith("num_") and _is_number(entry[key]):
                         counts.setdefault(key, []).append((float(last), float(entry[key])))
     except OSError as error:
         return TrainingCurves([], {}, [], missing=clean(f"log.jsonl: {error.strerror}"))

@@ -1,4 +1,4 @@
-"""Where the ground truth beside a render comes from: what the run kept, else the scene, if it is still there.
+"""Ground truth beside a render: the photograph that the run kept, else the scene's, if the scene is still there.
 
 A run keeps the photographs of the few views that its page shows, so that its directory makes a page on any machine.
 Whatever the source, a photograph is shown only if the render scores against it what the record says.
@@ -39,7 +39,7 @@ def even_views(views: int, wanted: int = EVEN_VIEWS) -> list[int]:
 
 
 def shown_views(facts: RunFacts) -> list[int]:
-    """The views a run's own page shows: a few spread evenly, and those with the lowest and the highest PSNR."""
+    """Indices of the views that a run's own page shows: a few spread evenly, the lowest and the highest PSNR."""
     chosen = even_views(len(facts.views))
     scores = facts.metrics["psnr"].per_view if "psnr" in facts.metrics else []
     known = [i for i, value in enumerate(scores[: len(facts.views)]) if value is not None]
@@ -69,7 +69,7 @@ def truth_pixels(view: View, scene: Scene) -> Pixels:
 
 def picture_names(views: Sequence[str]) -> list[str]:
     """File names of the renders of views; imported late, since it comes with torch."""
-    from splatwizard_core.evaluation.evaluate import png_names
+    from splatwizard_core.tooling import png_names
 
     return png_names(views)
 
@@ -88,7 +88,7 @@ class Truth:
         self.reason = ""
 
     def find(self, view: str) -> Pixels | None:
-        """The photograph of a view, or None, and then `reason` says why."""
+        """Return the photograph of a view, or None, and then `reason` says why."""
         for run in self._runs:
             if view in run.facts.views:
                 kept = run.directory / FOLDER / picture_names(run.facts.views)[run.facts.views.index(view)]

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from splatwizard_core.api import GaussianMethod, Method, create_method
-from splatwizard_core.runs.keys import dotted
 from sw_speedy_splat.config import SpeedySplatConfig
 from sw_speedy_splat.presets import PRESETS, RATES
 from sw_speedy_splat.stage import SpeedySplatStage
@@ -28,8 +27,8 @@ class SpeedySplat(GaussianMethod):
     DEFAULT_RATE: ClassVar[str] = "r3"  # the published shares
 
     def _base(self) -> Method:
-        """The configured 3DGS: its start and its stage."""
-        values = dotted(self.config.base, "")
+        """Return the configured 3DGS: its start and its stage."""
+        values = dict(self.config.base)
         preset = str(values.pop("preset", "paper"))
         length = {"iterations": self.config.iterations, "scale_schedule": self.config.scale_schedule}
         return create_method(self.plugins, "3dgs", {**length, **values}, preset=preset)

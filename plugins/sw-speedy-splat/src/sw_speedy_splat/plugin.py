@@ -1,4 +1,4 @@
-"""What this package provides: the method speedy-splat, and its score as a pruner for any method."""
+"""Registers the method speedy-splat, and its score as a pruner for any method."""
 
 from splatwizard_core.api import Registry, hookimpl
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec, view_colors
+from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, SplatModel
@@ -69,7 +69,7 @@ class SpeedyScore:
             colors = g.colors
             if colors is None:
                 assert g.sh is not None
-                colors = view_colors(g.sh.to_dense(), g.means, camera.center, g.sh.active_degree)
+                colors = g.sh.colors_from(camera.center, g.means)
             for one in torch.eye(3, device=model.device):  # with one channel left, the sum is that channel
                 behind = None if background is None else background * one
                 yield replace(g, sh=None, colors=colors * one), [camera], behind

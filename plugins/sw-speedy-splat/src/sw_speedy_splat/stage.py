@@ -2,34 +2,16 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from sw_finetuning.pruning import PruneByScore
-from sw_gaussians.statistics import accumulate_statistics
+from sw_gaussians.statistics import collect_statistics
+from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 
-from splatwizard_core.api import GaussianModel, RenderResult, Scheduler, Stage, When, load_pruner
-from splatwizard_core.training.plan import scaled
+from splatwizard_core.api import WrappedStage, load_pruner
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import torch
-    from torch import Tensor
-
-    from splatwizard_core.api import (
-        CameraSampler,
-        LossPack,
-        Method,
-        OptimizationParams,
-        PipelineParams,
-        PluginManager,
-        RasterOptions,
-        Scene,
-        SplatModel,
-        SplatOptimizer,
-        StageContext,
-        View,
-    )
+    from splatwizard_core.api import Method, OptimizationParams, PipelineParams, PluginManager, Scheduler
     from sw_speedy_splat.config import SpeedySplatConfig
 
 OWN = "speedy-splat"
@@ -40,24 +22,27 @@ DENSIFY, SOFT, RESET, HARD = 1, 2, 3, 4
 BEFORE_DENSIFY = 0
 
 
-class SpeedySplatStage(Stage):
-    """Everything that this class does not say itself is what the stage of 3DGS does.
+class SpeedySplatStage(WrappedStage):
+    """The stage of 3DGS with two removals more.
 
     base    the configured method 3dgs, whose one stage it is
     """
 
-    name = "speedy-splat"
-
     def __init__(self, config: SpeedySplatConfig, base: Method, plugins: PluginManager) -> None:
-        super().__init__(config)
-        self.config, self.plugins = config, plugins
-        (self.base,) = base.stages()
+        (inner,) = base.stages()
+        super().__init__(inner, config)
+        self.name = "speedy-splat"
+        self.config = config
         self.densify_stop: int = base.config.densify.stop
         self.pruner = load_pruner(plugins, config.prune.pruner, {OWN: {"channel_mode": config.prune.channel_mode}})
 
-    def when(self, when: When) -> When:
-        """A plan of the full run, in steps of this one."""
-        return scaled(when, self.config.schedule_scale)
+    @property
+    def iterations(self) -> int:
+        return self.config.iterations
+
+    @property
+    def prefer(self) -> tuple[str, ...]:
+        return ("speedy", *self.inner.prefer)
 
     @property
     def soft_plan(self) -> range:
@@ -76,13 +61,10 @@ class SpeedySplatStage(Stage):
         """Nothing is removed at the last step of a run that is cut short: no update would follow to repair it."""
         return stop if self.config.scale_schedule else min(stop, self.config.iterations)
 
-    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        self.base.register_pre_task(scheduler, ppl, opt)
-
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        tasks = self.plugins.tasks
-        later = {tasks.load("prune-and-densify"): DENSIFY, tasks.load("reset-opacity"): RESET}
-        self.base.register_post_task(_Ordered(scheduler, later), ppl, opt)
+        super().register_post_task(scheduler, ppl, opt)
+        scheduler.reprioritise(PruneAndDensify, DENSIFY)
+        scheduler.reprioritise(ResetOpacity, RESET)
         soft, hard = self.config.prune.soft, self.config.prune.hard
         statistics = self.pruner.uses_statistics
         if self.soft_plan and soft > 0:
@@ -99,57 +81,3 @@ class SpeedySplatStage(Stage):
             # The survivors are still updated in this step, as in the published code, which prunes after the update.
             prune = PruneByScore(self.pruner, hard, carry_grad=True)
             scheduler.register_task(self.when(self.hard_plan), prune, priority=HARD, name="hard prune")
-
-    # What follows is the stage of 3DGS.
-
-    @property
-    def prefer(self) -> tuple[str, ...]:
-        return ("speedy", *self.base.prefer)
-
-    def begin(self, context: StageContext) -> SplatModel:
-        return self.base.begin(context)
-
-    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
-        return self.base.create_optimizer(model, scene)
-
-    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        return self.base.create_sampler(scene, generator)
-
-    def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        return self.base.raster_options(step, background)
-
-    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        return self.base.loss(model, view, result, background, step)
-
-    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        return self.base.finish(model, scene)
-
-
-class _Ordered(Scheduler):
-    """Passes tasks on to another scheduler, some with a later priority: room between the tasks of a borrowed stage.
-
-    later   class of a task -> what is added to its priority
-    """
-
-    def __init__(self, inner: Scheduler, later: dict[type, int]) -> None:
-        super().__init__(inner.stage)
-        self.inner, self.later = inner, later
-
-    def register_task(
-        self,
-        when: When,
-        task: Callable[..., Any],
-        *,
-        priority: int = 0,
-        name: str | None = None,
-        log: bool = False,
-    ) -> None:
-        self.inner.register_task(when, task, priority=priority + self.later.get(type(task), 0), name=name, log=log)
-
-
-def collect_statistics(model: GaussianModel, result: RenderResult) -> None:
-    """Adds this view's screen-space gradients, of whichever kind 3DGS asked for, to the model's statistics."""
-    gradients = result.grad2d or result.absgrad2d
-    if gradients is None:
-        raise ValueError("a pruner that reads gradient statistics needs a base that renders them (not mcmc.enabled)")
-    accumulate_statistics(model, gradients.value, result.radii)

@@ -1,4 +1,4 @@
-"""What this package provides: the method trimming-the-fat, and its rule as a pruner for any method."""
+"""Registers the method trimming-the-fat, and its rule as a pruner for any method."""
 
 from splatwizard_core.api import Registry, hookimpl
 

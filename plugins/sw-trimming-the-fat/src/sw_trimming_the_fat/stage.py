@@ -6,14 +6,9 @@ import logging
 import math
 from typing import TYPE_CHECKING
 
-from sw_finetuning.fine_tuning import (
-    GRADIENT_STATISTICS,
-    FineTuningStage,
-    collect_anew,
-    collect_statistics,
-    windows_before,
-)
+from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
 from sw_finetuning.pruning import PruneByScore, scores_of
+from sw_gaussians.statistics import GRADIENT_STATISTICS, collect_statistics
 
 from splatwizard_core.api import (
     CameraIterator,
@@ -44,12 +39,13 @@ OWN = "trimming-the-fat"
 
 
 class TrimmingStage(FineTuningStage):
-    """Ten removals; whoever survives one is still updated in that step.
+    """Ten removals; a Gaussian that survives one is still updated in that step.
 
     Raises ConfigError for a pruner that is not installed.
     """
 
     name = "trimming-the-fat"
+    starts_from = "3dgs"
 
     def __init__(self, config: TrimmingTheFatConfig, plugins: PluginManager) -> None:
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
@@ -127,7 +123,7 @@ class PruneBelowBoth:
         log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
 
     def _explain(self, model: GaussianModel, views: int) -> None:
-        """Whether there are too many Gaussians without a gradient for anything to be below the quantile."""
+        """Raise, or warn, if too many Gaussians have no gradient for anything to be below the quantile."""
         without = float((mean_gradients(model) == 0).double().mean())
         if without < self.level:
             return

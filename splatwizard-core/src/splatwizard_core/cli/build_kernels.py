@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import click
 
-from splatwizard_core.cli.options import console, debug_option, json_option, options, print_json
-from splatwizard_core.cli.setup import say
+from splatwizard_core.cli import options as shared
 
 
 @click.command("build-kernels", short_help="compile all native modules ahead of time")
-@options(
+@shared.options(
     click.option(
         "--portable", is_flag=True,
         help="For any CPU of this architecture, with run-time dispatch.  [default: for this machine's CPU]",
@@ -25,7 +24,7 @@ from splatwizard_core.cli.setup import say
     ),
     click.option("--force", is_flag=True, help="Compile also what is up to date."),
     click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Compilers at once.  [default: the cores]"),
-    json_option, debug_option,
+    shared.json_option, shared.debug_option,
 )  # fmt: skip
 def build_kernels(
     portable: bool, into_packages: bool, cuda: bool, force: bool, jobs: int | None, as_json: bool
@@ -34,40 +33,20 @@ def build_kernels(
 
     Without this they are compiled when first used.
     """
-    from rich.markup import escape
-    from rich.table import Table
-
-    from splatwizard_core.native import build_all
+    from splatwizard_core.native.build import build_all
     from splatwizard_core.plugins import load_plugins
 
-    march = "portable" if portable else "native"
     rows = build_all(
-        load_plugins(), march=march, into_packages=into_packages, force=force, cuda=cuda, jobs=jobs, say=say
-    )
-    failed = [row for row in rows if row.error is not None]
+        load_plugins(), march="portable" if portable else "native", into_packages=into_packages, force=force, cuda=cuda,
+        jobs=jobs, say=shared.say,
+    )  # fmt: skip
     if as_json:
-        print_json(
-            {
-                "modules": [
-                    {
-                        "name": r.name,
-                        "state": r.state,
-                        "seconds": r.seconds,
-                        "path": None if r.path is None else str(r.path),
-                        "error": r.error,
-                    }
-                    for r in rows
-                ]
-            }
-        )
+        modules = [{name: getattr(row, name) for name in ("name", "state", "seconds", "error")} for row in rows]
+        paths = [None if row.path is None else str(row.path) for row in rows]
+        shared.print_json({"modules": [{**m, "path": p} for m, p in zip(modules, paths, strict=True)]})
     else:
-        table = Table()
-        for column in ("module", "state", "seconds"):
-            table.add_column(column)
-        for row in rows:
-            table.add_row(escape(row.name), row.state, f"{row.seconds:.1f}")
-        console().print(table)
-        for row in failed:
+        shared.print_table(["module", "state", "seconds"], [[r.name, r.state, f"{r.seconds:.1f}"] for r in rows])
+        for row in (r for r in rows if r.error is not None):
             click.echo(row.error, err=True)
-    if failed:
+    if any(row.error is not None for row in rows):
         click.get_current_context().exit(1)

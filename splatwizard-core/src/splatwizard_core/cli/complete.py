@@ -1,6 +1,6 @@
-"""What the shell offers when TAB is pressed: names from the registries, scenes, paths. Imports nothing heavy.
+"""Completions for the shell's TAB: names from the registries, scenes, paths. Imports nothing heavy.
 
-Each function is handed to click as `shell_complete`: (context, parameter, what is typed so far) -> items.
+Each `complete_*` is handed to click as `shell_complete`: (context, parameter, the word so far) -> items.
 """
 
 from __future__ import annotations
@@ -30,88 +30,69 @@ RATE_ALIASES = ("low", "default", "high", "all")
 MOST = 500  # items; nobody reads more, and a folder may hold a hundred thousand
 
 
-def files(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Files and folders, by the shell."""
+def complete_files(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer files and folders, by the shell."""
     return [CompletionItem(incomplete, type="file")]
 
 
-def folders(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Folders, by the shell."""
+def complete_folders(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer folders, by the shell."""
     return [CompletionItem(incomplete, type="dir")]
 
 
-def names(kind: str) -> Complete:
-    """Registered names of a kind; in a comma list, the one that is being typed."""
+def complete_nothing(_context: click.Context, _parameter: click.Parameter, _incomplete: str) -> list[CompletionItem]:
+    """Offer nothing: only the user knows the value."""
+    return []
 
-    def complete(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return _in_list(incomplete, [(entry.name, entry.summary) for entry in _registry(kind)])
+
+def complete_names(kind: str) -> Complete:
+    """Make a completion that offers the registered names of a kind; in a comma list, for its last word."""
+
+    def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return _in_list(incomplete, [(entry.name, entry.summary) for entry in _registered(kind)])
 
     return complete
 
 
-def rates(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Rate points of the methods on the line, and the aliases."""
-    found = _declared(context, "rates")
-    return _in_list(incomplete, [(name, None) for name in [*found, *RATE_ALIASES]])
+def complete_rates(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer the rate points of the methods on the line, and the aliases."""
+    return _in_list(incomplete, [(name, None) for name in [*_declared(context, "rates"), *RATE_ALIASES]])
 
 
-def presets(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Presets of the methods on the line."""
-    found = _declared(context, "presets") or list(COMMON_PRESETS)
-    return _starting(incomplete, [(name, None) for name in found])
+def complete_presets(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer the presets of the methods on the line."""
+    return _starting(incomplete, [(name, None) for name in _declared(context, "presets") or COMMON_PRESETS])
 
 
-def scenes(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """`demo`, dataset/scene below $SPLATWIZARD_DATA, and folders by the shell."""
-    found: list[tuple[str, str | None]] = [("demo", "procedural, made on the spot")]
-    root = os.environ.get(DATA)
-    if root:
-        found += [(name, None) for name in _dataset_scenes(Path(root).expanduser())]
+def complete_scenes(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer the default scene, dataset/scene below $SPLATWIZARD_DATA, and folders by the shell."""
+    default = [entry for entry in _registered("dataset") if entry.declared.get("default")]
+    found: list[tuple[str, str | None]] = [(entry.name, entry.summary) for entry in default]
+    if root := os.environ.get(DATA):
+        places = [(data, scene) for data in _folders_in(Path(root).expanduser()) for scene in _folders_in(data)]
+        found += [(f"{data.name}/{scene.name}", None) for data, scene in places[:MOST]]
     return [CompletionItem(incomplete, type="dir"), *_starting(incomplete, found)]
 
 
-def scene_or_file(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """What `sw info` takes."""
-    return [CompletionItem(incomplete, type="file"), *scenes(context, parameter, incomplete)[1:]]
+def complete_scene_or_file(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
+    """Offer scenes, and files by the shell."""
+    return [CompletionItem(incomplete, type="file"), *complete_scenes(context, parameter, incomplete)[1:]]
 
 
-def datasets(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """Known data sets; after a slash, the scenes of one."""
-    from sw_datasets.downloads.registry import load_registry
-
-    try:
-        known = load_registry(None)
-    except SplatwizardError:  # a registry of the user's own that cannot be read
-        return []
-    name, slash, _ = incomplete.partition("/")
-    if slash:
-        return _starting(incomplete, [(f"{name}/{s}", None) for s in (known[name].scenes if name in known else ())])
-    return _starting(incomplete, [(each, known[each].title) for each in known])
-
-
-def dataset_or_folder(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """What `sw data verify` takes."""
-    return [CompletionItem(incomplete, type="dir"), *datasets(context, parameter, incomplete)]
-
-
-def image_folders(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-    """The `images*` folders of the scene on the line."""
+def complete_image_folders(
+    context: click.Context, _parameter: click.Parameter, incomplete: str
+) -> list[CompletionItem]:
+    """Offer the `images*` folders of the scene on the line."""
     scene = context.params.get("scene")
     if not isinstance(scene, str):
         return []
-    root = os.environ.get(DATA)
-    for place in (Path(scene).expanduser(), *((Path(root).expanduser() / scene,) if root else ())):
-        if place.is_dir():
-            return _starting(incomplete, [(p.name, None) for p in _folders_in(place) if p.name.startswith("images")])
-    return []
+    roots = [Path(root).expanduser() for root in (".", os.environ.get(DATA)) if root]
+    places = [root / Path(scene).expanduser() for root in roots]
+    names = next(([path.name for path in _folders_in(place)] for place in places if place.is_dir()), [])
+    return _starting(incomplete, [(name, None) for name in names if name.startswith("images")])
 
 
-def nothing(_context: click.Context, _parameter: click.Parameter, _incomplete: str) -> list[CompletionItem]:
-    """For what only the user knows."""
-    return []
-
-
-def _registry(kind: str) -> Iterable[Entry]:
+def _registered(kind: str) -> Iterable[Entry]:
     from splatwizard_core.plugins import load_plugins
 
     try:
@@ -120,19 +101,12 @@ def _registry(kind: str) -> Iterable[Entry]:
         return []
 
 
-def _declared(context: click.Context, what: str) -> list[str]:
-    """What the registry entries of the methods on the command line declare, without importing them."""
-    from splatwizard_core.cli.setup import DEFAULT_METHOD
-
-    asked = context.params.get("methods") or context.params.get("method") or DEFAULT_METHOD
-    words = [asked] if isinstance(asked, str) else asked
-    methods = {name.strip() for word in words for name in word.split(",")}
-    found = [value for entry in _registry("method") if entry.name in methods for value in entry.declared.get(what, ())]
-    return list(dict.fromkeys(found))
-
-
-def _dataset_scenes(root: Path) -> list[str]:
-    return [f"{dataset.name}/{scene.name}" for dataset in _folders_in(root) for scene in _folders_in(dataset)][:MOST]
+def _declared(context: click.Context, field: str) -> list[str]:
+    """What the entries of the methods on the command line declare, without importing them."""
+    given = context.params.get("methods") or context.params.get("method") or ()
+    named = {name.strip() for text in ([given] if isinstance(given, str) else given) for name in text.split(",")}
+    chosen = [e for e in _registered("method") if (e.name in named if named else e.declared.get("default"))]
+    return list(dict.fromkeys(value for entry in chosen for value in entry.declared.get(field, ())))
 
 
 def _folders_in(path: Path) -> list[Path]:

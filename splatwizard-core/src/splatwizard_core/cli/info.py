@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import (
-    assignments,
-    console,
-    debug_option,
-    images_option,
-    json_option,
-    options,
-    print_json,
-    set_option,
-)
+from splatwizard_core.cli import options as shared
+from splatwizard_core.cli.complete import complete_scene_or_file
+from splatwizard_core.cli.paths import existing
+from splatwizard_core.cli.setup import Choices, takes_choices
+from splatwizard_core.cli.streams import without_orders
+from splatwizard_core.errors import UserInputError
+
+if TYPE_CHECKING:
+    from splatwizard_core.runs.record import Record
 
 
 @click.command(short_help="what is in a file or scene")
-@click.argument("path", metavar="PATH", shell_complete=complete.scene_or_file)
-@options(images_option, set_option, json_option, debug_option)
-def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) -> None:
-    """What is in PATH: a .swz file (bytes by section), a run directory (its file), a metrics.json (scores, and who
-    served which phase), a .ply, or a scene (folder, `demo`, dataset/scene)."""
+@click.argument("path", metavar="PATH", shell_complete=complete_scene_or_file)
+@shared.options(shared.images_option, shared.set_option, shared.json_option, shared.debug_option)
+@takes_choices
+def info(path: str, as_json: bool, chosen: Choices) -> None:
+    """Show what is in PATH: a .swz file (bytes by section), a run directory (its file), a metrics.json (scores, and who
+    served which phase), a .ply, or a scene (a folder, dataset/scene, or one that is made on the spot, by its name)."""
     if not path.strip():
         raise click.UsageError("PATH is empty")
     where = Path(path)
@@ -38,17 +37,18 @@ def info(path: str, images: str | None, sets: tuple[str, ...], as_json: bool) ->
     elif where.suffix == ".ply":
         facts = {"kind": "ply", **_ply_facts(where)}
     else:
-        facts = {"kind": "scene", **_scene_facts(path, images, sets)}
+        facts = {"kind": "scene", **_scene_facts(path, chosen)}
     if as_json:
-        print_json(facts)
+        shared.print_json(facts)
+    elif facts["kind"] == "file":
+        _print_file(facts)
+    elif facts["kind"] == "record":
+        _print_record(facts)
     else:
-        printers = {"file": _print_file, "record": _print_record, "ply": _print_plain, "scene": _print_plain}
-        printers[facts["kind"]](facts)
+        _print_plain(facts)
 
 
 def _starts_with(path: Path, magic: bytes) -> bool:
-    from splatwizard_core.errors import UserInputError
-
     try:
         with path.open("rb") as file:
             return file.read(len(magic)) == magic
@@ -72,12 +72,11 @@ def _record_facts(path: Path) -> dict[str, Any]:
     """The gist of a result record: what was run, its scores, and who served which phase."""
     from splatwizard_core.runs.record import read_record
 
-    record = read_record(path)
+    record: Record = read_record(path)
+    gist = {"method", "distribution", "preset", "rate", "scene", "date", "counts"}
     return {
         "path": str(path),
-        **record.model_dump(
-            mode="json", include={"method", "distribution", "preset", "rate", "scene", "date", "counts"}
-        ),
+        **record.model_dump(mode="json", include=gist),
         "protocol": record.protocol.id,
         "metrics": {n: m.mean for n, m in record.metrics.items() if not m.diagnostic and m.mean is not None},
         "bytes": record.file.bytes,
@@ -88,31 +87,7 @@ def _record_facts(path: Path) -> dict[str, Any]:
     }
 
 
-def _print_record(facts: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-    from sw_report.facts import PhaseFacts, TrainFacts
-
-    train = TrainFacts.model_validate(facts["train"])
-    gist = {k: v for k, v in facts.items() if k not in ("phases", "train")} | {"steps": train.steps}
-    gist["starts from"] = train.started_from()
-    _print_plain({k: v for k, v in gist.items() if v != ""})
-    if facts["phases"] is None:
-        console().print("who served which phase is not known of this record")
-        return
-    table = Table()
-    for name in ("phase", "provided by", "from"):
-        table.add_column(name, overflow="fold")
-    for phase in facts["phases"]:
-        served = PhaseFacts.model_validate(phase).by_distribution() or {"": ["-"]}
-        for i, (owner, parts) in enumerate(served.items()):
-            name = "" if i else phase["phase"]
-            table.add_row(escape(name), escape(", ".join(parts)), escape(owner), end_section=i == len(served) - 1)
-    console().print(table)
-
-
 def _ply_facts(path: Path) -> dict[str, Any]:
-    from splatwizard_core.cli.setup import existing
     from splatwizard_core.gaussians.ply import load_ply
 
     model = load_ply(existing(str(path)))
@@ -131,49 +106,61 @@ def _ply_facts(path: Path) -> dict[str, Any]:
     }
 
 
-def _scene_facts(spec: str, images: str | None, sets: tuple[str, ...]) -> dict[str, Any]:
-    from splatwizard_core.cli.setup import resolve_run_options
+def _scene_facts(spec: str, chosen: Choices) -> dict[str, Any]:
+    from splatwizard_core.cli.describe_scene import describe
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.scene.describe import describe
     from splatwizard_core.scene.loading import load_scene
 
-    _, options_, _ = resolve_run_options(None, assignments(sets, images=images))
-    return describe(load_scene(spec, options_, load_plugins()))
+    return describe(load_scene(spec, chosen.resolve_without_method().scene, load_plugins()))
 
 
 def _print_file(facts: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    out = console()
-    out.print(escape(f"{facts['path']}: {facts['method']} (layout version {facts['method_version']})"), soft_wrap=True)
-    if facts["requires"]:
-        out.print(escape(f"written with: {_shown(facts['requires'])}"), soft_wrap=True)
-    for name in ("raster", "static"):
-        if facts[name]:
-            out.print(escape(f"{name}: {_shown(facts[name])}"), soft_wrap=True)
-    table = Table()
-    table.add_column("section")
-    table.add_column("bytes", justify="right")
-    table.add_column("share", justify="right")
-    for name, size in facts["bytes"].items():
-        table.add_row(escape(name), f"{size:,}", f"{size / facts['size']:.1%}")
-    table.add_section()
-    table.add_row("file", f"{facts['size']:,}", "100.0%")
-    out.print(table)
+    lines = [f"{facts['path']}: {facts['method']} (layout version {facts['method_version']})"]
+    lines += [f"written with: {_shown(facts['requires'])}"] if facts["requires"] else []
+    lines += [f"{name}: {_shown(facts[name])}" for name in ("raster", "static") if facts[name]]
+    sections = [[name, f"{n:,}", f"{n / facts['size']:.1%}"] for name, n in facts["bytes"].items()]
+    click.echo(without_orders("\n".join(lines)))
+    total = ["file", f"{facts['size']:,}", "100.0%"]
+    shared.print_table(["section", "bytes", "share"], [*sections, [], total], right=2)
     for reason in facts["missing"].values():
-        out.print(escape(reason), soft_wrap=True)
+        click.echo(without_orders(reason))
+
+
+def _print_record(facts: dict[str, Any]) -> None:
+    gist = {name: value for name, value in facts.items() if name not in ("phases", "train")}
+    gist["steps"] = facts["train"]["steps"]
+    gist["starts from"] = _started_from(facts["train"]["pretraining"] or {}) or None
+    _print_plain(gist)
+    if facts["phases"] is None:
+        click.echo("who served which phase is not known of this record")
+        return
+    rows: list[list[str]] = []
+    for phase in facts["phases"]:
+        served: dict[str, list[str]] = {}
+        for part in phase["provided_by"]:
+            owner = f"{part['distribution']} {part['version']}".strip() or "no distribution"
+            served.setdefault(owner, []).append(f"{part['kind']} {part['name']}")
+        for i, (owner, parts) in enumerate((served or {"": ["-"]}).items()):
+            rows.append(["" if i else phase["phase"], ", ".join(parts), owner])
+        rows.append([])
+    shared.print_table(["phase", "provided by", "from"], rows)
+
+
+def _started_from(pretraining: dict[str, dict[str, Any]]) -> str:
+    """What a training started from, in words; empty: nothing that was trained."""
+    found = []
+    for name, scene in pretraining.items():
+        known = [f"{scene['preset']} preset"] if scene["preset"] is not None else []
+        known += [f"{scene['steps']:,} steps"] if scene["steps"] is not None else []
+        known += [f"{scene['train_s']:.0f} s"] if scene["train_s"] is not None else []
+        origin = f"from the file {scene['file']['name']}" if "name" in scene["file"] else f"({', '.join(known)})"
+        found.append(f"a trained {name} scene {origin}")
+    return "; ".join(found)
 
 
 def _print_plain(facts: dict[str, Any]) -> None:
-    from rich.markup import escape
-    from rich.table import Table
-
-    table = Table(show_header=False)
-    for name, value in facts.items():
-        if name != "kind" and value not in (None, [], {}):
-            table.add_row(name.replace("_", " "), escape(_shown(value)))
-    console().print(table)
+    known = {name: value for name, value in facts.items() if name != "kind" and value not in (None, "", [], {})}
+    shared.print_table([], [[name.replace("_", " "), _shown(value)] for name, value in known.items()])
 
 
 def _shown(value: Any) -> str:

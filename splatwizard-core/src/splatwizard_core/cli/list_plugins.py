@@ -6,47 +6,41 @@ from typing import Any
 
 import click
 
-from splatwizard_core.cli.options import console, debug_option, json_option, options, print_json
+from splatwizard_core.cli import options as shared
 
 
 @click.command("list-plugins", short_help="what is installed, what is broken and why")
-@options(json_option, debug_option)
+@shared.options(shared.json_option, shared.debug_option)
 def list_plugins(as_json: bool) -> None:
-    """Installed packages, what each provides, and what is broken and why.
+    """List the installed packages, what each provides, and what is broken and why.
 
     SW_PLUGINS=a,b in the environment restricts what is loaded (empty: the core alone).
     """
     found = gather()
     if as_json:
-        print_json(found)
+        shared.print_json(found)
     else:
         _print(found)
 
 
 def gather() -> dict[str, Any]:
-    """Installed plugins, name clashes and commands as plain values."""
+    """Collect installed plugins, name clashes and commands as plain values."""
     from splatwizard_core.cli.main import command_entries
     from splatwizard_core.plugins import load_plugins
 
     plugins = load_plugins()
-    rows = []
-    for info in plugins.plugins:
-        provides = [
-            {"kind": e.kind, "name": e.name, "summary": e.summary, "target": e.target, **dict(e.declared)}
-            for e in plugins.provided_by(info)
-        ]
-        rows.append(
-            {
-                "distribution": info.distribution,
-                "version": info.version,
-                "key": info.key,
-                "module": info.module,
-                "provides": provides,
-                "error": info.error,
-            }
-        )
+    rows = [
+        {
+            **{name: getattr(info, name) for name in ("distribution", "version", "key", "module", "error")},
+            "provides": [
+                {"kind": e.kind, "name": e.name, "summary": e.summary, "target": e.target, **dict(e.declared)}
+                for e in plugins.provided_by(info)
+            ],
+        }
+        for info in plugins.plugins
+    ]
     clashes = [
-        {"kind": kind, "name": name, "distributions": [f"{e.distribution} {e.version}" for e in entries]}
+        {"kind": kind, "name": name, "distributions": sorted(f"{e.distribution} {e.version}" for e in entries)}
         for kind, registry in plugins.registries.items()
         for name, entries in registry.clashes.items()
     ]
@@ -57,14 +51,15 @@ def _print(found: dict[str, Any]) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    out = console()
+    out = shared.console()
     table = Table(title="Installed packages", title_justify="left")
     for column in ("distribution", "version", "provides"):
         table.add_column(column, overflow="fold")
     for row in found["plugins"]:
         by_kind: dict[str, list[str]] = {}
         for entry in row["provides"]:
-            by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]))
+            default = " (default)" if entry.get("default") else ""
+            by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]) + default)
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if row["error"]:
             lines.append(f"[red]broken: {escape(row['error'])}[/red]")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import difflib
 import logging
 import math
 import sys
@@ -28,15 +29,18 @@ class LazyGroup(click.Group):
     """A group whose commands come from the registry and are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        return [entry.name for entry in command_entries()]
+        with _silent_for_completion(ctx):
+            return [entry.name for entry in command_entries()]
+        return []
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
         from splatwizard_core.plugins import load_plugins
 
-        commands = load_plugins().commands
-        if cmd_name not in commands and cmd_name not in commands.clashes:
-            return None
-        return commands.load(cmd_name)
+        with _silent_for_completion(ctx):
+            commands = load_plugins().commands
+            if cmd_name in commands or cmd_name in commands.clashes:
+                return commands.load(cmd_name)
+        return None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """One line a command, from the registry: `sw --help` imports none of them."""
@@ -44,12 +48,12 @@ class LazyGroup(click.Group):
             formatter.write_dl([(entry.name, entry.summary) for entry in command_entries()])
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
-        with _quiet_about_readers():
+        with _ended_by_reader():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command; a reader that goes away (`sw info x | head`) ends it quietly."""
-        with _quiet_about_readers():
+        with _ended_by_reader():
             result = super().invoke(ctx)
             sys.stdout.flush()
         return result
@@ -57,12 +61,16 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        from splatwizard_core.plugins.registry import nearest
+        from splatwizard_core.plugins.catalogue import package_of
 
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
-            hint = nearest("command", args[0], self.list_commands(ctx))
+            package = package_of("command", args[0])
+            near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
+            hint = f"did you mean '{near[0]}'?" if near else "`sw --help` lists all"
+            if package is not None:
+                hint = f"it comes with {package}: pip install {package}"
             raise click.UsageError(f"no command '{args[0]}': {hint}", ctx) from error
 
 
@@ -74,7 +82,17 @@ def command_entries() -> list[Entry]:
 
 
 @contextlib.contextmanager
-def _quiet_about_readers() -> Iterator[None]:
+def _silent_for_completion(ctx: click.Context) -> Iterator[None]:
+    """Swallow what is wrong with the plugins while the shell asks for completions: TAB is not the place to say so."""
+    try:
+        yield
+    except SplatwizardError:
+        if not ctx.resilient_parsing:
+            raise
+
+
+@contextlib.contextmanager
+def _ended_by_reader() -> Iterator[None]:
     try:
         yield
     except BrokenPipeError:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
 from splatwizard_core.cli import complete
+from splatwizard_core.cli.streams import without_orders
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -23,38 +25,52 @@ def _not_empty(_context: click.Context, parameter: click.Parameter, value: str |
 
 
 scene_option = click.option(
-    "--scene", metavar="SCENE", shell_complete=complete.scenes,
-    help="A folder (COLMAP, Blender, ...; the format is detected), `demo`, or `dataset/scene` under "
-    "$SPLATWIZARD_DATA.  [default: demo]",
+    "--scene", metavar="SCENE", shell_complete=complete.complete_scenes,
+    help="A folder (the format is detected), `dataset/scene` under $SPLATWIZARD_DATA, or a scene that is made on the "
+    "spot, by its name.  [default: such a one]",
 )  # fmt: skip
 images_option = click.option(
-    "--images", metavar="FOLDER", shell_complete=complete.image_folders,
-    help="Picture folder of a COLMAP scene, such as images_2.  [default: the data set's own]",
+    "--images", metavar="FOLDER", shell_complete=complete.complete_image_folders,
+    help="Picture folder of a scene that has several, such as images_2.  [default: the data set's own]",
 )  # fmt: skip
 method_option = click.option(
-    "--method", "-m", metavar="NAME", shell_complete=complete.names("method"),
-    help="Method, see `sw list-plugins`.  [default: 3dgs, or what --config says]",
+    "--method", "-m", "methods", multiple=True, metavar="NAME", shell_complete=complete.complete_names("method"),
+    help="Method, see `sw list-plugins`.  [default: the one marked there, or what --config says]",
+)  # fmt: skip
+methods_option = click.option(
+    "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]", shell_complete=complete.complete_names("method"),
+    help="One or more methods, see `sw list-plugins`; repeatable.  [default: the one marked there, or what --config "
+    "says]",
 )  # fmt: skip
 preset_option = click.option(
-    "--preset", metavar="NAME", shell_complete=complete.presets,
-    help="Named values of the method.  [default: paper; quick on the demo scene]",
+    "--preset", metavar="NAME", shell_complete=complete.complete_presets,
+    help="Named values of the method.  [default: paper; quick on a scene that is made on the spot]",
 )  # fmt: skip
 rate_option = click.option(
-    "--rate", metavar="NAME", shell_complete=complete.rates,
+    "--rate", metavar="NAME", shell_complete=complete.complete_rates,
     help="Rate point: r1 (smallest file) .. rN, or low, default, high.  [default: default]",
+)  # fmt: skip
+rates_option = click.option(
+    "--rate", metavar="NAME[,NAME]", shell_complete=complete.complete_rates,
+    help="Rate points: r1 (smallest file) .. rN, or low, default, high, all.  [default: default]",
 )  # fmt: skip
 config_option = click.option(
     "--config", "config_file", type=click.Path(dir_okay=False), metavar="FILE",
     help="TOML file of values; config.toml of a run directory repeats that run.  [default: none]",
 )  # fmt: skip
 set_option = click.option(
-    "--set", "sets", multiple=True, metavar="KEY=VALUE", shell_complete=complete.nothing,
+    "--set", "sets", multiple=True, metavar="KEY=VALUE", shell_complete=complete.complete_nothing,
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
 )  # fmt: skip
 init_option = click.option(
-    "--init", metavar="FILE.ply", shell_complete=complete.files, callback=_not_empty,
-    help="Start from this trained scene, for methods that start from one; for 3dgs its key `init`.  "
+    "--init", metavar="FILE.ply", shell_complete=complete.complete_files, callback=_not_empty,
+    help="Start from this trained scene, for methods that start from one or have a key `init`.  "
     "[default: it is trained first, or taken from an earlier run]",
+)  # fmt: skip
+out_option = click.option(
+    "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.complete_folders,
+    help="Root of the run directories, DIR/<scene>/<method>/<rate>; a later `sw run` with the same options goes on "
+    "there.",
 )  # fmt: skip
 device_option = click.option(
     "--device", type=click.Choice(["auto", "cpu", "cuda"]),
@@ -63,16 +79,10 @@ device_option = click.option(
 seed_option = click.option(
     "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
 )
-lpips_option = click.option(
-    "--lpips-weights", metavar="DIR", shell_complete=complete.folders,
-    help="Folder with vgg16-397923af.pth and alexnet-owt-7be5be79.pth, for LPIPS.  [default: torch.hub's cache]",
-)  # fmt: skip
 repeats_option = click.option(
     "--repeats", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
     help="Measure rendering speed N times; the spread goes into the record.",
 )  # fmt: skip
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
-debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")
 resume_option = click.option(
     "--resume/--fresh", default=True, show_default=True,
     help="Go on from the last checkpoint and skip finished steps, or discard what --out holds and start over.",
@@ -81,6 +91,8 @@ changed_plan_option = click.option(
     "--allow-changed-plan", is_flag=True,
     help="Resume although the plan or configuration differs from the checkpoint's; the difference is printed.",
 )  # fmt: skip
+json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
+debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")
 
 
 def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
@@ -94,40 +106,34 @@ def options(*decorators: Callable[[F], F]) -> Callable[[F], F]:
     return apply
 
 
-def assignments(sets: Sequence[str], **named: Any) -> dict[str, Any]:
-    """The values of --set together with those that have an option of their own (None: not given)."""
-    from splatwizard_core.errors import ConfigError
-    from splatwizard_core.runs.config import parse_set
-
-    values: dict[str, Any] = dict(parse_set(sets))
-    for key, value in named.items():
-        if value is None:
-            continue
-        if key in values and str(values[key]) != str(value):
-            raise ConfigError(f"--{key} {value} contradicts --set {key}={values[key]}: give one of them", key=key)
-        values[key] = value
-    return values
+def say(message: str) -> None:
+    """Print a line for the user on stderr: stdout holds results only."""
+    click.echo(without_orders(message), err=True)
 
 
 def print_json(content: Any) -> None:
-    """One JSON object on stdout; not-a-number never appears in it."""
+    """Print one JSON object on stdout; not-a-number never appears in it."""
     click.echo(json.dumps(content, indent=2, allow_nan=False))
 
 
-def console() -> Console:
-    """Where tables go; plain text if stdout is no terminal."""
-    import sys
+def counted(counts: dict[str, int]) -> str:
+    """`120,331 gaussians`, of all that a model counts."""
+    return ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in counts.items())
 
+
+def console() -> Console:
+    """The console for tables on stdout; plain text if that is no terminal. It knows whether it has `printed`."""
     from rich.console import Console
     from rich.text import Text
 
-    from splatwizard_core.cli.streams import without_orders
+    class SafeConsole(Console):
+        """Leaves a closed pipe to `main`, and passes on no orders to the terminal from what a file holds."""
 
-    class Loud(Console):
-        """Rich would end the process with status 1 where the reader of a pipe has gone; that is for `main` to say.
+        printed = False
 
-        And it would pass on what a file holds, orders to the terminal too.
-        """
+        def print(self, *objects: Any, **options: Any) -> None:
+            self.printed = True
+            super().print(*objects, **options)
 
         def on_broken_pipe(self) -> None:
             raise BrokenPipeError
@@ -136,4 +142,26 @@ def console() -> Console:
             return super().render_str(without_orders(text), **options)
 
     # A pipe has no width: 80 columns would break tables that are meant to be searched.
-    return Loud(highlight=False, width=None if sys.stdout.isatty() else 160)
+    return SafeConsole(highlight=False, width=None if sys.stdout.isatty() else 160)
+
+
+def print_table(columns: list[str], rows: list[list[str]], *, title: str | None = None, right: int = 0) -> None:
+    """Print a table on stdout as it is: brackets in its cells are no markup.
+
+    columns     headings; empty: a table without
+    rows        an empty one is a line between sections
+    right       columns at the end that are aligned to the right
+    """
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(title=title and escape(title), title_justify="left", show_header=bool(columns))
+    width = len(columns or (rows[0] if rows else ()))
+    for index, heading in enumerate(columns or [""] * width):
+        table.add_column(heading, justify="right" if index >= width - right else "left", overflow="fold")
+    for row in rows:
+        if row:
+            table.add_row(*map(escape, row))
+        else:
+            table.add_section()
+    console().print(table)

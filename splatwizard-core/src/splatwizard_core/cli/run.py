@@ -4,117 +4,74 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import (
-    assignments,
-    changed_plan_option,
-    config_option,
-    console,
-    debug_option,
-    device_option,
-    images_option,
-    init_option,
-    json_option,
-    lpips_option,
-    options,
-    preset_option,
-    print_json,
-    repeats_option,
-    resume_option,
-    scene_option,
-    seed_option,
-    set_option,
-)
-from splatwizard_core.cli.setup import (
-    lpips_folder,
-    method_names,
-    open_session,
-    output_folder,
-    resolve_all,
-    say,
-    say_device,
-)
+from splatwizard_core.cli import options as shared
+from splatwizard_core.cli.paths import output_folder
+from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices, warn_of_metrics
+
+if TYPE_CHECKING:
+    from splatwizard_core.plugins import PluginManager
+    from splatwizard_core.runs.observers import FinishedRun
 
 
 @click.command(short_help="train, encode, decode, evaluate, report: one scene")
-@options(
-    click.option(
-        "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]", shell_complete=complete.names("method"),
-        help="One or more methods; repeatable.  [default: 3dgs, or what --config says]",
-    ),
-    scene_option, images_option,
-    click.option(
-        "--rate", "rates", metavar="NAME[,NAME]", shell_complete=complete.rates,
-        help="Rate points: r1 (smallest file) .. rN, or low, default, high, all.  [default: default]",
-    ),
-    preset_option, init_option, config_option, set_option,
-    click.option(
-        "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.folders,
-        help="Root of the run directories, DIR/<scene>/<method>/<rate>.",
-    ),
-    device_option, seed_option, lpips_option, repeats_option, resume_option, changed_plan_option, json_option,
-    debug_option,
+@shared.options(
+    shared.methods_option, shared.scene_option, shared.images_option, shared.rates_option, shared.preset_option,
+    shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
+    shared.seed_option, shared.repeats_option, shared.resume_option, shared.changed_plan_option, shared.json_option,
+    shared.debug_option,
 )  # fmt: skip
-def run(
-    methods: tuple[str, ...],
-    scene: str | None,
-    images: str | None,
-    rates: str | None,
-    preset: str | None,
-    init: str | None,
-    config_file: str | None,
-    sets: tuple[str, ...],
-    out: str,
-    device: str | None,
-    seed: int | None,
-    lpips_weights: str | None,
-    repeats: int,
-    resume: bool,
-    allow_changed_plan: bool,
-    as_json: bool,
-) -> None:
+@takes_choices
+def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
     """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
 
-    Finished steps are not done again; an interrupted run goes on from its last checkpoint. Several runs end in one
-    table, one page and rd.svg, their rate-distortion curves, in the folder above theirs.
+    Finished steps are not done again; an interrupted run goes on from its last checkpoint. Installed packages make
+    tables and pages of the finished runs; those about several runs go into the folder above theirs.
     """
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.config import is_demo
+    from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
-    from splatwizard_core.runs.run import RunRequest
     from splatwizard_core.runs.run import run as run_one
 
     plugins = load_plugins()
-    values = assignments(sets, images=images, device=device, seed=seed, init=init)
-    resolved = resolve_all(
-        plugins, method_names(methods, config_file), rates,
-        preset=preset, config_file=config_file, values=values, scene=scene,
-    )  # fmt: skip
+    resolved = chosen.resolve(plugins)
     output_folder(out)
-    session = open_session(resolved[0].ppl, plugins)
-    for each in resolved:
-        session.scene(each)  # what is wrong with it is told before anything else is said
-    weights = lpips_folder(lpips_weights)
-    say_device(resolved[0].ppl, session)
-    if any(r.preset == "quick" and is_demo(r.scene_spec) for r in resolved) and preset is None:
-        say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
+    session = open_training_session(resolved, plugins)
+    warn_of_metrics(session, None, resolved[0].metrics)
+    if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
+        shared.say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
     finished: list[FinishedRun] = []
     written: list[Path] = []
-    out_console = None if as_json else console()
+    console = None if as_json else shared.console()
     for each in resolved:
         request = RunRequest(
-            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, lpips_weights=weights,
-            repeats=repeats,
+            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, repeats=repeats,
         )  # fmt: skip
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))
-        plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, out_console, say, written))
-    if len(finished) > 1:
-        written.clear()  # the pages of single runs lie beside their records
-    plugins.hook.run_finished(runs=FinishedRuns(finished, True, out_console, say, written))
+        plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, console, shared.say, written))
+    of_single_runs = set(written)
+    plugins.hook.run_finished(runs=FinishedRuns(finished, True, console, shared.say, written))
     if as_json:
         runs = [{"directory": str(f.directory), "record": f.record.model_dump(mode="json")} for f in finished]
-        print_json({"runs": runs, "written": [str(path) for path in written]})
+        shared.print_json({"runs": runs, "written": [str(path) for path in written if path not in of_single_runs]})
+    elif not getattr(console, "printed", False):
+        for line in [*(summary(each, plugins) for each in finished), *map(str, written)]:
+            click.echo(line)
+
+
+def summary(finished: FinishedRun, plugins: PluginManager) -> str:
+    """One line about a finished run, for where no package prints a table."""
+    from splatwizard_core.evaluation.metrics import MetricInfo
+
+    record = finished.record
+    scores = []
+    for entry in plugins.metrics:
+        info, metric = MetricInfo.of(entry), record.metrics.get(entry.name)
+        if metric is not None and metric.mean is not None and not metric.diagnostic:
+            scores.append(f"{info.label} {metric.mean:.{info.digits}f} {info.unit}".rstrip())
+    name = f"{record.method} {record.rate}: "
+    return name + ", ".join([*scores, f"{record.file.bytes:,} bytes"]) + f": {finished.directory}"

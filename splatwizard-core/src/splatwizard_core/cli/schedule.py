@@ -2,65 +2,45 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import (
-    assignments,
-    config_option,
-    debug_option,
-    json_option,
-    options,
-    print_json,
-    rate_option,
-    set_option,
-)
+from splatwizard_core.cli import options as shared
+from splatwizard_core.cli.complete import complete_names, complete_presets
+from splatwizard_core.cli.setup import Choices, takes_choices
 
 if TYPE_CHECKING:
     from splatwizard_core.training.stage import Stage
 
 
 @click.command(short_help="a method's plan as a table")
-@click.argument("method", shell_complete=complete.names("method"))
-@options(
+@click.argument("method", shell_complete=complete_names("method"))
+@shared.options(
     click.option(
-        "--preset", metavar="NAME", shell_complete=complete.presets,
+        "--preset", metavar="NAME", shell_complete=complete_presets,
         help="Named values of the method.  [default: paper, or what --config says]",
     ),
-    rate_option, config_option, set_option,
+    shared.rate_option, shared.config_option, shared.set_option,
     click.option("--verbose", is_flag=True, help="Also the first and last step and the number of executions."),
-    json_option, debug_option,
+    shared.json_option, shared.debug_option,
 )  # fmt: skip
-def schedule(
-    method: str,
-    preset: str | None,
-    rate: str | None,
-    config_file: str | None,
-    sets: tuple[str, ...],
-    verbose: bool,
-    as_json: bool,
-) -> None:
+@takes_choices
+def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None:
     """Print the plan that METHOD executes, stage by stage; needs no data, no device, no training.
 
     A stage says what trained scene it starts from, and a stage or task of another package which one that is.
     """
-    import json
-
-    from splatwizard_core.cli.setup import resolve_one
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.training.scheduler import build_schedulers, format_plan
-
-    plugins = load_plugins()
-    if config_file is None:
-        preset = preset or "paper"
-    resolved = resolve_one(
-        plugins, method, rate, preset=preset, config_file=config_file, values=assignments(sets), scene=None
-    )
     from splatwizard_core.plugins.origins import Origins
     from splatwizard_core.runs.phases import stage_parts
+    from splatwizard_core.training.plan import format_plan, plan_rows, row_facts
+    from splatwizard_core.training.scheduler import build_schedulers
 
+    plugins = load_plugins()
+    preset = chosen.preset or (None if chosen.config_file else "paper")
+    resolved = replace(chosen, methods=(method,), preset=preset).resolve_one(plugins)
     entry, origins = plugins.methods.entry(method), Origins(plugins)
     stages = list(plugins.methods.load(method)(plugins, resolved.config).stages())
     found: list[dict[str, Any]] = []
@@ -68,7 +48,8 @@ def schedule(
         pre, post = build_schedulers(stage, resolved.ppl)
         parts = stage_parts(origins, stage, resolved.ppl)
         if as_json:
-            rows = json.loads(format_plan(pre, post, style="json", total=stage.iterations, verbose=verbose))
+            plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
+            rows = [row_facts(row, verbose=verbose) for row in plan]
             found.append(
                 {
                     "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,
@@ -87,11 +68,11 @@ def schedule(
 
         click.echo(format_plan(pre, post, total=stage.iterations, verbose=verbose, origin=owner))
     if as_json:
-        print_json({"method": method, "preset": resolved.preset, "rate": resolved.rate, "stages": found})
+        shared.print_json({"method": method, "preset": resolved.preset, "rate": resolved.rate, "stages": found})
 
 
 def _notes(stage: Stage, method: tuple[str, str], owner: tuple[str, str]) -> list[str]:
-    """What the plan of a stage does not show: what it starts from, and whose it is if not the method's own."""
+    """Notes beside the plan of a stage: what it starts from, and whose it is if not the method's own."""
     notes = []
     if stage.starts_from is not None:
         notes.append(f"starts from a trained {stage.starts_from} scene")

@@ -6,66 +6,29 @@ from pathlib import Path
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.cli.options import (
-    assignments,
-    changed_plan_option,
-    config_option,
-    debug_option,
-    device_option,
-    images_option,
-    init_option,
-    json_option,
-    method_option,
-    options,
-    preset_option,
-    print_json,
-    rate_option,
-    resume_option,
-    scene_option,
-    seed_option,
-    set_option,
-)
-from splatwizard_core.cli.setup import open_session, output_folder, resolve_one, say_device
+from splatwizard_core.cli import options as shared
+from splatwizard_core.cli.paths import output_folder
+from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices
 
 
 @click.command(short_help="train one method on one scene")
-@options(
-    method_option, scene_option, images_option, rate_option, preset_option, init_option, config_option, set_option,
-    click.option(
-        "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.folders,
-        help="Root of the run directories, DIR/<scene>/<method>/<rate>; `sw run` with the same options goes on there.",
-    ),
-    device_option, seed_option, resume_option, changed_plan_option, json_option, debug_option,
+@shared.options(
+    shared.method_option, shared.scene_option, shared.images_option, shared.rate_option, shared.preset_option,
+    shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
+    shared.seed_option, shared.resume_option, shared.changed_plan_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
-def train(
-    method: str | None,
-    scene: str | None,
-    images: str | None,
-    rate: str | None,
-    preset: str | None,
-    init: str | None,
-    config_file: str | None,
-    sets: tuple[str, ...],
-    out: str,
-    device: str | None,
-    seed: int | None,
-    resume: bool,
-    allow_changed_plan: bool,
-    as_json: bool,
-) -> None:
+@takes_choices
+def train(out: str, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
     """Train one method on one scene; checkpoints and log go into its run directory."""
     from splatwizard_core.plugins import load_plugins
-    from splatwizard_core.runs.run import RunRequest, train_only
-    from splatwizard_core.runs.training_run import pretraining
+    from splatwizard_core.runs.directory import RunRequest
+    from splatwizard_core.runs.run import train_only
+    from splatwizard_core.runs.training import pretraining
 
     plugins = load_plugins()
-    values = assignments(sets, images=images, device=device, seed=seed, init=init)
-    resolved = resolve_one(plugins, method, rate, preset=preset, config_file=config_file, values=values, scene=scene)
+    resolved = chosen.resolve_one(plugins)
     output_folder(out)
-    session = open_session(resolved.ppl, plugins)
-    session.scene(resolved)  # what is wrong with it is told before anything else is said
-    say_device(resolved.ppl, session)
+    session = open_training_session([resolved], plugins)
     request = RunRequest(resolved, Path(out), resume=resume, allow_changed_plan=allow_changed_plan)
     trained, directory = train_only(session, request)
     facts = {
@@ -75,7 +38,7 @@ def train(
         "pretraining": pretraining(trained.facts),
     }
     if as_json:
-        print_json(facts)
+        shared.print_json(facts)
         return
-    counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts["counts"].items())
+    counted = shared.counted(facts["counts"])
     click.echo(f"{facts['steps']:,} steps in {facts['train_s']:.1f} s, {counted}: {directory}")

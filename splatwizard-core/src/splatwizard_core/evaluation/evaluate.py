@@ -15,9 +15,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, CapabilityError, SceneError
+from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.evaluation.image import prepare_render
-from splatwizard_core.evaluation.metrics import MetricSetup, PreparedMetric, default_metrics, prepare_metrics
+from splatwizard_core.evaluation.metrics import (
+    MetricInfo,
+    MetricSettings,
+    MetricSetup,
+    PreparedMetric,
+    default_metrics,
+    failure,
+    prepare_metrics,
+)
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import out_of_memory
@@ -75,27 +83,24 @@ class EvaluationResult:
 
 
 def render_options(raster: Mapping[str, Any], background: Tensor | None) -> RasterOptions:
-    """How a decoded scene is drawn: what its file asks for, on `background` [3].
+    """Options that draw a decoded scene as its file asks, on `background` [3].
 
-    Raises BitstreamError if the file asks for it with a value that makes no sense.
+    Raises BitstreamError for a value that makes no sense.
     """
     asked: dict[str, Any] = {}
-    for key, kind in RASTER_KEYS.items():
-        if key not in raster:
-            continue
-        value = raster[key]
-        if kind is float and type(value) in (int, float) and 0 <= value < math.inf:
-            value = float(value)
-        elif kind is float or type(value) is not kind:
+    for key in RASTER_KEYS.keys() & raster.keys():
+        value, kind = raster[key], RASTER_KEYS[key]
+        is_size = kind is float and type(value) in (int, float) and 0 <= value < math.inf
+        if not is_size and (kind is float or type(value) is not kind):
             raise BitstreamError(f"the file asks for rasterizer option {key} = {value!r:.80}, which makes no sense")
-        asked[key] = value
+        asked[key] = kind(value)
     return RasterOptions(background=background, **asked)
 
 
 def suggested_rasterizers(raster: Mapping[str, Any]) -> tuple[str, ...]:
-    """Names of the rasterizers that a file would like to be drawn with, `prefer` in its header, best first.
+    """Names of the rasterizers that a file prefers (`prefer` in its header), best first, installed or not.
 
-    What is not installed or cannot run here is passed over. Raises BitstreamError if that is no short list of names.
+    Raises BitstreamError if that is no short list of names.
     """
     names = raster.get("prefer", [])
     if not isinstance(names, list) or len(names) > 16 or not all(isinstance(n, str) and len(n) <= 64 for n in names):
@@ -104,7 +109,7 @@ def suggested_rasterizers(raster: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def raster_header(options: RasterOptions) -> dict[str, Any]:
-    """The inverse of `render_options`: what of `options` belongs into the file, since it changes the picture."""
+    """The options that belong into the file, since they change the picture: the inverse of `render_options`."""
     default = RasterOptions()
     return {key: getattr(options, key) for key in RASTER_KEYS if getattr(options, key) != getattr(default, key)}
 
@@ -130,7 +135,7 @@ def evaluate(
     options: RasterOptions,
     quantize8: bool = True,
     metrics: Sequence[str] | None = None,
-    lpips_weights: Path | None = None,
+    metric_settings: MetricSettings | None = None,
     save_to: Path | None = None,
     label: str = "evaluate",
 ) -> EvaluationResult:
@@ -140,82 +145,72 @@ def evaluate(
     options     as `render_options` makes them; their background is also that of RGBA pictures
     quantize8   round renders to 8 bit before comparing; a metric declared with `unrounded` never gets rounded ones
     metrics     names from the registry; None: every one that is installed
-    lpips_weights   folder that backbone weights are looked for in first
+    metric_settings     of metrics, group -> key -> value
     save_to     folder for the renders as PNG, named after the views; None: they are not kept
 
-    A metric that cannot be imported or says CapabilityError (weights missing, say) is left unknown, with its reason.
-    Raises SceneError without a view, UserInputError for weights that are damaged.
+    A metric that cannot be imported, says CapabilityError (weights missing, say) or breaks is left unknown, with its
+    reason. Raises SceneError without a view, UserInputError for settings or weights that are wrong.
     """
     if not views:
         raise SceneError("there is no view to evaluate on")
     wanted = [plugins.metrics.entry(n) for n in (default_metrics(plugins.metrics) if metrics is None else metrics)]
-    ready, missing = prepare_metrics(wanted, MetricSetup(device, lpips_weights))
-    unrounded = {entry.name for entry in wanted if entry.declared.get("unrounded")}
+    ready, missing = prepare_metrics(wanted, MetricSetup(device, metric_settings or {}))
     values: dict[str, list[float]] = {entry.name: [] for entry in wanted}
     visible = drawn = 0
-    saved: list[str] = []
+    names = png_names([view.name for view in views])
     pending: list[Future[None]] = []
     if save_to is not None:
         save_to.mkdir(parents=True, exist_ok=True)
     with track(label, total=len(views), unit="views") as bar, ThreadPoolExecutor(1) as writer:
-        for view, file_name in zip(views, png_names([v.name for v in views]), strict=True):
+        for view, file_name in zip(views, names, strict=True):
             result = render_view(model, view.camera.to(device), rasterizer, options)
             image = prepare_render(result.image, quantize8=quantize8)
-            truth = view.image(options.background, device)
             exact = prepare_render(result.image, quantize8=False)
-            for name, metric in ready.items():
-                if name in missing:
-                    continue
+            truth = view.image(options.background, device)
+            for entry in (e for e in wanted if e.name not in missing):
+                drawn_image = exact if MetricInfo.of(entry).unrounded else image
                 try:
-                    values[name].append(float(metric.compute(exact if name in unrounded else image, truth)))
-                except CapabilityError as error:
-                    missing[name] = str(error)
+                    values[entry.name].append(float(ready[entry.name].compute(drawn_image, truth)))
+                except (Exception, SystemExit) as error:
+                    missing[entry.name] = failure(entry, error)
             visible += int(result.visible.sum())
             drawn += len(result.inputs)
             if save_to is not None:
-                saved.append(file_name)
                 pending.append(writer.submit(save_png, image.cpu(), save_to / file_name))
             so_far = values.get("psnr")
             bar.advance(1, **({"PSNR": sum(so_far) / len(so_far)} if so_far else {}))
     for written in pending:
         written.result()  # a full disk must not pass unseen
     return EvaluationResult(
-        views=[v.name for v in views],
+        views=[view.name for view in views],
         metrics={e.name: _summary(e, values[e.name], ready.get(e.name), missing.get(e.name)) for e in wanted},
         visible_gaussians=visible / len(views),
         drawn_gaussians=drawn / len(views),
-        renders=saved,
+        renders=names if save_to is not None else [],
     )
 
 
 def _summary(entry: Entry, values: list[float], ready: PreparedMetric | None, missing: str | None) -> MetricResult:
-    direction = str(entry.declared.get("direction", "higher"))
-    diagnostic = bool(entry.declared.get("diagnostic"))
+    info = MetricInfo.of(entry)
     if ready is None or missing is not None:
-        return MetricResult(None, [], direction, missing, diagnostic)
+        return MetricResult(None, [], info.direction, missing, info.diagnostic)
     finite = [v if math.isfinite(v) else None for v in values]
-    reason = None
-    if any(math.isnan(v) for v in values):
-        reason = NOT_A_NUMBER
-    elif None in finite:
-        reason = INFINITE
+    reason = NOT_A_NUMBER if any(map(math.isnan, values)) else INFINITE if None in finite else None
     mean = None if reason else sum(values) / len(values)
-    return MetricResult(mean, finite, direction, reason, diagnostic, ready.made_with, ready.verified)
+    return MetricResult(mean, finite, info.direction, reason, info.diagnostic, ready.made_with, ready.verified)
 
 
 def png_names(views: Sequence[str]) -> list[str]:
     """File names for the renders of views: no folders, and unique also where stems are not."""
     flat = [name.replace("/", "__").replace(os.sep, "__") for name in views]
-    stems = [name.rsplit(".", 1)[0] for name in flat]
-    shared = Counter(stems)
-    used: set[str] = set()
-    found = []
-    for name, stem in zip(flat, stems, strict=True):
-        chosen = stem if shared[stem] == 1 else name
+    stems = Counter(name.rsplit(".", 1)[0] for name in flat)
+    found: dict[str, None] = {}
+    for name in flat:
+        stem = name.rsplit(".", 1)[0]
+        chosen = stem if stems[stem] == 1 else name
         # Also where the one's folder is spelt in the other's name: a/b.png and a__b.png.
         free = itertools.chain([chosen], (f"{chosen}~{n}" for n in itertools.count(2)))
-        found.append(next(candidate for candidate in free if candidate not in used))
-        used.add(found[-1])
+        found[next(candidate for candidate in free if candidate not in found)] = None
     return [f"{name}.png" for name in found]
 
 

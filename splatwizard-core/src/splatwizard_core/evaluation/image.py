@@ -1,4 +1,4 @@
-"""Image metrics: PSNR, SSIM and L1 of a render against a photograph, each in the conventions that the field mixes.
+"""Image metrics: PSNR, SSIM and L1 of a render against a photograph, as the 3DGS code computes them.
 
 Every metric takes (render, truth), both [3,H,W] floating point in 0..1, and returns a float. Renders are clamped
 (and, by protocol, rounded to 8 bit) before they come here: `prepare_render`.
@@ -11,9 +11,9 @@ import math
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, pad
+from torch.nn.functional import conv2d
 
-from splatwizard_core.errors import CapabilityError, ShapeError
+from splatwizard_core.errors import ShapeError
 
 WINDOW = 11  # pixels
 SIGMA = 1.5  # pixels
@@ -48,16 +48,6 @@ def psnr(render: Tensor, truth: Tensor) -> float:
     return math.inf if mse == 0 else -10 * math.log10(mse)
 
 
-def psnr_channel_mean(render: Tensor, truth: Tensor) -> float:
-    """Mean of the three channels' PSNRs, dB: never below `psnr` (Jensen). A diagnostic: some codes print this one.
-
-    Infinite as soon as one channel is identical.
-    """
-    _check(render, truth)
-    mse = (render.double() - truth.double()).square().mean(dim=(1, 2))  # [3]
-    return float((-10 * torch.log10(mse)).mean())
-
-
 def l1(render: Tensor, truth: Tensor) -> float:
     """Mean absolute error over all 3*H*W values, in float64."""
     _check(render, truth)
@@ -73,37 +63,8 @@ def ssim(render: Tensor, truth: Tensor) -> float:
     return float(ssim_map(render.float(), truth.float()).double().mean())
 
 
-def ssim_valid(render: Tensor, truth: Tensor) -> float:
-    """As `ssim`, but the mean is over the pixels whose whole window lies inside the picture (5 pixels from each edge).
-
-    A diagnostic: what scikit-image averages. Raises CapabilityError if no window fits.
-    """
-    _check(render, truth)
-    _check_window(render)
-    half = WINDOW // 2
-    return float(ssim_map(render.float(), truth.float())[:, half:-half, half:-half].double().mean())
-
-
-def ssim_reflect(render: Tensor, truth: Tensor) -> float:
-    """As `ssim`, but the picture goes on as its mirror image beyond the edge (which is not repeated).
-
-    A diagnostic: what torchmetrics 1.9 averages, and so the codes that use it (gsplat). Raises CapabilityError if no
-    window fits.
-    """
-    _check(render, truth)
-    _check_window(render)
-    half = WINDOW // 2
-    x, y = (pad(image.float()[None], [half] * 4, mode="reflect")[0] for image in (render, truth))
-    return float(ssim_map(x, y)[:, half:-half, half:-half].double().mean())
-
-
-def _check_window(image: Tensor) -> None:
-    if min(image.shape[1:]) < WINDOW:
-        raise CapabilityError(f"too-small: no window of {WINDOW}x{WINDOW} pixels fits into {list(image.shape)}")
-
-
 def ssim_map(x: Tensor, y: Tensor) -> Tensor:
-    """[C,H,W] -> [C,H,W], the index at each pixel; keeps the dtype."""
+    """The structural similarity at each pixel, [C,H,W] -> [C,H,W]; pads with zeros, keeps the dtype."""
     offsets = torch.arange(WINDOW, dtype=torch.float64) - WINDOW // 2
     window = torch.exp(-(offsets**2) / (2 * SIGMA**2))
     window = (window / window.sum()).to(x)  # [11]

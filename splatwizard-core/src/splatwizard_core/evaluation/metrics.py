@@ -1,4 +1,4 @@
-"""From registry entries to metrics that can be called: what they need is fetched once an evaluation.
+"""Metrics: how they are declared, what settings a user gives them, and how each gets ready for an evaluation.
 
 A metric is registered in one of two forms. The plain one is the callable itself, (render, truth) -> float. One that
 needs a network, or anything else to be loaded, is an object with `prepare(setup) -> PreparedMetric`, called once
@@ -7,38 +7,93 @@ before the first view.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+import dataclasses
+import difflib
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, PluginError
+from splatwizard_core.errors import CapabilityError, ConfigError, PluginError, SplatwizardError
+from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.registry import Entry, Registry
 
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
 T = TypeVar("T")
+SettingsT = TypeVar("SettingsT", bound="BaseModel")
 
 Metric = Callable[[Tensor, Tensor], float]
 """(render [3,H,W], truth [3,H,W]), both in 0..1 on one device -> the value."""
-
-
+MetricSettings = Mapping[str, Mapping[str, Any]]
+"""Group -> key -> value, as `metrics.GROUP.KEY=VALUE` gives them."""
 MISSING = ("weights-missing", "package-missing")
 """How the reason begins where something has to be brought; commands tell how, once, before the work."""
+
+
+@dataclass(frozen=True)
+class MetricInfo:
+    """The fields that the entry of a metric declares.
+
+    label       heading in tables, "PSNR"; the metric's name where none is declared
+    group       its settings are `metrics.GROUP.KEY`; the metric's name where none is declared
+    unit        "dB", or empty
+    digits      after the decimal point, in tables
+    direction   "higher" or "lower" is better
+    diagnostic  computed to tell conventions apart, not for tables
+    slow        left out of evaluations during a training
+    unrounded   gets the render as it is, not rounded to 8 bit
+    settings    "module:Model", the pydantic model of its settings; empty: it has none
+    """
+
+    label: str
+    group: str
+    unit: str = ""
+    digits: int = 4
+    direction: str = "higher"
+    diagnostic: bool = False
+    slow: bool = False
+    unrounded: bool = False
+    settings: str = ""
+
+    @classmethod
+    def of(cls, entry: Entry) -> MetricInfo:
+        """The fields of one entry; what else it declares is passed over."""
+        known = {f.name for f in dataclasses.fields(cls)} & entry.declared.keys()
+        return cls(**{"label": entry.name, "group": entry.name, **{name: entry.declared[name] for name in known}})
 
 
 @dataclass
 class MetricSetup:
     """What metrics may use to get ready.
 
-    device          where the images will be
-    lpips_weights   folder that the user named for backbone weights; None: only the usual places are searched
+    device      where the images will be
+    settings    of all metrics, by group; a metric reads its own with `read`
     """
 
     device: torch.device
-    lpips_weights: Path | None = None
+    settings: MetricSettings = field(default_factory=dict)
     _shared: dict[str, Any] = field(default_factory=dict, repr=False)
+
+    def read(self, model: type[SettingsT], group: str) -> SettingsT:
+        """The settings of a group. Raises ConfigError for a key that `model` does not have, or a bad value."""
+        from pydantic import ValidationError
+
+        given = self.settings.get(group, {})
+        for key in given:
+            if key not in model.model_fields:
+                raise _unknown(f"{group}.{key}", [f"{group}.{known}" for known in model.model_fields])
+        try:
+            return model.model_validate(dict(given))
+        except ValidationError as error:
+            first = error.errors()[0]
+            key = ".".join(["metrics", group, *map(str, first["loc"])])
+            reason = first["msg"].removeprefix("Value error, ")
+            raise ConfigError(f"bad value {first['input']!r} for '{key}': {reason}", key=key) from None
 
     def share(self, key: str, make: Callable[[], T]) -> T:
         """What `make` returns, made once for all metrics of this evaluation that ask under the same key."""
@@ -64,7 +119,11 @@ class PreparedMetric:
 
 @runtime_checkable
 class MetricFactory(Protocol):
-    """A metric that has to get ready."""
+    """A metric that has to get ready.
+
+    It may also have `unavailable(setup) -> str | None`: one line for the user, before the work, if it cannot be
+    computed here. That raises UserInputError for settings that name something which is not there.
+    """
 
     def prepare(self, setup: MetricSetup) -> PreparedMetric:
         """Load what is needed. Raises CapabilityError if something is missing, UserInputError if it is damaged."""
@@ -75,17 +134,60 @@ class MetricFactory(Protocol):
         ...
 
 
-def default_metrics(registry: Registry, *, on_the_way: bool = False) -> list[str]:
+AnyMetric = Metric | MetricFactory
+"""The target of a metric's entry."""
+
+
+def default_metrics(registry: Registry[AnyMetric], *, on_the_way: bool = False) -> list[str]:
     """Names of the metrics that are computed when none are named: every one that is installed.
 
     on_the_way  during training: only the quick ones whose value the log is read for
     """
-    if not on_the_way:
-        return registry.names
-    return [e.name for e in registry if not e.declared.get("diagnostic") and not e.declared.get("slow")]
+    infos = {entry.name: MetricInfo.of(entry) for entry in registry}
+    return [name for name, info in infos.items() if not (on_the_way and (info.diagnostic or info.slow))]
 
 
-def prepare_metrics(entries: Sequence[Entry], setup: MetricSetup) -> tuple[dict[str, PreparedMetric], dict[str, str]]:
+def check_settings(registry: Registry[AnyMetric], settings: MetricSettings) -> dict[str, dict[str, Any]]:
+    """The settings that were given, as their metrics' models understand them: plain values that JSON can hold.
+
+    Raises ConfigError for a group or key that no installed metric has, with the nearest one, and for a bad value.
+    """
+    models = {MetricInfo.of(e).group: e for e in registry if MetricInfo.of(e).settings}
+    checked: dict[str, dict[str, Any]] = {}
+    for group, given in settings.items():
+        if group not in models:
+            raise _unknown(f"{group}.{next(iter(given), '')}".rstrip("."), list(models))
+        entry = models[group]
+        model = dataclasses.replace(entry, target=MetricInfo.of(entry).settings).load()
+        read = MetricSetup(torch.device("cpu"), settings).read(model, group)
+        checked[group] = read.model_dump(mode="json", include=set(given))
+    return checked
+
+
+def _unknown(key: str, known: list[str]) -> ConfigError:
+    near = difflib.get_close_matches(key, known, n=1) or difflib.get_close_matches(key.partition(".")[0], known, n=1)
+    keys = ", ".join(f"metrics.{each}" for each in sorted(known))
+    hint = f"did you mean 'metrics.{near[0]}'?" if near else f"there are settings for {keys or 'no installed metric'}"
+    return ConfigError(f"unknown key 'metrics.{key}': {hint}", key=f"metrics.{key}")
+
+
+def unavailable(entries: Iterable[Entry], setup: MetricSetup) -> list[str]:
+    """One line for each thing that keeps some of these metrics from being computed here.
+
+    Raises UserInputError for settings that name something which is not there.
+    """
+    lines: list[str | None] = []
+    for entry in entries:
+        with contextlib.suppress(PluginError):  # the record tells why it cannot be imported
+            ask = getattr(entry.load(), "unavailable", None)
+            try:
+                lines.append(ask(setup) if callable(ask) else None)
+            except (Exception, SystemExit) as error:
+                lines.append(failure(entry, error))
+    return [line for line in dict.fromkeys(lines) if line is not None]
+
+
+def prepare_metrics(entries: Iterable[Entry], setup: MetricSetup) -> tuple[dict[str, PreparedMetric], dict[str, str]]:
     """The metrics that are ready, and of the others why not, both by name."""
     ready: dict[str, PreparedMetric] = {}
     missing: dict[str, str] = {}
@@ -94,26 +196,36 @@ def prepare_metrics(entries: Sequence[Entry], setup: MetricSetup) -> tuple[dict[
             target = entry.load()
             is_factory = isinstance(target, MetricFactory)
             ready[entry.name] = target.prepare(setup) if is_factory else PreparedMetric(target)
-        except (PluginError, CapabilityError) as error:
-            missing[entry.name] = str(error)
+        except (Exception, SystemExit) as error:
+            missing[entry.name] = failure(entry, error)
     return ready, missing
 
 
-def metric_identities(registry: Registry, setup: MetricSetup) -> dict[str, str | None]:
+def failure(entry: Entry, error: BaseException) -> str:
+    """Why a metric has no value: what it says itself, or, where it broke, its package and the error.
+
+    Raises the error itself if it is for the user (damaged weights), or about a GPU without memory.
+    """
+    if isinstance(error, (PluginError, CapabilityError)):
+        return str(error)
+    if isinstance(error, (SplatwizardError, torch.cuda.OutOfMemoryError)):
+        raise error
+    return f"metric '{entry.name}' of {entry.distribution} {entry.version} failed: {one_line(error)}"
+
+
+def metric_identities(registry: Registry[AnyMetric], setup: MetricSetup) -> dict[str, str | None]:
     """name -> what its values would depend on now, cheaply told; None: it cannot be computed now."""
     found: dict[str, str | None] = {}
     for entry in registry:
-        found[entry.name] = f"{entry.distribution} {entry.version}"
-        if not entry.declared.get("slow"):
-            continue
-        try:
-            target = entry.load()
-        except PluginError:
-            found[entry.name] = None
-            continue
-        if isinstance(target, MetricFactory):
-            identity = target.identity(setup)
-            found[entry.name] = None if identity is None else f"{found[entry.name]}, {identity}"
+        found[entry.name] = package = f"{entry.distribution} {entry.version}"
+        if MetricInfo.of(entry).slow:
+            try:
+                target = entry.load()
+                if isinstance(target, MetricFactory):
+                    identity = target.identity(setup)
+                    found[entry.name] = None if identity is None else f"{package}, {identity}"
+            except (Exception, SystemExit):
+                found[entry.name] = None
     return found
 
 

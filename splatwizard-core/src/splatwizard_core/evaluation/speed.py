@@ -14,12 +14,13 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.progress import track
 
 WARMUP_FRAMES = 10
@@ -42,7 +43,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class SpeedReport:
-    """What was measured.
+    """Rendering speed and peak memory.
 
     fps                 frames / total time, one synchronisation at both ends; over all repeats
     latency_ms_median, latency_ms_p95   of single frames, synchronised around each; over all repeats
@@ -71,43 +72,6 @@ class SpeedReport:
     memory_kind: str
 
 
-class _Frames(Generic[View]):
-    """Draws frames and consumes each, so that none can be left undone."""
-
-    def __init__(self, render: Callable[[View], Tensor], views: Sequence[View], device: torch.device) -> None:
-        self.render, self.views, self.device = render, views, device
-        self.sink: Tensor | None = None
-
-    def draw(self, view: View) -> None:
-        total = self.render(view).sum()
-        self.sink = total if self.sink is None else self.sink + total
-
-    def synchronize(self) -> None:
-        if self.device.type == "cuda":
-            torch.cuda.synchronize(self.device)
-
-    def throughput(self, rounds: int) -> float:
-        """Seconds for `rounds` over all views, waiting for the device at both ends alone."""
-        self.synchronize()
-        began = time.perf_counter()
-        for _ in range(rounds):
-            for view in self.views:
-                self.draw(view)
-        self.synchronize()
-        return time.perf_counter() - began
-
-    def latencies(self, rounds: int) -> list[float]:
-        """Seconds of each frame, waiting for the device around every one."""
-        seconds = []
-        for view in itertools.islice(itertools.cycle(self.views), rounds * len(self.views)):
-            self.synchronize()
-            began = time.perf_counter()
-            self.draw(view)
-            self.synchronize()
-            seconds.append(time.perf_counter() - began)
-        return seconds
-
-
 def measure_speed(
     render: Callable[[View], Tensor],
     views: Sequence[View],
@@ -128,51 +92,58 @@ def measure_speed(
         raise ValueError("measuring speed needs at least one view and one repeat")
     device = torch.device(device)
     on_cuda = device.type == "cuda"
-    frames = _Frames(render, views, device)
+    sink: Tensor | None = None
+
+    def seconds_of(frames: Sequence[View]) -> float:
+        """Draw frames, waiting for the device at both ends alone; each is consumed, so that none can be left undone."""
+        nonlocal sink
+        synchronize(device)
+        began = time.perf_counter()
+        for view in frames:
+            total = render(view).sum()
+            sink = total if sink is None else sink + total
+        synchronize(device)
+        return time.perf_counter() - began
+
     warmup = max(len(views), WARMUP_FRAMES)
     rounds = 1
     totals: list[float] = []
     latencies: list[list[float]] = []
     meter = MemoryMeter(device)
     with torch.no_grad(), track("measure speed", total=1 + repeats) as bar:
-        began = time.perf_counter()
-        frames.draw(views[0])
-        frames.synchronize()
-        first_frame_s = time.perf_counter() - began
-        for view in itertools.islice(itertools.cycle(views), 1, warmup):
-            frames.draw(view)
-        frames.synchronize()
+        first_frame_s = seconds_of(views[:1])
+        seconds_of(list(itertools.islice(itertools.cycle(views), 1, warmup)))
         bar.advance()
         if on_cuda:
             # The first frame may load kernels, so the length of a round is taken from one that is warm.
-            round_seconds = frames.throughput(1)
+            round_seconds = seconds_of(views)
             enough = min(math.ceil(CUDA_FRAMES / len(views)), math.ceil(CUDA_SECONDS / max(round_seconds, 1e-6)))
             rounds = max(1, min(enough, max_rounds))
             warmup += len(views)
+        measured = list(views) * rounds
         meter.start()
         for _ in range(repeats):
             if on_cuda:
-                totals.append(frames.throughput(rounds))
-            latencies.append(frames.latencies(rounds))
+                totals.append(seconds_of(measured))
+            latencies.append([seconds_of([view]) for view in measured])
             if not on_cuda:
                 totals.append(sum(latencies[-1]))
             bar.advance()
-    drawn = rounds * len(views)
     pooled = [seconds for each in latencies for seconds in each]
     return SpeedReport(
-        fps=repeats * drawn / sum(totals),
+        fps=repeats * len(measured) / sum(totals),
         latency_ms_median=1e3 * statistics.median(pooled),
-        latency_ms_p95=1e3 * percentile(pooled, 95),
-        frames=repeats * drawn,
+        latency_ms_p95=1e3 * float(np.percentile(pooled, 95)),
+        frames=repeats * len(measured),
         rounds=rounds,
         repeats=repeats,
         views=len(views),
         warmup_frames=warmup,
         first_frame_s=first_frame_s,
         spread=None if repeats == 1 else {
-            "fps": spread([drawn / seconds for seconds in totals]),
+            "fps": spread([len(measured) / seconds for seconds in totals]),
             "latency_ms_median": spread([1e3 * statistics.median(each) for each in latencies]),
-            "latency_ms_p95": spread([1e3 * percentile(each, 95) for each in latencies]),
+            "latency_ms_p95": spread([1e3 * float(np.percentile(each, 95)) for each in latencies]),
         },
         peak_bytes=meter.peak_bytes(),
         peak_reserved_bytes=meter.peak_reserved_bytes(),
@@ -183,12 +154,3 @@ def measure_speed(
 def spread(values: Sequence[float]) -> Spread:
     """Mean, sample standard deviation, least and largest of at least two values."""
     return Spread(len(values), statistics.fmean(values), statistics.stdev(values), min(values), max(values))
-
-
-def percentile(values: Sequence[float], percent: float) -> float:
-    """Linear interpolation between the sorted values."""
-    ordered = sorted(values)
-    place = (len(ordered) - 1) * percent / 100
-    low = math.floor(place)
-    high = math.ceil(place)
-    return ordered[low] + (ordered[high] - ordered[low]) * (place - low)

@@ -1,14 +1,17 @@
-"""What a rasterizer draws: activated Gaussians as plain tensors."""
+"""Activated Gaussians as plain tensors: the input of every rasterizer."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import operator
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from splatwizard_core.errors import ShapeError
+from splatwizard_core.gaussians.spherical_harmonics import eval_sh, rgb_to_dc
 
 
 @dataclass
@@ -28,6 +31,26 @@ class SH:
     codebook: Tensor | None = None
     indices: Tensor | None = None
     active_degree: int = 3
+
+    @classmethod
+    def from_rgb(cls, rgb: Tensor) -> SH:
+        """Degree 0: colours [N,3] that are the same from every side."""
+        return cls(dense=rgb_to_dc(rgb)[:, None], active_degree=0)
+
+    def colors_from(self, center: Tensor, means: Tensor, *, rows: Tensor | None = None, clamp: bool = True) -> Tensor:
+        """Colours as seen from `center`: max(0, 0.5 + SH), [N,3]; differentiable in coefficients and `means`.
+
+        center  [3] camera centre, world units, not on a mean
+        means   [N,3] world units
+        rows    which Gaussians; None: all
+        clamp   False leaves negative values (sensitivity passes)
+        """
+        sh = self.to_dense()
+        if rows is not None:
+            sh, means = sh[rows], means[rows]
+        raw = eval_sh(sh, torch.nn.functional.normalize(means - center, dim=-1), self.active_degree) + 0.5
+        # clamp's gradient passes at raw == 0, as the specification wants.
+        return raw.clamp(min=0) if clamp else raw
 
     def to_dense(self) -> Tensor:
         """[N,K,3], differentiable with respect to whatever is stored."""
@@ -60,11 +83,13 @@ class SH:
         if held < needed:
             raise ShapeError(f"SH degree {self.active_degree} needs {needed} coefficients, here are {held}")
 
-    def __len__(self) -> int:
-        for tensor in (self.dense, self.dc, self.indices):
-            if tensor is not None:
-                return tensor.shape[0]
-        return 0
+
+def check_shape(name: str, tensor: Tensor, expected: tuple[int | str, ...]) -> None:
+    """Raise ShapeError unless `tensor` has the sizes `expected`; a string there stands for any size."""
+    shape = tensor.shape
+    if len(shape) != len(expected) or any(a != e for a, e in zip(shape, expected, strict=True) if isinstance(e, int)):
+        wanted = ", ".join(str(e) for e in expected)
+        raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}", actual=shape, expected=expected)
 
 
 _TENSORS = (
@@ -118,6 +143,31 @@ class GaussianInputs:
                     found[full] = stored[name]
         return found
 
+    def gathered(
+        self,
+        *,
+        geometry: bool = True,
+        colors: bool = True,
+        lookup: Callable[[Tensor, Tensor], Tensor] = operator.getitem,
+    ) -> GaussianInputs:
+        """A shallow copy in which every Gaussian has its own scales, quaternion and colours; differentiable.
+
+        geometry, colors    False leaves the shapes, or the colours, in the form in which they are stored
+        lookup              (table [M,...], indices [N]) -> its rows [N,...]
+        """
+        g = replace(self)
+        if geometry and g.scales is not None and g.quats is not None:
+            if g.geom_indices is not None:
+                g.scales, g.quats = lookup(g.scales, g.geom_indices), lookup(g.quats, g.geom_indices)
+            if g.scale_factors is not None:
+                g.scales = g.scales * g.scale_factors[:, None]
+            g.geom_indices = g.scale_factors = None
+        if colors and g.sh is not None and g.sh.codebook is not None and g.sh.indices is not None:
+            rest = lookup(g.sh.codebook, g.sh.indices)
+            own: dict[str, Tensor] = {"dense": rest} if g.sh.dc is None else {"dc": g.sh.dc, "rest": rest}
+            g.sh = SH(**own, active_degree=g.sh.active_degree)
+        return g
+
     def requires_grad(self) -> bool:
         """Whether autograd would record anything for these inputs now."""
         return torch.is_grad_enabled() and any(t.requires_grad for t in self.tensors().values())
@@ -127,18 +177,8 @@ class GaussianInputs:
         n = self.means.shape[0]
 
         def need(name: str, tensor: Tensor | None, *expected: int | str) -> None:
-            if tensor is None or tensor.shape == expected:
-                return
-            ok = tensor.dim() == len(expected) and all(
-                isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
-            )
-            if not ok:
-                wanted = ", ".join(str(e) for e in expected)
-                raise ShapeError(
-                    f"GaussianInputs.{name} must be [{wanted}], got {list(tensor.shape)}",
-                    actual=tensor.shape,
-                    expected=expected,
-                )
+            if tensor is not None and tensor.shape != expected:
+                check_shape(f"GaussianInputs.{name}", tensor, expected)
 
         rows: int | str = n if self.geom_indices is None else "M"
         need("means", self.means, n, 3)

@@ -1,4 +1,4 @@
-"""Explicit 3D Gaussians: the model of 3DGS and of every method that prunes, quantises or refines its Gaussians."""
+"""Explicit 3D Gaussians: the model of 3DGS and of every method that prunes, quantizes or refines its Gaussians."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.errors import SceneError, ShapeError
-from splatwizard_core.gaussians.inputs import SH, GaussianInputs
+from splatwizard_core.gaussians.inputs import SH, GaussianInputs, check_shape
 from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
 from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -75,24 +75,16 @@ class GaussianModel(SplatModel):
     ) -> None:
         super().__init__()
         n = means.shape[0]
-        for name, tensor, tail in (
-            ("means", means, (3,)),
-            ("sh_dc", sh_dc, (1, 3)),
-            ("sh_rest", sh_rest, (None, 3)),
-            ("opacity_logits", opacity_logits, ()),
-            ("log_scales", log_scales, (3,)),
-            ("quats", quats, (4,)),
-        ):
-            expected = (n, *("K-1" if size is None else size for size in tail))
-            fits = tensor.dim() == len(expected) and all(
-                isinstance(e, str) or a == e for a, e in zip(tensor.shape, expected, strict=True)
-            )
-            if not fits:
-                raise ShapeError(
-                    f"GaussianModel.{name} must be {list(expected)}, got {list(tensor.shape)}",
-                    actual=tensor.shape,
-                    expected=expected,
-                )
+        tails: dict[str, tuple[Tensor, tuple[int | str, ...]]] = {
+            "means": (means, (3,)),
+            "sh_dc": (sh_dc, (1, 3)),
+            "sh_rest": (sh_rest, ("K-1", 3)),
+            "opacity_logits": (opacity_logits, ()),
+            "log_scales": (log_scales, (3,)),
+            "quats": (quats, (4,)),
+        }
+        for name, (tensor, tail) in tails.items():
+            check_shape(f"GaussianModel.{name}", tensor, (n, *tail))
             self.register_parameter(name, nn.Parameter(tensor.detach()))
         degree = math.isqrt(sh_rest.shape[1] + 1) - 1
         if (degree + 1) ** 2 != sh_rest.shape[1] + 1 or degree > 3:
@@ -211,6 +203,6 @@ class GaussianModel(SplatModel):
         self._splits = int(extra["splits"])
 
     def load_resized(self, state: dict[str, Tensor]) -> None:
-        """As for every model; the full SH degree becomes that of the state."""
+        """Load a state whose row counts differ; the full SH degree becomes that of the state."""
         super().load_resized(state)
         self.max_sh_degree = math.isqrt(self.sh_rest.shape[1] + 1) - 1

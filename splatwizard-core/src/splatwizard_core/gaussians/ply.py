@@ -39,7 +39,7 @@ def property_names(sh_rest: int) -> list[str]:
 
 
 def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
-    """A model with exactly the values of the file, active SH degree = the degree that is stored (0 .. 3).
+    """Read a model with exactly the values of the file, active SH degree = the degree that is stored (0 .. 3).
 
     Any order of properties, float or double, binary or ASCII, is read; normals and unknown properties are ignored.
     Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
@@ -56,7 +56,7 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
 
 
 def from_ply(data: bytes, path: str) -> GaussianModel:
-    """`load_ply` of the bytes of a file.
+    """Read a model from the bytes of a file, as `load_ply` does.
 
     path    what errors call it: where it lies, if it lies anywhere
     """
@@ -99,18 +99,23 @@ def from_ply(data: bytes, path: str) -> GaussianModel:
     )
 
 
-def save_ply(model: GaussianModel, path: str | os.PathLike[str]) -> None:
+def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """Write the raw parameters, binary little-endian, normals zero; `load_ply` gives every bit back.
 
-    The file is complete or absent: it is written beside `path` and then renamed.
+    The file is complete or absent: it is written beside `path` and then renamed. Raises SceneError for models that
+    are not explicit Gaussians.
     """
+    if not isinstance(model, GaussianModel):
+        raise SceneError(
+            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera", path=str(path)
+        )
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.write(ply_header(model.num_rows, model.sh_rest.shape[1]))
         file.write(_rows(model).data)
 
 
 def to_ply(model: GaussianModel) -> bytes:
-    """The bytes that `save_ply` writes."""
+    """The bytes that `export_ply` writes of a model."""
     return ply_header(model.num_rows, model.sh_rest.shape[1]) + _rows(model).tobytes()
 
 
@@ -139,15 +144,6 @@ def _rows(model: GaussianModel) -> NDArray[np.float32]:
         table[:, column : column + width] = part.detach().cpu().float().numpy()
         column += width
     return table
-
-
-def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
-    """The exporter `ply`. Raises SceneError for models that are not explicit Gaussians."""
-    if not isinstance(model, GaussianModel):
-        raise SceneError(
-            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera", path=str(path)
-        )
-    save_ply(model, path)
 
 
 def _check_header(head: bytes, size: int, path: str) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -14,30 +16,11 @@ C3 = (
     -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
     -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
 )  # fmt: skip
-MAX_DEGREE = 3
-
-
-def num_coefficients(degree: int) -> int:
-    """K = (degree + 1)^2."""
-    return (degree + 1) ** 2
-
-
-def degree_of(num: int) -> int:
-    """The degree that has `num` coefficients. Raises ShapeError if none up to 3 has."""
-    for degree in range(MAX_DEGREE + 1):
-        if num_coefficients(degree) == num:
-            return degree
-    raise ShapeError(f"{num} SH coefficients belong to no degree from 0 to {MAX_DEGREE}; expected 1, 4, 9 or 16")
 
 
 def rgb_to_dc(rgb: Tensor) -> Tensor:
     """The degree-0 coefficient whose colour is `rgb` from every side; any shape."""
     return (rgb - 0.5) / C0
-
-
-def dc_to_rgb(dc: Tensor) -> Tensor:
-    """Inverse of `rgb_to_dc`, not clamped."""
-    return dc * C0 + 0.5
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -73,18 +56,8 @@ def eval_sh(sh: Tensor, directions: Tensor, active_degree: int) -> Tensor:
     """
     if sh.dim() != 3 or sh.shape[-1] != 3:
         raise ShapeError(f"sh must be [N,K,3], got {list(sh.shape)}", actual=sh.shape, expected=("N", "K", 3))
-    degree = min(active_degree, degree_of(sh.shape[1]))
+    if sh.shape[1] not in (1, 4, 9, 16):
+        raise ShapeError(f"{sh.shape[1]} SH coefficients belong to no degree from 0 to 3; expected 1, 4, 9 or 16")
+    degree = min(active_degree, math.isqrt(sh.shape[1]) - 1)
     basis = sh_basis(directions, degree)  # [N, k]
     return (basis[:, :, None] * sh[:, : basis.shape[1]]).sum(dim=1)
-
-
-def view_colors(sh: Tensor, means: Tensor, center: Tensor, active_degree: int, *, clamp: bool = True) -> Tensor:
-    """Colours as seen from `center`: max(0, 0.5 + SH), [N,3]; differentiable in `sh` and `means`.
-
-    sh      [N,K,3];  means [N,3] world units;  center [3] camera centre, world units, not on a mean
-    clamp   False leaves negative values (sensitivity passes)
-    """
-    directions = torch.nn.functional.normalize(means - center, dim=-1)
-    raw = eval_sh(sh, directions, active_degree) + 0.5
-    # clamp's gradient passes at raw == 0, as the specification wants.
-    return raw.clamp(min=0) if clamp else raw

@@ -1,10 +1,10 @@
-"""What a method trains: parameters, and how they become Gaussians."""
+"""The base of all scene models: parameters, and how they become Gaussians."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -26,6 +26,11 @@ class SplatModel(nn.Module):
 
     ROWS: tuple[str, ...] = ()
     """Names of the parameters and buffers whose first dimension is the primitive; attributes of the model."""
+    ROW_LABEL: ClassVar[str] = "gaussians"
+    """The primitives' name in progress and messages, plural; a model of anchors says "anchors"."""
+
+    ROW_LABEL: str = "gaussians"
+    """The word for its primitives in progress lines and messages."""
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
@@ -37,7 +42,7 @@ class SplatModel(nn.Module):
 
     @property
     def num_rows(self) -> int:
-        """How many primitives the model stores: Gaussians, or anchors."""
+        """Number of primitives that the model stores (`ROW_LABEL` names them)."""
         return int(getattr(self, self.ROWS[0]).shape[0])
 
     @property
@@ -46,7 +51,7 @@ class SplatModel(nn.Module):
         return next(self.parameters()).device
 
     def counts(self) -> dict[str, int]:
-        """What is reported: {"num_gaussians": ...}, and {"num_anchors": ...} for anchor methods."""
+        """The counts that a record reports: {"num_gaussians": ...}; other models add those of their primitives."""
         return {"num_gaussians": self.num_rows}
 
     def prepare(self) -> None:

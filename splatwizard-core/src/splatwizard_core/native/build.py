@@ -1,4 +1,4 @@
-"""Compiles the native modules of everything that is installed: what `sw build-kernels` does."""
+"""Compilation of the native modules of all installed packages, ahead of time: `sw build-kernels`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CORE_MODULES = ("splatwizard_core.training.native:TRAINING",)
 
 @dataclass(frozen=True)
 class BuildRow:
-    """What `build_all` did with one module. state: built, up to date, or failed; `error` says why."""
+    """Outcome of `build_all` for one module. state: built, up to date, or failed; `error` says why."""
 
     name: str
     state: str

@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 
 BUILD_TIMEOUT = 600.0
 MARCHES = ("native", "portable")
+SWITCHED_OFF = "native code is switched off by SPLATWIZARD_NATIVE=0"
 
 Say = Callable[[str], None]
 
@@ -50,7 +51,7 @@ def cache_root() -> Path:
 
 @dataclass
 class _Session:
-    """What this process knows of a module; a loaded library cannot be unloaded, so it belongs to the process."""
+    """State of a module in this process, shared by all: a loaded library cannot be unloaded."""
 
     loaded: Path | None = None
     error: NativeBuildError | None = None
@@ -92,15 +93,16 @@ class NativeModule:
 
         Raises NativeBuildError with the reason and what to do; a second call raises it again without compiling.
         """
-        if self._session.loaded is not None:
+        session = self._session
+        if session.loaded is not None:
             return
-        if self._session.error is not None:
-            raise self._session.error
-        try:
-            self._session.loaded = self._load(say or _say)
-        except NativeBuildError as error:
-            self._session.error = error
-            raise
+        if session.error is None:
+            try:
+                session.loaded = self._load(say or _say)
+                return
+            except NativeBuildError as error:
+                session.error = error
+        raise session.error
 
     def try_load(self) -> bool:
         """Load, and say whether it worked; if not, warn once in this process. For code that has a torch fallback."""
@@ -126,38 +128,33 @@ class NativeModule:
 
         Raises NativeBuildError if native code is switched off, or if what is there does not load.
         """
-        if self._session.loaded is not None:
-            return True
-        if _disabled():
-            raise NativeBuildError("native code is switched off by SPLATWIZARD_NATIVE=0")
-        self._session.loaded, problems = self._load_existing()
-        if self._session.loaded is None and problems:
-            raise NativeBuildError("; ".join(problems))
+        if self._session.loaded is None:
+            if _disabled():
+                raise NativeBuildError(SWITCHED_OFF)
+            self._session.loaded, problems = self._load_existing()
+            if self._session.loaded is None and problems:
+                raise NativeBuildError("; ".join(problems))
         return self._session.loaded is not None
 
     def available(self, *, cuda: bool = False) -> str | None:
-        """Why `load` would fail, or with `cuda` give no CUDA kernels; or None.
+        """The reason why `load` would fail, or with `cuda` give no CUDA kernels; or None.
 
         Compiles nothing: a compiler that is there is taken to work.
         """
-        if self._session.error is not None:
-            return str(self._session.error)
-        if (
-            cuda
-            and not self._session.cuda
-            and not self._holds_cuda(self._session.loaded or next(self._existing(), None))
-        ):
-            if self._session.loaded is not None:
-                return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
-            missing = self._without_cuda()
-            if missing is not None:
-                return missing
-        if self._session.loaded is not None:
-            return None
-        if _disabled():
-            return "native code is switched off by SPLATWIZARD_NATIVE=0"
+        session = self._session
+        if session.error is not None:
+            return str(session.error)
         try:
-            if next(self._existing(), None) is None:
+            found = session.loaded or next(self._existing(), None)
+            if cuda and not session.cuda and not self._holds_cuda(found):
+                if session.loaded is not None:
+                    return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
+                missing = self._without_cuda()
+                if missing is not None:
+                    return missing
+            if session.loaded is None and _disabled():
+                return SWITCHED_OFF
+            if found is None:
                 toolchain.find_compiler()
         except NativeBuildError as error:
             return str(error)
@@ -183,7 +180,7 @@ class NativeModule:
 
     def is_built(self, march: str, folder: Path | None = None) -> bool:
         """Whether `build` with these arguments would find the library there and undamaged."""
-        return _intact(self._library(self.cache_folder if folder is None else folder, march))
+        return _intact(self._library(folder or self.cache_folder, march))
 
     def build(
         self,
@@ -201,7 +198,7 @@ class NativeModule:
         tools       shares its limit on concurrent compilers between modules
         Raises NativeBuildError.
         """
-        folder = self.cache_folder if folder is None else folder
+        folder = folder or self.cache_folder
         library = self._library(folder, march)
         say = say or _say
         try:
@@ -255,7 +252,7 @@ class NativeModule:
 
     def _load(self, say: Say) -> Path:
         if _disabled():
-            raise NativeBuildError(self._explain("native code is switched off by SPLATWIZARD_NATIVE=0"))
+            raise NativeBuildError(self._explain(SWITCHED_OFF))
         library, _ = self._load_existing()
         if library is not None:
             return library
@@ -326,7 +323,7 @@ class NativeModule:
         return bool(self.cuda_sources) and torch.version.cuda is not None
 
     def _without_cuda(self) -> str | None:
-        """Why a build here holds no CUDA kernels, or None."""
+        """The reason why a build here holds no CUDA kernels, or None."""
         if not self.cuda_sources:
             return f"module '{self.name}' has no CUDA kernels"
         return toolchain.cuda_mismatch()
@@ -350,7 +347,8 @@ class NativeModule:
                 for i, s in enumerate(self.kernels)
             ]
         if cuda:
-            gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in _plain(toolchain.cuda_architectures())]
+            plain = [a.replace(".", "") for a in toolchain.cuda_architectures()]
+            gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in plain]
             flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode)
             flags = (*flags, *toolchain.include_flags(torch_headers=False, cuda=False), *self.cuda_cflags)
             jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
@@ -424,7 +422,7 @@ def _timeout() -> float:
 
 
 def _facts(library: Path) -> dict[str, Any]:
-    """What the build wrote down of a library; empty if that cannot be read."""
+    """Facts that the build wrote beside a library; empty if they cannot be read."""
     try:
         facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -438,7 +436,3 @@ def _intact(library: Path) -> bool:
         return _facts(library).get("sha256") == file_sha256(library)
     except OSError:
         return False
-
-
-def _plain(architectures: list[str]) -> list[str]:
-    return [a.replace(".", "") for a in architectures]

@@ -54,7 +54,7 @@ class Job:
 
 
 def cores() -> int:
-    """How many compilers may run at once: $MAX_JOBS, else the cores that this process may use."""
+    """Number of compilers that may run at once: $MAX_JOBS, else the cores that this process may use."""
     limit = os.environ.get("MAX_JOBS", "")
     if limit.isdigit() and int(limit) > 0:
         return int(limit)
@@ -101,8 +101,34 @@ def nvcc_version(nvcc: str) -> tuple[int, int] | None:
     return None if found is None else (int(found[1]), int(found[2]))
 
 
+@dataclass(frozen=True)
+class Compilers:
+    """The compilers that builds would use on this machine.
+
+    cxx             command of the C++ compiler; None: there is none, and `problem` says why
+    nvcc            path of the CUDA compiler, None if there is none
+    nvcc_release    (major, minor) of it, None if it does not say
+    """
+
+    cxx: list[str] | None
+    problem: str | None
+    nvcc: str | None
+    nvcc_release: tuple[int, int] | None
+
+
+def installed_compilers() -> Compilers:
+    """Look for the C++ and the CUDA compiler; neither is run on anything."""
+    cxx, problem = None, None
+    try:
+        cxx = find_compiler()
+    except CompilerMissingError as error:
+        problem = str(error)
+    nvcc = find_nvcc()
+    return Compilers(cxx, problem, nvcc, None if nvcc is None else nvcc_version(nvcc))
+
+
 def cuda_mismatch() -> str | None:
-    """Why CUDA kernels for this torch cannot be compiled here, or None."""
+    """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
     import torch
 
     wanted = torch.version.cuda
@@ -156,7 +182,7 @@ def gpus() -> list[tuple[int, int]]:
 
 
 def cpu_identity() -> str:
-    """What -march=native depends on: the CPU's feature list."""
+    """The CPU's feature list and model, on which -march=native depends."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:

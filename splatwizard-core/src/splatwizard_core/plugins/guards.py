@@ -6,7 +6,6 @@ import functools
 import inspect
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager
-from types import SimpleNamespace
 from typing import Any
 
 import pluggy
@@ -17,9 +16,13 @@ Guard = Callable[[str, Iterable[Any]], AbstractContextManager[None]]
 """(hook, arguments) -> a context that takes any exception of the implementation."""
 
 
-def guarded_hooks(module: Any, manager: pluggy.PluginManager, guard: Guard) -> SimpleNamespace:
-    """What pluggy finds in `module`, under the same names and with the same options, each call inside `guard`."""
-    found = SimpleNamespace()
+class GuardedHooks:
+    """Stands for a plugin's module in pluggy: its hook implementations as attributes."""
+
+
+def guarded_hooks(module: Any, manager: pluggy.PluginManager, guard: Guard) -> GuardedHooks:
+    """The hook implementations of `module`, with their names and options, each call inside `guard`."""
+    found = GuardedHooks()
     for name in dir(module):
         options = manager.parse_hookimpl_opts(module, name)
         if options is None:

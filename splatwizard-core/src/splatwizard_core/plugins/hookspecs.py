@@ -89,7 +89,7 @@ def register_executors(registry: Registry) -> None:
 
 @hookspec
 def register_checks(registry: Registry) -> None:
-    """Add checks of the machine: callables () -> findings, each a line of the diagnosis that somebody asks for."""
+    """Add checks of the machine: callables () -> list[Check], each run in a process of its own when a user asks."""
 
 
 @hookspec

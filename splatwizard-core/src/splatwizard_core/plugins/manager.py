@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from splatwizard_core.evaluation.metrics import AnyMetric
     from splatwizard_core.gaussians.model import GaussianModel
     from splatwizard_core.method import Method
+    from splatwizard_core.plugins.check import Check
     from splatwizard_core.rendering.rasterizer import Rasterizer
     from splatwizard_core.scene.dataset import Dataset
     from splatwizard_core.training.pruner import Pruner
@@ -71,7 +72,7 @@ class PluginManager:
         self.exporters: Registry[Callable[..., None]] = Registry("exporter")
         self.importers: Registry[Callable[..., GaussianModel]] = Registry("importer")
         self.executors: Registry[Any] = Registry("executor")
-        self.checks: Registry[Callable[..., Any]] = Registry("check")
+        self.checks: Registry[Callable[[], list[Check]]] = Registry("check")
         self.downloads: Registry[Callable[[], bytes]] = Registry("download")
         self.commands: Registry[click.Command] = Registry("command")
         self._filled_by: dict[str, Registry[Any]] = {
@@ -95,10 +96,16 @@ class PluginManager:
         self.registries: dict[str, Registry[Any]] = {r.kind: r for r in self._filled_by.values()}
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
+        self._loaded: list[tuple[PluginInfo, object]] = []
         for entry_point in _chosen(entry_points, only):
             self._load(entry_point)
         for hook, registry in self._filled_by.items():
             getattr(self._pluggy.hook, hook)(registry=registry)
+        for info, hooks in self._loaded:
+            if info.error is not None:  # nothing is left of a plugin that failed half way
+                self._pluggy.unregister(hooks)
+                for registry in self.registries.values():
+                    registry._withdraw(info.distribution)
 
     def _load(self, entry_point: importlib.metadata.EntryPoint) -> None:
         info = plugin_info(entry_point)
@@ -109,12 +116,16 @@ class PluginManager:
                 raise PluginError(unmet)
             hooks = guarded_hooks(entry_point.load(), self._pluggy, functools.partial(self._guard, info))
             self._pluggy.register(hooks, name=entry_point.name)
-            self._pluggy.check_pending()
+            try:
+                self._pluggy.check_pending()
+            except pluggy.PluginValidationError:
+                self._pluggy.unregister(hooks)
+                raise
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
             info.error = one_line(error)
-            if self._pluggy.has_plugin(entry_point.name):
-                self._pluggy.unregister(name=entry_point.name)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
+        else:
+            self._loaded.append((info, hooks))
 
     @contextlib.contextmanager
     def _guard(self, info: PluginInfo, hook: str, arguments: Iterable[Any]) -> Iterator[None]:
@@ -134,8 +145,6 @@ class PluginManager:
                 log.warning("%s %s: %s failed: %s", info.distribution, info.version, hook, one_line(error))
                 return
             info.error = f"{hook}: {one_line(error)}"
-            for each in self.registries.values():
-                each._withdraw(info.distribution)
 
     @property
     def hook(self) -> pluggy.HookRelay:

@@ -97,7 +97,7 @@ class Registry(Generic[T_co]):
     @property
     def clashes(self) -> dict[str, list[Entry]]:
         """Names that several distributions claim; asking for one is an error."""
-        return dict(self._clashes)
+        return {name: sorted(found, key=lambda e: e.distribution) for name, found in self._clashes.items()}
 
     def __contains__(self, name: object) -> bool:
         return name in self._entries
@@ -126,7 +126,7 @@ class Registry(Generic[T_co]):
         if name in self._entries:
             return self._entries[name]
         if name in self._clashes:
-            owners = " and ".join(f"{e.distribution} {e.version}" for e in self._clashes[name])
+            owners = " and ".join(f"{e.distribution} {e.version}" for e in self.clashes[name])
             raise PluginError(
                 f"{self.kind} '{name}' is claimed by {owners}: uninstall one, or restrict with SW_PLUGINS"
             )

@@ -1,1 +1,1 @@
-"""rendering room."""
+"""Drawing: the contract of rasterizers, and the choice among those that are installed."""

@@ -10,32 +10,23 @@ from torch import Tensor
 
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs
-from splatwizard_core.rendering.rasterizer import (
-    AccumOutput,
-    Rasterizer,
-    RasterizerInfo,
-    RasterOptions,
-    RenderResult,
-)
+from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 
 _AS_FEATURES = frozenset({"DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED", "ALPHA_MAP"})
-ADAPTABLE = _AS_FEATURES | {"SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM"}
-"""Features that can be had from a rasterizer that does not declare them (maps need EXTRA_FEATURES instead)."""
+_REWRITTEN = frozenset({"SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM"})
 
 
 def adapted_requirements(required: frozenset[str], missing: frozenset[str]) -> frozenset[str] | None:
-    """What is asked of the rasterizer once `missing` is adapted; None if some of it cannot be."""
-    if not missing <= ADAPTABLE:
+    """The features that a rasterizer needs once `missing` is composed from others; None if some of it cannot be."""
+    if not missing <= _AS_FEATURES | _REWRITTEN:
         return None
-    needs = required - missing
-    if missing & _AS_FEATURES:
-        needs |= {"EXTRA_FEATURES"}
-    return needs
+    return required - missing | ({"EXTRA_FEATURES"} if missing & _AS_FEATURES else frozenset())
 
 
 class AdaptedRasterizer:
-    """A rasterizer behind rewritten requests; every feature in `missing` is composed from others.
+    """A rasterizer behind rewritten requests: every feature in `missing` is composed from others.
 
     SPLIT_SH      dc and rest are concatenated
     INDEXED_*     codebooks are gathered, scale factors multiplied in; autograd scatters
@@ -52,7 +43,7 @@ class AdaptedRasterizer:
 
         Raises CapabilityError for composed maps beside features that are detached from the geometry.
         """
-        drawn = self._gathered(g)
+        drawn = self._rewritten(g)
         if not self.missing & _AS_FEATURES or not (opt.depth or opt.alpha):
             return replace(self.inner.render(drawn, cam, opt), inputs=g)
         if opt.features_detach_geometry and g.features is not None:
@@ -83,30 +74,17 @@ class AdaptedRasterizer:
 
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from geometry alone."""
-        return self.inner.visible_filter(self._gathered(g), cam)
+        return self.inner.visible_filter(self._rewritten(g), cam)
 
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
         """Sum scores over views; no map is kept, so none is asked for."""
         if self.missing & _AS_FEATURES:
             opt = replace(opt, depth=frozenset(), alpha=False)
-        return self.inner.accumulate(self._gathered(g), cams, opt)
+        return self.inner.accumulate(self._rewritten(g), cams, opt)
 
-    def _gathered(self, g: GaussianInputs) -> GaussianInputs:
+    def _rewritten(self, g: GaussianInputs) -> GaussianInputs:
         """A shallow copy without the storage forms that the rasterizer does not read."""
-        g = replace(g)
-        if "INDEXED_GEOM" in self.missing:
-            assert g.scales is not None
-            assert g.quats is not None
-            if g.geom_indices is not None:
-                g.scales, g.quats = g.scales[g.geom_indices], g.quats[g.geom_indices]
-            if g.scale_factors is not None:
-                g.scales = g.scales * g.scale_factors[:, None]
-            g.geom_indices = g.scale_factors = None
-        if g.sh is not None and g.sh.codebook is not None and "INDEXED_SH" in self.missing:
-            assert g.sh.indices is not None
-            rest = g.sh.codebook[g.sh.indices]
-            colors = {"dense": rest} if g.sh.dc is None else {"dc": g.sh.dc, "rest": rest}
-            g.sh = SH(**colors, active_degree=g.sh.active_degree)
+        g = g.gathered(geometry="INDEXED_GEOM" in self.missing, colors="INDEXED_SH" in self.missing)
         if g.sh is not None and g.sh.dc is not None and "SPLIT_SH" in self.missing:
             g.sh = SH(dense=g.sh.to_dense(), active_degree=g.sh.active_degree)
         return g

@@ -8,31 +8,22 @@ import hashlib
 import json
 import os
 import sys
+import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
-
-from pydantic import TypeAdapter, ValidationError
+from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.files import file_sha256
-from splatwizard_core.runs.keys import (
-    block_keys,
-    dotted,
-    field_at,
-    flatten,
-    input_files,
-    nested,
-    set_at,
-    suggest,
-    value_at,
-)
-from splatwizard_core.runs.values import parse_text
+from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams
+from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
+from splatwizard_core.training.overrides import apply_overrides, checked_value, unknown_key
+from splatwizard_core.training.params import OptimizationParams, PipelineParams
 
 if TYPE_CHECKING:
+    from splatwizard_core.evaluation.metrics import MetricSettings
     from splatwizard_core.method import Method
 
 if sys.version_info >= (3, 11):
@@ -40,92 +31,34 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
-ParamsT = TypeVar("ParamsT", bound=Params)
+__all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
 RESERVED = ("method", "preset", "rate", "scene")
 # The seed of a scene's start points is the seed of the run.
 SCENE_KEYS = tuple(f.name for f in dataclasses.fields(SceneOptions) if f.name != "seed")
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
+METRICS = "metrics."  # keys of the settings of metrics: metrics.GROUP.KEY
 INIT = "init"  # a .ply in place of that scene; a method that has a key of this name means its own
 RATE_ALIASES = ("low", "default", "high", "all")
+TABLES = (PRETRAINED, METRICS)
 # What else stands at the top of a configuration: a method's own key of such a name would hide it. INIT may be both.
-TAKEN = {*RESERVED, *SCENE_KEYS, *PipelineParams.model_fields, PRETRAINED.rstrip(".")}
-
-
-def apply_overrides(config: ParamsT, values: Mapping[str, Any], *, source: str) -> ParamsT:
-    """`config` with some values replaced.
-
-    values  by dotted key; strings are parsed by the field's type ("true", "3e4", "[1, 2]", "none")
-    source  where they come from, for the message: "--set", "preset 'quick'", a file name
-
-    Raises ConfigError for an unknown key (with the nearest valid one) or a bad value.
-    """
-    cls = type(config)
-    content = config.model_dump()
-    for key, value in values.items():
-        annotation = field_at(cls, key)
-        if annotation is None:
-            raise unknown_key(key, block_keys(cls), source)
-        set_at(content, key, _parsed(annotation, key, value, source))
-    try:
-        return cls.model_validate(content)
-    except ValidationError as error:
-        raise _bad_value(error, values, source, block_keys(cls)) from None
-
-
-def _parsed(annotation: Any, key: str, value: Any, source: str) -> Any:
-    if not isinstance(value, str):
-        return value
-    try:
-        return parse_text(annotation, value)
-    except ValueError as error:
-        raise ConfigError(f"bad value '{value}' for '{key}' in {source}: {error}", key=key) from None
-
-
-def _bad_value(
-    error: ValidationError, values: Mapping[str, Any], source: str, described: Mapping[str, str]
-) -> ConfigError:
-    first = error.errors()[0]
-    location = [str(part) for part in first["loc"]]
-    # The culprit is the longest given key that the location starts with; a check over several fields has no location.
-    path = ".".join(location)
-    key = max((k for k in values if path == k or path.startswith(f"{k}.")), key=len, default=path)
-    reason = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    if not key:
-        return ConfigError(f"bad combination of values in {source}: {reason}")
-    value = values.get(key, first.get("input"))
-    about = f" ({described[key]})" if described.get(key) else ""
-    return ConfigError(f"bad value {value!r} for '{key}' in {source}: must be {reason}{about}", key=key)
-
-
-def unknown_key(key: str, known: Mapping[str, str] | Sequence[str], source: str) -> ConfigError:
-    """The error for a key that nothing has: it names the nearest valid one."""
-    near = suggest(key, list(known))
-    hint = f"did you mean '{near}'?" if near else _keys_beside(key, known)
-    return ConfigError(f"unknown key '{key}' in {source}: {hint}", key=key)
-
-
-def _keys_beside(key: str, known: Mapping[str, str] | Sequence[str]) -> str:
-    """What there is instead: the keys of the block that it names, else those at the top."""
-    block = key.rpartition(".")[0]
-    inside = sorted(k for k in known if block and k.startswith(f"{block}."))
-    if inside:
-        return f"'{block}' has {', '.join(k.removeprefix(f'{block}.') for k in inside)}"
-    return f"the keys are {', '.join(sorted({k.split('.')[0] for k in known}))}"
+TAKEN = {*RESERVED, *SCENE_KEYS, *PipelineParams.model_fields, *(prefix.rstrip(".") for prefix in TABLES)}
 
 
 @dataclass(frozen=True)
 class ResolvedConfig:
-    """What one run is made with, every value decided.
+    """Every value that one run is made with.
 
     method, preset, rate    names
-    scene_spec              "demo", a folder, or dataset/scene
+    scene_spec              a folder, dataset/scene, or the name of a procedural scene
     config                  the method's hyper-parameters
     ppl                     run parameters
     scene                   how the scene is read
     provenance              dotted key -> "preset 'quick'", "rate 'r2'", a file name or "--set"; absent: the default
     init                    a .ply that the run starts from in place of a trained scene; empty: none
     pretrained              values by dotted key of the method whose trained scene it starts from, and its "preset"
+    metrics                 settings of metrics, group -> key -> value
+    procedural              whether the scene is made on the spot
     """
 
     method: str
@@ -138,74 +71,80 @@ class ResolvedConfig:
     provenance: Mapping[str, str]
     init: str = ""
     pretrained: Mapping[str, Any] = field(default_factory=dict)
+    metrics: MetricSettings = field(default_factory=dict)
+    procedural: bool = False
+
+    @property
+    def scene_options(self) -> dict[str, Any]:
+        """Values of the scene keys; the seed is the run's."""
+        return {key: getattr(self.scene, key) for key in SCENE_KEYS}
+
+    @property
+    def absolute_scene(self) -> str:
+        """The scene as another process, with another working directory, can find it."""
+        is_path = not self.procedural and Path(self.scene_spec).exists()
+        return str(Path(self.scene_spec).resolve()) if is_path else self.scene_spec
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values by block, None included; what the record keeps."""
+        """Return plain values by block, None included, as the record keeps them."""
         found = {
             "method": self.method,
             "preset": self.preset,
             "rate": self.rate,
             "config": self.config.model_dump(mode="json"),
             "pipeline": self.ppl.model_dump(mode="json"),
-            "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
+            "scene": self.scene_options,
             "provenance": dict(self.provenance),
         }
         if self.init:
             found["init"] = self.init
-        if self.pretrained:
-            found["pretrained"] = self._pretrained_tables()
-        return found
+        return found | self._tables()
 
-    def _pretrained_tables(self) -> dict[str, Any]:
-        tables: dict[str, Any] = {}
+    def _tables(self) -> dict[str, Any]:
+        """Return the tables beside the blocks, of those that have values."""
+        pretrained: dict[str, Any] = {}
         for key, value in self.pretrained.items():
-            set_at(tables, key, value)
-        return tables
+            set_at(pretrained, key, value)
+        return {
+            **({"pretrained": pretrained} if pretrained else {}),
+            **({"metrics": {group: dict(values) for group, values in self.metrics.items()}} if self.metrics else {}),
+        }
 
     def toml(self) -> str:
-        """A file that makes the same run again when given as `--config`."""
+        """Return a file that makes the same run again when given as `--config`."""
         import tomli_w
 
         content: dict[str, Any] = {"method": self.method, "preset": self.preset, "rate": self.rate}
-        content["scene"] = absolute_spec(self.scene_spec)
+        content["scene"] = self.absolute_scene
         # The blocks are merged upwards: no two have a key in common (`check_own_keys`), or INIT is the method's own.
-        content |= {key: getattr(self.scene, key) for key in SCENE_KEYS}
-        content |= self.ppl.model_dump(mode="json")
+        content |= self.scene_options | self.ppl.model_dump(mode="json")
         config = self.config.model_dump(mode="json")
         for key, path in self._input_files().items():
             set_at(config, key, os.path.abspath(path))
         if self.init:
             content[INIT] = os.path.abspath(self.init)
-        if self.pretrained:
-            content["pretrained"] = self._pretrained_tables()
-        content |= config
-        return tomli_w.dumps(_spell_none(content))
+        return tomli_w.dumps(_spell_none(content | self._tables() | config))
 
     def training_content(self) -> dict[str, Any]:
-        """Everything that training depends on: not the `ENCODING` fields, the device or the rate's name.
+        """Return everything that training depends on: not the `ENCODING` fields, the device or the rate's name.
 
-        A file that it reads counts by what it holds. What it starts from is told apart (`experiments.start`).
+        A file that it reads counts by what it holds. What it starts from is told apart (`pretrained.training_key`).
         """
         config = self.config_content()
         for name in type(self.config).ENCODING:
             config.pop(name, None)
         run = self.ppl.model_dump(mode="json", include={"seed", "random_background", "clamp_render", "raster"})
-        return {
-            "method": self.method,
-            "config": config,
-            "pipeline": run,
-            "scene": {key: getattr(self.scene, key) for key in SCENE_KEYS},
-        }
+        return {"method": self.method, "config": config, "pipeline": run, "scene": self.scene_options}
 
     def config_content(self) -> dict[str, Any]:
-        """The method's hyper-parameters, with what its input files hold in place of where they lie."""
+        """Return the method's hyper-parameters, with what its input files hold in place of where they lie."""
         config = self.config.model_dump(mode="json")
         for key, digest in self._input_digests.items():
             set_at(config, key, digest)
         return config
 
     def _input_files(self) -> dict[str, str]:
-        """Dotted key of the config -> path, of those that are given and are a file."""
+        """Return dotted key of the config -> path, of those that are given and are a file."""
         paths = {key: str(value_at(self.config, key)) for key in input_files(type(self.config))}
         return {key: path for key, path in paths.items() if path and os.path.isfile(path)}
 
@@ -214,33 +153,33 @@ class ResolvedConfig:
         return {key: f"sha256 {file_sha256(Path(path))}" for key, path in self._input_files().items()}
 
     def training_hash(self) -> str:
-        """SHA-256 of `training_content`: rate points that differ in the codec alone share it."""
+        """Return the SHA-256 of `training_content`: rate points that differ in the codec alone share it."""
         return content_hash(self.training_content())
 
     def config_hash(self) -> str:
-        """SHA-256 over every value of the method, the run and the scene options."""
+        """Return the SHA-256 over every value of the method, the run and the scene options.
+
+        Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
+        """
         content = self.as_dict()
-        del content["provenance"]
+        for key in ("provenance", "metrics"):
+            content.pop(key, None)
         return content_hash(content)
 
 
-def is_demo(scene_spec: str) -> bool:
-    """Whether a scene is the procedural one."""
-    return scene_spec == "demo" or scene_spec.startswith("demo:")
-
-
-def absolute_spec(scene_spec: str) -> str:
-    """A scene as another process, with another working directory, can find it."""
-    return str(Path(scene_spec).resolve()) if not is_demo(scene_spec) and Path(scene_spec).exists() else scene_spec
+def is_procedural(plugins: PluginManager, scene_spec: str) -> bool:
+    """Whether a scene is made on the spot: the name of a dataset that declares it, alone or before `:variant`."""
+    name = scene_spec.partition(":")[0]
+    return name in plugins.datasets and bool(plugins.datasets.entry(name).declared.get("procedural"))
 
 
 def content_hash(content: Any) -> str:
-    """SHA-256 over JSON with sorted keys."""
+    """Return the SHA-256 over JSON with sorted keys."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _spell_none(value: Any) -> Any:
-    """TOML has no null; the word "none" is parsed back by the field's type."""
+    """Replace None, which TOML does not have, by the word "none", which is parsed back by the field's type."""
     if value is None:
         return "none"
     if isinstance(value, Mapping):
@@ -262,26 +201,23 @@ def check_own_keys(method: type[Method]) -> None:
 
 
 def rate_points(method: type[Method], asked: str) -> list[str]:
-    """The rate points that "r1,r3", "low", "default", "high" or "all" mean, in the method's order."""
+    """Return the rate points that "r1,r3", "low", "default", "high" or "all" mean, in the method's order."""
     names = list(method.RATES)
     aliases = {"low": [names[0]], "high": [names[-1]], "default": [method.DEFAULT_RATE], "all": names}
     found: list[str] = []
     for word in (w.strip() for w in asked.split(",")):
-        if word in aliases:
-            found += aliases[word]
-        elif word in names:
-            found.append(word)
-        else:
+        if word not in aliases and word not in names:
             raise ConfigError(
                 f"method '{method.name}' has no rate point '{word}': "
                 f"one of {', '.join(names)}, or {', '.join(RATE_ALIASES)}",
                 key="rate",
             )
+        found += aliases.get(word, [word])
     return sorted(set(found), key=names.index)
 
 
 def read_config_file(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file. Raises ConfigError that names the line."""
+    """Read the tables of a TOML file. Raises ConfigError that names the line."""
     try:
         with open(path, "rb") as file:
             tables: dict[str, Any] = tomllib.load(file)
@@ -293,7 +229,7 @@ def read_config_file(path: str | Path) -> dict[str, Any]:
 
 
 def parse_set(assignments: Sequence[str]) -> dict[str, str]:
-    """`["a.b=1", ...]` -> {"a.b": "1", ...}; a later one wins."""
+    """Split `["a.b=1", ...]` into {"a.b": "1", ...}; a later one wins."""
     values: dict[str, str] = {}
     for text in assignments:
         key, equals, value = text.partition("=")
@@ -311,100 +247,112 @@ def resolve(
     sets: Mapping[str, Any] | None = None,
     *,
     scene: str | None = None,
+    plugins: PluginManager | None = None,
 ) -> ResolvedConfig:
-    """Every value of a run of `method`: defaults -> preset -> rate point -> file -> sets, the later wins.
+    """Decide every value of a run of `method`: defaults -> preset -> rate point -> file -> sets, the later wins.
 
-    preset, rate    names; None: what the file says, else "quick" on the demo scene and "paper" elsewhere, and the
+    preset, rate    names; None: what the file says, else "quick" on a procedural scene and "paper" elsewhere, and the
                     method's DEFAULT_RATE
     config_file     TOML; keys as in `sets`, tables for blocks, besides the reserved `method`, `preset`, `rate`, `scene`
     sets            by dotted key: a key of the method's config, else of PipelineParams, else a scene option, else
-                    `init` or `pretrained.KEY`, which `experiments.start.settled` checks
-    scene           "demo", a folder, or dataset/scene; None: what the file says, else "demo"
+                    `metrics.GROUP.KEY`, `init` or `pretrained.KEY`; the last two `pretrained.checked_start` checks
+    scene           a folder, dataset/scene or a procedural scene; None: what the file says, else the default dataset
+    plugins         which scenes are procedural and which settings metrics have; None: those installed
 
     Raises ConfigError, and PluginError for a method whose Config has keys that belong to the run.
     """
     check_own_keys(method)
+    plugins = plugins or load_plugins()
     tables = read_config_file(config_file) if config_file is not None else {}
     said = {name: tables.pop(name) for name in RESERVED if name in tables}
-    for name, value in said.items():
-        if not isinstance(value, str) or not value.strip():
-            raise ConfigError(f"bad value {value!r} for '{name}' in {config_file}: expected a name", key=name)
-    for name, asked in (("preset", preset), ("rate", rate), ("scene", scene)):
-        if asked is not None and not asked.strip():
-            raise ConfigError(f"--{name} is empty: give a name, or leave it out", key=name)
-    for name, asked in (("method", method.name), ("preset", preset), ("rate", rate)):
-        if asked is not None and said.get(name, asked) != asked:
-            raise ConfigError(
-                f"{config_file} was written for {name} '{said[name]}', not '{asked}': "
-                f"leave out --{name}, or take the key '{name}' and the values that follow from it out of the file",
-                key=name,
-            )
-    scene_spec = scene or str(said.get("scene", "demo"))
-    preset = preset or said.get("preset") or ("quick" if is_demo(scene_spec) else "paper")
-    rate = rate or said.get("rate") or method.DEFAULT_RATE
+    _check_names(method, said, config_file, preset=preset, rate=rate, scene=scene)
+    scene_spec = scene or str(said.get("scene", plugins.datasets.default or ""))
+    procedural = is_procedural(plugins, scene_spec)
+    preset = preset or said.get("preset") or ("quick" if procedural else "paper")
     if preset not in method.PRESETS:
         raise ConfigError(
             f"method '{method.name}' has no preset '{preset}': one of {', '.join(method.PRESETS)}", key="preset"
         )
+    rate = rate or said.get("rate") or method.DEFAULT_RATE
     points = rate_points(method, rate)
     if len(points) != 1:
         raise ConfigError(f"one rate point is needed here, not '{rate}'", key="rate")
     (rate,) = points
 
-    layers: list[tuple[str, Mapping[str, Any]]] = [
+    config: OptimizationParams = method.Config()
+    init, pretrained, settings = "", dict[str, Any](), dict[str, Any]()
+    ppl, scene_options = PipelineParams(), SceneOptions()
+    known = {**dict.fromkeys(SCENE_KEYS, ""), **block_keys(PipelineParams), **block_keys(method.Config)}
+    hints = typing.get_type_hints(SceneOptions)
+    provenance: dict[str, str] = {}
+    for source, layer in (
         (f"preset '{preset}'", method.PRESETS[preset]),
         (f"rate '{rate}'", method.RATES[rate]),
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
-    ]
-    config: OptimizationParams = method.Config()
-    init, pretrained = "", dict[str, Any]()
-    ppl, scene_options = PipelineParams(), SceneOptions()
-    known = {**dict.fromkeys(SCENE_KEYS, ""), **block_keys(PipelineParams), **block_keys(method.Config)}
-    provenance: dict[str, str] = {}
-    for source, layer in layers:
-        values = _with_dotted_tables(layer)
-        parts: tuple[dict[str, Any], dict[str, Any], dict[str, Any]] = ({}, {}, {})
-        for key, value in values.items():
+    ):
+        of_method: dict[str, Any] = {}
+        of_run: dict[str, Any] = {}
+        of_scene: dict[str, Any] = {}
+        for key, value in _with_dotted_tables(layer).items():
             if field_at(method.Config, key) is not None:
-                parts[0][key] = value
+                of_method[key] = value
             elif field_at(PipelineParams, key) is not None:
-                parts[1][key] = value
+                of_run[key] = value
             elif key in SCENE_KEYS:
-                parts[2][key] = value
+                of_scene[key] = checked_value(hints[key], key, value, source=source)
             elif key == INIT and isinstance(value, str):
                 init = value
             elif key.startswith(PRETRAINED) and key != PRETRAINED:
                 pretrained[key.removeprefix(PRETRAINED)] = value
+            elif key.startswith(METRICS) and key.count(".") > 1:
+                set_at(settings, key.removeprefix(METRICS), value)
             else:
                 raise unknown_key(key, known, source)
             provenance[key] = source
-        config = apply_overrides(config, parts[0], source=source)
-        ppl = apply_overrides(ppl, parts[1], source=source)
-        scene_options = _scene_options(scene_options, parts[2], source)
+        config = apply_overrides(config, of_method, source=source)
+        ppl = apply_overrides(ppl, of_run, source=source)
+        scene_options = dataclasses.replace(scene_options, **of_scene)
     scene_options = dataclasses.replace(scene_options, seed=ppl.seed)
     return ResolvedConfig(
-        method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained
-    )
+        method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
+        _checked_settings(plugins, settings), procedural,
+    )  # fmt: skip
+
+
+def _checked_settings(plugins: PluginManager, settings: MetricSettings) -> MetricSettings:
+    if not settings:
+        return {}
+    from splatwizard_core.evaluation.metrics import check_settings
+
+    return check_settings(plugins.metrics, settings)
+
+
+def _check_names(
+    method: type[Method], said: Mapping[str, Any], config_file: str | Path | None, **asked: str | None
+) -> None:
+    """Raise ConfigError for empty names, and for a file that was written for others than the options ask for."""
+    for name, value in said.items():
+        if not isinstance(value, str) or not value.strip():
+            raise ConfigError(f"bad value {value!r} for '{name}' in {config_file}: expected a name", key=name)
+    for name, option in asked.items():
+        if option is not None and not option.strip():
+            raise ConfigError(f"--{name} is empty: give a name, or leave it out", key=name)
+    for name, option in (("method", method.name), ("preset", asked["preset"]), ("rate", asked["rate"])):
+        if option is not None and said.get(name, option) != option:
+            raise ConfigError(
+                f"{config_file} was written for {name} '{said[name]}', not '{option}': "
+                f"leave out --{name}, or take the key '{name}' and the values that follow from it out of the file",
+                key=name,
+            )
 
 
 def _with_dotted_tables(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values, the table `pretrained` of a file as dotted keys."""
+    """Return the values with the tables `pretrained` and `metrics` of a file as dotted keys."""
     found = dict(values)
-    table = found.get(PRETRAINED.rstrip("."))
-    if isinstance(table, Mapping):
-        del found[PRETRAINED.rstrip(".")]
-        found |= dotted(table, PRETRAINED)
+    for prefix in TABLES:
+        table = found.get(prefix.rstrip("."))
+        if isinstance(table, Mapping):
+            del found[prefix.rstrip(".")]
+            found |= dotted(table, prefix)
     return found
-
-
-def _scene_options(options: SceneOptions, values: Mapping[str, Any], source: str) -> SceneOptions:
-    hints = {f.name: TypeAdapter(nested(SceneOptions, f.name)) for f in dataclasses.fields(SceneOptions)}
-    changed = {}
-    for key, value in values.items():
-        parsed = _parsed(nested(SceneOptions, key), key, value, source)
-        try:
-            changed[key] = hints[key].validate_python(parsed)
-        except ValidationError as error:
-            raise _bad_value(error, {key: value}, source, {}) from None
-    return dataclasses.replace(options, **changed)

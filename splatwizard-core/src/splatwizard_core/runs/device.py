@@ -1,20 +1,19 @@
-"""Where a run computes, and with how many threads."""
+"""Choose where a run computes, and with how many threads."""
 
 from __future__ import annotations
 
-import importlib
 import os
-from typing import Any
 
 import torch
 
 from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.rendering.negotiation import info_from_entry, obstacle
 
 
 def choose_device(asked: str, plugins: PluginManager) -> torch.device:
-    """The device that `asked` means: "cpu", "cuda", or "auto", which is CUDA if a compiled rasterizer can run there.
+    """Return the device that `asked` means: "cpu", "cuda", or "auto": CUDA if a compiled rasterizer can run there.
 
     Raises CapabilityError if CUDA is asked for and there is none.
     """
@@ -30,7 +29,7 @@ def choose_device(asked: str, plugins: PluginManager) -> torch.device:
 
 
 def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> str:
-    """One line for the user: where a run computes, and why there."""
+    """Return one line for the user: where a run computes, and why there."""
     if chosen.type == "cuda":
         name = torch.cuda.get_device_name(chosen)
         served = ", ".join(cuda_rasterizers(plugins))
@@ -47,21 +46,9 @@ def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> s
 
 
 def cuda_rasterizers(plugins: PluginManager) -> list[str]:
-    """The installed rasterizers with CUDA kernels that say they can run here; the slow reference does not count."""
-    found = []
-    for entry in plugins.rasterizers:
-        if "cuda" not in entry.declared.get("devices", ()) or entry.declared.get("speed", 0) <= 0:
-            continue
-        probe = entry.declared.get("available")
-        minimum = tuple(entry.declared.get("min_cc") or (0, 0))
-        if torch.cuda.get_device_capability() >= minimum and (probe is None or _call(probe) is None):
-            found.append(entry.name)
-    return found
-
-
-def _call(target: str) -> Any:
-    module, _, function = target.partition(":")
-    return getattr(importlib.import_module(module), function)()
+    """List the installed rasterizers with CUDA kernels that say they can run here; a slow reference does not count."""
+    infos = [info_from_entry(entry) for entry in plugins.rasterizers if "cuda" in entry.declared.get("devices", ())]
+    return [info.name for info in infos if info.speed > 0 and obstacle(info, torch.device("cuda")) is None]
 
 
 def set_threads(asked: int) -> int:

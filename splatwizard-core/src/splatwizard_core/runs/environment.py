@@ -1,4 +1,4 @@
-"""What a result was made on: packages, device, threads."""
+"""Describe the machine that a result was made on: packages, device, threads."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from splatwizard_core.plugins import PluginManager
 
 
 def describe_environment(plugins: PluginManager, device: torch.device, seed: int) -> dict[str, Any]:
-    """Plain values for the record: no machine name, no path, no user."""
+    """Return plain values for the record: no machine name, no path, no user."""
     packages = {p.distribution: p.version for p in plugins.plugins}
     for name in ("torch", "numpy"):
         packages[name] = importlib.metadata.version(name)
@@ -44,7 +44,7 @@ def describe_environment(plugins: PluginManager, device: torch.device, seed: int
 
 
 def cpu_name() -> str:
-    """Model name of the processor as the system tells it."""
+    """Return the model name of the processor as the system tells it."""
     try:
         for line in Path("/proc/cpuinfo").read_text().splitlines():
             if line.startswith("model name"):
@@ -55,7 +55,7 @@ def cpu_name() -> str:
 
 
 def _clock(device: torch.device) -> int | None:
-    """The SM clock now, MHz; None where the packages that read it are not installed."""
+    """Return the SM clock now, MHz; None where the packages that read it are not installed."""
     try:
         return int(torch.cuda.clock_rate(device))
     except (ImportError, RuntimeError, OSError):

@@ -1,4 +1,4 @@
-"""What files hold, as checksums that are remembered between runs: reading thousands of pictures takes long."""
+"""Checksums of files, remembered between runs: reading thousands of pictures takes long."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class FileDigests:
                 self._known = known if isinstance(known, dict) else {}
 
     def of(self, files: Iterable[Path]) -> dict[Path, str]:
-        """File -> SHA-256, hexadecimal. Raises SceneError for one that cannot be read."""
+        """Map file to SHA-256, hexadecimal. Raises SceneError for one that cannot be read."""
         found: dict[Path, str] = {}
         unread: list[Path] = []
         for file in dict.fromkeys(files):
@@ -76,7 +76,7 @@ class FileDigests:
 
 
 def _stamp(file: Path) -> list[int]:
-    """What changes when a file does: size, two times in ns, inode; empty if it cannot be asked."""
+    """Return the facts that change when a file does: size, two times in ns, inode; empty if it cannot be asked."""
     try:
         facts = os.stat(file)
     except OSError:

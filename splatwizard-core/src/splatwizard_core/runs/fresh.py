@@ -1,4 +1,4 @@
-"""Running a step of `sw` in a process of its own, which gets what it is told and nothing else."""
+"""Run a step of `sw` in a process of its own, which gets what it is told and nothing else."""
 
 from __future__ import annotations
 

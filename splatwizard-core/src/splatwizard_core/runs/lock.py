@@ -35,7 +35,7 @@ _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 
 @dataclass(frozen=True)
 class Holder:
-    """Who holds a directory.
+    """The process that holds a directory.
 
     boot    identifies the running kernel: holders of one boot share their locks
     since   ISO 8601, UTC
@@ -141,7 +141,7 @@ def _try(descriptor: int, directory: Path, path: Path) -> tuple[str, str] | None
 
 
 def _silence(descriptor: int) -> float:
-    """Seconds since the file was last touched, by the clock that touches it."""
+    """Return the seconds since the file was last touched, by the clock that touches it."""
     last = os.fstat(descriptor).st_mtime_ns
     os.utime(descriptor)
     now = os.fstat(descriptor).st_mtime_ns
@@ -167,7 +167,7 @@ def _write_holder(descriptor: int) -> None:
 
 
 def read_holder(path: Path) -> Holder | None:
-    """Who wrote a lock file and did not clear it; None for nobody, or one that is just beginning or ending."""
+    """Read the holder that a lock file names; None for nobody, or one that is just beginning or ending."""
     try:
         told = json.loads(path.read_text())
         return Holder(
@@ -178,7 +178,7 @@ def read_holder(path: Path) -> Holder | None:
 
 
 def _boot() -> str:
-    """What identifies the running kernel: containers of one machine share it, and so their locks."""
+    """Return what identifies the running kernel: containers of one machine share it, and so their locks."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:

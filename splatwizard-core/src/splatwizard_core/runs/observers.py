@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
-
-from rich.console import Console
+from types import TracebackType
+from typing import TYPE_CHECKING, Protocol
 
 from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.guards import one_line
+from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.runs.record import Record
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.trainer import StepRecord
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,49 @@ class TrainingObserver(Protocol):
         ...
 
 
+class Observers:
+    """The observers of one training, each of which can fail alone. Used as a context that tells them of its end."""
+
+    def __init__(
+        self, plugins: PluginManager, observers: Sequence[TrainingObserver | None], say: Callable[[str], None]
+    ) -> None:
+        self._plugins, self._say = plugins, say
+        self._observers = [each for each in observers if each is not None]
+
+    @classmethod
+    def of(cls, plugins: PluginManager, training: StartedTraining | None, say: Callable[[str], None]) -> Observers:
+        """Ask every plugin for its observer of a training; None: a training that nobody is to watch."""
+        return cls(plugins, plugins.hook.run_started(training=training) if training is not None else [], say)
+
+    def __bool__(self) -> bool:
+        return bool(self._observers)
+
+    def __enter__(self) -> Observers:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._tell(lambda observer: observer.finished())
+
+    def after_step(self, model: SplatModel, record: StepRecord) -> None:
+        """Tell all of a step that is done."""
+        self._tell(lambda observer: observer.after_step(model, record))
+
+    def _tell(self, call: Callable[[TrainingObserver], None]) -> None:
+        for observer in list(self._observers):
+            try:
+                call(observer)
+            except (Exception, SystemExit) as error:
+                log.debug("an observer of the training failed", exc_info=True)
+                self._observers.remove(observer)
+                distribution, version = Origins(self._plugins).of(observer)
+                whose = f" of {distribution} {version}" if distribution else ""
+                self._say(f"warning: observer {type(observer).__name__}{whose} is dropped: {one_line(error)}")
+                with contextlib.suppress(Exception, SystemExit):
+                    observer.finished()
+
+
 @dataclass(frozen=True)
 class FinishedRun:
     """A run directory that is complete.
@@ -58,12 +110,13 @@ class FinishedRun:
 
 @dataclass(frozen=True)
 class FinishedRuns:
-    """What a command has finished: one run, or at its end all of them.
+    """The runs that a command has finished: one, or at its end all of them.
 
     complete    the command ends: these are all its runs
     console     where tables may be printed; None: the user asked for JSON
     say         takes one-line messages for the user
-    written     files that are named to the user at the end; a hook appends what it wrote
+    written     files that are named to the user at the end, those of single runs first; a hook appends what it wrote,
+                and may take back its own
     """
 
     runs: Sequence[FinishedRun]

@@ -1,4 +1,4 @@
-"""Who served which phase of a run: each stage of the training, the encode, the render; with distribution and version.
+"""Providers of each phase of a run: of each stage of the training, of encoding and rendering, with their versions.
 
 A part is {"kind", "name", "distribution", "version"}. Kinds are those of the registries ("rasterizer", "pruner",
 "coder", ...) and "stage", a training stage by the distribution of its class: a method that takes over another's stage
@@ -23,17 +23,17 @@ TRAIN, ENCODE, RENDER = "train", "encode", "render"
 
 
 def part_of(entry: Entry) -> Part:
-    """A registry entry as a part."""
+    """Return a registry entry as a part."""
     return _part(entry.kind, entry.name, entry.distribution, entry.version)
 
 
 def unique(parts: Iterable[Part]) -> list[Part]:
-    """Each part once, in the order in which they first came."""
+    """Return each part once, in the order in which they first came."""
     return list({tuple(part.values()): part for part in parts}.values())
 
 
 def rasterizer_parts(plugins: PluginManager, names: Iterable[str]) -> list[Part]:
-    """Rasterizers by name; one that is not installed any more has no distribution."""
+    """Return rasterizers, given by name, as parts; one that is not installed any more has no distribution."""
     registry = plugins.registries["rasterizer"]
     return unique(
         part_of(registry.entry(name)) if name in registry else _part("rasterizer", name, "", "") for name in names
@@ -41,7 +41,7 @@ def rasterizer_parts(plugins: PluginManager, names: Iterable[str]) -> list[Part]
 
 
 def stage_parts(origins: Origins, stage: Stage, ppl: PipelineParams) -> list[Part]:
-    """The stage itself, and the tasks of its plan that come from elsewhere."""
+    """Return the stage itself, and the tasks of its plan that come from elsewhere."""
     own = origins.of(stage)
     parts = [_part("stage", stage.name, *own)]
     for scheduler in build_schedulers(stage, ppl):
@@ -53,11 +53,11 @@ def stage_parts(origins: Origins, stage: Stage, ppl: PipelineParams) -> list[Par
 
 
 class StageParts:
-    """What serves each stage of a training, gathered while it runs.
+    """The parts that serve each stage of a training, gathered while it runs.
 
     stages      of the method, just made
-    loaded      what the registries were asked for, as it grows; what is in it now was asked for by making the stages
-    rasterizer  what the training renders with
+    loaded      entries that the registries were asked for, as it grows; making the stages has asked for those of now
+    rasterizer  that the training renders with
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class StageParts:
         self._pending: list[Part] = []
 
     def since_asked(self) -> list[Part]:
-        """What served since this was last asked."""
+        """Return the parts that served since this was last asked."""
         self._pending += [part_of(entry) for entry in self._loaded[self._mark :] if entry.kind != "method"]
         self._mark = len(self._loaded)
         self._pending += rasterizer_parts(self._plugins, sorted(self._rasterizer.served))
@@ -94,7 +94,7 @@ class StageParts:
 
     @contextlib.contextmanager
     def elsewhere(self) -> Iterator[None]:
-        """Leave out what another training asks for meanwhile."""
+        """Leave out the parts that another training asks for meanwhile."""
         self._pending = self.since_asked()
         try:
             yield
@@ -102,7 +102,10 @@ class StageParts:
             self._mark = len(self._loaded)
 
     def phases(self, provided: Mapping[str, Sequence[Part]]) -> list[dict[str, Any]]:
-        """The phases of the training; `provided` is what `since_asked` told during each stage, by its name."""
+        """Return the phases of the training.
+
+        provided    stage name -> the parts that `since_asked` told during it
+        """
         found = [_phase(TRAIN, self._common)] if self._common else []
         for fixed, (name, parts) in zip(self._fixed, provided.items(), strict=True):
             found.append(_phase(f"{TRAIN}: {name}", [*fixed, *parts]))
@@ -115,7 +118,7 @@ def phases_of_run(
     encoding: Mapping[str, Any],
     rasterizers: Mapping[str, str],
 ) -> list[dict[str, Any]] | None:
-    """All phases of a run from what its steps reported; None if one was done by a release that did not note them."""
+    """Return all phases of a run from the facts of its steps; None if an older release did one, which noted none."""
     if "phases" not in training or "parts" not in encoding:
         return None
     return [

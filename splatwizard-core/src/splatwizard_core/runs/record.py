@@ -1,17 +1,20 @@
-"""The result record, metrics.json: what every table is made from. A versioned schema; unknown values are null.
+"""The result record, metrics.json, that every table is made from. A versioned schema; unknown values are null.
 
 A value that is null has its reason in `unknown`, by dotted name; no value is ever 0 for "not measured".
+A field is added here and where it is measured: `picked` carries it into the record, `WhyNull` says why it may be null.
 Source: evaluation protocol, result record.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from splatwizard_core.errors import UserInputError
+from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.files import write_atomic
 from splatwizard_core.runs.record_versions import upgraded
 
@@ -19,14 +22,43 @@ SCHEMA: Literal[3] = 3
 FILE_NAME = "metrics.json"
 
 
+@dataclass(frozen=True)
+class WhyNull:
+    """Marks a field with the reason of its null, where whoever measured it told none."""
+
+    reason: str
+
+
 class Part(BaseModel):
     """Base of the record's blocks: nothing unknown, nothing that is not a number."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    def nulls(self, prefix: str = "") -> Iterator[tuple[str, str]]:
+        """Yield dotted name and reason of each null that is marked with one."""
+        for name, field in type(self).model_fields.items():
+            value = getattr(self, name)
+            if isinstance(value, Part):
+                yield from value.nulls(f"{prefix}{name}.")
+            elif value is None:
+                yield from ((prefix + name, mark.reason) for mark in field.metadata if isinstance(mark, WhyNull))
+
+
+def picked(block: type[Part], *sources: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of a block's fields, each from the last source that has it.
+
+    None for one that no source has, unless it has a default; whatever else the sources hold is left out.
+    """
+    merged: dict[str, Any] = {}
+    for source in sources:
+        merged |= source
+    return {
+        name: merged.get(name) for name, field in block.model_fields.items() if name in merged or field.is_required()
+    }
+
 
 class ProtocolBlock(Part):
-    """What makes results comparable: only equal ids may stand in one table. Rules that came later may stand beside."""
+    """The rules that make results comparable: only equal ids may stand in one table. Later rules may stand beside."""
 
     model_config = ConfigDict(extra="allow", frozen=True, allow_inf_nan=False)
 
@@ -51,7 +83,7 @@ class MetricBlock(Part):
 
 
 class SpreadBlock(Part):
-    """How much repeated measurements of one thing differ."""
+    """Spread of repeated measurements of one thing."""
 
     n: int = Field(ge=2, description="measurements")
     mean: float
@@ -74,7 +106,9 @@ class SpeedBlock(Part):
     repeats: int
     views: int
     warmup_frames: int
-    spread: dict[str, SpreadBlock] | None = Field(description="of fps and the latencies over the repeats")
+    spread: Annotated[dict[str, SpreadBlock] | None, WhyNull("measured once (--repeats N)")] = Field(
+        description="of fps and the latencies over the repeats"
+    )
     image_size: tuple[int, int] = Field(description="width, height of the first view drawn")
 
 
@@ -85,7 +119,7 @@ class MemoryBlock(Part):
     model_bytes: int = Field(description="held after the model was decoded and prepared")
     peak_load_bytes: int | None = Field(description="peak from opening the file to the decoded model")
     peak_render_bytes: int = Field(description="peak over the measured frames, the model included")
-    peak_reserved_bytes: int | None = None
+    peak_reserved_bytes: Annotated[int | None, WhyNull("a CPU has no such pool")] = None
 
 
 class StageBlock(Part):
@@ -114,10 +148,14 @@ class TrainBlock(Part):
     with_pretraining_s: float | None = Field(description="with the training of the scenes it starts from")
     pretraining: dict[str, PretrainingBlock] | None = Field(description="method -> its scene that this one used")
     steps: int | None
-    peak_bytes: int | None = Field(description="over the loop; without evaluation and checkpoints since schema 2")
+    peak_bytes: Annotated[int | None, WhyNull("not measured")] = Field(
+        description="over the loop; without evaluation and checkpoints since schema 2"
+    )
     memory_kind: Literal["cuda", "rss"] | None
-    pictures_in: str | None = Field(description="where the training pictures lay: host, cuda")
-    breakdown_s: dict[str, dict[str, float]] | None = Field(
+    pictures_in: Annotated[str | None, WhyNull("trained by a release that did not note it")] = Field(
+        description="where the training pictures lay: host, cuda"
+    )
+    breakdown_s: Annotated[dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")] = Field(
         description="stage -> part of a step -> seconds, if profiled"
     )
     trained_in: str | None = Field(description="rate point whose training this one shares (its own, as a rule)")
@@ -146,7 +184,7 @@ class RecordFile(Part):
 
 
 class ProvidedBlock(Part):
-    """Who served: a registered thing by its kind and name, a training `stage`, or a `task` of another package."""
+    """A part that served: a registered thing by kind and name, a training `stage`, or a `task` of another package."""
 
     kind: str
     name: str
@@ -186,10 +224,12 @@ class Record(Part):
     speed: SpeedBlock
     memory: MemoryBlock
     train: TrainBlock
-    geometry: dict[str, float] | None = None
+    geometry: Annotated[dict[str, float] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
-    phases: list[PhaseBlock] | None = Field(description="who served each phase, with distribution and version")
+    phases: Annotated[list[PhaseBlock] | None, WhyNull("trained or encoded by a release that did not note them")] = (
+        Field(description="who served each phase, with distribution and version")
+    )
     environment: dict[str, Any]
     flags: list[str] = Field(description="fit, rss, ...")
     unknown: dict[str, str] = Field(description="dotted name of each null -> why")
@@ -214,22 +254,32 @@ def read_record(path: Path) -> Record:
         raise UserInputError(f"{path}: not a result record of schema {SCHEMA}: {where}: {first['msg']}") from None
 
 
+def complete_record(values: Mapping[str, Any]) -> Record:
+    """Return the record of these values, each null with its reason. Raises SplatwizardError for a null without one."""
+    record = Record.model_validate(values)
+    told = record.unknown
+    marked = {name: reason for name, reason in record.nulls() if name not in told}
+    record = record.model_copy(update={"unknown": {**told, **marked}})
+    without = missing_reasons(record)
+    if without:
+        raise SplatwizardError(f"the record has null without a reason: {', '.join(without)}")
+    return record
+
+
 def missing_reasons(record: Record) -> list[str]:
-    """Dotted names of values that are null without a reason; a valid record has none."""
-    found: list[str] = []
-
-    def walk(value: Any, name: str) -> None:
-        if value is None and name not in record.unknown:
-            found.append(name)
-        elif isinstance(value, dict):
-            for key, inner in value.items():
-                walk(inner, f"{name}.{key}" if name else key)
-
+    """List the dotted names of values that are null without a reason; a valid record has none."""
     content = record.model_dump()
     for free in ("config", "environment", "unknown", "flags", "plan"):  # what they hold is described elsewhere
         if content.get(free) is not None:
             content.pop(free)
     for scene in (content["train"]["pretraining"] or {}).values():
         scene.update(config={} if scene["config"] is not None else None)
-    walk(content, "")
-    return found
+    return [name for name in _null_names(content, "") if name not in record.unknown]
+
+
+def _null_names(value: Any, name: str) -> Iterator[str]:
+    if value is None:
+        yield name
+    elif isinstance(value, dict):
+        for key, inner in value.items():
+            yield from _null_names(inner, f"{name}.{key}" if name else key)

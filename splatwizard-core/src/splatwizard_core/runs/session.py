@@ -1,31 +1,36 @@
-"""What several runs of one command share: plugins, device, loaded scenes and trained models."""
+"""Plugins, device, loaded scenes and trained models that several runs of one command share."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeVar
 
 import torch
 
-from splatwizard_core.errors import NativeBuildError
+from splatwizard_core.errors import NativeBuildError, SceneError
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.native.build import declared_modules, resolve_module
 from splatwizard_core.native.loader import cache_root
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.file_digests import FileDigests
-from splatwizard_core.runs.identity import scene_digest
-from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.runs.scene_digest import scene_digest
+from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
+
+T = TypeVar("T")
+Role = Literal["trained", "start", "file"]
+"""Of a model that a session keeps: trained last, started from last, or read from a file last."""
 
 
 @dataclass
 class TrainedModel:
-    """A finished training: the model, what it was made from, and what is reported of it."""
+    """A finished training: the model, the key of what it was made from, and the facts that are reported of it."""
 
     model: SplatModel
     key: str
@@ -43,90 +48,72 @@ class Session:
     plugins: PluginManager
     device: torch.device
     say: Callable[[str], None]
-    _scenes: dict[tuple[str, SceneOptions], Scene] = field(default_factory=dict)
-    _digests: dict[tuple[str, SceneOptions], str] = field(default_factory=dict)
-    _file_digests: dict[Path, str] = field(default_factory=dict)
-    _last_trained: TrainedModel | None = None
-    _given: TrainedModel | None = None
-    _start: TrainedModel | None = None
-    _said: set[str] = field(default_factory=set)
-    _kernels_loaded: bool = False
+    _made: dict[Hashable, Any] = field(default_factory=dict)
+    _models: dict[Role, TrainedModel] = field(default_factory=dict)
+
+    def _once(self, key: Hashable, make: Callable[[], T]) -> T:
+        if key not in self._made:
+            self._made[key] = make()
+        found: T = self._made[key]
+        return found
 
     def scene(self, resolved: ResolvedConfig) -> Scene:
-        """The scene of a run, loaded once; its warnings are told once."""
-        from splatwizard_core.scene.loading import load_scene
+        """Return the scene of a run, loaded once; its warnings are told once."""
 
-        key = (resolved.scene_spec, resolved.scene)
-        if key not in self._scenes:
+        def load() -> Scene:
+            if not resolved.scene_spec:
+                package = package_of("default", "dataset") or "'splatwizard-core[all]'"
+                raise SceneError(f"no scene is named, and the default one is not there: pip install {package}")
             scene = load_scene(resolved.scene_spec, resolved.scene, self.plugins)
             for warning in scene.warnings:
                 self.say(f"scene {scene.name}: {warning}")
-            self._scenes[key] = scene
-        return self._scenes[key]
+            return scene
+
+        return self._once(("scene", resolved.scene_spec, resolved.scene), load)
 
     def scene_digest(self, resolved: ResolvedConfig) -> str:
-        """What identifies the scene's content, computed once."""
-        key = (resolved.scene_spec, resolved.scene)
-        if key not in self._digests:
+        """Return the checksum of the scene's content, computed once."""
+
+        def digest() -> str:
             scene = self.scene(resolved)
-            self._digests[key] = scene_digest(scene, FileDigests(_digest_store(scene)))
-        return self._digests[key]
+            return scene_digest(scene, FileDigests(_digest_store(scene)))
+
+        return self._once(("digest", resolved.scene_spec, resolved.scene), digest)
 
     def file_digest(self, path: Path) -> str:
-        """SHA-256 of a file, read once."""
-        if path not in self._file_digests:
-            self._file_digests[path] = file_sha256(path)
-        return self._file_digests[path]
-
-    def given(self, path: Path) -> TrainedModel:
-        """The explicit Gaussians of a .ply as a trained scene, frozen; read once. Nobody knows how it was trained."""
-        from splatwizard_core.runs.start import check_model
-
-        digest = self.file_digest(path)
-        if self._given is None or self._given.key != digest:
-            model = check_model(str(path)).to(self.device).eval().requires_grad_(False)
-            self._given = TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
-        return self._given
+        """Return the SHA-256 of a file, read once."""
+        return self._once(path, lambda: file_sha256(path))
 
     def say_once(self, line: str) -> None:
         """Tell what rate points and stages would repeat."""
-        if line not in self._said:
-            self._said.add(line)
-            self.say(line)
-
-    def remember_start(self, trained: TrainedModel) -> None:
-        """Keep the trained scene that was last started from: often that of the next rate point too."""
-        self._start = trained
-
-    def start(self, key: str) -> TrainedModel | None:
-        """The trained scene that was last started from, if it is the one asked for."""
-        return self._start if self._start is not None and self._start.key == key else None
+        self._once(line, lambda: self.say(line))
 
     def load_kernels(self) -> None:
         """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.
 
         One that cannot be built is told once; whoever needs it falls back or says so.
         """
-        if self._kernels_loaded:
-            return
-        self._kernels_loaded = True
+        self._once("kernels", self._load_kernels)
+
+    def _load_kernels(self) -> None:
         for target in declared_modules(self.plugins):
             try:
                 resolve_module(target).try_load()
             except NativeBuildError as error:
                 self.say(f"warning: {error}")
 
-    def remember(self, trained: TrainedModel) -> None:
-        """Keep the last trained model: the next rate point often starts from it."""
-        self._last_trained = trained
+    def keep(self, role: Role, model: TrainedModel) -> None:
+        """Keep one model of each role: the next rate point often wants it again."""
+        self._models[role] = model
 
-    def trained(self, key: str) -> TrainedModel | None:
-        """The last trained model, if it is the one asked for."""
-        return self._last_trained if self._last_trained is not None and self._last_trained.key == key else None
+    def kept(self, role: Role, key: str) -> TrainedModel | None:
+        """Return the kept model of a role if it was made from what `key` stands for."""
+        found = self._models.get(role)
+        return found if found is not None and found.key == key else None
 
 
 def _digest_store(scene: Scene) -> Path | None:
-    """Where checksums of a scene's pictures are remembered; None for one that lies nowhere."""
+    """Return where checksums of a scene's pictures are remembered; None for one that lies nowhere."""
     if scene.path is None:
         return None
     name = hashlib.sha256(str(Path(scene.path).absolute()).encode()).hexdigest()

@@ -1,35 +1,39 @@
-"""Which versions of which distributions made a thing, and whether the same ones are installed."""
+"""Versions of the distributions that made a thing, and those of them that are another version now."""
 
 from __future__ import annotations
 
+import functools
+import importlib.metadata
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from splatwizard_core.plugins import Entry, PluginManager
+from packaging.requirements import Requirement
 
-CORE = "splatwizard-core"
+from splatwizard_core.plugins import Entry, PluginManager
+from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name
 
 
 def made_by(plugins: PluginManager, entries: Iterable[Entry]) -> dict[str, str]:
-    """Distribution -> version of the core and of everything that these entries come from."""
-    return installed(plugins, [entry.distribution for entry in entries])
+    """Map distribution to version, of the core, of all that these entries come from, and of our libraries below."""
+    providers = {entry.distribution for entry in entries} - {""}
+    return installed(plugins, providers.union(*map(_libraries, providers)))
 
 
 def installed(plugins: PluginManager, distributions: Iterable[str]) -> dict[str, str]:
-    """Distribution -> version as installed, the core's too; "" for one that is not there any more."""
-    versions = {plugin.distribution: plugin.version for plugin in plugins.plugins}
-    return {name: versions.get(name, "") for name in sorted({CORE, *distributions} - {""})}
+    """Map distribution to version as installed, the core's too; "" for one that is not there any more."""
+    loaded = {plugin.distribution: plugin.version for plugin in plugins.plugins}
+    return {name: loaded.get(name) or _version(name) for name in sorted({CORE, *distributions} - {""})}
 
 
 def providers(plugins: PluginManager, *kinds: str) -> list[str]:
-    """The distributions that provide anything of these kinds."""
+    """List the distributions that provide anything of these kinds."""
     return sorted({entry.distribution for kind in kinds for entry in plugins.registries[kind]})
 
 
 def changes(plugins: PluginManager, before: Any) -> list[str]:
-    """What was made by another version than is installed, such as `sw-codecs 0.1, now 0.2`; `before` as of `made_by`.
+    """List what was made by another version than is installed, such as `sw-x 0.1, now 0.2`; `before` as of `made_by`.
 
-    Nothing that can be read counts as a change too.
+    Versions that cannot be read count as a change too; a distribution that was not noted does not.
     """
     if not isinstance(before, Mapping):
         return ["versions that were not noted"]
@@ -39,3 +43,29 @@ def changes(plugins: PluginManager, before: Any) -> list[str]:
         for name, version in before.items()
         if now[str(name)] != version
     ]
+
+
+@functools.cache
+def _libraries(distribution: str) -> frozenset[str]:
+    """Find the distributions of ours that one requires, and those that they require: libraries have no entries."""
+    found: set[str] = set()
+    unseen = [distribution]
+    while unseen:
+        try:
+            lines = importlib.metadata.requires(unseen.pop()) or []
+        except importlib.metadata.PackageNotFoundError:
+            continue
+        for requirement in map(Requirement, lines):
+            name = normal_name(requirement.name)
+            needed = requirement.marker is None or requirement.marker.evaluate({"extra": ""})
+            if needed and name not in found and is_ours(name):
+                found.add(name)
+                unseen.append(name)
+    return frozenset(found)
+
+
+def _version(distribution: str) -> str:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return ""

@@ -1,1 +1,1 @@
-"""scene room."""
+"""Cameras, views, scenes, and the contract of the data sets that read them."""

@@ -46,6 +46,23 @@ class Camera:
                 expected=(3, 3),
             )
 
+    @classmethod
+    def look_at(
+        cls, eye: Tensor, target: Tensor, up: Tensor, *, width: int, height: int, fov_x: float, near: float = 0.2
+    ) -> Camera:
+        """A camera at `eye` that looks at `target`, principal point in the image centre, square pixels.
+
+        eye, target     [3] world units
+        up              [3] the world direction that points up in the picture
+        fov_x           horizontal field of view, radians
+        """
+        forward = torch.nn.functional.normalize(target - eye, dim=0)
+        right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+        down = torch.linalg.cross(forward, right)
+        R = torch.stack([right, down, forward])
+        focal = width / (2 * math.tan(fov_x / 2))
+        return cls(width, height, focal, focal, width / 2, height / 2, R, -R @ eye, near=near)
+
     @cached_property
     def center(self) -> Tensor:
         """Camera centre in the world, [3]."""
@@ -88,7 +105,10 @@ class Camera:
         )
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
-        """The same camera with R and tau on another device or in another dtype."""
+        """The same camera with R and tau on another device or in another dtype; kept, so that it is moved once."""
+        kept = self._moved.get((str(device), dtype))
+        if kept is not None:
+            return kept
         R = self.R.to(device=device, dtype=dtype)
         tau = self.tau.to(device=device, dtype=dtype)
         if R is self.R and tau is self.tau:
@@ -96,7 +116,13 @@ class Camera:
         moved = replace(self, R=R, tau=tau)
         if R.dtype == self.R.dtype and tau.dtype == self.tau.dtype and ("pose" in vars(self) or not self.R.is_cuda):
             vars(moved)["pose"] = self.pose  # the numbers stay: nobody need fetch them back
+        if not (R.requires_grad or tau.requires_grad):
+            self._moved[str(device), dtype] = moved
         return moved
+
+    @cached_property
+    def _moved(self) -> dict[tuple[str, torch.dtype | None], Camera]:
+        return {}
 
     def resized(self, width: int, height: int) -> Camera:
         """The same view at another resolution: intrinsics scale per axis, so the field of view is kept."""
@@ -104,20 +130,3 @@ class Camera:
         return replace(
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
-
-
-def look_at(
-    eye: Tensor, target: Tensor, up: Tensor, *, width: int, height: int, fov_x: float, near: float = 0.2
-) -> Camera:
-    """A camera at `eye` that looks at `target`, principal point in the image centre, square pixels.
-
-    eye, target     [3] world units
-    up              [3] the world direction that points up in the picture
-    fov_x           horizontal field of view, radians
-    """
-    forward = torch.nn.functional.normalize(target - eye, dim=0)
-    right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
-    down = torch.linalg.cross(forward, right)
-    R = torch.stack([right, down, forward])
-    focal = width / (2 * math.tan(fov_x / 2))
-    return Camera(width, height, focal, focal, width / 2, height / 2, R, -R @ eye, near=near)

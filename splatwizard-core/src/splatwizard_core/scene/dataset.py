@@ -1,4 +1,4 @@
-"""What a dataset family provides, and the choice of one for a path."""
+"""The contract of a dataset family, and the options that a scene is read with."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from splatwizard_core.scene.scene import Scene
 
 @dataclass(frozen=True)
 class SceneOptions:
-    """How a scene is to be read; None means the family's own default.
+    """Options of reading a scene; None means the family's own default.
 
     protocol        "survey" or "inria": which named choice of pictures the family's defaults follow (None: "survey")
     images          picture folder of a COLMAP scene, such as "images_2"
@@ -43,12 +43,23 @@ class SceneOptions:
 
 
 class Dataset(TypingProtocol):
-    """One family of scenes: detection is explicit, never by catching errors."""
+    """One family of scenes, found by explicit detection, never by catching errors.
+
+    Its registry entry may declare:
+
+    looks_for       file by which such a folder is known, for messages
+    without_poses   advice for a folder of pictures without poses; {path} stands for the folder
+    procedural      scenes are made on the spot: `load` gets the family's name, or VARIANT of NAME:VARIANT, as path
+    default         the scene that is used where none is named (of our packages only)
+    title, scenes   of a published collection: as papers write it, and its scenes by folder name
+    folders         names that the folder above its scenes has in the wild, besides the family's own
+    prefix          text that may stand before a scene's name in its folder's name
+    """
 
     def detect(self, path: Path) -> float:
-        """How surely `path` is of this family: 0 (no) to 1 (only this). Reads names, not pictures.
+        """Score how surely `path` is of this family: 0 (no) to 1 (only this). Reads names, not pictures.
 
-        The core's answer 0.5 for a layout (any COLMAP or Blender folder) and 0.8 to 0.9 for a published collection.
+        Families of a layout answer 0.5, those of a published collection 0.8 to 0.9.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""From what the user typed to a Scene: the family is found, then asked to load."""
+"""Loads the scene that a user names, with the installed family that reads it."""
 
 from __future__ import annotations
 
@@ -6,64 +6,72 @@ import logging
 import os
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING
 
-from sw_datasets.families import BENCHMARKS
-
-from splatwizard_core.errors import PluginError, SceneError
+from splatwizard_core.errors import SceneError
+from splatwizard_core.plugins.catalogue import catalogue, package_of
+from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.scene.dataset import Dataset, SceneOptions
-from splatwizard_core.scene.images import SUFFIXES
-from splatwizard_core.scene.locate import locate
+from splatwizard_core.scene.locate import is_procedural, locate
 from splatwizard_core.scene.scene import Scene
+
+if TYPE_CHECKING:
+    from splatwizard_core.scene.locate import Families
 
 log = logging.getLogger(__name__)
 
+PICTURES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp"))
+"""Suffixes by which a folder of pictures without poses is known."""
+
 
 def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scene:
-    """The scene that `spec` names.
+    """Load the scene that `spec` names.
 
-    demo                the procedural scene; `demo:tiny` is a small one for tests
+    NAME, NAME:VARIANT  a scene that the procedural family NAME makes, and one of its variants
     a path              a scene folder; the registered family that recognises it best reads it
-    family:path         the same, read as that family whatever it looks like (`colmap:scenes/garden`)
+    family:path         the same, read as that family whatever it looks like
     dataset/scene       a scene below $SPLATWIZARD_DATA: read as that family if one has the dataset's name, else by the
                         family that recognises it, and the dataset's name goes into the protocol
 
-    Raises SceneError in one or two lines: nothing there, no or several families, or what the loader found wrong.
+    Raises SceneError in one or two lines: nothing there, no or several families, the package of the family is not
+    installed, or what the loader found wrong.
     """
-    if spec == "demo":
-        return _dataset(plugins, "demo").load(Path("demo"), options)
-    family, separator, rest = spec.partition(":")
-    if separator and family in plugins.datasets and not os.path.exists(spec):
-        if family == "demo":
-            return _dataset(plugins, "demo").load(Path(rest), options)
-        return _dataset(plugins, family).load(locate(rest)[0], options)
-    path, collection = locate(spec)
-    if collection is not None and collection in plugins.datasets and collection != "demo":
-        return _dataset(plugins, collection).load(path, options)
-    family = _recognise(path, plugins)
-    scene = _dataset(plugins, family).load(path, options)
-    if collection is not None and family not in BENCHMARKS:
+    families = plugins.datasets
+    name, separator, rest = spec.partition(":")
+    package = package_of(families.kind, name.partition("/")[0])
+    if package is not None and not os.path.exists(spec):
+        raise SceneError(f"scene '{spec}' is read by {package}, which is not installed: pip install {package}")
+    if is_procedural(families, name) and not (separator and os.path.exists(spec)):
+        return _family(families, name).load(Path(rest if separator else name), options)
+    if separator and name in families and not os.path.exists(spec):
+        return _family(families, name).load(locate(rest, families)[0], options)
+    path, collection = locate(spec, families)
+    if collection is not None and collection in families and not is_procedural(families, collection):
+        return _family(families, collection).load(path, options)
+    family = _recognise(path, families)
+    scene = _family(families, family).load(path, options)
+    if collection is not None and not families.entry(family).declared.get("scenes"):
         scene.protocol = replace(scene.protocol, dataset=collection)
     return scene
 
 
-def _dataset(plugins: PluginManager, family: str) -> Dataset:
-    target = plugins.datasets.load(family)
-    return cast(Dataset, target() if isinstance(target, type) else target)
+def _family(families: Families, name: str) -> Dataset:
+    target = families.load(name)
+    return target() if isinstance(target, type) else target
 
 
-def _recognise(path: Path, plugins: PluginManager) -> str:
-    """The family with the highest detection score. Raises SceneError if none or several claim the path."""
+def _recognise(path: Path, families: Families) -> str:
+    """Name of the family with the highest detection score. Raises SceneError if none or several claim the path."""
     scores: dict[str, float] = {}
-    for entry in plugins.datasets:
+    for entry in families:
         try:
-            scores[entry.name] = float(_dataset(plugins, entry.name).detect(path))
-        except PluginError as error:
-            log.warning("%s", error)
+            scores[entry.name] = float(_family(families, entry.name).detect(path))
+        except (Exception, SystemExit) as error:  # of one family; the others are asked all the same
+            log.warning("data set '%s' of %s: %s", entry.name, entry.distribution, one_line(error))
     best = max(scores.values(), default=0.0)
     if best <= 0:
-        raise SceneError(_unrecognised(path, sorted(scores)), path=str(path))
+        raise SceneError(_unrecognised(path, families, sorted(scores)), path=str(path))
     winners = sorted(name for name, score in scores.items() if score == best)
     if len(winners) > 1:
         raise SceneError(
@@ -72,17 +80,18 @@ def _recognise(path: Path, plugins: PluginManager) -> str:
     return winners[0]
 
 
-def _unrecognised(path: Path, families: list[str]) -> str:
+def _unrecognised(path: Path, families: Families, asked: list[str]) -> str:
     if path.is_file():
         return f"{path} is a file, not a scene folder"
-    looked_for = (
-        "sparse/0/cameras.bin or .txt (COLMAP), transforms_train.json (Blender), poses_enu.json (BungeeNeRF); "
-        f"families asked: {', '.join(families)}"
-    )
+    declared = [entry.declared for entry in families]
+    looked_for = ", ".join(fields["looks_for"] for fields in declared if "looks_for" in fields)
+    told = f"Looked for {looked_for or 'nothing'}; families asked: {', '.join(asked) or 'none'}"
+    kind = families.kind
+    absent = sorted({package for name in catalogue().get(kind, ()) if (package := package_of(kind, name)) is not None})
+    told += "".join(f"; more are read by {package}: pip install {package}" for package in absent)
     folders = [path, path / "images", path / "input"]
-    if any(p.suffix.lower() in SUFFIXES for folder in folders if folder.is_dir() for p in folder.iterdir()):
-        return (
-            f"{path} holds pictures but no camera poses: run COLMAP on them first "
-            f"(colmap automatic_reconstructor --image_path ... --workspace_path {path}). Looked for {looked_for}"
-        )
-    return f"{path} is not a scene of a known family. Looked for {looked_for}"
+    if any(p.suffix.lower() in PICTURES for folder in folders if folder.is_dir() for p in folder.iterdir()):
+        cures = [fields["without_poses"] for fields in declared if "without_poses" in fields]
+        cure = "".join(f": {text.replace('{path}', str(path))}" for text in cures[:1])
+        return f"{path} holds pictures but no camera poses{cure}. {told}"
+    return f"{path} is not a scene of a known family. {told}"

@@ -62,7 +62,7 @@ class View:
 
     @property
     def kept_on(self) -> torch.device:
-        """Where `image` takes the picture from: a GPU after `keep_on`, else the host."""
+        """Device that `image` takes the picture from: a GPU after `keep_on`, else the host."""
         return torch.device("cpu") if self._resident is None else self._resident.device
 
     def _pixels_on(self, device: torch.device) -> Tensor:
@@ -84,9 +84,9 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Protocol:
-    """What makes two results comparable; its id stands in every record.
+    """Choices that must be equal for two results to be comparable; the id stands in every record.
 
-    dataset     family id, such as "mipnerf360", or "colmap" / "blender" / "demo"
+    dataset     name of the family, or of a data set of the user's own
     images      picture folder
     resolution  the rule of specs: -1, 1, 2, 4, 8 or a width
     split       "every<n>", "lod:<k>", "file", "all"
@@ -122,15 +122,15 @@ class Protocol:
 
 @dataclass(eq=False)
 class Scene:
-    """Everything a method may know of a scene.
+    """A scene, and all that a method may know of it.
 
     name        last part of its path
     train, test views, disjoint unless the split is "all"
     points      start points (SfM, or random for Blender scenes); None if there are none
     protocol    how pictures were chosen, resized and split
-    ground_truth    geometry that the scene brings. demo: "points" [P,3], "normals" [P,3], "depth": view name ->
-                    [1,H,W]; DTU: "world_mats" and "scale_mats" [n,4,4] float64, n views by name (their product projects
-                    the scene's units to pixels, scale_mats[0] takes them to millimetres); otherwise empty
+    ground_truth    geometry that the scene brings, by name: "points" [P,3], "normals" [P,3], "depth": view name ->
+                    [1,H,W]; "world_mats" and "scale_mats" [n,4,4] float64, n views by name (their product projects the
+                    scene's units to pixels, scale_mats[0] takes them to millimetres); often empty
     warnings    one-line facts the user should see (dropped points, off-centre principal point)
     """
 

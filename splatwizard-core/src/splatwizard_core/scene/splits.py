@@ -1,4 +1,4 @@
-"""Which views are tested: rules over the views sorted by name."""
+"""Splits views into train and test by rules over their names' order."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ RULES = "'every<n>' (every n-th is a test view), 'lod:<k>', 'all', or 'file' whe
 
 
 def split_views(views: Sequence[T], rule: str) -> tuple[list[T], list[T]]:
-    """(train, test) of views that are already sorted by name.
+    """Split views that are already sorted by name into (train, test).
 
     every<n>    index % n == 0 is tested, the rest is trained; n >= 2
     lod:<k>     k < 50: indices 0..k are tested, the others trained; k >= 50: 0..k trained, the rest tested

@@ -16,7 +16,11 @@ from splatwizard_core.training.native import TRAINING
 
 @dataclass(slots=True)
 class AdamUpdate:
-    """The arguments of one `adam_step`."""
+    """One Adam update of a tensor.
+
+    param, grad, exp_avg, exp_avg_sq    any shape, alike
+    step                                of this update, from 1
+    """
 
     param: Tensor
     grad: Tensor
@@ -31,7 +35,11 @@ class AdamUpdate:
 
 @torch.no_grad()
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
-    """`adam_step` for each of them: the same numbers, on CUDA in one launch."""
+    """Update `param`, `exp_avg` and `exp_avg_sq` of each in place, densely; as torch.optim.Adam, to 1e-6.
+
+    On CUDA in one launch. Raises ShapeError if shapes differ.
+    Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
+    """
     together = [u for u in updates if u.param.is_cuda]
     if together and TRAINING.has_cuda():
         left = torch.ops.splatwizard_training.adam_many(
@@ -40,67 +48,41 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
             [u.lr for u in together], [u.beta1 for u in together], [u.beta2 for u in together],
             [u.eps for u in together], [u.step for u in together],
         )  # fmt: skip
-        _mark_written(*(u.param for u in together))
+        for u in together:
+            torch.autograd.graph.increment_version(u.param)  # the kernels write behind autograd's back
         if not left and len(together) == len(updates):
             return
         updates = [u for u in updates if not u.param.is_cuda] + [together[i] for i in left]
     for u in updates:
-        adam_step(
-            u.param, u.grad, u.exp_avg, u.exp_avg_sq,
-            lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps, step=u.step,
-        )  # fmt: skip
+        _step(u)
 
 
-def _mark_written(*tensors: Tensor) -> None:
-    """The kernels write behind autograd's back."""
-    for tensor in tensors:
-        torch.autograd.graph.increment_version(tensor)
-
-
-@torch.no_grad()
-def adam_step(
-    param: Tensor,
-    grad: Tensor,
-    exp_avg: Tensor,
-    exp_avg_sq: Tensor,
-    *,
-    lr: float,
-    beta1: float,
-    beta2: float,
-    eps: float,
-    step: int,
-) -> None:
-    """Update `param`, `exp_avg` and `exp_avg_sq` in place, densely; the same numbers as torch.optim.Adam to 1e-6.
-
-    param, grad, exp_avg, exp_avg_sq    any shape, alike
-    step                                of this update, from 1
-
-    Raises ShapeError if the shapes differ.
-    Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
-    """
-    for name, tensor in (("grad", grad), ("exp_avg", exp_avg), ("exp_avg_sq", exp_avg_sq)):
-        if tensor.shape != param.shape:
+def _step(u: AdamUpdate) -> None:
+    param, exp_avg, exp_avg_sq = u.param, u.exp_avg, u.exp_avg_sq
+    for name in ("grad", "exp_avg", "exp_avg_sq"):
+        shape = getattr(u, name).shape
+        if shape != param.shape:
             raise ShapeError(
-                f"{name} is {list(tensor.shape)}, the parameter {list(param.shape)}",
-                actual=tensor.shape,
+                f"{name} is {list(shape)}, the parameter {list(param.shape)}",
+                actual=shape,
                 expected=tuple(param.shape),
             )
-    if step < 1:
-        raise ValueError(f"Adam's step counts from 1, got {step}")
-    grad = grad.contiguous()
+    if u.step < 1:
+        raise ValueError(f"Adam's step counts from 1, got {u.step}")
+    grad = u.grad.contiguous()
     tensors = (param, grad, exp_avg, exp_avg_sq)
     if not all(t.is_contiguous() for t in tensors):
-        exp_avg.lerp_(grad, 1.0 - beta1)
-        exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1.0 - beta2)
-        denominator = exp_avg_sq.sqrt().div_(math.sqrt(1.0 - beta2**step)).add_(eps)
-        param.addcdiv_(exp_avg, denominator, value=-lr / (1.0 - beta1**step))
+        exp_avg.lerp_(grad, 1.0 - u.beta1)
+        exp_avg_sq.mul_(u.beta2).addcmul_(grad, grad, value=1.0 - u.beta2)
+        denominator = exp_avg_sq.sqrt().div_(math.sqrt(1.0 - u.beta2**u.step)).add_(u.eps)
+        param.addcdiv_(exp_avg, denominator, value=-u.lr / (1.0 - u.beta1**u.step))
         return
     if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and TRAINING.try_load():
-        torch.ops.splatwizard_training.adam(*tensors, lr, beta1, beta2, eps, step)
+        torch.ops.splatwizard_training.adam(*tensors, u.lr, u.beta1, u.beta2, u.eps, u.step)
     else:
-        count = torch.tensor(float(step - 1), device=param.device)  # steps done; torch counts this one itself
+        count = torch.tensor(float(u.step - 1), device=param.device)  # steps done; torch counts this one itself
         adam(
             [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=True, amsgrad=False, maximize=False,
-            weight_decay=0.0, lr=lr, beta1=beta1, beta2=beta2, eps=eps,
+            weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
         )  # fmt: skip
-    _mark_written(param)
+    torch.autograd.graph.increment_version(param)

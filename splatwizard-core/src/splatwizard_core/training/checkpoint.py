@@ -46,7 +46,7 @@ class DamagedCheckpointError(CheckpointError):
 
 @dataclass
 class Checkpoint:
-    """A run after a step.
+    """State of a run after a step.
 
     stage, stage_name, step     where it stands; steps count from 1 in each stage
     finished    the stage is over (its last step, or a task stopped it)
@@ -121,7 +121,7 @@ class CheckpointStore:
         return sorted((p for p in found if _NAME.fullmatch(p.name)), key=lambda p: p.name, reverse=True)
 
     def newest(self) -> Checkpoint | None:
-        """The newest checkpoint that can be read, or None if there is none.
+        """Return the newest checkpoint that can be read, or None if there is none.
 
         A damaged one is set aside with a warning; raises CheckpointError if all of them are damaged.
         """
@@ -144,7 +144,7 @@ class CheckpointStore:
         return None
 
     def last_of(self, stage: int) -> Checkpoint:
-        """The checkpoint that finished a stage. Raises CheckpointError."""
+        """Return the checkpoint that finished a stage. Raises CheckpointError."""
         for path in self.paths():
             if path.name.startswith(f"{stage:02d}-"):
                 found = read_checkpoint(path)
@@ -155,7 +155,7 @@ class CheckpointStore:
         )
 
     def identity(self) -> dict[str, Any] | None:
-        """What the newest checkpoint was made from; None if there is none, or none that can be read."""
+        """Return the identity in the newest checkpoint; None if there is none, or none that can be read."""
         for path in self.paths()[:1]:
             with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
                 found = json.loads(path.read_text())["content"]["identity"]
@@ -285,7 +285,7 @@ def normalised(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Sequence[str], extent: float) -> list[str]:
-    """What a checkpoint was made with and this run is not, one line each; empty if nothing differs."""
+    """Return a line for each difference between a checkpoint's identity, plan or extent and this run's."""
     old, new = _flat(checkpoint.identity), _flat(normalised(identity))
     lines = []
     for key in sorted(old.keys() | new.keys()):

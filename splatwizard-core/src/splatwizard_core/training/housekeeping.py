@@ -1,36 +1,37 @@
-"""What happens between the steps of a stage and is no part of it: log, progress, evaluation, checkpoints, Ctrl-C."""
+"""The work between the steps of a stage: log, progress, evaluation, checkpoints, Ctrl-C."""
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Any
 
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
+from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.progress import track
 from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scalars import read_scalars
-from splatwizard_core.training.timing import LoopClock, synchronize
+from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
 
 log = logging.getLogger(__name__)
 
 Evaluate = Callable[[SplatModel, int], Mapping[str, Any] | None]
+OnStep = Callable[[SplatModel, StepRecord], None]
 
 UNREAD_LINES = 8  # log lines whose losses stay on a GPU until they are read together: each reading waits for it
 
 
 @dataclass
 class Progress:
-    """What a run accumulates over processes; part of every checkpoint.
+    """Figures that a run accumulates over processes; part of every checkpoint.
 
     stage_seconds   stage name -> wall clock of its loop without housekeeping
     stage_steps     stage name -> steps done
@@ -38,7 +39,7 @@ class Progress:
     peak_memory     bytes
     rasterizers     features asked for -> who served them
     pictures_in     where the training pictures were: "host" or "cuda"
-    provided        stage name -> what served it, as whoever started the training tells (JSON-able)
+    provided        stage name -> the rasterizers, pruners, ... that served it, as `train_stages(provided=...)` tells
     """
 
     stage_seconds: dict[str, float] = field(default_factory=dict)
@@ -52,9 +53,6 @@ class Progress:
     @property
     def steps(self) -> int:
         return sum(self.stage_steps.values())
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 class Housekeeping:
@@ -74,7 +72,7 @@ class Housekeeping:
         meter: MemoryMeter,
         *,
         label: str,
-        on_step: Callable[[StepRecord], None] | None = None,
+        on_step: OnStep | None = None,
         evaluate: Evaluate | None = None,
     ) -> None:
         self.trainer, self.name, self.progress, self.run_log = trainer, name, progress, run_log
@@ -82,7 +80,6 @@ class Housekeeping:
         self.guard = InterruptGuard()
         self.clock = LoopClock(progress.stage_seconds.get(name, 0.0))
         self._save, self._label = save, label
-        self._rows_are = "anchors" if "num_anchors" in trainer.model.counts() else "gaussians"
         self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
         self._saved_at = -1
         self._stack = ExitStack()
@@ -109,13 +106,14 @@ class Housekeeping:
         self._account()
 
     def after_step(self, record: StepRecord) -> None:
-        """Everything that is due after this step."""
+        """Do everything that is due after this step."""
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
         with self.clock.paused():
             try:
-                self._bar.advance(1, loss=record.total, **{self._rows_are: record.num_rows})
+                self._bar.advance(1, loss=record.total, **{self.trainer.model.ROW_LABEL: record.num_rows})
                 if self.on_step is not None:
-                    self.on_step(record)
+                    with rng.preserved():
+                        self.on_step(self.trainer.model, record)
                 self._log_step(record)
                 every = self.trainer.ppl.eval_every
                 if self.evaluate is not None and every and record.step % every == 0:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 
 log = logging.getLogger(__name__)
@@ -45,19 +47,11 @@ class InterruptGuard:
             return
         raise KeyboardInterrupt
 
-    def step(self) -> _Busy:
-        """Marks the part in which an interrupt waits."""
-        return _Busy(self)
-
-
-class _Busy:
-    def __init__(self, guard: InterruptGuard) -> None:
-        self._guard = guard
-
-    def __enter__(self) -> None:
-        self._guard._busy = True
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._guard._busy = False
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Mark the part in which an interrupt waits."""
+        self._busy = True
+        try:
+            yield
+        finally:
+            self._busy = False

@@ -8,7 +8,9 @@ import math
 def exponential_lr(
     step: float, *, init: float, final: float, max_steps: int, delay_steps: int = 0, delay_mult: float = 1.0
 ) -> float:
-    """From `init` to `final`, log-linearly over `max_steps`, constant afterwards; 0 for step < 0 or init = 0.
+    """Return a rate that falls from `init` to `final`, log-linearly over `max_steps`, and stays there.
+
+    It is 0 for step < 0 or init = 0.
 
     delay_steps     with more than 0 the rate is damped at first: by `delay_mult` at step 0, rising as a sine
     delay_mult      without effect while delay_steps is 0, as in the authors' configuration of 3DGS

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import torch
@@ -11,7 +12,6 @@ from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.training.native import TRAINING
-from splatwizard_core.training.stage import LossPack
 
 Padding = Literal["same", "valid"]
 
@@ -21,8 +21,16 @@ C1 = 0.01**2
 C2 = 0.03**2
 
 
+@dataclass
+class LossPack:
+    """The loss of one step: `total` is what backward starts from, `parts` are what the log shows (scalars)."""
+
+    total: Tensor
+    parts: dict[str, Tensor] = field(default_factory=dict)
+
+
 def ssim(x: Tensor, y: Tensor, *, padding: Padding = "same") -> Tensor:
-    """Mean structural similarity of two images in 0..1, window 11 x 11 Gaussian with sigma 1.5, per channel.
+    """Return the mean structural similarity of two images in 0..1, window 11 x 11 Gaussian with sigma 1.5, per channel.
 
     x, y        [..., H, W] float32 or float64, alike in shape, dtype and device
     padding     "same": zeros beside the image (3DGS training); "valid": only where the window fits
@@ -33,11 +41,11 @@ def ssim(x: Tensor, y: Tensor, *, padding: Padding = "same") -> Tensor:
     Source: Wang et al. 2004; padding as in 3DGS (arXiv 2308.04079).
     """
     _check(x, y, padding)
-    if _fused(x, y):
-        node = _PhotometricOnCuda if x.is_cuda else _Photometric
-        result: Tensor = node.apply(x, y, padding == "valid", 0.0, 1.0, 0.0)[0]  # type: ignore[no-untyped-call]
-        return result
-    return _ssim_torch(x, y, padding)
+    node = _fused(x, y)
+    if node is None:
+        return _ssim_torch(x, y, padding)
+    result: Tensor = node.apply(x, y, padding == "valid", 0.0, 1.0, 0.0)[0]  # type: ignore[no-untyped-call]
+    return result
 
 
 def photometric_loss(
@@ -48,7 +56,7 @@ def photometric_loss(
     clamp: bool = False,
     padding: Padding = "same",
 ) -> LossPack:
-    """The 3DGS loss (1 - lambda) mean|image - target| + lambda (1 - SSIM).
+    """Return the 3DGS loss (1 - lambda) mean|image - target| + lambda (1 - SSIM).
 
     image           [3,H,W] the render, differentiable
     target          [3,H,W] the photograph, 0..1
@@ -64,8 +72,8 @@ def photometric_loss(
     _check(image, target, padding)
     if clamp:
         image = image.clamp(0.0, 1.0)
-    if _fused(image, target):
-        node = _PhotometricOnCuda if image.is_cuda else _Photometric
+    node = _fused(image, target)
+    if node is not None:
         total, l1, similarity = node.apply(  # type: ignore[no-untyped-call]
             image, target, padding == "valid", 1.0 - lambda_dssim, -lambda_dssim, lambda_dssim
         )
@@ -146,10 +154,13 @@ def _ssim_torch(x: Tensor, y: Tensor, padding: Padding) -> Tensor:
     return similarity
 
 
-def _fused(x: Tensor, y: Tensor) -> bool:
-    if x.dtype != torch.float32 or y.requires_grad or x.device.type not in ("cpu", "cuda"):
-        return False
-    return TRAINING.has_cuda() if x.is_cuda else TRAINING.try_load()
+def _fused(x: Tensor, y: Tensor) -> type[torch.autograd.Function] | None:
+    """Return the fused loss that takes these images; None: torch operations do."""
+    if x.dtype != torch.float32 or y.requires_grad:
+        return None
+    if x.is_cuda:
+        return _PhotometricOnCuda if TRAINING.has_cuda() else None
+    return _Photometric if x.device.type == "cpu" and TRAINING.try_load() else None
 
 
 def _check(x: Tensor, y: Tensor, padding: str) -> None:

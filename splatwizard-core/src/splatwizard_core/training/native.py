@@ -8,9 +8,9 @@ TRAINING = NativeModule(
     name="splatwizard_training",
     package="splatwizard_core.training",
     sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
-    kernels=("kernels/ssim.cpp", "kernels/adam.cpp", "kernels/sparse_adam.cpp"),
+    kernels=("kernels/ssim.cpp", "kernels/adam.cpp"),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu", "kernels/cuda/statistics.cu"),
+    cuda_sources=("kernels/cuda/ssim.cu", "kernels/cuda/adam.cu"),
     # Without these two GCC keeps sqrt and division out of vector code. No -ffinite-math-only: a NaN in the image
     # must reach the loss, where the trainer looks for it.
     cflags=("-fno-math-errno", "-fno-trapping-math"),

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.training.learning_rate import exponential_lr
-from splatwizard_core.training.sparse_adam import BiasCorrection
+from splatwizard_core.training.adam import AdamUpdate, adam_steps
 
-__all__ = ["ParamGroup", "SplatOptimizer", "exponential_lr"]
+if TYPE_CHECKING:
+    from splatwizard_core.rendering.rasterizer import RenderResult
 
 
 @dataclass
@@ -34,11 +34,20 @@ class ParamGroup:
 
 
 @dataclass
-class _Moments:
-    exp_avg: Tensor
-    exp_avg_sq: Tensor
-    step: int = 0
-    row_steps: Tensor | None = None  # [N] int32 updates of each row, for sparse steps with bias correction
+class AdamState:
+    """The state of one parameter.
+
+    step        updates so far
+    tensors     "exp_avg" and "exp_avg_sq", of the parameter's shape; a subclass of the optimizer may keep more that
+                have a row for each row of the parameter
+    """
+
+    step: int
+    tensors: dict[str, Tensor]
+
+    def change(self, function: Callable[[Tensor], Tensor]) -> None:
+        """Replace each tensor by `function` of it."""
+        self.tensors = {name: function(tensor) for name, tensor in self.tensors.items()}
 
 
 class SplatOptimizer:
@@ -46,98 +55,63 @@ class SplatOptimizer:
 
     A parameter without `.grad` is skipped: its moments and its step counter stay. So what a task has just
     replaced (densify, prune, opacity reset) is not updated in that step, as in the published trainer.
+
+    groups      name -> ParamGroup
+    states      parameter name -> AdamState, from its first update on
     """
 
-    def __init__(
-        self, model: SplatModel, groups: Iterable[ParamGroup], *, sparse: BiasCorrection | None = None
-    ) -> None:
-        """Raises ValueError for a group that names nothing, or a parameter that two groups claim.
-
-        sparse  update only the rows that `step` is told of (`sparse_adam`), with this bias correction; None: dense
-        """
+    def __init__(self, model: SplatModel, groups: Iterable[ParamGroup]) -> None:
+        """Raises ValueError for a group that names nothing, or a parameter that two groups claim."""
         self.model = model
-        self.sparse = sparse
         self.groups = {group.name: group for group in groups}
-        self._members: dict[str, list[str]] = {}
-        self._moments: dict[str, _Moments] = {}
-        owner: dict[str, str] = {}
+        self.states: dict[str, AdamState] = {}
+        self._group_of: dict[str, str] = {}  # parameter name -> name of its group
         known = [name for name, _ in model.named_parameters()]
         for name in self.groups:
             members = [k for k in known if k == name or k.startswith(f"{name}.")]
             if not members:
                 raise ValueError(f"{type(model).__name__} has no parameter or submodule with parameters '{name}'")
             for member in members:
-                if member in owner:
-                    raise ValueError(f"parameter '{member}' is in the groups '{owner[member]}' and '{name}'")
-                owner[member] = name
-            self._members[name] = members
+                if member in self._group_of:
+                    raise ValueError(f"parameter '{member}' is in the groups '{self._group_of[member]}' and '{name}'")
+                self._group_of[member] = name
 
     def lr(self, name: str) -> float:
-        """Current learning rate of a group."""
+        """Return the current learning rate of a group."""
         return self.groups[name].lr
 
     def set_lr(self, name: str, lr: float) -> None:
-        """Learning rate of a group from the next `step` on."""
+        """Set the learning rate of a group from the next `step` on."""
         self.groups[name].lr = lr
 
     @torch.no_grad()
-    def step(self, visible: Tensor | None = None) -> None:
-        """One Adam update of every parameter that has a gradient.
+    def step(self, result: RenderResult | None = None) -> None:
+        """Update every parameter that has a gradient.
 
-        visible     [N] bool, with `sparse`: which rows of the model are updated (None: all of them). Parameters that
-                    are not rows of the model (networks) are updated whole.
-
-        Raises ShapeError if the mask does not fit, ValueError if the optimizer is a dense one.
+        result  of the step's render, for an optimizer that updates only what it shows; this one updates all rows
         """
-        from splatwizard_core.training.adam import AdamUpdate, adam_steps
+        self.update([update for _, update in self.due()])
 
-        if visible is not None and self.sparse is None:
-            raise ValueError("step(visible) needs an optimizer that was made with `sparse`")
-        updates = []
-        for group_name, group in self.groups.items():
-            beta1, beta2 = group.betas
-            for name in self._members[group_name]:
-                param = _parameter(self.model, name)
-                if param.grad is None:
-                    continue
-                moments = self._moments.get(name)
-                if moments is None:
-                    # As torch.optim.Adam: moments exist from the first update on.
-                    moments = self._moments[name] = _Moments(_zeros(param), _zeros(param))
-                moments.step += 1
-                if self.sparse is not None and name in self.model.ROWS:
-                    self._sparse_step(param, moments, group, visible)
-                    continue
-                updates.append(
-                    AdamUpdate(
-                        param.data,
-                        param.grad,
-                        moments.exp_avg,
-                        moments.exp_avg_sq,
-                        lr=group.lr,
-                        beta1=beta1,
-                        beta2=beta2,
-                        eps=group.eps,
-                        step=moments.step,
-                    )
-                )
+    def due(self) -> Iterator[tuple[str, AdamUpdate]]:
+        """Each parameter that has a gradient, by name, with its next update, which is counted as done."""
+        for name, group_name in self._group_of.items():
+            param = _parameter(self.model, name)
+            if param.grad is None:
+                continue
+            state = self.states.get(name)
+            if state is None:
+                # As torch.optim.Adam: moments exist from the first update on.
+                state = self.states[name] = AdamState(0, {"exp_avg": _zeros(param), "exp_avg_sq": _zeros(param)})
+            state.step += 1
+            group, moments = self.groups[group_name], state.tensors
+            yield name, AdamUpdate(
+                param.data, param.grad, moments["exp_avg"], moments["exp_avg_sq"],
+                lr=group.lr, beta1=group.betas[0], beta2=group.betas[1], eps=group.eps, step=state.step,
+            )  # fmt: skip
+
+    def update(self, updates: Sequence[AdamUpdate]) -> None:
+        """Do these updates, densely."""
         adam_steps(updates)
-
-    def _sparse_step(self, param: Tensor, moments: _Moments, group: ParamGroup, visible: Tensor | None) -> None:
-        from splatwizard_core.training.sparse_adam import sparse_adam
-
-        assert param.grad is not None
-        assert self.sparse is not None
-        if visible is None:
-            visible = torch.ones(len(param), dtype=torch.bool, device=param.device)
-        if self.sparse == "per_row" and moments.row_steps is None:
-            moments.row_steps = torch.zeros(len(param), dtype=torch.int32, device=param.device)
-        beta1, beta2 = group.betas
-        sparse_adam(
-            param.data, param.grad, moments.exp_avg, moments.exp_avg_sq, visible,
-            lr=group.lr, beta1=beta1, beta2=beta2, eps=group.eps,
-            bias_correction=self.sparse, row_steps=moments.row_steps,
-        )  # fmt: skip
 
     def zero_grad(self) -> None:
         """Drop the gradients of all parameters of the model, those in no group included."""
@@ -163,13 +137,9 @@ class SplatOptimizer:
             new = rows.get(name)
             new = old.new_zeros(count, *old.shape[1:]) if new is None else new.detach().to(old)
             self._put(model, name, torch.cat([old.detach(), new]))
-            moments = self._moments.get(prefix + name)
-            if moments is not None:
-                zeros = torch.zeros_like(new)
-                moments.exp_avg = torch.cat([moments.exp_avg, zeros])
-                moments.exp_avg_sq = torch.cat([moments.exp_avg_sq, zeros])
-                if moments.row_steps is not None:
-                    moments.row_steps = torch.cat([moments.row_steps, moments.row_steps.new_zeros(count)])
+            state = self.states.get(prefix + name)
+            if state is not None:
+                state.change(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
 
     def _check_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> int:
         counts = set()
@@ -219,11 +189,9 @@ class SplatOptimizer:
             self._put(model, name, kept(old.detach()))
             if grad is not None:
                 _attribute(model, name).grad = kept(grad)
-            moments = self._moments.get(prefix + name)
-            if moments is not None:
-                moments.exp_avg, moments.exp_avg_sq = kept(moments.exp_avg), kept(moments.exp_avg_sq)
-                if moments.row_steps is not None:
-                    moments.row_steps = kept(moments.row_steps)
+            state = self.states.get(prefix + name)
+            if state is not None:
+                state.change(kept)
 
     @torch.no_grad()
     def set_rows(self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor]) -> None:
@@ -251,38 +219,30 @@ class SplatOptimizer:
                 self._put(model, name, old.detach().index_copy(0, index, rows[name].detach().to(old)))
             elif isinstance(old, nn.Parameter):
                 self._put(model, name, old.detach())
-            moments = self._moments.get(prefix + name)
-            if moments is not None:
-                moments.exp_avg = moments.exp_avg.index_fill(0, index, 0)
-                moments.exp_avg_sq = moments.exp_avg_sq.index_fill(0, index, 0)
-                if moments.row_steps is not None:
-                    moments.row_steps = moments.row_steps.index_fill(0, index, 0)
+            state = self.states.get(prefix + name)
+            if state is not None:
+                state.change(lambda t: t.index_fill(0, index, 0))
 
     @torch.no_grad()
     def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
         """Give one parameter (or buffer) a new value; its moments become zero, its step counter stays."""
         old = _attribute(model, name)
         self._put(model, name, tensor.detach().to(old))
-        moments = self._moments.get(self._prefix(model) + name)
-        if moments is not None:
+        state = self.states.get(self._prefix(model) + name)
+        if state is not None:
             fresh = _attribute(model, name)
-            moments.exp_avg, moments.exp_avg_sq = _zeros(fresh), _zeros(fresh)
-            moments.row_steps = None  # its count is one of updates that the moments hold
+            state.tensors = {"exp_avg": _zeros(fresh), "exp_avg_sq": _zeros(fresh)}
 
     def moments(self, name: str) -> tuple[Tensor, Tensor, int] | None:
-        """(exp_avg, exp_avg_sq, step) of a parameter by its full name; None before its first update."""
-        found = self._moments.get(name)
-        return None if found is None else (found.exp_avg, found.exp_avg_sq, found.step)
+        """Return (exp_avg, exp_avg_sq, step) of a parameter by its full name; None before its first update."""
+        state = self.states.get(name)
+        return None if state is None else (state.tensors["exp_avg"], state.tensors["exp_avg_sq"], state.step)
 
     def state_dict(self) -> dict[str, Any]:
         """{"groups": {name: {lr, eps, betas}}, "moments": {parameter: {exp_avg, exp_avg_sq, step}}}; no copies."""
         return {
             "groups": {n: {"lr": g.lr, "eps": g.eps, "betas": list(g.betas)} for n, g in self.groups.items()},
-            "moments": {
-                n: {"exp_avg": m.exp_avg, "exp_avg_sq": m.exp_avg_sq, "step": m.step}
-                | ({} if m.row_steps is None else {"row_steps": m.row_steps})
-                for n, m in self._moments.items()
-            },
+            "moments": {name: {**state.tensors, "step": state.step} for name, state in self.states.items()},
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
@@ -292,22 +252,21 @@ class SplatOptimizer:
         """
         if set(state["groups"]) != set(self.groups):
             raise ValueError(f"optimizer groups differ: {', '.join(state['groups'])} / {', '.join(self.groups)}")
-        members = {member for names in self._members.values() for member in names}
         loaded = {}
-        for name, m in state["moments"].items():
-            if name not in members:
+        for name, saved in state["moments"].items():
+            if name not in self._group_of:
                 raise ValueError(f"optimizer state of '{name}', which is in no group")
             param = self.model.get_parameter(name)
-            if m["exp_avg"].shape != param.shape or m["exp_avg_sq"].shape != param.shape:
-                raise ValueError(f"optimizer state of '{name}' is {list(m['exp_avg'].shape)}, not {list(param.shape)}")
-            # Clones: what is loaded must not be changed in place.
-            loaded[name] = _Moments(m["exp_avg"].clone().to(param), m["exp_avg_sq"].clone().to(param), int(m["step"]))
-            if "row_steps" in m:
-                loaded[name].row_steps = m["row_steps"].clone().to(param.device, torch.int32)
+            tensors = {key: value for key, value in saved.items() if key != "step"}
+            for moment in (tensors["exp_avg"], tensors["exp_avg_sq"]):
+                if moment.shape != param.shape:
+                    raise ValueError(f"optimizer state of '{name}' is {list(moment.shape)}, not {list(param.shape)}")
+            # Copies: what is loaded must not be changed in place.
+            loaded[name] = AdamState(int(saved["step"]), {k: t.to(param.device, copy=True) for k, t in tensors.items()})
         for name, g in state["groups"].items():
-            betas = g["betas"]
-            self.groups[name] = ParamGroup(name, float(g["lr"]), float(g["eps"]), (float(betas[0]), float(betas[1])))
-        self._moments = loaded
+            first, second = g["betas"]
+            self.groups[name] = ParamGroup(name, float(g["lr"]), float(g["eps"]), (float(first), float(second)))
+        self.states = loaded
 
     def _prefix(self, model: SplatModel) -> str:
         """Where `model` sits in the optimizer's model: "" for itself, "inner." for a submodule."""

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import copy
+import functools
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,7 @@ from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences, normalised
-from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, Progress
+from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows, row_facts
 from splatwizard_core.training.rng import Streams
@@ -25,7 +26,7 @@ from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.timing import StageClock
-from splatwizard_core.training.trainer import StepRecord, Trainer
+from splatwizard_core.training.trainer import Trainer
 
 __all__ = ["TrainOutcome", "TrainingStopped", "train_stages"]
 
@@ -36,37 +37,26 @@ class TrainingStopped(KeyboardInterrupt):
     """`stop_after` was reached and a checkpoint written: the run is to be resumed, its outcome does not exist yet."""
 
 
-@dataclass
-class TrainOutcome:
-    """A finished training, resumed processes included.
+@dataclass(kw_only=True)
+class TrainOutcome(Progress):
+    """A finished training: its figures, of resumed processes too, and
 
-    model           what the last stage's `finish` returned
-    stage_seconds   wall clock of each stage's loop, by stage name, without housekeeping
-    train_s         their sum
-    steps           over all stages
-    peak_memory     bytes above what was there before (CPU: resident set; CUDA: allocator, absolute)
-    stage_breakdown stage name -> seconds in pre, render, loss, backward, post, optimize; None: not profiled
-    plan            of each stage: name, steps, and its tasks as printed
-    rasterizers     features asked for -> who served them
-    pictures_in     where the training pictures were: "host" or "cuda"
-    provided        stage name -> what served it, as `train_stages(provided=...)` told
+    model   as the last stage's `finish` returned it
+    plan    of each stage: name, steps, and its tasks as printed
     """
 
     model: SplatModel
-    stage_seconds: dict[str, float]
-    train_s: float
-    steps: int
-    peak_memory: int
-    stage_breakdown: dict[str, dict[str, float]] | None
     plan: list[dict[str, Any]]
-    rasterizers: dict[str, str]
-    pictures_in: str = "host"
-    provided: dict[str, list[dict[str, str]]] = field(default_factory=dict)
+
+    @property
+    def train_s(self) -> float:
+        """Seconds of all stages' loops, without housekeeping."""
+        return sum(self.stage_seconds.values())
 
 
 @dataclass
 class _Run:
-    """What all stages of one run share."""
+    """The parts that all stages of one run share, see `train_stages`."""
 
     stages: Sequence[Stage]
     create_model: Callable[[], SplatModel]
@@ -76,41 +66,45 @@ class _Run:
     identity: Mapping[str, Any]
     trained: Callable[[str], SplatModel]
     store: CheckpointStore | None
+    run_log: RunLog
+    stop_after: int | None
     allow_changed_plan: bool
+    on_step: OnStep | None
+    evaluate: Evaluate | None
     provided: Callable[[], list[dict[str, str]]]
-    names: list[str] = field(init=False)
+    progress: Progress = field(default_factory=Progress)
 
-    def __post_init__(self) -> None:
-        self.names = []
+    @property
+    def names(self) -> list[str]:
+        """Names of the stages, made unique."""
+        names: list[str] = []
         for stage in self.stages:
-            taken = self.names.count(stage.name)
-            self.names.append(stage.name if not taken else f"{stage.name}-{len(self.names)}")
+            names.append(f"{stage.name}-{len(names)}" if stage.name in names else stage.name)
+        return names
 
     def streams(self, index: int) -> Streams:
-        """Those of a stage; a later stage does not repeat the draws of the first."""
+        """Return the streams of a stage; a later stage does not repeat the draws of the first."""
         return Streams(self.ppl.seed, "" if index == 0 else f"{index}/")
 
-    def begin(self, index: int, model: SplatModel | None, streams: Streams) -> SplatModel:
-        """The model of a stage before its first step.
+    def trainer(self, index: int, model: SplatModel | None) -> Trainer:
+        """Return the trainer of a stage before its first step.
 
         model   as the stage before left it; None: this stage does not need one, or is the first
         """
-        stage = self.stages[index]
+        stage, streams = self.stages[index], self.streams(index)
         if stage.starts_from is not None:
-            # The trained scene belongs to whoever made it, and other stages may be taught by it.
+            # A copy: the trained scene stays with the runner, and other stages may be taught by it.
             model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True).train()
         elif model is None:
             model = self.create_model()
-        return stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))
-
-    def trainer(self, index: int, model: SplatModel, streams: Streams, breakdown: dict[str, float] | None) -> Trainer:
-        clock = StageClock(model.device, breakdown) if self.ppl.profile == "stages" else None
-        return Trainer(
-            self.stages[index], model, self.scene, self.ppl, self.rasterizer, streams, index=index, stage_clock=clock
-        )
+        model = stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))
+        clock = None
+        if self.ppl.profile == "stages":
+            clock = StageClock(model.device, self.progress.breakdown.get(self.names[index]))
+        return Trainer(stage, model, self.scene, self.ppl, self.rasterizer, streams, index=index, stage_clock=clock)
 
     def before(self, index: int) -> SplatModel | None:
-        """The model that a stage begins with, rebuilt from the last checkpoints of the stages before it."""
+        """Return the model that a stage begins with, rebuilt from the last checkpoints of the stages before it."""
         if index == 0 or self.stages[index].starts_from is not None:
             return None
         assert self.store is not None
@@ -118,13 +112,10 @@ class _Run:
         return trainer.stage.finish(trainer.model, self.scene)
 
     def restore(self, saved: Checkpoint) -> Trainer:
-        """The trainer of a checkpoint's stage as it was after the checkpoint's step. Raises CheckpointError."""
-        index = saved.stage
-        if index >= len(self.stages):
-            raise CheckpointError(f"the checkpoint is of stage {index}, this run has {len(self.stages)} stages")
-        streams = self.streams(index)
-        model = self.begin(index, self.before(index), streams)
-        trainer = self.trainer(index, model, streams, saved.progress["breakdown"].get(self.names[index]))
+        """Return the trainer of a checkpoint's stage as it was after the checkpoint's step. Raises CheckpointError."""
+        if saved.stage >= len(self.stages):
+            raise CheckpointError(f"the checkpoint is of stage {saved.stage}, this run has {len(self.stages)} stages")
+        trainer = self.trainer(saved.stage, self.before(saved.stage))
         changed = self._check(saved, trainer)
         try:
             trainer.load_state_dict(saved.state, saved.step)
@@ -138,7 +129,7 @@ class _Run:
         return trainer
 
     def _check(self, saved: Checkpoint, trainer: Trainer) -> list[str]:
-        """What differs from what the checkpoint was made with; raises CheckpointError unless that is allowed."""
+        """Return what differs from what the checkpoint was made with; raise CheckpointError unless that is allowed."""
         changed = differences(saved, self.identity, plan_of(trainer), self.scene.extent)
         if changed and not self.allow_changed_plan:
             more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
@@ -151,28 +142,55 @@ class _Run:
         return changed
 
     def describe(self, index: int) -> dict[str, Any]:
-        """A stage's plan for the record."""
+        """Return a stage's plan for the record."""
         stage = self.stages[index]
         pre, post = build_schedulers(stage, self.ppl)
         rows = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
         return {"stage": self.names[index], "iterations": stage.iterations, "tasks": [row_facts(r) for r in rows]}
 
-    def checkpoint(self, trainer: Trainer, progress: Progress, *, finished: bool) -> Checkpoint:
-        return Checkpoint(
-            trainer.index,
-            trainer.stage.name,
-            trainer.step,
-            finished,
-            normalised(self.identity),
-            plan_of(trainer),
-            self.scene.extent,
-            progress.as_dict(),
-            {**trainer.state_dict(), "rng": rng.capture()},
-        )
+    def save(self, trainer: Trainer, finished: bool) -> None:
+        """Write a checkpoint of the trainer as it is."""
+        known = self.progress.provided.setdefault(self.names[trainer.index], [])
+        known += [part for part in self.provided() if part not in known]
+        if self.store is not None:
+            state = {**trainer.state_dict(), "rng": rng.capture()}
+            self.store.write(
+                Checkpoint(
+                    trainer.index, trainer.stage.name, trainer.step, finished, normalised(self.identity),
+                    plan_of(trainer), self.scene.extent, asdict(self.progress), state,
+                )
+            )  # fmt: skip
+
+    def run_stage(self, trainer: Trainer, meter: MemoryMeter) -> None:
+        """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
+        index, iterations, name = trainer.index, trainer.stage.iterations, self.names[trainer.index]
+        before = self.progress.steps - self.progress.stage_steps.get(name, 0)
+        stop_after = self.stop_after
+        until = iterations if stop_after is None else min(iterations, stop_after - before)
+        label = f"train {self.identity.get('method', name)}"
+        if len(self.stages) > 1:
+            label += f": {name} ({index + 1} of {len(self.stages)})"
+        housekeeping = Housekeeping(
+            trainer, name, self.progress, self.run_log, functools.partial(self.save, trainer), meter,
+            label=label, on_step=self.on_step, evaluate=self.evaluate,
+        )  # fmt: skip
+        if until > trainer.step or stop_after is None:
+            decode_all(self.scene.train)  # reading pictures is not training time
+            self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
+            try:
+                with housekeeping:
+                    trainer.run(until, housekeeping.after_step, housekeeping.guard)
+            finally:
+                keep_pictures(self.scene.train, "cpu")
+        finished = trainer.stopped or trainer.step >= iterations
+        housekeeping.save(finished=finished)
+        done, last = before + trainer.step, finished and index == len(self.stages) - 1
+        if stop_after is not None and done >= stop_after and not last:
+            raise TrainingStopped(f"stopped after step {done}; run again to go on")
 
 
 def plan_of(trainer: Trainer) -> list[str]:
-    """What identifies the plan of a stage."""
+    """Return what identifies the plan of a stage."""
     return [*trainer.pre.plan_lines(), *trainer.post.plan_lines()]
 
 
@@ -189,7 +207,7 @@ def train_stages(
     stop_after: int | None = None,
     resume: bool = True,
     allow_changed_plan: bool = False,
-    on_step: Callable[[StepRecord], None] | None = None,
+    on_step: OnStep | None = None,
     evaluate: Evaluate | None = None,
     log_path: Path | None = None,
     provided: Callable[[], list[dict[str, str]]] = list,
@@ -204,7 +222,7 @@ def train_stages(
     stop_after      stop after this step, counted over all stages: a checkpoint is written and TrainingStopped raised
     resume          go on from the newest checkpoint; False: remove what the directory holds and start again
     allow_changed_plan  go on although plan or identity differ; the differences are logged
-    on_step         called after each step; not part of the training time
+    on_step         (model, record), called after each step; its time and its random draws are not the training's
     evaluate        (model, step of the stage) -> metrics for the log, every `ppl.eval_every` steps, without gradient,
                     in eval mode, with the process-wide random states kept
     log_path        of log.jsonl; default: in `directory`
@@ -221,13 +239,13 @@ def train_stages(
         log_path = directory / "log.jsonl"
     store = None if directory is None else CheckpointStore(directory, ppl.keep_checkpoints)
     run_log = RunLog(log_path)
-    run = _Run(stages, create_model, scene, ppl, rasterizer, identity, trained, store, allow_changed_plan, provided)
-    if not resume:
-        if store is not None:
-            store.clear()
-        run_log.clear()
+    run = _Run(
+        stages, create_model, scene, ppl, rasterizer, identity, trained, store, run_log, stop_after,
+        allow_changed_plan, on_step, evaluate, provided,
+    )  # fmt: skip
+    if not resume and store is not None:
+        store.clear()
     saved = store.newest() if store is not None else None
-    progress = Progress() if saved is None else Progress(**saved.progress)
     meter = MemoryMeter("cpu")
     meter.start()
     trainer: Trainer | None = None
@@ -236,6 +254,7 @@ def train_stages(
         if saved is None:
             run_log.clear()
         else:
+            run.progress = Progress(**saved.progress)
             trainer = run.restore(saved)
             run_log.rewind(saved.stage, saved.step)
             provided()  # what began the stage is known from the process that began it
@@ -243,70 +262,15 @@ def train_stages(
         saved = None  # its tensors are as large as the model and its optimizer
         with run_log:
             for index in range(len(plans), len(stages)):
-                if trainer is None:
-                    streams = run.streams(index)
-                    trainer = run.trainer(index, run.begin(index, model, streams), streams, None)
+                trainer = trainer or run.trainer(index, model)
                 if meter.kind == "rss" and trainer.device.type == "cuda":
                     meter = MemoryMeter(trainer.device)
                     meter.start()
                 plans.append(run.describe(index))
                 if not trainer.stopped:
-                    _run_stage(run, trainer, progress, run_log, meter, stop_after, on_step, evaluate)
+                    run.run_stage(trainer, meter)
                 model = trainer.stage.finish(trainer.model, scene)
                 trainer = None
     assert model is not None
-    seconds = progress.stage_seconds
-    return TrainOutcome(
-        model,
-        dict(seconds),
-        sum(seconds.values()),
-        progress.steps,
-        progress.peak_memory,
-        progress.breakdown or None,
-        plans,
-        dict(progress.rasterizers),
-        progress.pictures_in,
-        {name: progress.provided.get(name, []) for name in run.names},
-    )
-
-
-def _run_stage(
-    run: _Run,
-    trainer: Trainer,
-    progress: Progress,
-    run_log: RunLog,
-    meter: MemoryMeter,
-    stop_after: int | None,
-    on_step: Callable[[StepRecord], None] | None,
-    evaluate: Evaluate | None,
-) -> None:
-    """One stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
-    index, iterations = trainer.index, trainer.stage.iterations
-    name = run.names[index]
-    before = progress.steps - progress.stage_steps.get(name, 0)
-    until = iterations if stop_after is None else min(iterations, stop_after - before)
-
-    def save(finished: bool) -> None:
-        known = progress.provided.setdefault(name, [])
-        known += [part for part in run.provided() if part not in known]
-        if run.store is not None:
-            run.store.write(run.checkpoint(trainer, progress, finished=finished))
-
-    title = str(run.identity.get("method", name))
-    label = f"train {title}" if len(run.stages) == 1 else f"train {title}: {name} ({index + 1} of {len(run.stages)})"
-    housekeeping = Housekeeping(
-        trainer, name, progress, run_log, save, meter, label=label, on_step=on_step, evaluate=evaluate
-    )
-    if until > trainer.step or stop_after is None:
-        decode_all(run.scene.train)  # reading pictures is not training time
-        progress.pictures_in = "cuda" if keep_pictures(run.scene.train, trainer.device) else "host"
-        try:
-            with housekeeping:
-                trainer.run(until, housekeeping.after_step, housekeeping.guard)
-        finally:
-            keep_pictures(run.scene.train, "cpu")
-    finished = trainer.stopped or trainer.step >= iterations
-    housekeeping.save(finished=finished)
-    last = finished and index == len(run.stages) - 1
-    if stop_after is not None and before + trainer.step >= stop_after and not last:
-        raise TrainingStopped(f"stopped after step {before + trainer.step}; run again to go on")
+    run.progress.provided = {name: run.progress.provided.get(name, []) for name in run.names}
+    return TrainOutcome(**vars(run.progress), model=model, plan=plans)

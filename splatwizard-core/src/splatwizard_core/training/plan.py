@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import numbers
 from collections.abc import Callable, Collection, Sequence
@@ -17,7 +16,7 @@ LISTED_ENTRIES = 6  # longer lists are abbreviated when printed
 
 
 def check_when(when: Any) -> When:
-    """`when` itself (lists and sets as copies without duplicates), after checking its form.
+    """Return `when` itself (lists and sets as copies without duplicates), after checking its form.
 
     Raises TypeError for a bool, a float, or an iterator (it has no known end); ValueError for a negative step.
     """
@@ -45,14 +44,14 @@ def _step(value: Any) -> int:
 
 
 def steps_of(when: When) -> Collection[int]:
-    """The steps of a checked plan, in a form that answers `step in steps` in constant time; nothing is expanded."""
+    """Return the steps of a checked plan in a form that answers `step in steps` at once; nothing is expanded."""
     if isinstance(when, range):
         return when
     return frozenset((when,)) if isinstance(when, int) else frozenset(when)
 
 
 def describe_when(when: When) -> str:
-    """The registered form: `range(500, 15000, 100)` with the fewest arguments that say the same, `7`, `[1, 2]`."""
+    """Return the registered form, `range(500, 15000, 100)` (with as few arguments as say the same), `7` or `[1, 2]`."""
     if isinstance(when, range):
         if when.step != 1:
             return f"range({when.start}, {when.stop}, {when.step})"
@@ -65,7 +64,7 @@ def describe_when(when: When) -> str:
 
 
 def scaled(when: When, factor: float) -> When:
-    """The plan of a shorter or longer run: every bound and interval times `factor`, rounded to the nearest step.
+    """Return the plan of a shorter or longer run: every bound and interval times `factor`, rounded to the nearest step.
 
     Intervals are at least 1; what fired at a step > 0 still does; a range that was not empty stays so.
     """
@@ -109,7 +108,7 @@ class Registration:
         return step > self.after and step in self.steps
 
     def fires_in(self, start: int, total: int | None) -> list[int] | range:
-        """The steps s at which it runs, start < s <= total (None: no end), ascending."""
+        """Return the steps s at which it runs, start < s <= total (None: no end), ascending."""
         low, high = max(start, self.after, 0) + 1, math.inf if total is None else total
         if isinstance(self.steps, range):
             steps = self.steps
@@ -127,7 +126,7 @@ class PlanRow:
 
     stage       "Pre" or "Post"
     overlaps    the same callable stands in this stage once more and both fire at some step: it runs twice there
-    first, last, count      first step, last step and number of executions inside (start, total]; None: never
+    first, last, count      first step, last step and number of executions up to the last step; None: never
     """
 
     stage: str
@@ -140,77 +139,51 @@ class PlanRow:
     count: int
 
 
-def plan_rows(
-    pre: Sequence[Registration], post: Sequence[Registration], *, start: int = 0, total: int | None = None
-) -> list[PlanRow]:
-    """The rows of a plan in stage and order of execution.
+def plan_rows(pre: Sequence[Registration], post: Sequence[Registration], *, total: int | None = None) -> list[PlanRow]:
+    """Return the rows of a plan.
 
-    start   steps that are over
-    total   last step T; None: as far as the plans reach
+    pre, post   registrations in order of execution
+    total       last step T; None: as far as the plans reach
     """
     rows = []
     for title, registrations in (("Pre", pre), ("Post", post)):
-        ordered = _in_order(registrations)
-        for row in ordered:
-            steps = row.fires_in(start, total)
-            rows.append(
-                PlanRow(
-                    title,
-                    row.name,
-                    describe_when(row.when),
-                    row.priority,
-                    any(_overlap(row, other, start, total) for other in ordered if other is not row),
-                    steps[0] if steps else None,
-                    steps[-1] if steps else None,
-                    len(steps),
-                )
-            )
+        for r in registrations:
+            steps = r.fires_in(0, total)
+            overlaps = any(_overlap(r, other, total) for other in registrations if other is not r)
+            first, last = (steps[0], steps[-1]) if steps else (None, None)
+            rows.append(PlanRow(title, r.name, describe_when(r.when), r.priority, overlaps, first, last, len(steps)))
     return rows
 
 
-def _in_order(registrations: Sequence[Registration]) -> list[Registration]:
-    return sorted(registrations, key=lambda r: (r.priority, r.order))
-
-
-def _overlap(a: Registration, b: Registration, start: int, total: int | None) -> bool:
+def _overlap(a: Registration, b: Registration, total: int | None) -> bool:
     if a.task != b.task:
         return False
-    few, many = sorted((a.fires_in(start, total), b.fires_in(start, total)), key=len)
+    few, many = sorted((a.fires_in(0, total), b.fires_in(0, total)), key=len)
     return not set(few).isdisjoint(many)
 
 
 def format_plan(
     pre: Any,
     post: Any,
-    style: str = "table",
-    start: int = 0,
     total: int | None = None,
     *,
     verbose: bool = False,
     origin: Callable[[Any], str] | None = None,
 ) -> str:
-    """The plan that will be executed, as text.
+    """Return the plan that will be executed as a table Stage | Task | Plan, one row a registration.
 
     pre, post   the two schedulers of a stage
-    style       "table": Stage | Task | Plan, one row a registration, in stage and order of execution;
-                "json": a list of objects with these and the priority
-    start       steps that are over (a resumed run)
     total       last step T; None: as far as the plans reach
-    verbose     also first step, last step and number of executions inside (start, total]
-    origin      (task) -> whose it is, a column of the table if any of them is somebody else's; "" for the stage's own
+    verbose     also first step, last step and number of executions up to T
+    origin      (task) -> whose it is, a column of the table if any of them is another package's; "" for the stage's own
     """
-    rows = plan_rows(pre.registrations, post.registrations, start=start, total=total)
-    if style == "json":
-        return json.dumps([row_facts(row, verbose=verbose) for row in rows], indent=2)
-    if style != "table":
-        raise ValueError(f"a plan is printed as 'table' or 'json', not '{style}'")
     cells = [["Stage", "Task", "Plan", *(["First", "Last", "Runs"] if verbose else [])]]
-    for row in rows:
+    for row in plan_rows(pre.registrations, post.registrations, total=total):
         plan = f"{row.plan} (overlaps)" if row.overlaps else row.plan
         extra = ["-" if v is None else str(v) for v in (row.first, row.last, row.count)] if verbose else []
         cells.append([row.stage, row.task, plan, *extra])
     if origin is not None:
-        owners = [origin(r.task) for part in (pre, post) for r in _in_order(part.registrations)]
+        owners = [origin(r.task) for r in (*pre.registrations, *post.registrations)]
         if any(owners):
             cells = [[*line, owner] for line, owner in zip(cells, ["From", *owners], strict=True)]
     widths = [max(len(line[i]) for line in cells) for i in range(len(cells[0]))]
@@ -220,7 +193,7 @@ def format_plan(
 
 
 def row_facts(row: PlanRow, *, verbose: bool = False) -> dict[str, Any]:
-    """One row as plain values."""
+    """Return one row as plain values."""
     facts: dict[str, Any] = {"stage": row.stage, "task": row.task, "plan": row.plan, "priority": row.priority}
     if row.overlaps:
         facts["overlaps"] = True
@@ -229,17 +202,16 @@ def row_facts(row: PlanRow, *, verbose: bool = False) -> dict[str, Any]:
     return facts
 
 
-def plan_lines(pre: Sequence[Registration], post: Sequence[Registration]) -> list[str]:
-    """What identifies a plan: stage, name, every step and the priority of each registration, in order of execution."""
+def plan_lines(registrations: Sequence[Registration]) -> list[str]:
+    """Return what identifies a plan: stage, name, every step and the priority of each registration, in their order."""
     lines = []
-    for registrations in (pre, post):
-        for r in _in_order(registrations):
-            # describe_when abbreviates lists; what identifies a plan may not.
-            steps = describe_when(r.when) if isinstance(r.when, int | range) else str(sorted(r.when))
-            lines.append(f"{r.stage} | {r.name} | {steps} | priority {r.priority}")
+    for r in registrations:
+        # describe_when abbreviates lists; what identifies a plan may not.
+        steps = describe_when(r.when) if isinstance(r.when, int | range) else str(sorted(r.when))
+        lines.append(f"{r.stage} | {r.name} | {steps} | priority {r.priority}")
     return lines
 
 
 def plan_digest(lines: Sequence[str]) -> str:
-    """SHA-256 of `plan_lines`: equal plans, equal text."""
+    """Return the SHA-256 of `plan_lines`: equal plans, equal text."""
     return hashlib.sha256("\n".join(lines).encode()).hexdigest()

@@ -1,4 +1,4 @@
-"""The face of the pruners that plugins provide, and how a method gets the one that its config names."""
+"""The contract of pruners, and how a method gets the one that its config names."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Pruner(Protocol):
-    """Scores primitives; how many go is the caller's business (training/pruning.py).
+    """Scores primitives; how many go is the caller's business.
 
     What is registered is a class whose settings all have defaults, so that any method can use any pruner:
     `load_pruner(plugins, name)`.
@@ -47,7 +47,7 @@ def load_pruner(
     *,
     key: str = "prune.pruner",
 ) -> Pruner:
-    """The pruner that a method's config names: a method asks in `stages`, before anything is trained.
+    """Return the pruner that a method's config names: a method asks in `stages`, before anything is trained.
 
     settings    name of a pruner -> its settings: a method knows those of its own; any other has its defaults
     key         of the config that names it

@@ -25,7 +25,7 @@ class Streams:
         self._made: dict[str, torch.Generator] = {}
 
     def __call__(self, name: str) -> torch.Generator:
-        """The generator of this stream; the same object each time."""
+        """Return the generator of this stream; the same object each time."""
         if name not in self._made:
             self._made[name] = stream(self.seed, self.prefix + name)
         return self._made[name]
@@ -41,7 +41,7 @@ class Streams:
 
 
 def capture() -> dict[str, Any]:
-    """The process-wide states: python, numpy, torch CPU, and each CUDA device if CUDA is in use."""
+    """Return the process-wide states: python, numpy, torch CPU, and each CUDA device if CUDA is in use."""
     version, words, gauss = random.getstate()
     kind, keys, position, has_gauss, cached = np.random.get_state(legacy=True)
     return {
@@ -66,7 +66,7 @@ def restore(state: dict[str, Any]) -> None:
 
 @contextmanager
 def preserved() -> Iterator[None]:
-    """Whatever the block draws, the process-wide generators are afterwards as they were before."""
+    """Restore the process-wide generators after the block, whatever it draws."""
     state = capture()
     try:
         yield
@@ -76,7 +76,7 @@ def preserved() -> Iterator[None]:
 
 @contextmanager
 def seeded(seed: int) -> Iterator[None]:
-    """In the block the process-wide generators are seeded (from the stream "global"); afterwards as before."""
+    """Seed the process-wide generators in the block (from the stream "global"); afterwards they are as before."""
     with preserved():
         digest = hashlib.sha256(f"{seed}/global".encode()).digest()
         random.seed(digest)

@@ -1,6 +1,6 @@
 """log.jsonl: one JSON object a line, appended while a run trains; a resumed run takes back what it will do again.
 
-A line is there once its line break is: whoever reads while a run writes passes over what follows the last one.
+A line is there once its line break is: a reader passes over what follows the last line break.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from splatwizard_core.files import naming_full_disk, write_atomic
 class RunLog:
     """Appends lines to a file; None as the path: keeps nothing.
 
-    Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "num_gaussians" or "num_anchors",
-    "lr", "seconds"; or "task" (a task that logs); or "metrics" (an evaluation).
+    Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "lr", "seconds" and the model's
+    `counts()`; or "task" (a task that logs); or "metrics" (an evaluation).
     """
 
     def __init__(self, path: Path | None) -> None:

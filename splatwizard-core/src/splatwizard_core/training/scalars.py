@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 def read_scalars(scalars: Sequence[Tensor]) -> list[float]:
-    """The values of one-element tensors, in order; each GPU among their devices is waited for once."""
+    """Return the values of one-element tensors, in order; each GPU among their devices is waited for once."""
     found = [0.0] * len(scalars)
     elsewhere: dict[torch.device, list[int]] = {}
     for i, scalar in enumerate(scalars):
@@ -39,7 +39,7 @@ class Verdict:
         self._fine = fine
 
     def fine(self) -> bool:
-        """The answer; waits for it if it is not there yet."""
+        """Return the answer; waits for it if it is not there yet."""
         if self._event is not None:
             self._event.synchronize()
         return bool(self._fine)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import bisect
 import functools
 import inspect
 import logging
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Final
 
 import torch
@@ -14,11 +14,11 @@ import torch
 from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, scaled, steps_of
+from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, steps_of
 from splatwizard_core.training.stage import Stage
 from splatwizard_core.training.tasks import POST_ONLY, SOURCES, Binding, TaskContext, bind
 
-__all__ = ["STOP", "PhaseSwitch", "Scheduler", "TaskContext", "build_schedulers", "format_plan", "plan_lines", "scaled"]
+__all__ = ["STOP", "PhaseSwitch", "Scheduler", "build_schedulers", "format_plan"]
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +29,7 @@ class _Stop:
 
 
 STOP: Final = _Stop()
-"""What a task returns to end its training stage cleanly after the current step."""
+"""Returned by a task to end its training stage cleanly after the current step."""
 
 
 class Scheduler:
@@ -76,13 +76,19 @@ class Scheduler:
             self.stage, plan, steps_of(plan), task, name, priority, len(self._entries), log, self._step or 0
         )
         # A new list: exec may be iterating over the old one.
-        entries = list(self._entries)
-        bisect.insort(entries, (entry, binding), key=lambda e: (e[0].priority, e[0].order))
-        self._entries = entries
+        self._entries = sorted([*self._entries, (entry, binding)], key=_order)
+
+    def reprioritise(self, kind: type, priority: int) -> None:
+        """Give all registered tasks that are instances of `kind` another priority.
+
+        So a stage that wraps another one makes room between the tasks that it has taken over.
+        """
+        changed = [(replace(e, priority=priority) if isinstance(e.task, kind) else e, b) for e, b in self._entries]
+        self._entries = sorted(changed, key=_order)
 
     @property
     def registrations(self) -> list[Registration]:
-        """In order of execution."""
+        """All registrations in order of execution."""
         return [entry for entry, _ in self._entries]
 
     def check(self, context: TaskContext) -> None:
@@ -123,12 +129,16 @@ class Scheduler:
         return any(e.after > 0 and e.fires_in(step, None) for e in self.registrations)
 
     def plan_lines(self) -> list[str]:
-        """What identifies the plan: everything but what tasks registered while they ran."""
-        return plan_lines([e for e in self.registrations if e.after == 0], [])
+        """Return what identifies the plan: everything but what tasks registered while they ran."""
+        return plan_lines([e for e in self.registrations if e.after == 0])
+
+
+def _order(entry: tuple[Registration, Binding]) -> tuple[int, int]:
+    return entry[0].priority, entry[0].order
 
 
 class PhaseSwitch:
-    """Sugar for the common change of mode: `PhaseSwitch(10_000, "entropy").register(scheduler)`.
+    """Change of the model's phase at a step: `PhaseSwitch(10_000, "entropy").register(scheduler)`.
 
     At `step` it sets `model.phase = name`, or runs `task` instead if there is one. The plan shows it as
     "switch to <name>". The model keeps its phase in `state_dict_extra()["phase"]`, so that a resumed run has it.
@@ -148,7 +158,7 @@ class PhaseSwitch:
 
 
 def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Scheduler]:
-    """The plan of a stage, (pre, post), without scene, model or device: what is printed is what is run."""
+    """Return the plan of a stage, (pre, post), without scene, model or device: what is printed is what is run."""
     pre, post = Scheduler("pre"), Scheduler("post")
     stage.register_pre_task(pre, ppl, stage.opt)
     stage.register_post_task(post, ppl, stage.opt)
@@ -156,7 +166,7 @@ def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Sche
 
 
 def task_name(task: Callable[..., Any]) -> str:
-    """The name of a function with spaces; of the function inside a partial; of the class of a callable object."""
+    """Return the name of a function (also inside a partial) with spaces, or of a callable object's class."""
     while isinstance(task, functools.partial):
         task = task.func
     named = inspect.isroutine(task) or inspect.isclass(task)

@@ -1,9 +1,9 @@
-"""A training stage: what it starts from, its schedule, its loss, its optimizer. The trainer knows no method."""
+"""A training stage: the scene that it starts from, its schedule, its loss, its optimizer."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -12,23 +12,17 @@ from torch import Tensor
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.scene import Scene, View
+from splatwizard_core.training.losses import LossPack, photometric_loss
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
+from splatwizard_core.training.plan import When, scaled
 
 if TYPE_CHECKING:
     from splatwizard_core.training.optimizer import SplatOptimizer
     from splatwizard_core.training.scheduler import Scheduler
 
 
-@dataclass
-class LossPack:
-    """The loss of one step: `total` is what backward starts from, `parts` are what the log shows (scalars)."""
-
-    total: Tensor
-    parts: dict[str, Tensor] = field(default_factory=dict)
-
-
 class CameraSampler:
-    """Which view is trained next. Its whole state can be saved and restored.
+    """The order in which views are trained. Its whole state can be saved and restored.
 
     Default: uniformly without replacement over the training views, refilled when empty.
     A stage with its own idea (pseudo views, say) subclasses it; a view without a picture is legal if the
@@ -43,17 +37,17 @@ class CameraSampler:
         self._order: list[int] = []
 
     def next(self, step: int) -> View:
-        """The view of this step."""
+        """Return the view of this step."""
         if not self._order:
             self._order = torch.randperm(len(self.views), generator=self.generator).tolist()
         return self.views[self._order.pop()]
 
     def state_dict(self) -> dict[str, Any]:
-        """JSON-able, together with the generator's state as a tensor under "generator"."""
+        """Return the order that is left (JSON-able) and the generator's state, a tensor under "generator"."""
         return {"order": list(self._order), "generator": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Inverse of `state_dict`. Raises ValueError if it is that of a sampler of other views."""
+        """Restore what `state_dict` returned. Raises ValueError if it is that of a sampler of other views."""
         order = [int(i) for i in state["order"]]
         if order and max(order) >= len(self.views):
             raise ValueError(f"the state is that of a sampler of other views: view {max(order)} of {len(self.views)}")
@@ -62,7 +56,7 @@ class CameraSampler:
 
 
 class CameraIterator:
-    """The cameras that schedule tasks iterate over: training views in order, independent of the training sampler."""
+    """Training views in order, for schedule tasks to iterate over; independent of the training sampler."""
 
     def __init__(self, views: list[View]) -> None:
         self.views = views
@@ -76,7 +70,7 @@ class CameraIterator:
 
 @dataclass
 class StageContext:
-    """What the runner hands to a stage when it begins.
+    """The parts of a run that a stage is given when it begins.
 
     model       the model as the stage before left it (or as `Method.create_model` made it)
     scene       the scene
@@ -114,7 +108,7 @@ class Stage:
 
     @property
     def starts_from(self) -> str | None:
-        """Name of a method whose trained scene this stage starts from (the runner supplies it).
+        """Name of the method whose trained scene this stage starts from (the runner supplies it).
 
         None: it goes on from the stage before.
         """
@@ -147,28 +141,27 @@ class Stage:
         raise NotImplementedError
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        """Which view is trained next."""
+        """Return the sampler that says which view is trained next."""
         return CameraSampler(scene.train, generator)
 
-    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        """Register what runs before rendering.
+    def when(self, when: When) -> When:
+        """Return a plan of the full run in steps of this one: scaled with `opt.scale_schedule`, else as it is."""
+        return scaled(when, self.opt.schedule_scale)
 
-        With `opt.scale_schedule` a plan is that of a shorter run: `plan.scaled(when, opt.schedule_scale)`.
-        """
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        """Register what runs before rendering, at the steps of `self.when(plan of the full run)`."""
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        """Register what runs between backward and the optimizer step."""
+        """Register what runs between backward and the optimizer step, at the steps of `self.when(...)`."""
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        """How this step is rendered. Must not ask for different features at different steps."""
+        """Return how this step is rendered. Must not ask for different features at different steps."""
         return RasterOptions(background=background)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        """The loss of this step. Default: 0.8 L1 + 0.2 (1 - SSIM) against the view's picture on `background`."""
-        from splatwizard_core.training.losses import photometric_loss
-
+        """Return the loss of this step. Default: 0.8 L1 + 0.2 (1 - SSIM) against the view's picture on `background`."""
         return photometric_loss(result.image, view.image(background, result.image.device))
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        """Called once after the last step; returns the model that the next stage, or the encoder, gets."""
+        """Return the model that the next stage, or the encoder, gets; called once after the last step."""
         return model

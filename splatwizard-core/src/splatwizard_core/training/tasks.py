@@ -1,4 +1,4 @@
-"""What a schedule task may ask for, and how its parameters are bound to it: by their type annotations."""
+"""The values that a schedule task may ask for, bound to its parameters by their type annotations."""
 
 from __future__ import annotations
 
@@ -16,14 +16,15 @@ from splatwizard_core.errors import TaskSignatureError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
 from splatwizard_core.scene.scene import Scene
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
-from splatwizard_core.training.stage import CameraIterator, LossPack
+from splatwizard_core.training.stage import CameraIterator
 
 
 @dataclass
 class TaskContext:
-    """Everything that tasks are given, by the field that an annotation selects.
+    """The values that tasks are given, by the field that an annotation selects.
 
     step        the current step, 1-based
     cameras     the task camera iterator, independent of the training sampler
@@ -68,16 +69,14 @@ class Argument:
     """Where one parameter's value comes from.
 
     field       of TaskContext
-    classes     what the value must be an instance of
-    optional    None is legal too
-    keyword     passed by this name; None: by position
+    classes     the value must be an instance of one of them
+    keyword     passed by its name, not by position
     """
 
     parameter: str
     field: str
     classes: tuple[type, ...]
-    optional: bool
-    keyword: str | None
+    keyword: bool
 
 
 class Binding:
@@ -90,7 +89,7 @@ class Binding:
         """Raise TaskSignatureError if the context holds something else than a parameter is annotated with."""
         for a in self.arguments:
             value = getattr(context, a.field)
-            if a.field in skip or isinstance(value, a.classes) or (value is None and a.optional):
+            if a.field in skip or isinstance(value, a.classes):
                 continue
             wanted = " | ".join(c.__name__ for c in a.classes)
             raise TaskSignatureError(
@@ -99,8 +98,8 @@ class Binding:
 
     def __call__(self, context: TaskContext) -> Any:
         self.check(context)
-        positional = [getattr(context, a.field) for a in self.arguments if a.keyword is None]
-        named = {a.keyword: getattr(context, a.field) for a in self.arguments if a.keyword is not None}
+        positional = [getattr(context, a.field) for a in self.arguments if not a.keyword]
+        named = {a.parameter: getattr(context, a.field) for a in self.arguments if a.keyword}
         return self.task(*positional, **named)
 
 
@@ -115,32 +114,27 @@ def bind(task: Callable[..., Any], stage: str, name: str, sources: Sequence[tupl
     """
     if inspect.isclass(task):
         raise TaskSignatureError(f"task '{name}' is the class {task.__name__} itself: register an instance of it")
-    function, given, named = _unwrap_partial(task)
     try:
-        parameters = list(inspect.signature(function).parameters.values())
+        parameters = inspect.signature(task).parameters.values()
     except (TypeError, ValueError) as error:
         raise TaskSignatureError(f"task '{name}': its signature cannot be read ({error})") from error
-    namespace = _namespace(function)
+    given = task.keywords if isinstance(task, functools.partial) else {}
+    namespace = _namespace(task)
     arguments: list[Argument] = []
     by_keyword = False  # behind a parameter that keeps its default, the rest goes by name
-    for position, p in enumerate(parameters):
+    for p in parameters:
         if p.kind in (p.VAR_POSITIONAL, p.VAR_KEYWORD):
             stars = "*" if p.kind is p.VAR_POSITIONAL else "**"
             raise TaskSignatureError(
                 f"task '{name}': {stars}{p.name} cannot be supplied; name and annotate the parameters"
             )
-        if position < given:
-            continue
-        if p.name in named:
-            by_keyword = True
-            continue
-        source = _source(p, name, sources, namespace)
-        if source is None:
+        classes = () if p.name in given else _classes(p, name, namespace)
+        field = _field_of(classes, sources)
+        if field is None:
             if p.default is p.empty:
                 raise TaskSignatureError(_unusable(p, name, sources))
             by_keyword = True
             continue
-        field, classes, optional = source
         if field in POST_ONLY and stage != "post":
             raise TaskSignatureError(
                 f"task '{name}': parameter '{p.name}' wants {classes[0].__name__}, which exists after rendering only; "
@@ -148,76 +142,54 @@ def bind(task: Callable[..., Any], stage: str, name: str, sources: Sequence[tupl
             )
         if by_keyword and p.kind is p.POSITIONAL_ONLY:
             raise TaskSignatureError(f"task '{name}': '{p.name}' is positional-only behind a parameter left out")
-        keyword = p.name if by_keyword or p.kind is p.KEYWORD_ONLY else None
-        arguments.append(Argument(p.name, field, classes, optional, keyword))
+        arguments.append(Argument(p.name, field, classes, by_keyword or p.kind is p.KEYWORD_ONLY))
     return Binding(task, name, arguments)
 
 
-def _unwrap_partial(task: Callable[..., Any]) -> tuple[Callable[..., Any], int, frozenset[str]]:
-    """The function inside nested partials, how many positional arguments they supply, and which by name."""
-    given, named = 0, set()
-    while isinstance(task, functools.partial):
-        given += len(task.args)
-        named |= set(task.keywords)
-        task = task.func
-    return task, given, frozenset(named)
+def _namespace(task: Callable[..., Any]) -> dict[str, Any]:
+    """Return the globals in which string annotations are read."""
+    function: Any = task.func if isinstance(task, functools.partial) else task
+    if not hasattr(function, "__globals__"):
+        function = type(function).__call__
+    return dict(getattr(inspect.unwrap(function), "__globals__", {}))
 
 
-def _namespace(function: Callable[..., Any]) -> dict[str, Any]:
-    """The globals in which string annotations are read."""
-    target: Any = function
-    if not hasattr(target, "__globals__") and not inspect.ismethod(target):
-        target = getattr(type(target), "__call__", target)  # noqa: B004 (the function itself is wanted)
-    target = inspect.unwrap(target)
-    return dict(getattr(getattr(target, "__func__", target), "__globals__", {}))
+def _classes(p: inspect.Parameter, name: str, namespace: dict[str, Any]) -> tuple[Any, ...]:
+    """Return what the annotation of a parameter allows, Annotated, unions and TypeVars unwrapped."""
+
+    def resolve(annotation: Any) -> Any:
+        holder = types.SimpleNamespace(__annotations__={"it": annotation})
+        try:
+            return typing.get_type_hints(holder, globalns=namespace, include_extras=True)["it"]
+        except NameError as error:
+            raise TaskSignatureError(
+                f"task '{name}': annotation {annotation!r} of parameter '{p.name}' cannot be resolved ({error}); "
+                "import the name at run time, not under TYPE_CHECKING"
+            ) from error
+        except (TypeError, SyntaxError) as error:
+            raise TaskSignatureError(
+                f"task '{name}': annotation {annotation!r} of parameter '{p.name}' is not a type ({error})"
+            ) from error
+
+    def members(annotation: Any) -> tuple[Any, ...]:
+        inner: Sequence[Any]
+        if typing.get_origin(annotation) is Annotated:
+            inner = typing.get_args(annotation)[:1]
+        elif isinstance(annotation, TypeVar):
+            inner = [resolve(a) for a in annotation.__constraints__ or (annotation.__bound__,)]
+        elif typing.get_origin(annotation) in (Union, types.UnionType):
+            inner = typing.get_args(annotation)
+        else:
+            return (annotation,)
+        return tuple(c for a in inner for c in members(a))
+
+    return () if p.annotation is p.empty else members(resolve(p.annotation))
 
 
-def _source(
-    p: inspect.Parameter, name: str, sources: Sequence[tuple[type, str]], namespace: dict[str, Any]
-) -> tuple[str, tuple[type, ...], bool] | None:
-    """(field, classes, whether None is legal), or None if the annotation selects nothing."""
-    if p.annotation is p.empty:
-        return None
-    members, optional = _members(_resolve(p.annotation, p.name, name, namespace), p.name, name, namespace)
-    fields = {_field(member, sources) for member in members}
-    if len(fields) != 1 or None in fields:
-        return None
-    (field,) = fields
-    assert field is not None
-    return field, tuple(members), optional
-
-
-def _resolve(annotation: Any, parameter: str, name: str, namespace: dict[str, Any]) -> Any:
-    holder = types.SimpleNamespace(__annotations__={"it": annotation})
-    try:
-        return typing.get_type_hints(holder, globalns=namespace, include_extras=True)["it"]
-    except NameError as error:
-        raise TaskSignatureError(
-            f"task '{name}': annotation {annotation!r} of parameter '{parameter}' cannot be resolved ({error}); "
-            "import the name at run time, not under TYPE_CHECKING"
-        ) from error
-    except (TypeError, SyntaxError) as error:
-        raise TaskSignatureError(
-            f"task '{name}': annotation {annotation!r} of parameter '{parameter}' is not a type ({error})"
-        ) from error
-
-
-def _members(annotation: Any, parameter: str, name: str, namespace: dict[str, Any]) -> tuple[list[Any], bool]:
-    """The classes that an annotation allows (Annotated, unions and TypeVar bounds unwrapped), and if None is one."""
-    while typing.get_origin(annotation) is Annotated:
-        annotation = typing.get_args(annotation)[0]
-    if isinstance(annotation, TypeVar):
-        bound = annotation.__bound__
-        alternatives = list(annotation.__constraints__) or ([] if bound is None else [bound])
-        resolved = [_resolve(a, parameter, name, namespace) for a in alternatives]
-        parts = [_members(r, parameter, name, namespace) for r in resolved]
-    elif typing.get_origin(annotation) in (Union, types.UnionType):
-        parts = [_members(a, parameter, name, namespace) for a in typing.get_args(annotation)]
-    elif annotation is type(None):
-        return [], True
-    else:
-        return [annotation], False
-    return [c for classes, _ in parts for c in classes], any(optional for _, optional in parts)
+def _field_of(classes: Sequence[Any], sources: Sequence[tuple[type, str]]) -> str | None:
+    """Return the one field that all the classes (but NoneType) select, or None."""
+    fields = {_field(c, sources) for c in classes if c is not types.NoneType}
+    return fields.pop() if len(fields) == 1 else None
 
 
 def _field(annotation: Any, sources: Sequence[tuple[type, str]]) -> str | None:

@@ -1,4 +1,4 @@
-"""Where the time of a training loop goes."""
+"""Clocks of a training loop: its whole time, and the time of each stage of a step."""
 
 from __future__ import annotations
 
@@ -8,14 +8,10 @@ from contextlib import contextmanager
 
 import torch
 
+from splatwizard_core.memory import synchronize
+
 STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
 """The five stages of a step, the third in its two halves."""
-
-
-def synchronize(device: torch.device) -> None:
-    """Wait for the device; nothing to wait for on a CPU."""
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
 
 
 class LoopClock:
@@ -55,17 +51,21 @@ class LoopClock:
 
 
 class StageClock:
-    """Seconds per stage of a step; synchronises the device at every mark, which is why it is opt-in."""
+    """Seconds per stage of a step; synchronises the device at every mark, which is why it is opt-in.
+
+    totals      over all steps
+    last_step   of the last one
+    """
 
     def __init__(self, device: torch.device, totals: dict[str, float] | None = None) -> None:
         self.device = device
         self.totals = dict.fromkeys(STAGES, 0.0) | (totals or {})
-        self._last: dict[str, float] = {}
+        self.last_step: dict[str, float] = {}
         self._since = 0.0
 
     def start(self) -> None:
         """A step begins."""
-        self._last = {}
+        self.last_step = {}
         synchronize(self.device)
         self._since = time.perf_counter()
 
@@ -73,11 +73,6 @@ class StageClock:
         """This stage ends here."""
         synchronize(self.device)
         now = time.perf_counter()
-        self._last[stage] = now - self._since
+        self.last_step[stage] = now - self._since
         self.totals[stage] += now - self._since
         self._since = now
-
-    @property
-    def last_step(self) -> dict[str, float]:
-        """Seconds per stage of the last step."""
-        return self._last

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, NoReturn
+from typing import Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -22,11 +22,12 @@ from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_core.training.interrupt import InterruptGuard
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scalars import Verdict
 from splatwizard_core.training.scheduler import build_schedulers
-from splatwizard_core.training.stage import CameraIterator, LossPack, Stage
+from splatwizard_core.training.stage import CameraIterator, Stage
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
 
@@ -162,7 +163,7 @@ class Trainer:
             clock.mark("post")
 
         if step < self.stage.iterations:
-            self.optimizer.step(result.visible if self.optimizer.sparse else None)
+            self.optimizer.step(result)
         self.optimizer.zero_grad()
         if clock:
             clock.mark("optimize")
@@ -201,48 +202,35 @@ class Trainer:
         if self.device.type == "cpu":
             self.check_losses()
         elif len(self._unchecked) >= CHECK_EVERY:
-            self._hear_verdict()
-            records, self._unchecked = self._unchecked, []
-            self._asked = Verdict([r.total for r in records]), records
+            self._ask_verdict()
         return record
 
     def check_losses(self) -> None:
         """Raise TrainingDiverged if a loss since the last look is not finite. Waits for the device."""
+        self._ask_verdict()
+        self._hear_verdict()
+
+    def _ask_verdict(self) -> None:
         self._hear_verdict()
         records, self._unchecked = self._unchecked, []
-        if not records:
-            return
-        if len(records) == 1:
-            fine = math.isfinite(records[0].total.item())
-        else:
-            fine = Verdict([r.total for r in records]).fine()
-        if not fine:
-            self._raise_diverged(records)
+        if records:
+            self._asked = Verdict([r.total for r in records]), records
 
     def _hear_verdict(self) -> None:
         asked, self._asked = self._asked, None
-        if asked is not None and not asked[0].fine():
-            self._raise_diverged(asked[1])
-
-    @staticmethod
-    def _raise_diverged(records: list[StepRecord]) -> NoReturn:
-        for record in records:
-            if math.isfinite(record.total.item()):
-                continue
-            values = {name: part.item() for name, part in record.parts.items()}
-            values["total"] = record.total.item()
-            part = next(name for name, value in values.items() if not math.isfinite(value))
-            raise TrainingDiverged(record.step, record.view, part, values[part])
-        raise AssertionError("all of these losses are finite")
+        if asked is None or asked[0].fine():
+            return
+        record = next(r for r in asked[1] if not math.isfinite(r.total.item()))
+        values = {name: part.item() for name, part in {**record.parts, "total": record.total}.items()}
+        part = next(name for name, value in values.items() if not math.isfinite(value))
+        raise TrainingDiverged(record.step, record.view, part, values[part])
 
     def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
-        view = self._view
-        rows = self._num_rows()
-        what = "anchors" if "num_anchors" in self.model.counts() else "Gaussians"
+        view, rows = self._view, f"{self._num_rows():,} {self.model.ROW_LABEL}"
         drawn = "" if view is None else f" at {view.camera.width}x{view.camera.height}"
         return out_of_memory(
             error,
-            f"step {self.step + 1} of stage '{self.stage.name}' with {rows:,} {what}{drawn}",
+            f"step {self.step + 1} of stage '{self.stage.name}' with {rows}{drawn}",
             "free the GPU and give the same command again, it goes on from the last checkpoint; "
             "smaller pictures, or a plan that makes fewer, start anew",
         )
@@ -260,14 +248,14 @@ class Trainer:
         return self._background
 
     def _camera(self, view: View) -> Camera:
-        """The view's camera on the model's device, moved once."""
+        """Return the view's camera on the model's device, where it is moved once."""
         camera = self._cameras.get(view)
         if camera is None:
             camera = self._cameras[view] = view.camera.to(self.device)
         return camera
 
     def state_dict(self) -> dict[str, Any]:
-        """All that the next step depends on, tensors and JSON-able values in nested dicts; no copies."""
+        """Return all that the next step depends on, tensors and JSON-able values in nested dicts; no copies."""
         return {
             "model": self.model.state_dict(),
             "extra": self.model.state_dict_extra(),
@@ -277,7 +265,7 @@ class Trainer:
         }
 
     def load_state_dict(self, state: dict[str, Any], step: int) -> None:
-        """Continue after `step`. Raises the errors of whoever finds that its part does not fit."""
+        """Restore what `state_dict` returned after `step`. Raises the error of the part that does not fit."""
         self.model.load_resized(state["model"])
         self.model.load_state_dict_extra(state["extra"])
         self.optimizer.load_state_dict(state["optimizer"])

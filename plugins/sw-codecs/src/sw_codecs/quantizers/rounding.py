@@ -119,6 +119,14 @@ class SteRound:
         return finite_values(within(symbols, -INDEX_LIMIT, INDEX_LIMIT).to(torch.float64) * step64)
 
 
+def add_noise(x: Tensor, step: Tensor, uniform: Tensor) -> Tensor:
+    """x + step * (u - 1/2), as one operator: rounding to multiples of `step` as it is seen in training; differentiable.
+
+    uniform     draws u ~ U(0,1) of the shape of x; they are overwritten
+    """
+    return torch.addcmul(x, uniform.sub_(0.5), step)
+
+
 class UniformNoise(SteRound):
     """x + step * u with u ~ U(-1/2, 1/2) in training; the gradient is 1 for x and u for the step. Files are rounded.
 
@@ -133,11 +141,11 @@ class UniformNoise(SteRound):
         *,
         mean: float | Tensor | None = None,
     ) -> Tensor:
-        u = torch.rand(x.shape, generator=generator, device=x.device, dtype=x.dtype) - 0.5
+        u = torch.rand(x.shape, generator=generator, device=x.device, dtype=x.dtype)
         q = self._step(x, step)
         low, high = self._limits(x, q, mean)
         if low is not None and high is not None:
             x = torch.clamp(x, low * q.detach(), high * q.detach())
-        return x + q * u
+        return add_noise(x, q, u)
 
     __call__ = forward

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from splatwizard_core.cli import complete
 from splatwizard_core.tooling import (
     assignments,
+    complete_folders,
+    complete_image_folders,
     console,
     debug_option,
     json_option,
@@ -21,11 +22,12 @@ from splatwizard_core.tooling import (
     say,
     set_option,
 )
+from sw_datasets.commands import completions
 from sw_datasets.commands.fetch import fetch, registry_option
 
 if TYPE_CHECKING:
     from sw_datasets.downloads.presence import ScenePresence
-    from sw_datasets.downloads.registry import DataSet, Registry
+    from sw_datasets.downloads.registry import DataSet, DataSets
     from sw_datasets.verify import Verdict
 
 
@@ -35,7 +37,7 @@ def data() -> None:
 
 
 @data.command("list", short_help="the published data sets, and which of them are here")
-@click.argument("dataset", required=False, shell_complete=complete.datasets)
+@click.argument("dataset", required=False, shell_complete=completions.datasets)
 @options(registry_option, json_option, debug_option)
 def list_datasets(dataset: str | None, registry: str | None, as_json: bool) -> None:
     """The published data sets, and which scenes of them lie under $SPLATWIZARD_DATA; of one DATASET scene by scene.
@@ -43,7 +45,8 @@ def list_datasets(dataset: str | None, registry: str | None, as_json: bool) -> N
     Checksum: "verified" if everything that is here was unpacked by `sw data fetch` from archives whose SHA-256 was
     pinned; "pinned" if nothing is here and the registry states the SHA-256 of what would be fetched.
     """
-    from sw_datasets.downloads.presence import DATA_VARIABLE, data_root
+    from splatwizard_core.tooling import DATA_VARIABLE
+    from sw_datasets.downloads.presence import data_root
     from sw_datasets.downloads.registry import load_registry
 
     known = load_registry(registry)
@@ -160,7 +163,9 @@ def _print_one(facts: dict[str, Any]) -> None:
 
 
 @data.command(short_help="check the scenes that are here")
-@click.argument("targets", nargs=-1, metavar="[DATASET[/SCENE]|FOLDER]...", shell_complete=complete.dataset_or_folder)
+@click.argument(
+    "targets", nargs=-1, metavar="[DATASET[/SCENE]|FOLDER]...", shell_complete=completions.dataset_or_folder
+)
 @options(
     click.option("--checksums", is_flag=True,
                  help="Compare the SHA-256 of every file with what `sw data fetch` unpacked, not its size alone."),
@@ -189,7 +194,7 @@ def verify(targets: tuple[str, ...], checksums: bool, decode: bool, registry: st
         raise click.exceptions.Exit(1)
 
 
-def _verify_jobs(targets: tuple[str, ...], known: Registry) -> list[tuple[str, Path, DataSet | None, bool]]:
+def _verify_jobs(targets: tuple[str, ...], known: DataSets) -> list[tuple[str, Path, DataSet | None, bool]]:
     """(name, folder, data set or None, whether it is there at all) of every scene to check."""
     from splatwizard_core.api import UserInputError
     from sw_datasets.downloads.presence import data_root, scene_presence
@@ -262,11 +267,11 @@ data.add_command(fetch)
 
 
 @data.command(short_help="a pinhole copy of a COLMAP scene with lens distortion")
-@click.argument("scene", metavar="SCENE", shell_complete=complete.folders)
-@click.argument("out", metavar="OUT", shell_complete=complete.folders)
+@click.argument("scene", metavar="SCENE", shell_complete=complete_folders)
+@click.argument("out", metavar="OUT", shell_complete=complete_folders)
 @options(
     click.option("--images", metavar="FOLDER", default="images", show_default=True,
-                 shell_complete=complete.image_folders,
+                 shell_complete=complete_image_folders,
                  help="Which picture folder of SCENE to undistort; OUT/images holds the result."),
     click.option("--quality", type=click.IntRange(1, 100), default=100, show_default=True, metavar="1..100",
                  help="Of JPEG pictures that are written."),
@@ -276,7 +281,7 @@ def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) ->
     """Write a copy of the COLMAP scene SCENE without lens distortion into the new folder OUT: pinhole cameras, the
     same poses, points and image names, pictures (and masks) resampled and cut so that no black border is left.
 
-    Needs the package pycolmap: pip install 'splatwizard-core[pycolmap]'.
+    Needs the package pycolmap: pip install 'sw-datasets[pycolmap]'.
     """
     from sw_datasets.undistort import undistort_scene
 
@@ -292,7 +297,7 @@ def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) ->
 
 
 @data.command(short_help="write the procedural demo scene")
-@click.argument("out", metavar="OUT", shell_complete=complete.folders)
+@click.argument("out", metavar="OUT", shell_complete=complete_folders)
 @options(
     click.option(
         "--size", type=click.Choice(["demo", "tiny"]), default="demo", show_default=True,
@@ -318,7 +323,7 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UserInputError(f"{out} is not an empty folder: choose another one")
     output_folder(target)
-    _, scene_options, _ = resolve_run_options(None, assignments(sets))
+    scene_options = resolve_run_options(None, assignments(sets)).scene
     scene = load_scene("demo" if size == "demo" else f"demo:{size}", scene_options, load_plugins())
     say(f"drawing {len(scene.train) + len(scene.test)} views")
     write_scene(scene, target, layout, text=text)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from splatwizard_core.cli import complete
-from splatwizard_core.tooling import debug_option, json_option, options, print_json, say
+from splatwizard_core.tooling import complete_nothing, debug_option, json_option, options, print_json, say
+from sw_datasets.commands import completions
 
 if TYPE_CHECKING:
     from sw_datasets.downloads.download import Fetched
@@ -26,10 +26,10 @@ registry_option = click.option(
 
 
 @click.command(short_help="download published data sets")
-@click.argument("targets", nargs=-1, required=True, metavar="DATASET[/SCENE]...", shell_complete=complete.datasets)
+@click.argument("targets", nargs=-1, required=True, metavar="DATASET[/SCENE]...", shell_complete=completions.datasets)
 @options(
     click.option("--yes", "-y", is_flag=True, help="Do not ask."),
-    click.option("--sha256", "pins", multiple=True, metavar="[FILE=]HEX", shell_complete=complete.nothing,
+    click.option("--sha256", "pins", multiple=True, metavar="[FILE=]HEX", shell_complete=complete_nothing,
                  help="What the archive's SHA-256 must be; repeatable where several archives are fetched."),
     click.option("--from", "archives", multiple=True, metavar="FILE", type=click.Path(dir_okay=False),
                  help="Unpack this archive, which is here already, instead of downloading one."),
@@ -171,9 +171,9 @@ def _alone(root: Path) -> Iterator[None]:
 
 def _fetch_one(root: Path, jobs: list[Job], local: Path | None, keep: bool) -> list[dict[str, Any]]:
     """One archive, and all that is wanted of it."""
-    from splatwizard_core.errors import ArchiveError
     from sw_datasets.downloads.download import check_file, download
     from sw_datasets.downloads.fetch import archive_path, unpack_job
+    from sw_datasets.errors import ArchiveError
 
     file = jobs[0].file
     if local is not None:

@@ -6,29 +6,29 @@ from dataclasses import replace
 from pathlib import Path
 
 from splatwizard_core.api import Scene, SceneError, SceneOptions
-from splatwizard_core.scene.images import fitted_size
 from sw_datasets.demo.synthetic import SIZES, make_scene
 from sw_datasets.families import DEMO
-from sw_datasets.rules import of_no_use, settle
+from sw_datasets.pictures import fitted_size
+from sw_datasets.rules import rules_for, unused_option_warnings
 
-NO_USE = ("principal_point", "mask_background", "legacy_8bit_composite", "init_points")
-"""Scene options that change nothing here: the pictures are drawn, and the size of the scene says how many points."""
+UNUSED_OPTIONS = ("principal_point", "mask_background", "legacy_8bit_composite", "init_points")
+"""Scene options that change nothing: pictures are drawn, and the size of the scene sets the number of points."""
 
 
 class DemoDataset:
-    """No folder is ever of this family; the name `demo` asks for it."""
+    """The procedural scene, asked for by the name `demo`; no folder is of this family."""
 
     def detect(self, path: Path) -> float:
-        """0: the scene is not read from anywhere."""
+        """Return 0: the scene is not read from a folder."""
         return 0.0
 
     def load(self, path: Path, options: SceneOptions) -> Scene:
-        """path: `demo` or `tiny`, the name of a size. Raises SceneError for another one, ConfigError for `images`."""
+        """Draw the scene of a size, `demo` or `tiny`. Raises SceneError for another one, ConfigError for `images`."""
         variant = str(path)
         if variant not in SIZES:
             raise SceneError(f"there is no demo scene '{variant}': use demo or demo:tiny")
         size = SIZES[variant]
-        rules = settle(replace(DEMO, split=f"every{size.test_every}"), variant, options)
+        rules = rules_for(replace(DEMO, split=f"every{size.test_every}"), variant, options)
         width, height = fitted_size(size.width, size.height, rules.resolution)
         scene = make_scene(
             replace(size, width=width, height=height),
@@ -39,5 +39,5 @@ class DemoDataset:
             source_size=(size.width, size.height),
             resolution=rules.resolution,
         )
-        scene.warnings += of_no_use(options, NO_USE, DEMO)
+        scene.warnings += unused_option_warnings(options, UNUSED_OPTIONS, DEMO)
         return scene

@@ -19,7 +19,7 @@ OFFSET = 1e-5
 
 @dataclass(frozen=True)
 class Solid:
-    """A shape and what it is made of; the stage casts no shadow on anything above it, which saves asking."""
+    """A shape and its material; the stage casts no shadow on anything above it, so its shadow need not be traced."""
 
     shape: Shape
     material: Material

@@ -61,17 +61,17 @@ class Shape:
 
     @cached_property
     def is_upright(self) -> bool:
-        """Not turned at all: the local axes are those of the world."""
+        """Whether the local axes are those of the world: no rotation."""
         return bool((self.rotation == np.eye(3)).all())
 
     @property
     def radius(self) -> float:
-        """Of a sphere about `position` that holds the solid."""
+        """Radius of a sphere about `position` that holds the solid."""
         raise NotImplementedError
 
     @property
     def area(self) -> float:
-        """Of the surface."""
+        """Area of the surface."""
         raise NotImplementedError
 
     def hit(self, o: Vec, d: Vec) -> Vec:

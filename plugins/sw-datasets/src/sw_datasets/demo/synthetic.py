@@ -12,7 +12,6 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, assemble_scene, stream
-from splatwizard_core.scene.camera import look_at
 from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks
@@ -23,7 +22,7 @@ FOV_X = math.radians(46)
 
 @dataclass(frozen=True)
 class DemoSize:
-    """How much of the demo scene there is.
+    """Size of the demo scene.
 
     views           cameras on the hemisphere; every `test_every`-th by name is a test view
     width, height   pixels
@@ -126,7 +125,7 @@ def orbit(count: int, width: int, height: int) -> list[Camera]:
         eye = torch.tensor([level * math.cos(azimuth), level * math.sin(azimuth), distance * rise + 0.35]).double()
         target = torch.tensor([0.12 * math.sin(2.3 * i), 0.12 * math.cos(3.1 * i), 0.30]).double()
         up = torch.tensor([0.0, 0.0, 1.0]).double()
-        cameras.append(look_at(eye, target, up, width=width, height=height, fov_x=FOV_X).to(dtype=torch.float32))
+        cameras.append(Camera.look_at(eye, target, up, width=width, height=height, fov_x=FOV_X).to(dtype=torch.float32))
     return cameras
 
 
@@ -172,7 +171,7 @@ def sample_surfaces(world: World, count: int, generator: torch.Generator) -> tup
 
 
 def start_points(world: World, cameras: list[Camera], count: int, generator: torch.Generator) -> PointCloud:
-    """What structure from motion would find: noisy, coloured points that at least two of the cameras see."""
+    """Start points as structure from motion finds them: noisy, coloured, each seen by at least two of the cameras."""
     xyz, _, which = sample_surfaces(world, 2 * count, generator)
     seen = np.zeros(xyz.shape[1], dtype=int)
     rgb = np.zeros_like(xyz)

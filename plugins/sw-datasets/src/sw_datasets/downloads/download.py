@@ -8,6 +8,7 @@ again. Beside FILE lie FILE.part, what came so far, and FILE.part.json, of what 
 from __future__ import annotations
 
 import contextlib
+import errno
 import importlib
 import json
 import re
@@ -19,14 +20,15 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from splatwizard_core.api import CapabilityError, track
-from splatwizard_core.errors import FetchError
-from splatwizard_core.tooling import Bar, full_disk_code, write_json
+from splatwizard_core.tooling import Bar, write_json
+from sw_datasets.errors import FetchError
 
 CHUNK_BYTES = 1 << 15  # what a broken connection costs at most
 ATTEMPTS = 6  # in a row without one new byte; with the pauses below that is half a minute of silence
 PAUSE_SECONDS = 1.0  # before the second attempt; doubled for each further one
 TIMEOUT_SECONDS = 30.0  # without a byte
 MEGABYTE = 1_000_000
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 RETRIED = (408, 425, 429, 500, 502, 503, 504)
 """Answers that pass: too busy, being restarted."""
 
@@ -46,7 +48,7 @@ class Fetched:
 
 @dataclass
 class _Part:
-    """What FILE.part is a part of: address, length in all (None: unknown), and what tells versions apart."""
+    """The file that FILE.part is a part of: address, length in all (None: unknown), and the marks of its version."""
 
     url: str
     total: int | None = None
@@ -55,12 +57,12 @@ class _Part:
 
 
 def require_pooch() -> Any:
-    """The module. Raises CapabilityError that says how to install it."""
+    """Import pooch. Raises CapabilityError that says how to install it."""
     try:
         return importlib.import_module("pooch")
     except ImportError as error:
         raise CapabilityError(
-            f"downloading needs the package pooch ({error}): pip install 'splatwizard-core[download]'",
+            f"downloading needs the package pooch ({error}): pip install 'sw-datasets[download]'",
             missing=["pooch"],
         ) from error
 
@@ -122,7 +124,7 @@ def sha256_with_progress(path: Path) -> str:
 
 @contextlib.contextmanager
 def byte_progress(label: str, total: int | None, start: int = 0) -> Iterator[Callable[[int], None]]:
-    """A progress display in MB; what it yields is called with numbers of bytes."""
+    """Show progress in MB; yields a function that is called with numbers of bytes."""
     whole = None if total is None else -(-total // MEGABYTE)
     with track(label, total=whole, start=start // MEGABYTE, unit="MB") as bar:
         yield _Counter(bar, start)
@@ -159,7 +161,7 @@ class _Transfer:
         self.part = self._read_note()
 
     def run(self) -> None:
-        """Until the file is whole. Raises FetchError."""
+        """Connect until the file is whole. Raises FetchError."""
         failures = 0
         while True:
             before = self._have()
@@ -177,7 +179,7 @@ class _Transfer:
                 self.pause(PAUSE_SECONDS * 2 ** (failures - 1))
                 continue
             except OSError as error:
-                if full_disk_code(error) is None:
+                if error.errno not in NO_SPACE:
                     raise
                 raise FetchError(
                     f"{self.path}: the disk is full; {self._have():,} bytes are kept, make space and give the same "
@@ -230,7 +232,7 @@ class _Transfer:
         return self.path.stat().st_size if self.path.exists() else 0
 
     def _read_note(self) -> _Part:
-        """What the part is of; another address, or no readable note: the part is of no use and deleted."""
+        """Read the note beside the part. Another address, or no readable note: the part is deleted."""
         try:
             part = _Part(**json.loads(self.note.read_bytes()))
         except (OSError, ValueError, TypeError):
@@ -242,7 +244,7 @@ class _Transfer:
         return part
 
     def begin(self, response: Any, start: int) -> int:
-        """What the first lines of an answer mean: the byte of the file at which its body begins."""
+        """Return the byte of the file at which the body of an answer begins."""
         if response.status_code == 416:
             total = _total(response.headers.get("Content-Range", ""))
             if total is not None and total == start:
@@ -296,7 +298,7 @@ class _Transfer:
 
 
 class _Sink(contextlib.ExitStack):
-    """What pooch writes to: the part file, opened when the answer says where its bytes belong."""
+    """The file object that pooch writes to: the part file, opened when the answer says where its bytes belong."""
 
     def __init__(self, transfer: _Transfer, start: int) -> None:
         super().__init__()
@@ -315,7 +317,7 @@ class _Sink(contextlib.ExitStack):
         self.count = self.enter_context(byte_progress(label, self.transfer.part.total, start))
 
     def write(self, block: bytes) -> int:
-        """The next bytes of the body."""
+        """Write the next bytes of the body."""
         if self.file is None:
             raise _Broken("the server answered nothing that can be kept")
         total = self.transfer.part.total
@@ -325,7 +327,7 @@ class _Sink(contextlib.ExitStack):
         return self.file.write(block)
 
     def flush(self) -> None:
-        """Nothing: the file is written when it is closed, and blocks are large."""
+        """Do nothing: the file is written when it is closed, and blocks are large."""
 
 
 class _Broken(Exception):  # noqa: N818 (not an error for the user)

@@ -1,4 +1,4 @@
-"""From "mipnerf360, please" to scene folders under $SPLATWIZARD_DATA: which archives, where they go, what is noted."""
+"""Plans which archives are needed for the scenes asked for, and unpacks them under $SPLATWIZARD_DATA."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ DOWNLOADS = ".downloads"
 
 @dataclass(frozen=True)
 class Job:
-    """What one archive is needed for: some scenes of a data set, or (no scenes) all that it holds."""
+    """One archive and the purpose it is fetched for: some scenes of a data set, or (no scenes) all that it holds."""
 
     dataset: DataSet
     file: DataFile
@@ -39,7 +39,7 @@ class Job:
 
 @dataclass
 class Plan:
-    """What is to be fetched, and what needs not be.
+    """Archives to fetch, and scenes that need none.
 
     present     scenes or files that are there already
     partly      scenes that are there but lack something; nothing is written over them
@@ -51,7 +51,10 @@ class Plan:
 
 
 def plan_fetch(root: Path, registry: Mapping[str, DataSet], targets: Sequence[str]) -> Plan:
-    """What `targets` (DATASET or DATASET/SCENE) need that is not there. Raises UserInputError for unknown names."""
+    """Plan which archives bring the missing scenes of `targets` (DATASET or DATASET/SCENE).
+
+    Raises UserInputError for unknown names.
+    """
     wanted: dict[str, list[str]] = {}
     for target in targets:
         name, slash, scene = target.partition("/")
@@ -90,12 +93,12 @@ def plan_fetch(root: Path, registry: Mapping[str, DataSet], targets: Sequence[st
 
 
 def archive_path(root: Path, file: DataFile) -> Path:
-    """Where the archive is downloaded to: the same file of two data sets once, equal names of two addresses apart."""
+    """Path to download an archive to: the same file of two data sets once, equal names of two addresses apart."""
     return root / DOWNLOADS / f"{hashlib.sha256(file.url.encode()).hexdigest()[:8]}-{file.name}"
 
 
 def unpack_job(root: Path, job: Job, archive: Fetched) -> dict[str, Path]:
-    """Unpack what the job wants and note it; returns scene (or file) name -> folder. Raises FetchError."""
+    """Unpack the scenes of a job, with receipts; returns scene (or file) name -> folder. Raises FetchError."""
     from sw_datasets.downloads.unpack import unpack_scenes, unpack_whole
 
     if job.file.into is not None:

@@ -1,4 +1,4 @@
-"""Which scenes of a data set lie below $SPLATWIZARD_DATA. Looks at names only; nothing is read. No torch."""
+"""Finds scenes of a data set below $SPLATWIZARD_DATA by the names of folders; no file of a scene is read. No torch."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import DATA_VARIABLE
 from sw_datasets.downloads.registry import DataSet
 from sw_datasets.families import BENCHMARKS
 
-DATA_VARIABLE = "SPLATWIZARD_DATA"
 RECEIPTS = ".fetched"
 """Folder of a data set where `sw data fetch` keeps what it unpacked: one JSON file a scene."""
 
@@ -49,7 +49,7 @@ def data_root() -> Path:
 
 
 def scene_presence(root: Path, dataset: DataSet, scene: str) -> ScenePresence:
-    """Where a scene lies, and whether all that it needs is there."""
+    """Find the folder of a scene, and whether all that it needs is there."""
     names = dataset.folder_names(scene)
     for home in homes(root, dataset):
         for name in names:
@@ -74,7 +74,7 @@ def homes(root: Path, dataset: DataSet) -> list[Path]:
 
 
 def dataset_state(root: Path, dataset: DataSet, scenes: list[ScenePresence]) -> State:
-    """All scenes (or files) present, some, or none."""
+    """Whether all scenes (or files) of the data set are present, some, or none."""
     if scenes:
         states: list[State] = [scene.state for scene in scenes]
     else:
@@ -88,7 +88,7 @@ def dataset_state(root: Path, dataset: DataSet, scenes: list[ScenePresence]) -> 
 
 
 def read_receipt(home: Path, folder: str) -> dict[str, Any] | None:
-    """What `sw data fetch` noted: {"archive": {...}, "files": {path: [bytes, sha256]}}; None if it did not."""
+    """Read the receipt of a scene: {"archive": {...}, "files": {path: [bytes, sha256]}}; None if there is none."""
     try:
         receipt = json.loads((home / RECEIPTS / f"{folder}.json").read_bytes())
     except (OSError, ValueError, RecursionError):

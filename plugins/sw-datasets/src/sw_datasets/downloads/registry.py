@@ -1,8 +1,9 @@
-"""The registry of data sets: what is published where, as plain data (public_data.toml and registries of one's own)."""
+"""Registries of data sets: where each is published, as plain data in TOML, of installed packages and of one's own."""
 
 from __future__ import annotations
 
 import difflib
+import logging
 import os
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -13,15 +14,18 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError, model_validator
 
 from splatwizard_core.api import ConfigError, UserInputError
+from splatwizard_core.tooling import load_plugins
 
 if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
 
+log = logging.getLogger(__name__)
+
 REGISTRY_VARIABLE = "SPLATWIZARD_DATA_REGISTRY"
 PUBLIC = "public"
-"""The name of the registry that ships with the core."""
+"""Name of the registry that ships with this package."""
 
 
 def _folder_name(name: str) -> str:
@@ -77,7 +81,7 @@ class DataFile(BaseModel):
 class DataSet(BaseModel):
     """One data set: scenes below $SPLATWIZARD_DATA/<folder>/.
 
-    id, registry    its name; which registry lists it ("public", or a file)
+    id, registry    its name; the registry that lists it ("public", another package's, or a file)
     folder          where its scenes lie, the id unless it shares a folder with another one
     title           as papers write it
     homepage        where its authors describe it and its licence
@@ -125,7 +129,7 @@ class DataSet(BaseModel):
         return file.scenes or self.scenes
 
     def check_scene(self, scene: str) -> None:
-        """Raises UserInputError for a scene that the data set does not have."""
+        """Raise UserInputError for a scene that the data set does not have."""
         if scene not in self.scenes:
             there = ", ".join(self.scenes) or "it holds no scenes"
             raise UserInputError(f"data set '{self.id}' has no scene '{scene}': {there}")
@@ -135,14 +139,14 @@ class DataSet(BaseModel):
         return (self.prefix + scene, scene) if self.prefix else (scene,)
 
 
-class Registry(Mapping[str, DataSet]):
+class DataSets(Mapping[str, DataSet]):
     """Data sets by id, in the order in which they were listed."""
 
     def __init__(self, datasets: Sequence[DataSet]) -> None:
         self._datasets = {dataset.id: dataset for dataset in datasets}
 
     def __getitem__(self, name: str) -> DataSet:
-        """Raises UserInputError with the nearest id."""
+        """The data set of this id. Raises UserInputError with the nearest id."""
         if name not in self._datasets:
             near = difflib.get_close_matches(name, self._datasets, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"there are {', '.join(self._datasets)}"
@@ -159,14 +163,29 @@ class Registry(Mapping[str, DataSet]):
         return len(self._datasets)
 
 
-def load_registry(own: str | os.PathLike[str] | None = None) -> Registry:
-    """The public data sets and those of one's own registry, which replaces entries of the same id.
+def load_registry(own: str | os.PathLike[str] | None = None) -> DataSets:
+    """The data sets that installed packages know how to fetch, and those of one's own registry.
 
-    own     TOML file; None: what $SPLATWIZARD_DATA_REGISTRY names, if anything
+    own     TOML file; None: the one that $SPLATWIZARD_DATA_REGISTRY names, if any. Its entries replace others of the
+            same id
 
-    Raises ConfigError that names file, data set and key.
+    What this package lists stays its own: another package's entry of the same id is left out, with a warning, and so is
+    a package whose registry cannot be read. Raises ConfigError that names file, data set and key for one's own.
     """
-    datasets = {d.id: d for d in parse_registry(files(__package__).joinpath("public_data.toml").read_bytes(), PUBLIC)}
+    datasets: dict[str, DataSet] = {}
+    for entry in sorted(load_plugins().downloads, key=lambda entry: (entry.name != PUBLIC, entry.name)):
+        try:
+            listed = parse_registry(entry.load()(), entry.name)
+        except (Exception, SystemExit) as error:  # of one package; the others are read all the same
+            log.warning("downloads '%s' of %s cannot be read: %s", entry.name, entry.distribution, error)
+            continue
+        for dataset in listed:
+            kept = datasets.setdefault(dataset.id, dataset)
+            if kept is not dataset:
+                log.warning(
+                    "data set '%s' of %s is left out: '%s' lists one of that name",
+                    dataset.id, entry.distribution, kept.registry,
+                )  # fmt: skip
     path = own or os.environ.get(REGISTRY_VARIABLE)
     if path:
         named = "" if own else f" (${REGISTRY_VARIABLE})"
@@ -175,11 +194,16 @@ def load_registry(own: str | os.PathLike[str] | None = None) -> Registry:
         except OSError as error:
             raise ConfigError(f"registry {path}{named} cannot be read: {error.strerror or error}") from error
         datasets |= {d.id: d for d in parse_registry(content, str(path))}
-    return Registry(list(datasets.values()))
+    return DataSets(list(datasets.values()))
+
+
+def public_data() -> bytes:
+    """The registry of this package, TOML: the published data sets."""
+    return files(__package__).joinpath("public_data.toml").read_bytes()
 
 
 def parse_registry(content: bytes, name: str) -> list[DataSet]:
-    """The data sets of a TOML text. Raises ConfigError that names `name`, the data set and the key."""
+    """Parse the data sets of a TOML text. Raises ConfigError that names `name`, the data set and the key."""
     try:
         tables: dict[str, Any] = tomllib.loads(content.decode())
     except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:

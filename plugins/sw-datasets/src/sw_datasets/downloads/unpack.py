@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import IO, Any
 
 from splatwizard_core.api import track
-from splatwizard_core.errors import ArchiveError, FetchError
-from splatwizard_core.scene.images import is_inside
 from splatwizard_core.tooling import new_folder
 from sw_datasets.downloads.download import byte_progress
+from sw_datasets.errors import ArchiveError, FetchError
+from sw_datasets.pictures import is_inside
 
 MAX_MEMBERS = 200_000
 MAX_RATIO = 100  # bytes unpacked per byte of archive; pictures reach 1.1, COLMAP text models 5
@@ -38,7 +38,7 @@ JUNK = ("__MACOSX", ".DS_Store", "Thumbs.db")
 """What systems leave in archives; passed over."""
 
 Files = dict[str, tuple[int, str]]
-"""What was unpacked: path -> (bytes, SHA-256)."""
+"""Unpacked files: path -> (bytes, SHA-256)."""
 
 
 @dataclass(frozen=True)

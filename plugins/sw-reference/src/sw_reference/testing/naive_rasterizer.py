@@ -10,7 +10,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, eval_sh
+from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
 
 Note = Callable[["Tensor | float", float], None]
 MaskedNote = Callable[..., None]
@@ -18,7 +18,7 @@ MaskedNote = Callable[..., None]
 
 @dataclass
 class Pair:
-    """What one Gaussian does to every pixel, each [H,W]; `raw` is alpha before the clamp and the cuts."""
+    """The effect of one Gaussian on every pixel, each [H,W]; `raw` is alpha before the clamp and the cuts."""
 
     index: int
     offset: Tensor  # [H,W,2] centre minus pixel
@@ -226,8 +226,7 @@ def _color(g: GaussianInputs, i: int, R: Tensor, tau: Tensor, opt: RasterOptions
     if g.colors is not None:
         return g.colors[i]
     assert g.sh is not None
-    toward = g.means[i] + R.T @ tau
-    raw = eval_sh(g.sh.to_dense()[i : i + 1], (toward / toward.norm())[None], g.sh.active_degree)[0] + 0.5
+    raw = g.sh.colors_from(-R.T @ tau, g.means, rows=torch.tensor([i]), clamp=False)[0]
     if not opt.clamp_color:
         return raw
     note(raw + 1, 1.0)  # absolute distance to zero

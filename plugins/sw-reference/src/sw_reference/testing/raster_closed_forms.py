@@ -7,9 +7,8 @@ import math
 import torch
 
 from splatwizard_core.api import SH, Rasterizer, RasterOptions
-from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
-from sw_reference.testing.raster_scenes import permute_inputs
-from sw_reference.testing.rasterizer_checks import check, close, draw, front_camera, splats
+from sw_reference.testing.facts import check, close, draw
+from sw_reference.testing.raster_scenes import front_camera, permute_inputs, splats
 
 VARIANCE = (64 * 0.2 / 4) ** 2 + 0.3
 """Of the standard splat (scale 0.2 at depth 4, focal length 64) on the screen, px^2."""
@@ -196,7 +195,7 @@ def any_number_of_colour_channels(r: Rasterizer, device: str) -> None:
 def negative_sh_colours_are_clamped_at_zero(r: Rasterizer, device: str) -> None:
     g = splats([[0, 0, 4]], opacities=[0.8])
     g.colors = None
-    g.sh = SH(dense=rgb_to_dc(torch.tensor([[[-0.5, 0.25, 1.5]]])), active_degree=0)
+    g.sh = SH.from_rgb(torch.tensor([[-0.5, 0.25, 1.5]]))
     image = draw(r, device, g, front_camera(), RasterOptions()).image
     close(image[:, 32, 32], CENTRE_ALPHA * torch.tensor([0.0, 0.25, 1.5]))
 
@@ -205,7 +204,7 @@ def negative_sh_colours_are_clamped_at_zero(r: Rasterizer, device: str) -> None:
 def unclamped_sh_colours_stay_negative(r: Rasterizer, device: str) -> None:
     g = splats([[0, 0, 4]], opacities=[0.8])
     g.colors = None
-    g.sh = SH(dense=rgb_to_dc(torch.tensor([[[-0.5, 0.25, 1.5]]])), active_degree=0)
+    g.sh = SH.from_rgb(torch.tensor([[-0.5, 0.25, 1.5]]))
     image = draw(r, device, g, front_camera(), RasterOptions(clamp_color=False)).image
     close(image[:, 32, 32], CENTRE_ALPHA * torch.tensor([-0.5, 0.25, 1.5]))
 

@@ -8,8 +8,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterizerInfo, RasterOptions, RenderResult
-from splatwizard_core.rendering.rasterizer import feature_names, required_features
+from splatwizard_core.api import (
+    Camera,
+    Feature,
+    GaussianInputs,
+    Rasterizer,
+    RasterizerInfo,
+    RasterOptions,
+    RenderResult,
+)
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, margin_scene, with_tensors
 
 DEPTHS = frozenset({"inverse", "accumulated", "expected", "median"})
@@ -69,7 +76,7 @@ def _options(case: RasterCase, info: RasterizerInfo, cam: Camera, dtype: torch.d
 def applies(case: RasterCase, info: RasterizerInfo) -> bool:
     """Whether the rasterizer declares what this case needs."""
     g, cam = margin_scene(case, 1)
-    needed = feature_names(required_features(g, _options(case, info, cam, torch.float64))) - {"FLOAT64"}
+    needed = Feature.asked_by(_options(case, info, cam, torch.float64), g).names - {"FLOAT64"}
     return info.needs <= needed <= info.features
 
 

@@ -10,15 +10,17 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterOptions
 from sw_reference.projection import rotation_matrices
+from sw_reference.testing.facts import check, close, draw
 from sw_reference.testing.raster_scenes import (
     RasterCase,
     concatenate_inputs,
     draw_scene,
+    front_camera,
     margin_scene,
     permute_inputs,
+    splats,
     with_tensors,
 )
-from sw_reference.testing.rasterizer_checks import check, close, draw, front_camera, splats
 
 CASE = RasterCase("robust", n=20, width=37, height=29, color="colors")
 LEAVES = ("means", "opacities", "scales", "quats", "colors")

@@ -9,8 +9,6 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import SH, Camera, GaussianInputs, RasterOptions
-from splatwizard_core.gaussians.spherical_harmonics import num_coefficients
-from splatwizard_core.scene.camera import look_at
 from sw_reference.projection import covariances
 from sw_reference.testing.naive_rasterizer import naive_render
 
@@ -19,7 +17,7 @@ MARGIN = 1e-3
 
 @dataclass(frozen=True)
 class RasterCase:
-    """What a random scene looks like.
+    """Description of a random scene.
 
     color       "sh" (dense), "split" (dc + rest), "indexed" (codebook), "colors" ([N,C])
     geometry    "scales" (with unnormalised quats), "surfels" (two scales), "cov3d", "indexed" (codebook with scale
@@ -77,7 +75,7 @@ def draw_scene(case: RasterCase, seed: int, dtype: torch.dtype = torch.float64) 
     if case.color == "colors":
         g.colors = rand(n, case.channels)
     else:
-        sh = randn(n, num_coefficients(case.degree), 3) * case.sh_scale
+        sh = randn(n, (case.degree + 1) ** 2, 3) * case.sh_scale
         sh[:, 0] = randn(n, 3) * 0.8 + 0.6
         if case.color == "sh":
             g.sh = SH(dense=sh, active_degree=case.active_degree)
@@ -90,7 +88,7 @@ def draw_scene(case: RasterCase, seed: int, dtype: torch.dtype = torch.float64) 
         g.features = randn(n, case.features)
 
     eye = torch.tensor([0.3, -0.4, -4.0], dtype=torch.float64)
-    cam = look_at(
+    cam = Camera.look_at(
         eye, torch.tensor([0.05, 0.1, 0.0], dtype=torch.float64), torch.tensor([0.1, -1.0, 0.0], dtype=torch.float64),
         width=case.width, height=case.height, fov_x=0.8,
     )  # fmt: skip
@@ -145,3 +143,26 @@ def concatenate_inputs(a: GaussianInputs, b: GaussianInputs) -> GaussianInputs:
     """Both sets drawn together; same fields in both, no codebooks."""
     other = b.tensors()
     return _map(a, lambda name, x: torch.cat([x, other[name]]))
+
+
+def front_camera(width: int = 64, height: int = 64, **changes: float) -> Camera:
+    """At the origin, looking along +z, focal length 64 px, principal point in the centre."""
+    cam = Camera(width, height, 64.0, 64.0, width / 2, height / 2, torch.eye(3), torch.zeros(3))
+    return replace(cam, **changes)  # type: ignore[arg-type]
+
+
+def splats(
+    means: list[list[float]], *, opacities: list[float], scales: list[float] | None = None, colors: Tensor | None = None
+) -> GaussianInputs:
+    """Isotropic Gaussians, default scale 0.2, default colours distinct and fixed; float32 on the CPU."""
+    n = len(means)
+    if colors is None:
+        colors = 0.2 + 0.6 * torch.rand(n, 3, generator=torch.Generator().manual_seed(5))
+    size = torch.tensor(scales if scales is not None else [0.2] * n, dtype=torch.float32)
+    return GaussianInputs(
+        torch.tensor(means, dtype=torch.float32).reshape(n, 3),
+        torch.tensor(opacities, dtype=torch.float32),
+        size[:, None].repeat(1, 3),
+        torch.tensor([1.0, 0, 0, 0]).repeat(n, 1),
+        colors=colors,
+    )

@@ -7,9 +7,9 @@ from torch import Tensor
 
 from splatwizard_core.api import GaussianInputs, Rasterizer, RasterOptions, ScoreSpec
 from sw_reference.scores import view_fisher
+from sw_reference.testing.facts import check, close, draw
 from sw_reference.testing.naive_rasterizer import Pair, naive_render
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, margin_scene
-from sw_reference.testing.rasterizer_checks import check, close, draw
 
 CASE = RasterCase(
     "scores", n=14, width=37, height=19, color="colors", opacity=(0.8, 0.98), scale=(0.5, 0.9), spread=0.7

@@ -19,7 +19,8 @@ from splatwizard_core.api import (
     RenderResult,
 )
 from sw_reference.testing import raster_closed_forms, raster_robustness
-from sw_reference.testing.rasterizer_checks import CheckFunction, check, close, draw, front_camera, splats
+from sw_reference.testing.facts import CheckFunction, check, close, draw
+from sw_reference.testing.raster_scenes import front_camera, splats
 
 DEPTHS = frozenset({"accumulated", "expected", "inverse", "median"})
 EVERYTHING = RasterOptions(depth=DEPTHS, normals=True, distortion=True, alpha=True)

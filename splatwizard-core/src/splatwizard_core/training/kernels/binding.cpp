@@ -5,7 +5,6 @@
 #include <torch/library.h>
 
 #include <cmath>
-#include <optional>
 #include <tuple>
 #include <vector>
 
@@ -68,37 +67,6 @@ void adam(const at::Tensor& param, const at::Tensor& grad, const at::Tensor& exp
   SW_SELECT(adam)(args, splatwizard::torch_parallel());
 }
 
-// mask [N] bool; row_steps [N] int32 or nothing: no bias correction.
-void sparse_adam(const at::Tensor& param, const at::Tensor& grad, const at::Tensor& exp_avg,
-                 const at::Tensor& exp_avg_sq, const at::Tensor& mask, const std::optional<at::Tensor>& row_steps,
-                 double lr, double beta1, double beta2, double eps) {
-  check(param, "sparse_adam", "param");
-  check(grad, "sparse_adam", "grad");
-  check(exp_avg, "sparse_adam", "exp_avg");
-  check(exp_avg_sq, "sparse_adam", "exp_avg_sq");
-  const int64_t count = param.numel();
-  const int64_t rows = param.dim() > 0 ? param.size(0) : 0;
-  TORCH_CHECK(grad.numel() == count && exp_avg.numel() == count && exp_avg_sq.numel() == count,
-              "sparse_adam: param, grad, exp_avg and exp_avg_sq differ in size");
-  TORCH_CHECK(mask.is_cpu() && mask.scalar_type() == at::kBool && mask.is_contiguous() && mask.dim() == 1 &&
-                  mask.size(0) == rows && param.dim() > 0,
-              "sparse_adam: mask must be a contiguous bool tensor [", rows, "] on the CPU, got ", mask.sizes());
-  int32_t* steps = nullptr;
-  if (row_steps.has_value()) {
-    TORCH_CHECK(row_steps->is_cpu() && row_steps->scalar_type() == at::kInt && row_steps->is_contiguous() &&
-                    row_steps->numel() == rows,
-                "sparse_adam: row_steps must be a contiguous int32 tensor [", rows, "] on the CPU");
-    steps = row_steps->mutable_data_ptr<int32_t>();
-  }
-  if (count == 0) return;
-  const splatwizard::SparseAdamArgs args{
-      param.mutable_data_ptr<float>(), grad.const_data_ptr<float>(), exp_avg.mutable_data_ptr<float>(),
-      exp_avg_sq.mutable_data_ptr<float>(), mask.const_data_ptr<bool>(), steps, rows, count / rows, lr,
-      std::log(beta1), std::log(beta2), static_cast<float>(1. - beta1), static_cast<float>(beta2),
-      static_cast<float>(1. - beta2), static_cast<float>(eps)};
-  SW_SELECT(sparse_adam)(args, splatwizard::torch_parallel());
-}
-
 }  // namespace
 
 TORCH_LIBRARY(splatwizard_training, m) {
@@ -106,8 +74,6 @@ TORCH_LIBRARY(splatwizard_training, m) {
         " -> (float, float, Tensor)");
   m.def("adam(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, float lr, float beta1,"
         " float beta2, float eps, int step) -> ()");
-  m.def("sparse_adam(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor mask,"
-        " Tensor(d!)? row_steps, float lr, float beta1, float beta2, float eps) -> ()");
   // On CUDA, where nothing may wait for a number: means [3] = offset + weighted sum, L1, SSIM; see binding_cuda.cpp.
   m.def("photometric_means(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset,"
         " bool with_grad) -> (Tensor means, Tensor slopes)");
@@ -115,9 +81,6 @@ TORCH_LIBRARY(splatwizard_training, m) {
         " float ssim_weight) -> Tensor");
   m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
         " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> int[]");
-  m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
-        " Tensor(c!) max_radii) -> ()");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));
-  m.impl("sparse_adam", c10::DispatchKey::CPU, TORCH_FN(sparse_adam));
   m.impl("adam", c10::DispatchKey::CPU, TORCH_FN(adam));
 }

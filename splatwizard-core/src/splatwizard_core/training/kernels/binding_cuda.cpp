@@ -125,37 +125,12 @@ std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std:
   return left;
 }
 
-void view_statistics(const at::Tensor& gradients, const at::Tensor& radii, const at::Tensor& grad_accum,
-                     const at::Tensor& denom, const at::Tensor& max_radii) {
-  const int64_t count = radii.numel();
-  TORCH_CHECK(radii.is_cuda() && radii.scalar_type() == at::kInt && radii.is_contiguous(),
-              "view_statistics: radii must be a contiguous int32 tensor on a GPU, got ", radii.toString());
-  check(gradients, "view_statistics", "gradients");
-  TORCH_CHECK(gradients.numel() == 2 * count && gradients.device() == radii.device() &&
-                  reinterpret_cast<uintptr_t>(gradients.const_data_ptr()) % 8 == 0,
-              "view_statistics: gradients do not fit the radii");
-  const std::pair<const char*, const at::Tensor*> sums[] = {
-      {"grad_accum", &grad_accum}, {"denom", &denom}, {"max_radii", &max_radii}};
-  for (const auto& [name, tensor] : sums) {
-    check(*tensor, "view_statistics", name);
-    TORCH_CHECK(tensor->numel() == count && tensor->device() == radii.device(), "view_statistics: ", name,
-                " does not fit the radii");
-  }
-  const c10::cuda::CUDAGuard guard(radii.device());
-  kernels::statistics({gradients.const_data_ptr<float>(), radii.const_data_ptr<int32_t>(),
-                       grad_accum.mutable_data_ptr<float>(), denom.mutable_data_ptr<float>(),
-                       max_radii.mutable_data_ptr<float>(), count},
-                      c10::cuda::getCurrentCUDAStream());
-  C10_CUDA_KERNEL_LAUNCH_CHECK();
-}
-
 }  // namespace
 
 TORCH_LIBRARY_IMPL(splatwizard_training, CUDA, m) {
   m.impl("photometric_means", photometric);
   m.impl("photometric_backward", photometric_backward);
   m.impl("adam_many", adam_many);
-  m.impl("view_statistics", view_statistics);
 }
 
 #endif  // SW_WITH_CUDA

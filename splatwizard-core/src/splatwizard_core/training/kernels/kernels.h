@@ -34,28 +34,11 @@ struct AdamArgs {
   float eps;
 };
 
-// The same for the marked rows of a [rows, width] parameter.
-struct SparseAdamArgs {
-  float* param;
-  const float* grad;
-  float* exp_avg;
-  float* exp_avg_sq;
-  const bool* mask;     // [rows] which rows are updated
-  int32_t* row_steps;   // [rows] updates of each row so far, counted up; null: no bias correction
-  int64_t rows, width;
-  double lr, log_beta1, log_beta2;
-  float one_minus_beta1;
-  float beta2;
-  float one_minus_beta2;
-  float eps;
-};
-
 }  // namespace splatwizard
 
 #define SW_DECLARE_TRAINING(arch)                                                                     \
   namespace arch {                                                                                    \
   void photometric(const splatwizard::PhotometricArgs& args, const splatwizard::Parallel& parallel); \
   void adam(const splatwizard::AdamArgs& args, const splatwizard::Parallel& parallel);                \
-  void sparse_adam(const splatwizard::SparseAdamArgs& args, const splatwizard::Parallel& parallel);  \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_TRAINING)

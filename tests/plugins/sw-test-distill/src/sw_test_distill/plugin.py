@@ -1,4 +1,4 @@
-"""What this package provides."""
+"""Registers the method of this package."""
 
 from splatwizard_core.api import Registry, hookimpl
 

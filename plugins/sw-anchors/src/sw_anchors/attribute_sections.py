@@ -1,0 +1,145 @@
+"""Sections of an anchor file that hold attributes: integers, block by block of anchors, under predicted Gaussians.
+
+A method writes down once how it walks over the rows, predicting each block of integers from what is known by then. The
+walk hands them to an `AttributeEncoder`, which rounds the values of a model and codes them, or to an
+`AttributeDecoder`, which reads them from the file: both answer with the integers, so both sides know the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from splatwizard_core.api import BitstreamError
+from sw_anchors.shape import GROUPS, AnchorShape
+from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
+from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
+from sw_codecs.quantizers.rounding import SteRound
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import ContainerReader, ContainerWriter
+    from sw_anchors.coded_anchors import CodedAnchors
+    from sw_anchors.decoded_anchors import DecodedAnchors
+
+
+class Block(NamedTuple):
+    """Numbers of a section that are coded at once: some rows and columns of a group."""
+
+    section: str
+    group: str
+    rows: slice
+    columns: slice = slice(None)
+
+
+class AttributeCoder:
+    """One side of the coding of all attributes.
+
+    rows        the blocks of rows that a walk goes over, in order
+    """
+
+    def __init__(self, count: int, shape: AnchorShape, mode: str) -> None:
+        """Of `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`."""
+        self.coder = ConditionalGaussian(mode)
+        self.rows = self.coder.blocks(count, max(shape.widths))
+
+    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+        """Code one block; its integers [n,C] int64, 0 where they are not in the file.
+
+        context     distributions of its numbers, in the units of the mode
+        step        [n,1] float64, quantiser steps in units of the values
+        present     [n,C] bool: numbers that are in the file; None: all
+        """
+        raise NotImplementedError
+
+
+class AttributeEncoder(AttributeCoder):
+    """Rounds the attributes of a model's anchors `rows` [N] (their order in the file) and codes them."""
+
+    def __init__(self, model: CodedAnchors, rows: Tensor, sections: Sequence[str], mode: str) -> None:
+        super().__init__(len(rows), model.shape, mode)
+        self._values = dict(zip(GROUPS, (v.detach().cpu() for v in model.raw(rows)), strict=True))
+        self._centres = dict(zip(GROUPS, (c.cpu() for c in model.centres()), strict=True))
+        self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
+        self._round = SteRound()
+
+    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+        values = self._values[block.group][block.rows, block.columns].double()
+        symbols, _ = self._round.encode(values, step, mean=self._centres[block.group])
+        symbols = symbols if present is None else symbols * present
+        self._coded[block.section].append(self.coder.encode(symbols.numpy(), context, present))
+        return symbols
+
+    def write(self, writer: ContainerWriter) -> None:
+        """Add all sections, after the walk."""
+        writer.require("entropy model", "conditional-gaussian")
+        for name, blocks in self._coded.items():
+            writer.add(name, self.coder.join(blocks))
+
+
+class AttributeDecoder(AttributeCoder):
+    """Reads what an AttributeEncoder wrote into a DecodedAnchors; errors name the section."""
+
+    def __init__(self, reader: ContainerReader, model: DecodedAnchors, sections: Sequence[str], mode: str) -> None:
+        """Raises BitstreamError if a section is missing."""
+        shape = AnchorShape(model.features.shape[1], model.num_offsets)
+        super().__init__(model.num_rows, shape, mode)
+        self._reader = reader
+        found = (model.features.data, model.scales.data, model.offsets.data.view(-1, shape.widths[2]))
+        self._found = dict(zip(GROUPS, found, strict=True))
+        self._coded: dict[str, Iterator[bytes]] = {
+            name: self.coder.split(reader.section(name), len(self.rows)) for name in sections
+        }
+
+    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+        """Raises BitstreamError for damage."""
+        with self._reader.decoding(block.section):
+            symbols = torch.from_numpy(self.coder.decode(next(self._coded[block.section]), context, present))
+        self._found[block.group][block.rows, block.columns] = (symbols * step).to(torch.float32)
+        return symbols
+
+    def finish(self) -> None:
+        """Raise BitstreamError if bytes follow the last block of a section, or a value is not finite."""
+        for name, blocks in self._coded.items():
+            with self._reader.decoding(name):
+                next(blocks, None)
+        for group, values in self._found.items():
+            if not bool(torch.isfinite(values).all()):
+                raise BitstreamError(
+                    f"{self._reader.name}: decoded {group} are not finite: the file is damaged or hostile"
+                )
+
+
+class ExactNetwork:
+    """A context network evaluated in integers (`integer-mlp`), the same on every machine.
+
+    Means and scales come in base steps with 12 fractional bits, steps as multiples of the base in 1/4096.
+    """
+
+    def __init__(
+        self, network: nn.Sequential, shape: AnchorShape, base_steps: Sequence[float], *, step_offset: int = 0
+    ) -> None:
+        """step_offset  added to round(4096 (1 + tanh t)) of a step logit t.
+
+        Raises ValueError if the network cannot be evaluated exactly.
+        """
+        units = [1 / base for base, width in zip(base_steps, shape.widths, strict=True) for _ in range(2 * width)]
+        self._network = IntegerMlp.from_module(network, output_scale=np.array([*units, 1.0, 1.0, 1.0]))
+        self._shape, self._base_steps, self._step_offset = shape, tuple(base_steps), step_offset
+
+    def __call__(self, features: Tensor) -> dict[str, RowContext]:
+        """Distributions by group for anchors with features int64 [n, inputs], 12 fractional bits."""
+        parts = torch.split(self._network(features), self._shape.outputs, dim=1)
+        multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
+        return {
+            group: RowContext(parts[2 * i], parts[2 * i + 1], multipliers[:, i : i + 1])
+            for i, group in enumerate(GROUPS)
+        }
+
+    def steps(self, group: str, context: RowContext) -> Tensor:
+        """[n,1] float64: quantiser steps of a group, in units of the values."""
+        multipliers: Tensor = context.step
+        return multipliers.to(torch.float64) * (self._base_steps[GROUPS.index(group)] / (1 << FRACTION))

@@ -1,0 +1,138 @@
+"""Operators of a training step on anchors, each one node of the graph of derivatives.
+
+Noise, rate and decoding of a step share one matrix of all numbers of an anchor. Gradients are written into place: rows
+are taken once each, so nothing has to be summed (indexing a CUDA tensor sorts its index on the way back).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+
+def anchor_values(
+    rows: Tensor,
+    features: Tensor,
+    log_scales: Tensor,
+    offsets: Tensor,
+    mask_logits: Tensor,
+    mask_weights: Tensor | None,
+    threshold: float,
+) -> tuple[Tensor, Tensor]:
+    """(values [V, F+6+3k]: features, exp(log_scales) and offsets of the anchors `rows`; their masks [V,k]).
+
+    rows            [V] int64, each at most once
+    mask_weights    [N,1] or None for 1: a mask is 1 where sigmoid(logit) times its weight exceeds `threshold`, else 0;
+                    its gradient is that of sigmoid(logit) times the weight, and none goes to the weight
+    """
+    found = _Values.apply(rows, features, log_scales, offsets, mask_logits, mask_weights, threshold)  # type: ignore[no-untyped-call]
+    values, masks = found
+    return values, masks
+
+
+class _Values(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        rows: Tensor,
+        features: Tensor,
+        log_scales: Tensor,
+        offsets: Tensor,
+        mask_logits: Tensor,
+        mask_weights: Tensor | None,
+        threshold: float,
+    ) -> tuple[Tensor, Tensor]:
+        scales = log_scales.index_select(0, rows).exp_()
+        values = torch.cat([features.index_select(0, rows), scales, offsets.flatten(1).index_select(0, rows)], dim=1)
+        soft = mask_logits.index_select(0, rows).sigmoid_()
+        weights = None if mask_weights is None else mask_weights.index_select(0, rows)
+        weighted = soft if weights is None else soft * weights
+        ctx.save_for_backward(rows, scales, soft, weights)
+        ctx.shapes = [t.shape for t in (features, log_scales, offsets, mask_logits)]
+        return values, (weighted > threshold).to(soft.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_values: Tensor, to_masks: Tensor) -> tuple[Tensor | None, ...]:
+        rows, scales, soft, weights = ctx.saved_tensors
+        shapes = ctx.shapes
+        widths = [shapes[0][1], 6, shapes[2][1] * shapes[2][2]]
+        to_features, to_scales, to_offsets = torch.split(to_values, widths, dim=1)
+        to_soft = torch.ops.aten.sigmoid_backward(to_masks if weights is None else to_masks * weights, soft)
+        sources = (to_features, to_scales * scales, to_offsets.reshape(-1, *shapes[2][1:]), to_soft)
+        found = [s.new_zeros(shape).index_copy_(0, rows, s) for s, shape in zip(sources, shapes, strict=True)]
+        return None, *found, None, None
+
+
+def take_rows(rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+    """Rows [S] (int64, each at most once) of each tensor; differentiable."""
+    found: tuple[Tensor, ...] = _TakeRows.apply(rows, *tensors)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _TakeRows(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
+        ctx.save_for_backward(rows)
+        ctx.count = len(tensors[0])
+        return tuple(t.index_select(0, rows) for t in tensors)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        (rows,) = ctx.saved_tensors
+        return None, *(
+            g.new_zeros(ctx.count, *g.shape[1:]).index_copy_(0, rows, g) if needed else None
+            for g, needed in zip(grads, ctx.needs_input_grad[1:], strict=True)
+        )
+
+
+def widen(steps: Tensor, group: Tensor, one_hot: Tensor) -> Tensor:
+    """Steps [V,3] of the groups, one for each column: [V,C].
+
+    group       [C] int64: the group of each column
+    one_hot     [C,3] the same as zeros and ones
+    """
+    found: Tensor = _Widen.apply(steps, group, one_hot)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _Widen(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, steps: Tensor, group: Tensor, one_hot: Tensor) -> Tensor:
+        ctx.save_for_backward(one_hot)
+        return steps.index_select(1, group)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        (one_hot,) = ctx.saved_tensors
+        return torch.mm(grad, one_hot), None, None
+
+
+def mean_product(scales: Tensor) -> Tensor:
+    """Mean over the rows of scales [M,3] of their product, 0 for none; a scalar, differentiable.
+
+    As `scales.prod(dim=1).mean()`, whose backward looks for zeros and so waits for a GPU.
+    """
+    found: Tensor = _MeanProduct.apply(scales)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _MeanProduct(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, scales: Tensor) -> Tensor:
+        ctx.save_for_backward(scales)
+        x, y, z = scales.unbind(1)
+        total: Tensor = (x * y * z).sum() / max(len(scales), 1)
+        return total
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        (scales,) = ctx.saved_tensors
+        found: Tensor = grad / max(len(scales), 1) * scales.roll(1, 1) * scales.roll(-1, 1)
+        return found

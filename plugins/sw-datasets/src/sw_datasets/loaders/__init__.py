@@ -1,0 +1,1 @@
+"""Readers of scene folders: one module for each layout on disk."""

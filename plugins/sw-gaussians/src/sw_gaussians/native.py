@@ -1,0 +1,17 @@
+"""The native module of training Gaussians: sparse Adam on the CPU, gradient statistics on CUDA."""
+
+from __future__ import annotations
+
+from splatwizard_core.api import NativeModule
+
+GAUSSIANS = NativeModule(
+    name="splatwizard_gaussians",
+    package="sw_gaussians",
+    sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
+    kernels=("kernels/sparse_adam.cpp",),
+    headers=("kernels/*.h", "kernels/cuda/*.h"),
+    cuda_sources=("kernels/cuda/statistics.cu",),
+    cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
+    seconds=10,
+    without="sparse Adam and the gradient statistics run on torch operations: the same numbers, slower",
+)

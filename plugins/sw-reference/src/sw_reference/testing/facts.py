@@ -1,0 +1,54 @@
+"""One fact about rasterizers as a function that can be called, and the steps that such functions share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, RasterOptions, RenderResult
+from sw_reference.testing.raster_scenes import with_tensors
+
+CheckFunction = Callable[[Rasterizer, str], None]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One fact; call it with the rasterizer and the device to run on. Raises AssertionError."""
+
+    function: CheckFunction
+    needs: frozenset[str]
+
+    def __call__(self, rasterizer: Rasterizer, device: str = "cpu") -> None:
+        self.function(rasterizer, device)
+
+    def __str__(self) -> str:
+        return self.function.__name__
+
+
+CHECKS: list[Check] = []
+"""Every fact, in the order in which the modules that state them are imported."""
+
+
+def check(*needs: str) -> Callable[[CheckFunction], CheckFunction]:
+    """Add a function to the list; `needs` are names of features."""
+
+    def add(function: CheckFunction) -> CheckFunction:
+        CHECKS.append(Check(function, frozenset(needs)))
+        return function
+
+    return add
+
+
+def draw(rasterizer: Rasterizer, device: str, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
+    """Render on `device`; results come back as they are."""
+    moved = with_tensors(g, {name: x.to(device) for name, x in g.tensors().items()})
+    return rasterizer.render(moved, cam.to(device), opt)
+
+
+def close(actual: Tensor, expected: Tensor | float, *, atol: float = 1e-5, rtol: float = 1e-5) -> None:
+    """Values agree; devices and dtypes do not matter."""
+    wanted = torch.as_tensor(expected, dtype=torch.float64).detach().cpu()
+    torch.testing.assert_close(actual.detach().double().cpu(), wanted.expand(actual.shape), atol=atol, rtol=rtol)

@@ -1,0 +1,89 @@
+"""Facts that installed packages declare in their registry entries: how metrics are written, published data sets.
+
+A record may name a metric, a data set or a method that is not installed here: it is then shown by its name, and
+nothing more is known of it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from splatwizard_core.tooling import load_plugins
+
+
+@dataclass(frozen=True)
+class MetricStyle:
+    """Spelling of one metric: its name in tables, its unit, its decimals.
+
+    label       as papers write it; the metric's name if nothing is declared
+    unit        "dB", or nothing
+    digits      decimals in tables
+    position    place in tables, smaller first; infinite if nothing is declared
+    """
+
+    label: str
+    unit: str = ""
+    digits: int = 4
+    position: float = math.inf
+
+    @property
+    def heading(self) -> str:
+        """Label and unit."""
+        return f"{self.label} {self.unit}".strip()
+
+
+@dataclass(frozen=True)
+class DatasetFacts:
+    """A published data set.
+
+    title       as papers write it
+    scenes      those of published tables; empty: any
+    prefix      what folders may have before the name of a scene ("scan" before DTU's "24")
+    """
+
+    title: str
+    scenes: tuple[str, ...] = ()
+    prefix: str = ""
+
+    def scene_of(self, folder: str) -> str:
+        """Name of the scene in a folder: the published one that is meant, else the folder's own name."""
+        bare = folder.removeprefix(self.prefix) if self.prefix else folder
+        return bare if bare in self.scenes else folder
+
+
+def metric_style(name: str) -> MetricStyle:
+    """Spelling of a metric, as its entry declares it; names are compared without case, and with `-` and `_` alike."""
+    metrics = load_plugins().metrics
+    key = metric_key(name)
+    declared: Mapping[str, Any] = metrics.entry(key).declared if key in metrics else {}
+    digits, position = declared.get("digits"), declared.get("position")
+    return MetricStyle(
+        str(declared.get("label", name)),
+        str(declared.get("unit", "")),
+        digits if isinstance(digits, int) and 0 <= digits < 16 else MetricStyle.digits,
+        position if isinstance(position, (int, float)) else math.inf,
+    )
+
+
+def metric_key(name: str) -> str:
+    """Name of a metric as the registry spells it."""
+    return name.lower().replace("-", "_")
+
+
+def dataset_facts(name: str) -> DatasetFacts:
+    """Title and published scenes of a data set."""
+    datasets = load_plugins().datasets
+    declared: Mapping[str, Any] = datasets.entry(name).declared if name in datasets else {}
+    scenes = declared.get("table_scenes", declared.get("scenes", ()))
+    return DatasetFacts(str(declared.get("title", name)), tuple(map(str, scenes)), str(declared.get("prefix", "")))
+
+
+def bd_anchor_rank(method: str) -> float:
+    """Rank of a method among those that BD-rates usually compare against, smallest first; infinite for others."""
+    methods = load_plugins().methods
+    declared: Mapping[str, Any] = methods.entry(method).declared if method in methods else {}
+    rank = declared.get("bd_anchor")
+    return rank if isinstance(rank, (int, float)) else math.inf

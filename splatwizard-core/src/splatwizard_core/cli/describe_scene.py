@@ -1,0 +1,60 @@
+"""Facts of a scene as plain values, for `sw info SCENE`."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from typing import Any
+
+from splatwizard_core.scene.scene import Scene
+
+
+def describe(scene: Scene) -> dict[str, Any]:
+    """Collect facts of a scene that can be printed as JSON; no picture is decoded.
+
+    name, path, dataset, protocol (its id), named_protocol ("survey", "inria", "custom"), background, split     text
+    views           {"train": n, "test": n}
+    resolutions     [{"width", "height", "views"}], most frequent first
+    cameras         {"intrinsics": how many differ, "fov_x_deg": [min, max], "fov_y_deg": [min, max]}
+    points          {"count", "colours": bool, "min": [3], "max": [3]} or None
+    extent          world units, from the training cameras
+    masks, ground_truth, warnings
+    """
+    views = list(scene.train)
+    seen = {id(view) for view in views}
+    views += [view for view in scene.test if id(view) not in seen]
+    cameras = [view.camera for view in views]
+    sizes = Counter((c.width, c.height) for c in cameras)
+    points = scene.points
+    return {
+        "name": scene.name,
+        "path": scene.path,
+        "dataset": scene.protocol.dataset,
+        "protocol": scene.protocol.id,
+        "named_protocol": scene.protocol.name,
+        "background": scene.protocol.background,
+        "split": scene.protocol.split,
+        "views": {"train": len(scene.train), "test": len(scene.test)},
+        "resolutions": [{"width": w, "height": h, "views": n} for (w, h), n in sizes.most_common()],
+        "cameras": {
+            "intrinsics": len({(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in cameras}),
+            "fov_x_deg": _range([c.fov_x for c in cameras], 180 / math.pi),
+            "fov_y_deg": _range([c.fov_y for c in cameras], 180 / math.pi),
+        },
+        "points": None
+        if points is None
+        else {
+            "count": len(points),
+            "colours": points.rgb is not None,
+            "min": points.xyz.amin(0).tolist() if len(points) else None,
+            "max": points.xyz.amax(0).tolist() if len(points) else None,
+        },
+        "extent": scene.extent,
+        "masks": sum(view.load_mask is not None for view in views),
+        "ground_truth": sorted(scene.ground_truth),
+        "warnings": list(scene.warnings),
+    }
+
+
+def _range(values: list[float], factor: float) -> list[float]:
+    return [round(min(values) * factor, 3), round(max(values) * factor, 3)]

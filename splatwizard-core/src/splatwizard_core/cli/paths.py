@@ -1,0 +1,55 @@
+"""Paths that commands take, checked before the work and not after it. All raise UserInputError."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+from splatwizard_core.errors import UserInputError
+
+
+def existing(path: str) -> Path:
+    """A path that must be there."""
+    found = Path(path)
+    if not found.exists():
+        raise UserInputError(f"{path}: there is no such file or folder")
+    return found
+
+
+def existing_file(path: str) -> Path:
+    """A file that must be there; of a run directory the error names the file inside."""
+    found = existing(path)
+    if found.is_dir():
+        inside = found / "scene.swz"
+        hint = f"the file in it is {inside}" if inside.is_file() else "name the .swz or .ply in it"
+        raise UserInputError(f"{path} is a folder, and this command takes a file: {hint}")
+    return found
+
+
+def output_file(path: str | Path) -> Path:
+    """A path that a file can be written to."""
+    target = Path(path)
+    if target.is_dir():
+        raise UserInputError(f"{path} is a folder: give the name of a file in it")
+    if not target.parent.is_dir():
+        raise UserInputError(f"cannot write {path}: there is no folder {target.parent}")
+    _check_writable(target.parent, f"cannot write {path}")
+    return target
+
+
+def output_folder(path: str | Path) -> Path:
+    """A folder that files can be written to, there or not; whoever writes the first file makes it."""
+    target = Path(path)
+    nearest = next(place for place in (target, *target.absolute().parents) if place.exists())
+    if nearest == target and not target.is_dir():
+        raise UserInputError(f"cannot write into {path}: it is a file, not a folder")
+    _check_writable(nearest, f"cannot write into {path}")
+    return target
+
+
+def _check_writable(folder: Path, told: str) -> None:
+    """Find out by writing whether a file can be written into a folder that is there."""
+    try:
+        tempfile.TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise UserInputError(f"{told}: {folder}: {error.strerror}") from None

@@ -1,0 +1,147 @@
+"""Capabilities of rasterizers, and which of them a request needs."""
+
+from __future__ import annotations
+
+import enum
+import functools
+import itertools
+import operator
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from splatwizard_core.gaussians.inputs import GaussianInputs
+    from splatwizard_core.rendering.rasterizer import RasterOptions
+
+
+class Feature(enum.Flag):
+    """Capabilities of a rasterizer; registry entries spell them as strings of the same names."""
+
+    BACKWARD = enum.auto()
+    ANTIALIAS = enum.auto()
+    ABSGRAD = enum.auto()
+    VISIBLE_FILTER = enum.auto()
+    COV3D = enum.auto()
+    COLORS_ND = enum.auto()
+    EXTRA_FEATURES = enum.auto()
+    SPLIT_SH = enum.auto()
+    INDEXED_SH = enum.auto()
+    INDEXED_GEOM = enum.auto()
+    NO_COLOR_CLAMP = enum.auto()
+    DEPTH_INVERSE = enum.auto()
+    DEPTH_ACCUM = enum.auto()
+    DEPTH_EXPECTED = enum.auto()
+    DEPTH_MEDIAN = enum.auto()
+    ALPHA_MAP = enum.auto()
+    NORMALS = enum.auto()
+    DISTORTION = enum.auto()
+    SURFEL = enum.auto()
+    SCORE_HITS = enum.auto()
+    SCORE_OPACITY = enum.auto()
+    SCORE_OPACITY_T = enum.auto()
+    SCORE_BLEND = enum.auto()
+    SCORE_BLEND_MAX = enum.auto()
+    SCORE_GAMMA = enum.auto()
+    SCORE_DIST = enum.auto()
+    SCORE_PIXEL_WEIGHT = enum.auto()
+    SCORE_GRAD_SQ = enum.auto()
+    FISHER = enum.auto()
+    TIGHT_TILES = enum.auto()
+    FLOAT64 = enum.auto()
+    DETERMINISTIC = enum.auto()
+    UINT8_OUT = enum.auto()
+
+    @property
+    def names(self) -> frozenset[str]:
+        """{"BACKWARD", ...}: as registry entries spell them."""
+        return _names(self)
+
+    @classmethod
+    def asked_by(cls, opt: RasterOptions, g: GaussianInputs | None = None) -> Feature:
+        """The features that drawing `g` with `opt` needs; without `g`, those that the options alone ask for.
+
+        Raises ValueError for an option value that no rasterizer knows.
+        """
+        asked: Feature | None = vars(opt).get("_asked")  # options do not change, and every step of a training asks
+        if asked is None:
+            asked = vars(opt)["_asked"] = _of_options(opt)
+        return asked if g is None else _union(asked, (*_shape_traits(g), *_other_traits(g)))
+
+    @classmethod
+    def geometry_of(cls, g: GaussianInputs) -> Feature:
+        """The features that reading the shapes of `g` needs, whatever is drawn."""
+        return _union(cls(0), _shape_traits(g))
+
+
+def _shape_traits(g: GaussianInputs) -> tuple[bool, ...]:
+    return (
+        g.cov3d is not None,
+        g.geom_indices is not None or g.scale_factors is not None,
+        g.scales is not None and g.scales.shape[-1] == 2,
+        g.means.dtype == torch.float64,
+    )
+
+
+def _other_traits(g: GaussianInputs) -> tuple[bool, ...]:
+    return (
+        g.requires_grad(),
+        g.features is not None,
+        g.colors is not None and g.colors.shape[-1] != 3,
+        g.sh is not None and g.sh.codebook is not None,
+        g.sh is not None and g.sh.dc is not None,
+    )
+
+
+_TRAITS = (
+    Feature.COV3D, Feature.INDEXED_GEOM, Feature.SURFEL, Feature.FLOAT64,
+    Feature.BACKWARD, Feature.EXTRA_FEATURES, Feature.COLORS_ND, Feature.INDEXED_SH, Feature.SPLIT_SH,
+)  # fmt: skip
+"""The features that the traits of inputs stand for, in their order."""
+_DEPTHS = {
+    "inverse": Feature.DEPTH_INVERSE,
+    "accumulated": Feature.DEPTH_ACCUM,
+    "expected": Feature.DEPTH_EXPECTED,
+    "median": Feature.DEPTH_MEDIAN,
+}
+_SCORES = {
+    kind: Feature[f"SCORE_{kind.upper()}"]
+    for kind in ("hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq")
+}
+
+
+@functools.cache
+def _names(features: Feature) -> frozenset[str]:
+    return frozenset(f.name for f in Feature if f in features and f.name is not None)
+
+
+@functools.cache  # a training asks for the same at every step, and `|` of flags is slow
+def _union(asked: Feature, traits: tuple[bool, ...]) -> Feature:
+    return functools.reduce(operator.or_, itertools.compress(_TRAITS, traits), asked)
+
+
+def _of_options(opt: RasterOptions) -> Feature:
+    if opt.dtype_out not in ("float32", "uint8"):
+        raise ValueError(f"dtype_out is '{opt.dtype_out}': one of float32, uint8")
+    for known, what, asked in (
+        (_DEPTHS, "depth mode", opt.depth),
+        (_SCORES, "score kind", [spec.kind for spec in opt.scores]),
+    ):
+        for name in asked:
+            if name not in known:
+                raise ValueError(f"unknown {what} '{name}': one of {', '.join(known)}")
+    needed = (
+        (opt.antialias, Feature.ANTIALIAS),
+        (opt.absgrad, Feature.ABSGRAD),
+        (opt.normals, Feature.NORMALS),
+        (opt.distortion, Feature.DISTORTION),
+        (opt.alpha, Feature.ALPHA_MAP),
+        (not opt.clamp_color, Feature.NO_COLOR_CLAMP),
+        (opt.fisher, Feature.FISHER),
+        (opt.dtype_out == "uint8", Feature.UINT8_OUT),
+        (opt.grad2d, Feature.BACKWARD),
+        (any(spec.pixel_weight is not None for spec in opt.scores), Feature.SCORE_PIXEL_WEIGHT),
+        *((True, _DEPTHS[mode]) for mode in opt.depth),
+        *((True, _SCORES[spec.kind]) for spec in opt.scores),
+    )
+    return functools.reduce(operator.or_, (feature for asked, feature in needed if asked), Feature(0))

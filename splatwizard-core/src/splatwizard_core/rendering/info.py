@@ -1,0 +1,197 @@
+"""The declaration of a rasterizer in its registry entry, and the checks that hold a request against it."""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from splatwizard_core.errors import CapabilityError, ConfigError, PluginError, ShapeError
+from splatwizard_core.plugins.registry import Entry, Registry
+from splatwizard_core.rendering.features import Feature
+
+if TYPE_CHECKING:
+    from splatwizard_core.gaussians.inputs import GaussianInputs
+    from splatwizard_core.rendering.rasterizer import RasterOptions
+
+
+@dataclass(frozen=True)
+class DeviceInfo:
+    """Differences of a rasterizer on one device: features it lacks there, another probe, another speed."""
+
+    lacks: frozenset[str] = frozenset()
+    available: str | None = None
+    speed: int | None = None
+
+
+@dataclass(frozen=True)
+class RasterizerInfo:
+    """Declaration of one rasterizer: where it runs, which features it offers, how exact and how fast it is.
+
+    available       "module:function" of a cheap probe () -> str | None, the reason why it cannot run here;
+                    it must not compile anything. None: always available
+    exactness       "exact", "tight" (differs only by the classic clipping), "approx-fp16", "approx-uint8"
+    speed           rank within a device, higher is faster; 0: an oracle, which serves where nothing else can
+    min_cc          lowest CUDA compute capability
+    needs           features that every request must hold: a rasterizer of surfels draws nothing else
+    profiles        sets of constants and quirks that `RasterOptions.profile` may name
+    per_device      device -> what is different there; see `on`
+    """
+
+    name: str
+    devices: frozenset[str]
+    dtypes: frozenset[str]
+    features: frozenset[str]
+    available: str | None = None
+    combos_forbidden: tuple[frozenset[str], ...] = ()
+    exactness: str = "exact"
+    speed: int = 0
+    min_cc: tuple[int, int] | None = None
+    needs: frozenset[str] = frozenset()
+    profiles: tuple[str, ...] = ()
+    per_device: Mapping[str, DeviceInfo] = field(default_factory=dict)
+
+    @classmethod
+    def declared(cls, hook: Callable[[Registry[Any]], None], name: str) -> RasterizerInfo:
+        """The declaration of one rasterizer in a plugin's `register_rasterizers`, for its class to show."""
+        registry: Registry[Any] = Registry("rasterizer")
+        hook(registry)
+        return cls.from_entry(registry.entry(name))
+
+    @classmethod
+    def from_entry(cls, entry: Entry) -> RasterizerInfo:
+        """The declaration in a registry entry. Raises PluginError for an unknown feature or a field of another kind."""
+        declared = entry.declared
+        features = frozenset(declared.get("features", ()))
+        unknown = sorted(features - {f.name for f in Feature})
+        if unknown:
+            raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} declares unknown features {unknown}")
+        min_cc = declared.get("min_cc")
+        try:
+            return cls(
+                name=entry.name,
+                devices=frozenset(declared.get("devices", ("cpu",))),
+                dtypes=frozenset(declared.get("dtypes", ("float32",))),
+                features=features,
+                available=declared.get("available"),
+                combos_forbidden=tuple(frozenset(combo) for combo in declared.get("combos_forbidden", ())),
+                exactness=declared.get("exactness", "exact"),
+                speed=int(declared.get("speed", 0)),
+                min_cc=None if min_cc is None else (int(min_cc[0]), int(min_cc[1])),
+                needs=frozenset(declared.get("needs", ())),
+                profiles=tuple(declared.get("profiles", ())),
+                per_device={
+                    device: DeviceInfo(frozenset(there.get("lacks", ())), there.get("available"), there.get("speed"))
+                    for device, there in declared.get("on", {}).items()
+                },
+            )
+        except (TypeError, ValueError, IndexError, AttributeError) as error:
+            raise PluginError(
+                f"rasterizer '{entry.name}' of {entry.distribution} is declared wrongly: {error}"
+            ) from error
+
+    def on(self, device: str) -> RasterizerInfo:
+        """The declaration for one kind of device ("cpu", "cuda")."""
+        here = self.per_device.get(device)
+        if here is None:
+            return self
+        known: dict[str, RasterizerInfo] = vars(self).setdefault("_on", {})  # asked for at every render
+        if device not in known:
+            known[device] = replace(
+                self,
+                features=self.features - here.lacks,
+                available=here.available or self.available,
+                speed=self.speed if here.speed is None else here.speed,
+                per_device={},
+            )
+        return known[device]
+
+    def obstacle(self, device: torch.device | str) -> str | None:
+        """The reason why it cannot run on `device`, as its own probe says, or None; compiles nothing.
+
+        Raises what the probe raises.
+        """
+        device = torch.device(device)
+        here = self.on(device.type)
+        if here.min_cc is not None and device.type == "cuda":
+            capability = torch.cuda.get_device_capability(device)
+            if capability < here.min_cc:
+                return f"it needs compute capability {here.min_cc}, this GPU has {capability}"
+        if here.available is None:
+            return None
+        module, _, function = here.available.partition(":")
+        probe: Callable[[], str | None] = getattr(importlib.import_module(module), function)
+        return probe()
+
+    def check_request(self, g: GaussianInputs, opt: RasterOptions) -> None:
+        """Hold a request to draw `g` with `opt` against the declaration; every rasterizer calls it first.
+
+        Raises ShapeError for inputs that do not fit together, CapabilityError for a feature or a device, ConfigError
+        for a profile or another option.
+        """
+        g.validate()
+        self.on(g.means.device.type).check_offered(Feature.asked_by(opt, g))
+        if opt.profile and opt.profile not in self.profiles:
+            raise ConfigError(
+                f"rasterizer '{self.name}' knows no profile '{opt.profile}'; one of "
+                f"{', '.join(self.profiles) or 'none'}",
+                key="raster.profile",
+            )
+        if opt.clamp_grad not in ("exact", "pass"):
+            raise ConfigError(f"clamp_grad is '{opt.clamp_grad}', must be 'exact' or 'pass'")
+        self._check_placement(g)
+
+    def check_geometry(self, g: GaussianInputs) -> None:
+        """Hold a request for `visible_filter` against the declaration: as `check_request`, of shapes alone."""
+        g.validate()
+        self.on(g.means.device.type).check_offered(Feature.VISIBLE_FILTER | Feature.geometry_of(g))
+        self._check_placement(g)
+
+    def check_offered(self, asked: Feature) -> None:
+        """Raise CapabilityError unless everything in `asked` is declared, together and with what `needs` names."""
+        wanted = asked.names
+        missing = wanted - self.features
+        if missing:
+            raise CapabilityError(
+                f"rasterizer '{self.name}' does not offer {', '.join(sorted(missing))}; "
+                "`sw list-plugins` shows which one does",
+                missing=missing,
+            )
+        if not self.needs <= wanted:
+            raise CapabilityError(
+                f"rasterizer '{self.name}' draws nothing without {', '.join(sorted(self.needs - wanted))}; "
+                "`sw list-plugins` shows which one draws the rest",
+                missing=frozenset(),
+            )
+        for combo in self.combos_forbidden:
+            if combo <= wanted:
+                raise CapabilityError(
+                    f"rasterizer '{self.name}' does not offer {' and '.join(sorted(combo))} together", missing=combo
+                )
+
+    def _check_placement(self, g: GaussianInputs) -> None:
+        """All tensors share a kind of device and a dtype that are declared (GaussianInputs.validate: one device)."""
+        if g.means.device.type not in self.devices:
+            raise CapabilityError(
+                f"rasterizer '{self.name}' draws on {', '.join(sorted(self.devices))}, "
+                f"the Gaussians are on {g.means.device}",
+                missing=(),
+            )
+        dtype = g.means.dtype
+        for name, tensor in g.tensors().items():
+            if tensor.is_floating_point() and (tensor.dtype != dtype or _dtype_name(dtype) not in self.dtypes):
+                raise ShapeError(
+                    f"rasterizer '{self.name}' needs all tensors in one dtype of {', '.join(sorted(self.dtypes))}: "
+                    f"{name} is {_dtype_name(tensor.dtype)}"
+                    + (f", means {_dtype_name(dtype)}" if name != "means" else "")
+                )
+
+
+@functools.cache
+def _dtype_name(dtype: torch.dtype) -> str:
+    """As declared: "float32", ..."""
+    return str(dtype).removeprefix("torch.")

@@ -1,0 +1,206 @@
+"""Decode a model from a file and nothing else: by the method that its header names, timed by the protocol."""
+
+from __future__ import annotations
+
+import json
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
+from splatwizard_core.evaluation.speed import Spread, spread
+from splatwizard_core.files import replacing
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import MemoryMeter, synchronize
+from splatwizard_core.method import Method
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.progress import track
+from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
+
+REPEATS = 3
+
+
+@dataclass(frozen=True)
+class DecodeReport:
+    """Facts and times of decoding a file.
+
+    digest              of the model; equal models have equal digests
+    decode_s            median of `decode_runs_s`: from opening the file to a model on the device
+    decode_spread       how much the timed decodes differ; None for fewer than two
+    first_decode_s      of the decode before the timed ones, which imports what is imported late
+    jit_s               loading (or compiling) the native modules, before all decodes
+    peak_bytes          memory growth over the first decode; `memory_kind` says of what
+    """
+
+    method: str
+    method_version: int
+    digest: str
+    counts: dict[str, int]
+    bytes: int
+    sections: dict[str, int]
+    raster: dict[str, Any]
+    decode_s: float
+    decode_runs_s: list[float]
+    decode_spread: Spread | None
+    first_decode_s: float
+    jit_s: float
+    peak_bytes: int
+    memory_kind: str
+    device: str
+
+    def as_dict(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
+    """Return the decoded model, ready to render on `device`, and the file it came from.
+
+    Raises BitstreamError for a damaged file, PluginError if something that it needs is not installed.
+    """
+    reader = ContainerReader.open(path)
+    return decode_model(reader, plugins).to(device).eval().requires_grad_(False), reader
+
+
+def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
+    """Return the model in a parsed file, on the CPU. Raises as `open_model`."""
+    method_class = _method_of(reader, plugins)
+    if reader.version > method_class.version:
+        entry = plugins.methods.entry(reader.method)
+        raise BitstreamError(
+            f"{reader.name}: version {reader.version} of the layout of '{reader.method}' is newer than "
+            f"{method_class.version}, which {entry.distribution} {entry.version} reads: upgrade it with "
+            f"{upgrade_command(reader, entry.distribution, entry.version)}"
+        )
+    try:
+        with torch.no_grad():
+            model = method_class(plugins, None).decode(reader)
+    except PluginError as error:
+        # Asked for only now: what helped to write the file may have nothing to do with reading it.
+        if error.kind is None or error.name is None:
+            raise
+        raise missing_plugin(reader, plugins, error.kind, error.name) from error
+    except BitstreamError as error:
+        newer = newer_than_installed(reader, plugins)
+        if not newer:
+            raise
+        told = "; ".join(f"{each.distribution} {each.version}, installed is {have}" for each, have in newer)
+        wanted = " ".join(f"'{each.distribution}>={each.version}'" for each, _ in newer)
+        raise BitstreamError(
+            f"{error} (the file was written with {told}: pip install {wanted})", section=error.section
+        ) from error
+    return model
+
+
+def import_method(path: str | Path, plugins: PluginManager) -> None:
+    """Import the method that a file names, so that its code counts neither as memory nor as time of what follows."""
+    _method_of(ContainerReader.open(path), plugins)
+
+
+def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
+    """Return the class of the method that wrote a file. Raises PluginError that says what to install."""
+    name, methods = reader.method, plugins.methods
+    if name in methods or name in methods.clashes:
+        return methods.load(name)
+    raise missing_plugin(reader, plugins, "method", name)
+
+
+def timed_decode(
+    path: str | Path,
+    plugins: PluginManager,
+    device: torch.device,
+    *,
+    repeats: int = REPEATS,
+    load_kernels: Callable[[], None] | None = None,
+) -> tuple[SplatModel, DecodeReport]:
+    """Decode once untimed and `repeats` times timed.
+
+    load_kernels    () -> every native module is loaded or compiled; before everything else, timed apart
+
+    Raises SplatwizardError if two decodes give different models.
+    """
+
+    def once() -> tuple[SplatModel, ContainerReader, float]:
+        synchronize(device)
+        began = time.perf_counter()
+        model, reader = open_model(path, plugins, device)
+        synchronize(device)
+        return model, reader, time.perf_counter() - began
+
+    import_method(path, plugins)
+    began = time.perf_counter()
+    if load_kernels is not None:
+        load_kernels()
+    jit_s = time.perf_counter() - began
+    meter = MemoryMeter(device)
+    meter.start()
+    with track(f"decode {Path(path).name}", total=1 + repeats) as bar:
+        model, reader, first = once()
+        peak = meter.peak_bytes()
+        digest = model.digest()
+        bar.advance()
+        runs: list[float] = []
+        for _ in range(repeats):
+            del model
+            model, reader, seconds = once()
+            runs.append(seconds)
+            bar.advance()
+    if model.digest() != digest:
+        raise SplatwizardError(
+            f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
+        )
+    return model, DecodeReport(
+        method=reader.method,
+        method_version=reader.version,
+        digest=digest,
+        counts=model.counts(),
+        bytes=reader.size,
+        sections={"header": reader.header_bytes, **reader.sections},
+        raster=reader.raster,
+        decode_s=statistics.median(runs) if runs else first,
+        decode_runs_s=runs,
+        decode_spread=spread(runs) if len(runs) > 1 else None,
+        first_decode_s=first,
+        jit_s=jit_s,
+        peak_bytes=peak,
+        memory_kind=meter.kind,
+        device=str(device),
+    )
+
+
+def save_decoded(model: SplatModel, report: DecodeReport, path: Path, plugins: PluginManager) -> None:
+    """Keep a decoded model: `.safetensors` holds its tensors and says what they are, any other suffix is an exporter's.
+
+    Raises UserInputError if no exporter writes such files.
+    """
+    if path.suffix != ".safetensors":
+        export_model(model, path, plugins)
+        return
+    from safetensors.torch import save_file
+
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
+    told = {"method": report.method, "digest": report.digest, "extra": json.dumps(model.state_dict_extra())}
+    with replacing(path) as temporary:
+        save_file(tensors, temporary, metadata=told)
+
+
+def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: str | None = None) -> str:
+    """Write an interchange format; returns the name of the exporter.
+
+    name    of the exporter; None: the one whose declared suffix `path` has
+
+    Raises UserInputError if there is none, or if the model has no such form.
+    """
+    if name is None:
+        suffixes = {str(e.declared.get("suffix", "")): e.name for e in plugins.exporters}
+        name = suffixes.get(path.suffix)
+        if name is None:
+            known = ", ".join(f"{suffix} ({exporter})" for suffix, exporter in sorted(suffixes.items()) if suffix)
+            raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
+    plugins.exporters.load(name)(model, path)
+    return name

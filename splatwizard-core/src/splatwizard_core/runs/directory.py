@@ -1,0 +1,107 @@
+"""A run directory: its place, its files, and the log of the steps that are finished in it."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.errors import SceneError
+from splatwizard_core.files import remove_folder, sweep, write_atomic, write_json
+from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.record import FILE_NAME
+
+STEPS = "steps.json"
+CHECKPOINTS = "checkpoints"
+CONFIG = "config.toml"
+LOG = "log.jsonl"
+ENCODED = "scene.swz"
+RENDERS = "renders"
+# A file that says that something is finished goes first when a directory is cleared.
+OWN_FILES = (STEPS, FILE_NAME, CHECKPOINTS, CONFIG, LOG, ENCODED, RENDERS, "truth", "report.html")
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """One run that is asked for.
+
+    out         root of all run directories
+    resume      use the finished steps and checkpoints that are there; False: discard them
+    allow_changed_plan  resume although the plan or configuration differs from the checkpoint's
+    repeats     how often rendering speed is measured; decoding is timed as often, and at least three times
+    """
+
+    resolved: ResolvedConfig
+    out: Path
+    resume: bool = True
+    allow_changed_plan: bool = False
+    repeats: int = 1
+
+
+class StepLog:
+    """The finished steps of a run directory, each with the key of its inputs and the facts that came out.
+
+    A step counts as done only under the same key, so that changed inputs do it again.
+    """
+
+    def __init__(self, directory: Path) -> None:
+        self.path = directory / STEPS
+        self._steps: dict[str, Any] = {}
+        try:
+            content = json.loads(self.path.read_text())
+        except (OSError, ValueError):
+            return  # none yet, or damaged: then the steps are done again
+        if isinstance(content, dict):
+            self._steps = {k: v for k, v in content.items() if isinstance(v, dict) and {"key", "facts"} <= set(v)}
+
+    def done(self, step: str, key: str) -> dict[str, Any] | None:
+        """Return the facts of a finished step, or None if it was not done from these inputs."""
+        found = self._steps.get(step)
+        return found["facts"] if found is not None and found["key"] == key else None
+
+    def finish(self, step: str, key: str, facts: dict[str, Any]) -> None:
+        """Remember a finished step."""
+        self._steps[step] = {"key": key, "facts": facts}
+        write_json(self.path, self._steps)
+
+
+def run_directory(request: RunRequest) -> Path:
+    """Return out/<scene>/<method>/<rate>. Raises SceneError for a scene whose folder's name is not UTF-8."""
+    resolved = request.resolved
+    scene = resolved.absolute_scene
+    try:
+        scene.encode()  # config.toml and the record name it
+    except UnicodeEncodeError:
+        shown = os.fsencode(scene).decode(errors="replace")
+        raise SceneError(
+            f"scene '{shown}': the name of its folder, or the locale, is not UTF-8: rename it, or set LC_ALL=C.UTF-8",
+            path=shown,
+        ) from None
+    return request.out / Path(scene).name.replace(":", "-") / resolved.method / resolved.rate
+
+
+def begin(directory: Path, request: RunRequest) -> None:
+    """Clear what is to be cleared, and what a killed process left half written."""
+    for folder in (directory, *(path for path in map(directory.joinpath, OWN_FILES) if path.is_dir())):
+        sweep(folder)
+    if not request.resume:
+        discard(directory)
+    if not (directory / CONFIG).exists():
+        write_config(directory, request.resolved)
+
+
+def write_config(directory: Path, resolved: ResolvedConfig) -> None:
+    """Write config.toml, which repeats the run. A changed one replaces it only once its training is accepted."""
+    write_atomic(directory / CONFIG, resolved.toml())
+
+
+def discard(directory: Path) -> None:
+    """Remove what a run wrote; anything else in the directory stays."""
+    for name in OWN_FILES:
+        path = directory / name
+        if path.is_dir() and not path.is_symlink():
+            remove_folder(path)
+        else:
+            path.unlink(missing_ok=True)

@@ -1,0 +1,127 @@
+"""Encode a trained model into one file: from a run directory, or from a .ply."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from splatwizard_core.coding.container import ContainerWriter
+from splatwizard_core.coding.requirements import Requirement
+from splatwizard_core.errors import SplatwizardError, UserInputError
+from splatwizard_core.evaluation.evaluate import raster_header
+from splatwizard_core.files import file_sha256
+from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.memory import synchronize
+from splatwizard_core.method import Method
+from splatwizard_core.plugins import Entry
+from splatwizard_core.plugins.catalogue import CORE
+from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.phases import part_of, unique
+from splatwizard_core.runs.pretrained import make_method, training_key
+from splatwizard_core.runs.session import Session, TrainedModel
+from splatwizard_core.runs.training import cached_directory, finished_directory, train
+from splatwizard_core.runs.versions import made_by
+
+NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
+"""Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""
+
+
+def encode(
+    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, device: torch.device
+) -> dict[str, Any]:
+    """Write one file; returns the facts of the encoding, for the record and for what is done again later.
+
+    raster  what the header asks of a rasterizer
+    device  where the model is
+
+    The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
+    """
+    before = model.digest()
+    synchronize(device)
+    began = time.perf_counter()
+    writer = ContainerWriter(method.name, method.version, raster=raster)
+    with torch.no_grad(), method.plugins.recording() as loaded:
+        method.encode(model, writer)
+    loaded += [method.plugins.registries[kind].entry(name) for kind, name in writer.required]
+    if method.name in method.plugins.methods:
+        loaded.insert(0, method.plugins.methods.entry(method.name))
+    writer.requires = requirements(loaded)
+    size = writer.write(path)
+    synchronize(device)
+    seconds = time.perf_counter() - began
+    if model.digest() != before:
+        raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
+    return {
+        "encode_s": seconds,
+        "bytes": size,
+        "sha256": file_sha256(path),
+        "made_by": made_by(method.plugins, loaded),
+        "parts": unique(part_of(entry) for entry in loaded),
+    }
+
+
+def requirements(entries: Iterable[Entry]) -> list[Requirement]:
+    """List what a reader needs for a file that these entries wrote: the core first, each distribution once."""
+    versions = {CORE: importlib.metadata.version(CORE)}
+    provided: dict[str, dict[tuple[str, str], None]] = {CORE: {}}
+    for entry in entries:
+        if entry.distribution and entry.version and entry.kind in NEEDED_KINDS:
+            versions[entry.distribution] = entry.version
+            provided.setdefault(entry.distribution, {})[entry.kind, entry.name] = None
+    # A local version (1.0+cpu) is no lower bound that pip takes.
+    found = [Requirement(name, versions[name].partition("+")[0], tuple(pairs)) for name, pairs in provided.items()]
+    return [each for each in found if each.is_well_formed]  # it is advice: an odd name must not spoil the file
+
+
+def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
+    """Return the finished training of a run directory. Raises UserInputError if it is not finished."""
+    parents = directory.resolve().parents
+    request = RunRequest(resolved, parents[min(2, len(parents) - 1)])  # OUT/<scene>/<method>/<rate>
+    key = training_key(session, resolved)
+    cached = cached_directory(session, resolved, request.out, key)
+
+    def check() -> None:
+        if finished_directory(directory, key, cached) is None:
+            raise UserInputError(
+                f"{directory} holds no finished training of this configuration: `sw train --config "
+                f"{directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
+            )
+
+    check()  # before the lock too, which is a file in the directory
+    with directory_lock(directory, say=session.say):
+        check()
+        return train(session, request, directory)
+
+
+def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
+    """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
+    trained = load_finished(session, resolved, directory)
+    inside = target.resolve().parent == directory.resolve()
+    with directory_lock(directory) if inside else contextlib.nullcontext():
+        method = make_method(session.plugins, resolved)
+        return encode(method, trained.model, trained.facts["raster"], target, session.device)
+
+
+def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
+    """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
+    from splatwizard_core.gaussians.ply import load_ply
+
+    session.load_kernels()
+    if path.suffix != ".ply":
+        raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
+    model = load_ply(path).to(session.device).eval().requires_grad_(False)
+    method = make_method(session.plugins, resolved)
+    last = list(method.stages())[-1]
+    raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))
+    try:
+        return encode(method, model, raster, target, session.device)
+    except (TypeError, AttributeError) as error:
+        raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error

@@ -1,0 +1,180 @@
+"""The trained scene of another method, or of a file, that a training starts from; and the key that identifies both.
+
+A stage names the method (`starts_from`, `taught_by`). How its scene is trained follows from the run: the same preset if
+that method has it, the same run and scene options, and the values of `pretrained.KEY`. With `init = FILE.ply` the file
+is that scene instead.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
+from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.ply import load_ply
+from splatwizard_core.method import Method
+from splatwizard_core.plugins import PluginManager
+from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
+from splatwizard_core.runs.session import Session
+from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
+from splatwizard_core.training.overrides import apply_overrides
+from splatwizard_core.training.params import PipelineParams
+
+IDENTITY = 2  # raised when checkpoints come to say something else of what they were made from
+PRESET = "preset"  # `pretrained.preset`: of the method that is started from
+
+
+def make_method(plugins: PluginManager, resolved: ResolvedConfig) -> Method:
+    """Return the configured method."""
+    method: Method = plugins.methods.load(resolved.method)(plugins, resolved.config)
+    return method
+
+
+def named_scenes(method: Method) -> list[str]:
+    """List the methods whose trained scenes the stages start from or are taught by, that of the first stage first."""
+    stages = list(method.stages())
+    names = [name for stage in stages for name in (stage.starts_from, *stage.taught_by) if name is not None]
+    return list(dict.fromkeys(names))
+
+
+def first_scene(method: Method) -> str | None:
+    """Name the method whose trained scene the first stage starts from; None: from the scene's points, say."""
+    return method.stages()[0].starts_from
+
+
+def base_config(plugins: PluginManager, name: str, outer: ResolvedConfig) -> ResolvedConfig:
+    """Return the configuration that trains the scene of method `name` which `outer` starts from.
+
+    Raises PluginError if the method is not installed, ConfigError that names the key `pretrained.KEY`.
+    """
+    cls = plugins.methods.load(name)
+    wanted = dict(outer.pretrained)
+    asked = wanted.pop(PRESET, None)
+    preset = asked if asked is not None else outer.preset if outer.preset in cls.PRESETS else "paper"
+    beside = next((key for key in wanted if is_beside_method(cls.Config, key)), None)
+    if beside is not None:
+        raise ConfigError(
+            f"'pretrained.{beside}' is no key of '{name}' but one of the run: give '{beside}', which holds for both",
+            key=f"pretrained.{beside}",
+        )
+    try:
+        base = resolve(cls, str(preset), sets=wanted, scene=outer.scene_spec or None, plugins=plugins)
+    except ConfigError as error:
+        # What the other method's configuration says of its keys, with the names that they have here.
+        told = re.sub(r"\b(key|for|mean) '([\w.]+)'", r"\1 'pretrained.\2'", str(error))
+        raise ConfigError(told, key=error.key) from None
+    # What a preset says about the run (clamped renders, say) belongs to the base method; the rest is as outside.
+    said = {key: value for key, value in cls.PRESETS[base.preset].items() if field_at(PipelineParams, key) is not None}
+    ppl = apply_overrides(outer.ppl, said, source=f"preset '{base.preset}' of '{name}'")
+    return replace(base, ppl=ppl, scene=outer.scene)
+
+
+def starts(session: Session, resolved: ResolvedConfig) -> dict[str, dict[str, Any]]:
+    """Map each method that is started from to everything that its scene depends on; empty for most methods."""
+    method = make_method(session.plugins, resolved)
+    found: dict[str, dict[str, Any]] = {}
+    for name in named_scenes(method):
+        if resolved.init and name == first_scene(method):
+            found[name] = {"file": f"sha256 {session.file_digest(Path(resolved.init))}"}
+            continue
+        base = base_config(session.plugins, name, resolved)
+        inner = starts(session, base)
+        version = session.plugins.methods.load(name).version
+        found[name] = {**base.training_content(), "method_version": version}
+        if inner:
+            found[name]["starts from"] = inner
+    return found
+
+
+def training_key(session: Session, resolved: ResolvedConfig) -> str:
+    """Return the key of everything a training is made from: equal keys mean an interchangeable model."""
+    cls = session.plugins.methods.load(resolved.method)
+    content: list[Any] = [
+        IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version
+    ]  # fmt: skip
+    before = starts(session, resolved)
+    return content_hash([*content, before] if before else content)
+
+
+def unused_start(plugins: PluginManager, resolved: ResolvedConfig) -> ConfigError | None:
+    """Return the error for `init` or `pretrained.KEY` of a method that starts from no trained scene; None: it does."""
+    if not resolved.init and not resolved.pretrained:
+        return None
+    method = make_method(plugins, resolved)
+    if first_scene(method) is not None or (not resolved.init and named_scenes(method)):
+        return None
+    key = INIT if resolved.init else f"pretrained.{next(iter(resolved.pretrained))}"
+    about = f"'init' ({resolved.init})" if resolved.init else f"'{key}'"
+    return ConfigError(
+        f"method '{resolved.method}' does not start from a trained scene, so {about} is of no use to it: leave it out",
+        key=key,
+    )
+
+
+def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
+    """Return the configuration with its start checked, and the values of `pretrained.KEY` parsed.
+
+    Before anything runs: raises UserInputError for a file that is no model, ConfigError for a wrong key or value, or
+    for either of them where the method starts from no trained scene.
+    """
+    unused = unused_start(plugins, resolved)
+    if unused is not None:
+        raise unused
+    if resolved.pretrained:
+        resolved = _with_parsed_values(plugins, resolved)
+    own = str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
+    for path in filter(None, (resolved.init, own)):
+        stamp = os.stat(path).st_mtime_ns if os.path.exists(path) else 0
+        _checked_once(path, stamp)  # a command with many rate points asks as often
+    return resolved
+
+
+@functools.cache
+def _checked_once(path: str, stamp: int) -> None:
+    check_model(path)
+
+
+def _with_parsed_values(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
+    method = make_method(plugins, resolved)
+    names, first = named_scenes(method), first_scene(method)
+    key = f"pretrained.{next(iter(resolved.pretrained))}"
+    if resolved.init and names == [first]:
+        raise ConfigError(
+            f"'{key}' is about training a {first} scene, and 'init' ({resolved.init}) is one: give one of them", key=key
+        )
+    parsed = dict(resolved.pretrained)
+    for name in names:
+        base = base_config(plugins, name, resolved)
+        parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}
+        checked_start(plugins, base)
+    return replace(resolved, pretrained=parsed)
+
+
+def check_model(path: str) -> GaussianModel:
+    """Read the explicit Gaussians of a .ply. Raises UserInputError that says what is wrong with it, and what to do."""
+    where = Path(path)
+    if where.is_dir():
+        inside = sorted(where.rglob("*.ply"))
+        hint = f"name the .ply in it, such as {inside[-1]}" if inside else "it has to be the .ply of a trained scene"
+        raise UserInputError(f"init: {path} is a folder: {hint}")
+    if not where.is_file():
+        raise UserInputError(f"init: {path}: there is no such file")
+    with open(where, "rb") as file:
+        if file.read(4) == b"SPWZ":
+            raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")
+    try:
+        model = load_ply(where)
+    except SplatwizardError as error:
+        reason = str(error).removeprefix(f"{where}: ").removeprefix(f"{where.name}: ")
+        raise UserInputError(f"init: {path}: {reason}") from None
+    if model.num_rows == 0:
+        raise UserInputError(f"init: {path} holds no Gaussian")
+    damaged = sum(int((~getattr(model, name).isfinite()).sum()) for name in model.ROWS)
+    if damaged:
+        raise UserInputError(f"init: {path}: {damaged:,} of its values are not finite numbers")
+    return model

@@ -1,0 +1,89 @@
+"""Values put into a configuration by dotted key: parsed by the field's type, checked, and wrong ones explained."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.training.keys import block_keys, field_at, set_at, suggest
+from splatwizard_core.training.values import parse_text
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -> ModelT:
+    """Return `config` with some values replaced.
+
+    values  by dotted key; strings are parsed by the field's type ("true", "3e4", "[1, 2]", "none")
+    source  where they come from, for the message: "--set", "preset 'quick'", a file name
+
+    Raises ConfigError for an unknown key (with the nearest valid one) or a bad value.
+    """
+    cls = type(config)
+    content = config.model_dump()
+    for key, value in values.items():
+        annotation = field_at(cls, key)
+        if annotation is None:
+            raise unknown_key(key, block_keys(cls), source)
+        set_at(content, key, _parsed(annotation, key, value, source))
+    try:
+        return cls.model_validate(content)
+    except ValidationError as error:
+        raise _bad_value(error, values, source, block_keys(cls)) from None
+
+
+def checked_value(annotation: Any, key: str, value: Any, *, source: str) -> Any:
+    """Return one value as the type `annotation` has it. Raises ConfigError."""
+    try:
+        return TypeAdapter(annotation).validate_python(_parsed(annotation, key, value, source))
+    except ValidationError as error:
+        raise ConfigError(f"bad value {value!r} for '{key}' in {source}: must be {_reason(error)}", key=key) from None
+
+
+def unknown_key(key: str, known: Mapping[str, str] | Sequence[str], source: str) -> ConfigError:
+    """Make the error for a key that nothing has: it names the nearest valid one."""
+    near = suggest(key, list(known))
+    hint = f"did you mean '{near}'?" if near else _keys_beside(key, known)
+    return ConfigError(f"unknown key '{key}' in {source}: {hint}", key=key)
+
+
+def _parsed(annotation: Any, key: str, value: Any, source: str) -> Any:
+    if not isinstance(value, str):
+        return value
+    try:
+        return parse_text(annotation, value)
+    except ValueError as error:
+        raise ConfigError(f"bad value '{value}' for '{key}' in {source}: {error}", key=key) from None
+
+
+def _bad_value(
+    error: ValidationError, values: Mapping[str, Any], source: str, described: Mapping[str, str]
+) -> ConfigError:
+    first = error.errors()[0]
+    location = [str(part) for part in first["loc"]]
+    # The culprit is the longest given key that the location starts with; a check over several fields has no location.
+    path = ".".join(location)
+    key = max((k for k in values if path == k or path.startswith(f"{k}.")), key=len, default=path)
+    reason = _reason(error)
+    if not key:
+        return ConfigError(f"bad combination of values in {source}: {reason}")
+    value = values.get(key, first.get("input"))
+    about = f" ({described[key]})" if described.get(key) else ""
+    return ConfigError(f"bad value {value!r} for '{key}' in {source}: must be {reason}{about}", key=key)
+
+
+def _reason(error: ValidationError) -> str:
+    message: str = error.errors()[0]["msg"]
+    return message.removeprefix("Input should be ").removeprefix("Value error, ")
+
+
+def _keys_beside(key: str, known: Mapping[str, str] | Sequence[str]) -> str:
+    """List what there is instead: the keys of the block that it names, else those at the top."""
+    block = key.rpartition(".")[0]
+    inside = sorted(k for k in known if block and k.startswith(f"{block}."))
+    if inside:
+        return f"'{block}' has {', '.join(k.removeprefix(f'{block}.') for k in inside)}"
+    return f"the keys are {', '.join(sorted({k.split('.')[0] for k in known}))}"

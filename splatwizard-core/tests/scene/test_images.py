@@ -1,0 +1,62 @@
+"""Pictures of many views: decoded once, checked without being kept."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from splatwizard_core.errors import SceneError
+from splatwizard_core.scene.camera import Camera
+from splatwizard_core.scene.images import check_pictures, decode_all
+from splatwizard_core.scene.scene import View
+
+CAMERA = Camera(8, 6, 10.0, 10.0, 4.0, 3.0, torch.eye(3), torch.zeros(3))
+
+
+class Pictures:
+    """Views that count how often each is decoded."""
+
+    def __init__(self, count: int) -> None:
+        self.decoded = [0] * count
+        self.masks = 0
+        self.views = [View(CAMERA, str(i), self.loader(i), self.load_mask) for i in range(count)]
+
+    def loader(self, i: int):
+        def load() -> np.ndarray:
+            self.decoded[i] += 1
+            return np.full((6, 8, 3), i, np.uint8)
+
+        return load
+
+    def load_mask(self) -> np.ndarray:
+        self.masks += 1
+        return np.ones((6, 8), bool)
+
+
+def damaged() -> np.ndarray:
+    raise SceneError("b.png: the picture cannot be decoded")
+
+
+def test_decode_all_decodes_every_view_once():
+    pictures = Pictures(5)
+    decode_all(pictures.views[:2])
+    decode_all([*pictures.views, View(CAMERA, "without a picture")])
+    assert pictures.decoded == [1] * 5
+    assert [int(view.pixels[0, 0, 0]) for view in pictures.views] == [0, 1, 2, 3, 4]
+    assert pictures.masks == 0
+
+
+def test_checked_pictures_are_not_kept():
+    pictures = Pictures(2)
+    check_pictures(pictures.views)
+    assert (pictures.decoded, pictures.masks) == ([1, 1], 2)
+    assert not any("pixels" in vars(view) for view in pictures.views)
+
+
+@pytest.mark.parametrize(
+    "views", [[View(CAMERA, "b", damaged)], [View(CAMERA, "b", lambda: np.zeros((6, 8, 3), np.uint8), damaged)]]
+)
+def test_a_damaged_picture_or_mask_is_found_before_it_is_needed(views):
+    with pytest.raises(SceneError, match=r"b\.png"):
+        check_pictures(views)

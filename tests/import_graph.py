@@ -1,0 +1,116 @@
+"""Who imports whom, read from the syntax trees of the workspace: modules, rooms of the core, and packages."""
+
+from __future__ import annotations
+
+import ast
+import re
+import sys
+from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).parents[1]
+CORE = ROOT / "splatwizard-core" / "src" / "splatwizard_core"
+PACKAGES = sorted(p for p in ROOT.glob("plugins/*/src/sw_*") if p.is_dir())
+"""Import packages of the workspace besides the core."""
+STRANGERS = sorted(p for folder in ("examples", "tests/plugins") for p in ROOT.glob(f"{folder}/*/src/sw_*"))
+"""Packages as third parties would write them."""
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Dotted names of all modules that a file imports, at any depth but under `if TYPE_CHECKING:`."""
+
+    def visit(node: ast.AST) -> Iterator[str]:
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        typing_only = isinstance(node, ast.If) and ast.unparse(node.test).endswith("TYPE_CHECKING")
+        for child in node.orelse if typing_only else ast.iter_child_nodes(node):
+            yield from visit(child)
+
+    return visit(ast.parse(path.read_text(encoding="utf-8")))
+
+
+def files_of(package: Path) -> list[Path]:
+    return sorted(package.rglob("*.py"))
+
+
+def module_name(path: Path, package: Path) -> str:
+    parts = path.relative_to(package.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+@cache
+def module_graph() -> Mapping[str, frozenset[str]]:
+    """Module -> the modules of the workspace that it imports when it runs, function-level imports included."""
+    files = {module_name(p, package): p for package in (CORE, *PACKAGES) for p in files_of(package)}
+
+    def home(name: str) -> str | None:
+        """The module that a dotted name is or lies in."""
+        while name and name not in files:
+            name = name.rpartition(".")[0]
+        return name or None
+
+    return {
+        module: frozenset(found for name in imported(path) if (found := home(name)) is not None and found != module)
+        for module, path in files.items()
+    }
+
+
+def circles(graph: Mapping[str, frozenset[str]]) -> list[list[str]]:
+    """The groups of nodes that reach each other (strongly connected components of more than one), by Tarjan."""
+    index: dict[str, int] = {}
+    low: dict[str, int] = {}
+    stack: list[str] = []
+    found: list[list[str]] = []
+
+    def visit(node: str) -> None:
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        for other in graph[node]:
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in stack:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            at = stack.index(node)
+            group = stack[at:]
+            del stack[at:]
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for node in graph:
+        if node not in index:
+            visit(node)
+    return found
+
+
+def longest_chain(graph: Mapping[str, frozenset[str]]) -> list[str]:
+    """The longest path of imports in a graph without circles."""
+
+    @cache
+    def from_(node: str) -> tuple[str, ...]:
+        return (node, *max((from_(other) for other in graph[node]), key=len, default=()))
+
+    return list(max((from_(node) for node in graph), key=len))
+
+
+def project(package: Path) -> dict[str, object]:
+    """The [project] table of an import package."""
+    table: dict[str, object] = tomllib.loads((package.parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
+    return table
+
+
+def declared_dependencies(package: Path) -> set[str]:
+    """Distributions that a package lists as dependencies, without extras."""
+    listed = project(package)["dependencies"]
+    assert isinstance(listed, list)
+    return {re.split(r"[ <>=!~\[(;]", line, maxsplit=1)[0] for line in listed}

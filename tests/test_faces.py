@@ -1,0 +1,51 @@
+"""The two faces of the core: few names, lazy, typed, and each of them documented."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+
+import pytest
+from import_graph import CORE, ROOT
+
+from splatwizard_core import api, tooling
+
+PAGE = (ROOT / "docs" / "plugins.md").read_text("utf-8")
+MOST_NAMES = 80
+
+
+@pytest.mark.parametrize("face", [api, tooling], ids=["api", "tooling"])
+def test_every_name_leads_to_what_its_module_has(face):
+    for name in face.__all__:
+        assert getattr(face, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'no_such_name'"):
+        _ = face.no_such_name
+
+
+@pytest.mark.parametrize("face", [api, tooling], ids=["api", "tooling"])
+def test_the_stub_says_the_same_to_type_checkers(face):
+    stub = (CORE / f"{face.__name__.rpartition('.')[2]}.pyi").read_text("utf-8")
+    told = set(re.findall(r"^from splatwizard_core\.(\S+) import (\w+) as \2$", stub, re.M))
+    assert told == {(module, name) for module, names in face.MODULES.items() for name in names.split()}
+    assert len(told) == len(stub.splitlines())
+
+
+def test_the_api_is_small():
+    assert len(api.__all__) == len(set(api.__all__)) <= MOST_NAMES
+
+
+@pytest.mark.parametrize(("face", "title"), [(api, "The API"), (tooling, "For packages about runs")])
+def test_every_name_is_documented(face, title):
+    section = re.search(rf"^## {title}\n(.*?)(?=^## |\Z)", PAGE, re.M | re.S)
+    assert section is not None
+    assert set(re.findall(r"^\| `(\w+)` \|", section.group(1), re.M)) == set(face.__all__)
+
+
+def test_importing_the_api_is_quick():
+    """The best of three, in a new process: what is measured is work, not the machine's load."""
+    program = "import time; t = time.perf_counter(); import splatwizard_core.api; print(time.perf_counter() - t)"
+    done = [
+        subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True) for _ in range(3)
+    ]
+    assert min(float(each.stdout) for each in done) < 0.1

@@ -1,0 +1,111 @@
+"""Each package as a wheel of its own: beside the core and what it declares alone, and named when it is gone."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fresh_environments import FreshEnvironment, make_environment
+from import_graph import PACKAGES, declared_dependencies, project
+
+from splatwizard_core.coding.container import ContainerReader
+
+GOLDEN = Path(__file__).parent / "golden"
+BY_NAME = {str(project(package)["name"]): package for package in PACKAGES}
+IMPORT_ALL = """
+import importlib, pkgutil, sys
+package = importlib.import_module(sys.argv[1])
+for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+    if not module.name.endswith("__main__"):
+        importlib.import_module(module.name)
+"""
+
+
+def needed(distribution: str) -> list[str]:
+    """A package of ours and those of ours that it requires, directly or through others."""
+    found: list[str] = []
+    waiting = [distribution]
+    while waiting:
+        name = waiting.pop()
+        if name in BY_NAME and name not in found:
+            found.append(name)
+            waiting += sorted(declared_dependencies(BY_NAME[name]))
+    return found
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("distribution", sorted(BY_NAME))
+def test_a_package_works_alone_beside_the_core(fresh_environment, wheels, distribution):
+    fresh_environment.install(wheels["splatwizard-core"], *(wheels[name] for name in needed(distribution)))
+    listed = fresh_environment.plugins()
+    assert {name: row["error"] for name, row in listed.items() if row["error"]} == {}
+    if "entry-points" in project(BY_NAME[distribution]):
+        assert listed[distribution]["provides"]
+    fresh_environment.python_c(IMPORT_ALL, BY_NAME[distribution].name)
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory, wheels) -> FreshEnvironment:
+    environment = make_environment(tmp_path_factory.mktemp("everything") / "env")
+    environment.install(*wheels.values())
+    return environment
+
+
+@contextlib.contextmanager
+def uninstalled(environment: FreshEnvironment, distribution: str) -> Iterator[None]:
+    """The environment without one distribution, for a while."""
+    stem = distribution.replace("-", "_")
+    (site,) = environment.prefix.glob("lib/python*/site-packages")
+    taken = [site / stem, *site.glob(f"{stem}-*.dist-info")]
+    assert len(taken) == 2
+    away = environment.prefix / "away"
+    away.mkdir()
+    for path in taken:
+        path.rename(away / path.name)
+    yield
+    for path in taken:
+        (away / path.name).rename(path)
+    away.rmdir()
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.swz")), ids=lambda p: p.stem)
+def test_a_file_whose_provider_is_gone_names_it(everything, path):
+    """The header knows its packages; of older files that do not, the catalogue does."""
+    reader = ContainerReader.open(path)
+    listed = json.loads(everything.run("list-plugins", "--json").stdout)["plugins"]
+    (provider,) = [
+        row["distribution"]
+        for row in listed
+        for each in row["provides"]
+        if (each["kind"], each["name"]) == ("method", reader.method)
+    ]
+    with uninstalled(everything, provider):
+        done = everything.run("decode", str(path), check=False)
+    assert done.returncode == 2
+    assert f"pip install {provider}" in done.stderr or f"pip install '{provider}" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.pipeline
+def test_a_library_that_is_gone_is_named(everything):
+    with uninstalled(everything, "sw-codecs"):
+        done = everything.run("decode", str(GOLDEN / "3dgs_r3_v1.swz"), check=False)
+    assert done.returncode == 2
+    assert "needs sw-codecs, which is not installed: pip install sw-codecs" in done.stderr
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize(
+    ("command", "package"),
+    [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
+     (["run", "--method", "hac"], "sw-hac"), (["render", "x.ply", "--scene", "demo", "--out", "o"], "sw-datasets")],
+)  # fmt: skip
+def test_the_core_alone_names_the_package_of_what_is_asked_for(fresh_environment, wheels, command, package, tmp_path):
+    fresh_environment.install(wheels["splatwizard-core"])
+    done = fresh_environment.run(*command, check=False)
+    assert done.returncode == 2
+    assert f"pip install {package}" in done.stderr
