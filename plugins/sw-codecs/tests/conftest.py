@@ -1,4 +1,4 @@
-"""What every decoder must stand: cut anywhere, changed at any byte, it raises BitstreamError or still decodes right."""
+"""A decoder of bytes that are cut anywhere or changed at any byte raises BitstreamError or still decodes right."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What the package registers can be listed without torch, loaded by name and constructed without arguments."""
+"""Entries of the package can be listed without torch, loaded by name and constructed without arguments."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""What this package provides."""
+"""Entries of this package: quantizers, entropy and context models, coders, codecs of Gaussians."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 MANY = 100_000
 """Symbols on which an estimated and a real size are compared."""
 AGREEMENT = 0.02
-"""How far the two may be apart."""
+"""Largest relative difference of the two."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What holds for every registered quantizer: a file's symbols and side information suffice, on a fresh object."""
+"""Every registered quantizer: a file's symbols and side information suffice, on a fresh object."""
 
 import numpy as np
 import pytest

@@ -38,46 +38,30 @@ def load_strict(data: bytes) -> Any:
     return value
 
 
-def check_json(value: Any) -> None:
-    """Raise ValueError if `value` is not plain JSON data within the bounds of this module."""
-    # A path is (path of the parent, key or index): spelled out only for a message, since a name repeated for each
-    # element of a long list would take memory by the square of the file. Leaves are not stacked: most values are.
-    stack: list[tuple[Any, _Path | None, int]] = []
+def check_json(value: Any, path: _Path | None = None, depth: int = 0) -> None:
+    """Raise ValueError if `value` is not plain JSON data within the bounds of this module.
+
+    path, depth     where it stands; a path is spelled out only for a message
+    """
     if isinstance(value, (list, tuple, dict)):
-        stack.append((value, None, 1))
-    else:
-        _check_leaf(value, None, None)
-    while stack:
-        item, path, depth = stack.pop()
-        if depth > MAX_DEPTH:
+        if depth >= MAX_DEPTH:
             raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
-        for step, each in item.items() if isinstance(item, dict) else enumerate(item):
-            if isinstance(item, dict):
+        for step, each in value.items() if isinstance(value, dict) else enumerate(value):
+            if isinstance(value, dict):
                 if not isinstance(step, str):
                     raise ValueError(f"'{_place(path)}': key {step!r} is not a string")
                 _check_text(step, path)
-            if isinstance(each, (list, tuple, dict)):
-                if each or depth >= MAX_DEPTH:
-                    stack.append((each, (path, step), depth + 1))
-            else:
-                _check_leaf(each, path, step)
-
-
-def _check_leaf(item: Any, path: _Path | None, step: Any) -> None:
-    """Raise ValueError unless `item`, at `step` of the container at `path`, is null, a boolean, a number or a text."""
-    if item is None or isinstance(item, bool):
-        return
-    here = (path, step) if step is not None else path
-    if isinstance(item, int):
-        if abs(item) > MAX_INTEGER:
-            raise ValueError(f"'{_place(here)}': an integer does not fit 64 bits")
-    elif isinstance(item, float):
-        if not math.isfinite(item):
-            raise ValueError(f"'{_place(here)}': {item} is not a finite number")
-    elif isinstance(item, str):
-        _check_text(item, here)
-    else:
-        raise ValueError(f"'{_place(here)}': {type(item).__name__} is not JSON data")
+            check_json(each, (path, step), depth + 1)
+    elif isinstance(value, str):
+        _check_text(value, path)
+    elif isinstance(value, float):
+        if not math.isfinite(value):
+            raise ValueError(f"'{_place(path)}': {value} is not a finite number")
+    elif isinstance(value, int):  # bool among them
+        if abs(value) > MAX_INTEGER:
+            raise ValueError(f"'{_place(path)}': an integer does not fit 64 bits")
+    elif value is not None:
+        raise ValueError(f"'{_place(path)}': {type(value).__name__} is not JSON data")
 
 
 def _place(path: _Path | None) -> str:

@@ -46,7 +46,7 @@ def split_classes(values: np.ndarray, mantissa: int) -> tuple[np.ndarray, np.nda
 
 
 def class_bits(classes: np.ndarray, mantissa: int) -> np.ndarray:
-    """How many raw low bits values of these classes have; int64."""
+    """Number of raw low bits of values of these classes, int64."""
     return np.maximum((np.asarray(classes, np.int64) >> mantissa) - 1, 0)
 
 

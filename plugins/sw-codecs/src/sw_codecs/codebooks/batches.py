@@ -100,7 +100,7 @@ def smoothed(counts: Tensor) -> Tensor:
 
 
 def _move(counts: Tensor, sums: Tensor, n: Tensor, m: Tensor, moved: tuple[Tensor, Tensor]) -> None:
-    """Where `moved` differs from the batch's n and m, an entry forgets what it was, in place."""
+    """Reset, in place, the state of entries whose `moved` sums differ from the batch's n and m."""
     anew = (moved[0] != n) | (moved[1] != m).any(1)
     counts[anew], sums[anew] = moved[0][anew], moved[1][anew]
 

@@ -34,7 +34,7 @@ def code_counts(codes: np.ndarray) -> np.ndarray:
 
 
 def rounded_counts(counts: np.ndarray) -> np.ndarray:
-    """What `counts` are after storing: int64."""
+    """Counts as they are after storing, int64."""
     return code_counts(count_codes(counts))
 
 

@@ -1,4 +1,4 @@
-"""What an entropy coder is told about the symbols: their probability model, as plain arrays.
+"""Probability models that entropy coders take, as plain arrays.
 
 A Gaussian or Laplace model has bins of unit width at the integers: code k = round(x / step) with mean / step and
 scale / step. Float models are evaluated in floating point by the coder, so a file that uses them is tied to the

@@ -339,7 +339,7 @@ class MixedHashGrid(nn.Module):
 
     @torch.no_grad()
     def places(self, x: Tensor) -> GridPlaces:
-        """Where [n,3] in [0,1] lie: what a lookup needs, and no training changes."""
+        """Entries and weights of places [n,3] in [0,1], which training does not change."""
         blocks = map(self._places, x.split(PLACE_ROWS))
         first = next(blocks)
         if len(first.space) == len(x):

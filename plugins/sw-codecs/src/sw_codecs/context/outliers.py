@@ -1,4 +1,4 @@
-"""Which points of a cloud lie apart from the others: the Local Outlier Factor (Breunig et al., SIGMOD 2000)."""
+"""Outliers of a cloud by the Local Outlier Factor (Breunig et al., SIGMOD 2000)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a point falls in a unit cube whose axes are the principal axes of a cloud, with far points pulled in.
+"""Frame of a cloud: places in a unit cube along its principal axes, with far points pulled in.
 
 The frame of a triplane: world -> principal axes, in standard deviations -> contraction into a ball -> the box of the
 inliers. Its constants are floats in the file; places are computed from position codes in integers alone, so that every

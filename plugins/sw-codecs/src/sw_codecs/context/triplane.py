@@ -25,7 +25,7 @@ ROWS_AT_ONCE = 1 << 13
 
 
 class PlaneSites(NamedTuple):
-    """Where n places lie on the planes of each scale: what no training changes while resolutions stay.
+    """Cells and weights of n places on the planes of each scale; training changes none while resolutions stay.
 
     cells       [n, scales, 3, 4] int32: the four values around a place, in a table of the 3 H W places of a scale
     weights     [n, scales, 3, 4]
@@ -82,7 +82,7 @@ class Triplane(nn.Module):
 
     @torch.no_grad()
     def sites(self, places: Tensor) -> PlaneSites:
-        """Where `places` lie on the planes."""
+        """Cells and weights of `places` on the planes."""
         cells, weights = [], []
         for plane in self.planes:
             size = plane.shape[-1]
@@ -105,7 +105,7 @@ class Triplane(nn.Module):
         return found
 
     def integers(self) -> list[Tensor]:
-        """What goes into the file: int64 [3, C, m B, m B] per scale. Raises ValueError if a value is not finite."""
+        """Planes of the file, int64 [3, C, m B, m B] per scale. Raises ValueError if a value is not finite."""
         found = []
         for plane in self.planes:
             scaled = torch.round(plane.detach().to(torch.float64) * GAIN)

@@ -26,7 +26,7 @@ SYMBOL_LIMIT = 1 << 24
 
 
 class PlaneModel(Protocol):
-    """What predicts a plane: `ExactSpatialAr`."""
+    """Predictor of a plane, such as `ExactSpatialAr`."""
 
     def __call__(self, neighbors: Tensor) -> tuple[np.ndarray, np.ndarray]:
         """(mean int64 [n] with 12 fractional bits, level 0..63) for neighbours int64 [n, 12]."""

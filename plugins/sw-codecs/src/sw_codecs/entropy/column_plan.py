@@ -1,4 +1,4 @@
-"""How one column of integers is best written: a constant, bins or magnitudes with raw low bits, or a dictionary.
+"""Plans of how a column of integers is written: a constant, bins or magnitudes with raw low bits, or a dictionary.
 
 Every scheme turns a value into a class (coded with the column's own count table) and raw low bits. Uniform bins suit
 bounded values, magnitude classes long tails, a dictionary few values far apart, and the differences of successive rows
@@ -78,7 +78,7 @@ class ColumnPlan:
         return plan
 
     def residuals(self, column: np.ndarray) -> np.ndarray:
-        """What is coded of each row: the value, or its difference to the row above; int64 [N]."""
+        """Values to code, int64 [N]: those of the rows, or their differences to the row above."""
         return column if self.first is None else np.diff(column, prepend=self.first)
 
     def values(self, residuals: np.ndarray) -> np.ndarray:

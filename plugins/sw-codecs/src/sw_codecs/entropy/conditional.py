@@ -125,7 +125,7 @@ class ConditionalGaussian:
 
     @staticmethod
     def blocks(rows: int, columns: int) -> list[slice]:
-        """How `rows` rows of at most `columns` numbers are cut: at most 2^20 numbers a block."""
+        """Slices that cut `rows` rows of at most `columns` numbers into blocks of at most 2^20 numbers."""
         size = max(1, BLOCK_SYMBOLS // max(columns, 1))
         return [slice(start, min(start + size, rows)) for start in range(0, rows, size)]
 

@@ -30,7 +30,7 @@ PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits
 
 @dataclass(frozen=True)
 class FloatContext:
-    """What `bits` takes: mean, scale, step as float tensors that broadcast with the values, in the same unit.
+    """Context of `bits`: mean, scale, step as float tensors that broadcast with the values, in the same unit.
 
     smallest_probability    floor of the probability of a value; the default is the coder's, HAC trains with 1e-6
     grad_below_bound        whether what lies below the floor is still pulled (`sw_codecs.entropy.rates.lower_bound`)
@@ -49,7 +49,7 @@ class FloatContext:
 
 @dataclass(frozen=True)
 class IntegerContext:
-    """What `encode` and `decode` take: integers [n] in units of the base step with 12 fractional bits.
+    """Context of `encode` and `decode`: integers [n] in units of the base step with 12 fractional bits.
 
     mean, scale     int64 [n], |value| < 2^48; a scale below the smallest level (0.05 steps) counts as that level
     multiplier      64..16384 [n] or one number: the step is base step * multiplier / 4096 (`step_multipliers`)

@@ -23,7 +23,7 @@ REACH = {"gaussian": 6.2, "laplace": 20.8}
 
 @dataclass(frozen=True)
 class MixtureContext:
-    """What `bits` and `encode` take; all in the unit of the values, float tensors.
+    """Context of `bits` and `encode`; all in the unit of the values, float tensors.
 
     logits  [..., K] weights are their softmax; [C, K] or [K] for `encode`
     mean    [..., K]

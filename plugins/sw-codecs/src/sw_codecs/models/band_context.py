@@ -21,7 +21,7 @@ ROWS_PER_CLASS = 2048
 
 
 def suitable_classes(rows: int) -> int:
-    """How many classes pay for this many Gaussians: a power of two, 1 .. 8."""
+    """Number of classes that pays for this many Gaussians: a power of two, 1 .. 8."""
     count = 1
     while count < 8 and rows >= 2 * count * ROWS_PER_CLASS:
         count *= 2

@@ -45,7 +45,7 @@ ROWS_AT_ONCE = 1 << 12
 
 
 class Layout(Params):
-    """What the header says of a quantised file; everything has bounds, since a stranger may have written it."""
+    """Header values of a quantised file; all have bounds, since a stranger may have written them."""
 
     num_gaussians: int = Field(ge=0, lt=2**32)
     max_sh_degree: int = Field(ge=0, le=3)
@@ -121,7 +121,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
 def lattice(
     model: GaussianModel, codec: Codec, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 ) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:
-    """What is coded: the header, grid cells [N,3] in the order of `sort`, and the attribute integers [N,C] likewise."""
+    """Header, grid cells [N,3] in the order of `sort`, and integers of the attributes [N,C] likewise."""
     arrays = {
         name: getattr(model, name).detach().cpu().numpy()
         for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")

@@ -8,7 +8,7 @@ from splatwizard_core.api import Params
 
 
 class Codec(Params):
-    """What the file holds."""
+    """Mode and quantiser steps of the file."""
 
     mode: Literal["exact", "quantized"] = Field(
         "exact", description="float32 as trained, or quantised and entropy-coded"

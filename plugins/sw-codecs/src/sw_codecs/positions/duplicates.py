@@ -26,7 +26,7 @@ def encode_duplicates(extra: np.ndarray) -> bytes:
 
 
 def decode_duplicates(reader: ByteReader, count: int, distinct: int) -> np.ndarray:
-    """How often each distinct point occurs; int64 [distinct], sums to `count`."""
+    """Times that each distinct point occurs; int64 [distinct], sums to `count`."""
     times = np.ones(distinct, np.int64)
     places = reader.varint(distinct)
     if places:

@@ -1,4 +1,4 @@
-"""How many points a file may claim: a few bytes must not make a reader fill its memory with copies of one point."""
+"""Limit of the points that a file may claim, so that a few bytes cannot fill a reader's memory with copies of one."""
 
 from __future__ import annotations
 

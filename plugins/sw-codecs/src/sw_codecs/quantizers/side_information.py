@@ -1,4 +1,4 @@
-"""What quantizers read from a file, held against what it must be: nothing but BitstreamError comes of a bad one."""
+"""Checks of the side information that quantizers read from a file; a bad one raises BitstreamError."""
 
 from __future__ import annotations
 
