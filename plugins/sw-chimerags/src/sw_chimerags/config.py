@@ -16,9 +16,9 @@ class Train(Params):
     """Stage 1: whose training makes the student."""
 
     method: str = Field("speedy-splat", description="any installed method of explicit Gaussians; its stages run first")
-    soft: float = Field(0.80, ge=0, lt=1, description="`prune.soft` of speedy-splat; of no use to others")
-    hard: float = Field(0.30, ge=0, lt=1, description="`prune.hard` of speedy-splat; of no use to others")
-    stop: int = Field(30_000, ge=0, description="`prune.stop` of speedy-splat; of no use to others")
+    soft: float = Field(0.80, ge=0, lt=1, description="`prune.soft` of speedy-splat; other methods do not read it")
+    hard: float = Field(0.30, ge=0, lt=1, description="`prune.hard` of speedy-splat; other methods do not read it")
+    stop: int = Field(30_000, ge=0, description="`prune.stop` of speedy-splat; other methods do not read it")
 
 
 class Mask(Params):

@@ -1,4 +1,4 @@
-"""Learning from a frozen teacher instead of photographs: a trained scene's renders, also from poses without a photograph.
+"""Learning from a frozen teacher instead of photographs: from its renders, also at poses without a photograph.
 
 Source: LightGaussian (arXiv 2311.17245), distillation with pseudo views.
 """
