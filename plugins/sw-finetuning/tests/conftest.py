@@ -10,7 +10,7 @@ import torch
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.scene.camera import look_at
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import train_stages
@@ -26,7 +26,7 @@ def make_scene(views=6, points=40, radius=3.0):
         angle = 2 * math.pi * i / views
         eye = torch.tensor([radius * math.cos(angle), radius * math.sin(angle), 1.0])
         pixels = torch.randint(0, 256, (HEIGHT, WIDTH, 3), generator=generator).numpy().astype(np.uint8)
-        camera = look_at(eye, ORIGIN, UP, width=WIDTH, height=HEIGHT, fov_x=0.8)
+        camera = Camera.look_at(eye, ORIGIN, UP, width=WIDTH, height=HEIGHT, fov_x=0.8)
         made.append(View(camera, f"view{i}.png", lambda pixels=pixels: pixels))
     cloud = PointCloud(torch.rand(points, 3, generator=generator) - 0.5, torch.rand(points, 3, generator=generator))
     return Scene("toy", made, made[:1], cloud, Protocol("toy"))

@@ -29,9 +29,6 @@ class SplatModel(nn.Module):
     ROW_LABEL: ClassVar[str] = "gaussians"
     """The primitives' name in progress and messages, plural; a model of anchors says "anchors"."""
 
-    ROW_LABEL: str = "gaussians"
-    """The word for its primitives in progress lines and messages."""
-
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """The activated Gaussians that `camera` sees; differentiable with respect to the parameters.
 

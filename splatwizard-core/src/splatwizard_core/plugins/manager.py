@@ -17,7 +17,7 @@ from splatwizard_core.plugins import hookspecs
 from splatwizard_core.plugins.catalogue import normal_name
 from splatwizard_core.plugins.guards import guarded_hooks, one_line
 from splatwizard_core.plugins.loading import PluginInfo, names_of, plugin_info, unmet_requirement
-from splatwizard_core.plugins.registry import Coders, Entry, Registry
+from splatwizard_core.plugins.registry import Coders, Entry, Registry, TypedRegistry
 
 if TYPE_CHECKING:
     import click
@@ -54,28 +54,28 @@ class PluginManager:
 
     def __init__(self, entry_points: Iterable[importlib.metadata.EntryPoint], only: set[str] | None = None) -> None:
         self.plugins: list[PluginInfo] = []
-        self.rasterizers: Registry[Callable[[], Rasterizer]] = Registry("rasterizer")
-        self.pruners: Registry[Callable[..., Pruner]] = Registry("pruner")
-        self.quantizers: Registry[Callable[..., Quantizer]] = Registry("quantizer")
-        self.entropy_models: Registry[Callable[..., EntropyModel]] = Registry("entropy model")
-        self.context_models: Registry[Callable[..., ContextModel]] = Registry("context model")
-        self.coders: Registry[Callable[..., Any]] = Registry("coder")
+        self.rasterizers: TypedRegistry[Callable[[], Rasterizer]] = TypedRegistry("rasterizer")
+        self.pruners: TypedRegistry[Callable[..., Pruner]] = TypedRegistry("pruner")
+        self.quantizers: TypedRegistry[Callable[..., Quantizer]] = TypedRegistry("quantizer")
+        self.entropy_models: TypedRegistry[Callable[..., EntropyModel]] = TypedRegistry("entropy model")
+        self.context_models: TypedRegistry[Callable[..., ContextModel]] = TypedRegistry("context model")
+        self.coders: TypedRegistry[Callable[..., Any]] = TypedRegistry("coder")
         self.entropy_coders: Coders[EntropyCoder] = Coders(self.coders, "symbols")
         self.position_codecs: Coders[PositionCodec] = Coders(self.coders, "positions")
         self.array_coders: Coders[ArrayCoder] = Coders(self.coders, "arrays")
         self.vector_coders: Coders[VectorCoder] = Coders(self.coders, "vectors")
         self.gaussian_codecs: Coders[GaussianCodec] = Coders(self.coders, "gaussians")
-        self.tasks: Registry[Callable[..., Any]] = Registry("task")
-        self.methods: Registry[type[Method]] = Registry("method")
-        self.datasets: Registry[type[Dataset] | Dataset] = Registry("dataset")
-        self.metrics: Registry[AnyMetric] = Registry("metric")
-        self.exporters: Registry[Callable[..., None]] = Registry("exporter")
-        self.importers: Registry[Callable[..., GaussianModel]] = Registry("importer")
-        self.executors: Registry[Any] = Registry("executor")
-        self.checks: Registry[Callable[[], list[Check]]] = Registry("check")
-        self.downloads: Registry[Callable[[], bytes]] = Registry("download")
-        self.commands: Registry[click.Command] = Registry("command")
-        self._filled_by: dict[str, Registry[Any]] = {
+        self.tasks: TypedRegistry[Callable[..., Any]] = TypedRegistry("task")
+        self.methods: TypedRegistry[type[Method]] = TypedRegistry("method")
+        self.datasets: TypedRegistry[type[Dataset] | Dataset] = TypedRegistry("dataset")
+        self.metrics: TypedRegistry[AnyMetric] = TypedRegistry("metric")
+        self.exporters: TypedRegistry[Callable[..., None]] = TypedRegistry("exporter")
+        self.importers: TypedRegistry[Callable[..., GaussianModel]] = TypedRegistry("importer")
+        self.executors: TypedRegistry[Any] = TypedRegistry("executor")
+        self.checks: TypedRegistry[Callable[[], list[Check]]] = TypedRegistry("check")
+        self.downloads: TypedRegistry[Callable[[], bytes]] = TypedRegistry("download")
+        self.commands: TypedRegistry[click.Command] = TypedRegistry("command")
+        self._filled_by: dict[str, Registry] = {
             "register_rasterizers": self.rasterizers,
             "register_pruners": self.pruners,
             "register_quantizers": self.quantizers,
@@ -93,7 +93,7 @@ class PluginManager:
             "register_downloads": self.downloads,
             "register_commands": self.commands,
         }
-        self.registries: dict[str, Registry[Any]] = {r.kind: r for r in self._filled_by.values()}
+        self.registries: dict[str, Registry] = {r.kind: r for r in self._filled_by.values()}
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
         self._loaded: list[tuple[PluginInfo, object]] = []

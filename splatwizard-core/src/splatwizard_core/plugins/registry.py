@@ -13,7 +13,6 @@ from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins.catalogue import is_ours, package_of
 
 T = TypeVar("T")
-T_co = TypeVar("T_co", covariant=True)
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,8 @@ class Entry:
         return found
 
 
-class Registry(Generic[T_co]):
-    """The entries of one kind, by name; T_co is the type of their targets. Plugins see only `add`."""
+class Registry:
+    """The entries of one kind, by name. Plugins see only `add`."""
 
     def __init__(self, kind: str) -> None:
         self.kind = kind
@@ -136,19 +135,27 @@ class Registry(Generic[T_co]):
             name=name,
         )
 
-    def load(self, name: str) -> T_co:
+    def load(self, name: str) -> Any:
         """Import and return what `name` stands for. Raises PluginError as `entry` does, or if the import fails."""
         entry = self.entry(name)
         for record in self._recorders:
             record.append(entry)
-        found: T_co = entry.load()
+        return entry.load()
+
+
+class TypedRegistry(Registry, Generic[T]):
+    """A registry whose targets have the type T: the contract of its kind."""
+
+    def load(self, name: str) -> T:
+        """Import and return what `name` stands for. Raises PluginError as `entry` does, or if the import fails."""
+        found: T = super().load(name)
         return found
 
 
 class Coders(Generic[T]):
     """The coders of one sort, typed: those entries of the coder registry that declare `codes` so."""
 
-    def __init__(self, registry: Registry[Any], codes: str) -> None:
+    def __init__(self, registry: Registry, codes: str) -> None:
         self._registry = registry
         self.codes = codes
 

@@ -9,7 +9,7 @@ import torch
 from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.rendering.negotiation import info_from_entry, obstacle
+from splatwizard_core.rendering.info import RasterizerInfo
 
 
 def choose_device(asked: str, plugins: PluginManager) -> torch.device:
@@ -47,8 +47,9 @@ def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> s
 
 def cuda_rasterizers(plugins: PluginManager) -> list[str]:
     """List the installed rasterizers with CUDA kernels that say they can run here; a slow reference does not count."""
-    infos = [info_from_entry(entry) for entry in plugins.rasterizers if "cuda" in entry.declared.get("devices", ())]
-    return [info.name for info in infos if info.speed > 0 and obstacle(info, torch.device("cuda")) is None]
+    entries = [entry for entry in plugins.rasterizers if "cuda" in entry.declared.get("devices", ())]
+    infos = [info for info in map(RasterizerInfo.from_entry, entries) if info.speed > 0]
+    return [info.name for info in infos if info.obstacle("cuda") is None]
 
 
 def set_threads(asked: int) -> int:
