@@ -135,7 +135,7 @@ def scratch_folder(purpose: str) -> Iterator[Path]:
 
     Those of the same purpose that killed processes left are removed too.
     """
-    base = Path(tempfile.gettempdir()) / f"sw-{purpose}"
+    base = Path(tempfile.gettempdir()) / f"splatwizard-{purpose}"
     _remove_leftovers(base)
     folder = _temporary(base)
     with naming_full_disk(folder):

@@ -136,7 +136,8 @@ def test_ctrl_c_finishes_the_step_and_saves_it(toy, whole, tmp_path):
 
     done = []
     with pytest.raises(KeyboardInterrupt):
-        toy.train(iterations=200, directory=tmp_path, rasterizer=Interrupted(), on_step=lambda _, r: done.append(r.step))
+        steps = Interrupted()
+        toy.train(iterations=200, directory=tmp_path, rasterizer=steps, on_step=lambda _, r: done.append(r.step))
     assert done[-1] == 121
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     steps = []

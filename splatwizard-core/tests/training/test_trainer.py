@@ -277,7 +277,8 @@ def test_housekeeping_is_no_part_of_the_training_time(toy):
 
 def test_a_record_has_what_the_log_shows(toy, tmp_path):
     records = []
-    toy.train(iterations=30, on_step=lambda _, r: records.append(r), directory=tmp_path, ppl=PipelineParams(log_every=7))
+    ppl = PipelineParams(log_every=7)
+    toy.train(iterations=30, on_step=lambda _, r: records.append(r), directory=tmp_path, ppl=ppl)
     assert [r.step for r in records] == list(range(1, 31))
     assert all(not r.total.requires_grad for r in records)
     lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]

@@ -43,7 +43,7 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     warn_of_metrics(session, None, resolved[0].metrics)
     say_device(resolved[0].ppl, session)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
-        shared.say("preset quick: the plan scaled down for the demo scene (--preset paper runs it in full)")
+        shared.say("preset quick: the plan scaled down for a procedural scene (--preset paper runs it in full)")
     finished: list[FinishedRun] = []
     written: list[Path] = []
     console = None if as_json else shared.console()

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from splatwizard_core.errors import CapabilityError, ConfigError, PluginError, SplatwizardError
 from splatwizard_core.plugins.guards import one_line
-from splatwizard_core.plugins.registry import Entry, Registry
+from splatwizard_core.plugins.registry import Entry, TypedRegistry
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -138,7 +138,7 @@ AnyMetric = Metric | MetricFactory
 """The target of a metric's entry."""
 
 
-def default_metrics(registry: Registry[AnyMetric], *, on_the_way: bool = False) -> list[str]:
+def default_metrics(registry: TypedRegistry[AnyMetric], *, on_the_way: bool = False) -> list[str]:
     """Names of the metrics that are computed when none are named: every one that is installed.
 
     on_the_way  during training: only the quick ones whose value the log is read for
@@ -147,7 +147,7 @@ def default_metrics(registry: Registry[AnyMetric], *, on_the_way: bool = False) 
     return [name for name, info in infos.items() if not (on_the_way and (info.diagnostic or info.slow))]
 
 
-def check_settings(registry: Registry[AnyMetric], settings: MetricSettings) -> dict[str, dict[str, Any]]:
+def check_settings(registry: TypedRegistry[AnyMetric], settings: MetricSettings) -> dict[str, dict[str, Any]]:
     """The settings that were given, as their metrics' models understand them: plain values that JSON can hold.
 
     Raises ConfigError for a group or key that no installed metric has, with the nearest one, and for a bad value.
@@ -213,7 +213,7 @@ def failure(entry: Entry, error: BaseException) -> str:
     return f"metric '{entry.name}' of {entry.distribution} {entry.version} failed: {one_line(error)}"
 
 
-def metric_identities(registry: Registry[AnyMetric], setup: MetricSetup) -> dict[str, str | None]:
+def metric_identities(registry: TypedRegistry[AnyMetric], setup: MetricSetup) -> dict[str, str | None]:
     """name -> what its values would depend on now, cheaply told; None: it cannot be computed now."""
     found: dict[str, str | None] = {}
     for entry in registry:

@@ -6,7 +6,7 @@ import functools
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -56,9 +56,9 @@ class RasterizerInfo:
     per_device: Mapping[str, DeviceInfo] = field(default_factory=dict)
 
     @classmethod
-    def declared(cls, hook: Callable[[Registry[Any]], None], name: str) -> RasterizerInfo:
+    def declared(cls, hook: Callable[[Registry], None], name: str) -> RasterizerInfo:
         """The declaration of one rasterizer in a plugin's `register_rasterizers`, for its class to show."""
-        registry: Registry[Any] = Registry("rasterizer")
+        registry: Registry = Registry("rasterizer")
         hook(registry)
         return cls.from_entry(registry.entry(name))
 

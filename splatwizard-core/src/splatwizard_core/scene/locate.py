@@ -13,10 +13,10 @@ from splatwizard_core.errors import SceneError
 if TYPE_CHECKING:
     from typing import TypeAlias
 
-    from splatwizard_core.plugins.registry import Registry
+    from splatwizard_core.plugins.registry import TypedRegistry
     from splatwizard_core.scene.dataset import Dataset
 
-    Families: TypeAlias = Registry[type[Dataset] | Dataset]
+    Families: TypeAlias = TypedRegistry[type[Dataset] | Dataset]
 
 DATA_VARIABLE = "SPLATWIZARD_DATA"
 """Names the folder where data sets lie."""
