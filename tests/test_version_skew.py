@@ -1,5 +1,6 @@
 """A file from another time or another installation says exactly what to install."""
 
+import importlib.metadata
 import json
 import struct
 import zlib
@@ -12,6 +13,7 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins
 
 GOLDEN = Path(__file__).parent / "golden"
+HERE = importlib.metadata.version("sw-3dgs")  # all packages have one version
 COMMANDS = {
     "decode": ["decode", "{file}"],
     "eval": ["eval", "{file}", "--scene", "demo:tiny", "--no-speed"],
@@ -112,21 +114,21 @@ def test_a_missing_entropy_model(tmp_path, capsys, only):
 
 def test_an_installed_plugin_that_is_left_out_needs_no_installation(tmp_path, capsys, only):
     only("3dgs")
-    assert said(capsys, "decode", write(tmp_path)).endswith("sw-codecs 0.1.0 is there, but SW_PLUGINS leaves it out")
+    assert said(capsys, "decode", write(tmp_path)).endswith(f"sw-codecs {HERE} is there, but SW_PLUGINS leaves it out")
 
 
 def test_a_plugin_too_old_to_have_the_method(tmp_path, capsys):
     path = write(
         tmp_path, method="3dgs-next", requires=requires(sw_3dgs="0.7") | {"sw-3dgs": ["0.7", "method:3dgs-next"]}
     )
-    assert said(capsys, "decode", path).endswith("sw-3dgs 0.1.0 is too old: pip install 'sw-3dgs>=0.7'")
+    assert said(capsys, "decode", path).endswith(f"sw-3dgs {HERE} is too old: pip install 'sw-3dgs>=0.7'")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
 def test_a_newer_layout_of_a_method(tmp_path, capsys, command):
     path = write(tmp_path, method_version=2, requires=requires(sw_3dgs="0.9"))
     assert said(capsys, command, path) == (
-        "error: garden.swz: version 2 of the layout of '3dgs' is newer than 1, which sw-3dgs 0.1.0 reads: "
+        f"error: garden.swz: version 2 of the layout of '3dgs' is newer than 1, which sw-3dgs {HERE} reads: "
         "upgrade it with pip install 'sw-3dgs>=0.9'"
     )
 
@@ -144,7 +146,9 @@ def test_a_newer_coded_stream(tmp_path, capsys, section):
     line = said(capsys, "decode", write(tmp_path, data=parts.join()))
     assert f"section '{section}'" in line
     assert "version 2" in line
-    assert line.endswith("(the file was written with sw-codecs 0.4, installed is 0.1.0: pip install 'sw-codecs>=0.4')")
+    assert line.endswith(
+        f"(the file was written with sw-codecs 0.4, installed is {HERE}: pip install 'sw-codecs>=0.4')"
+    )
 
 
 def newer_container(data: bytes, header: bytes) -> bytes:
@@ -201,7 +205,7 @@ def test_really_missing_packages(fresh_environment, wheels, tmp_path):
     fresh_environment.install(wheels["sw-3dgs"])
     done = fresh_environment.run("decode", str(path), check=False)
     assert done.returncode == 2
-    assert "sw-3dgs 0.1.0 does not load: needs " in done.stderr
-    fresh_environment.install(wheels["sw-codecs"], wheels["sw-rasterizers"])
+    assert f"sw-3dgs {HERE} does not load: needs " in done.stderr
+    fresh_environment.install(*(wheels[f"sw-{name}"] for name in ("codecs", "gaussians", "rasterizers", "reference")))
     decoded = json.loads(fresh_environment.run("decode", str(path), "--repeats", "0", "--json").stdout)
     assert decoded["counts"] == {"num_gaussians": 48}

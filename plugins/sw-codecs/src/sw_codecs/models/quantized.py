@@ -198,11 +198,13 @@ def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArr
     return activity_classes(lower, layout.sh_classes), layout.sh_classes
 
 
+BESIDE = ("mode", "codec", "method")
+"""Header values that a method keeps beside the codec's own."""
+
+
 def _layout(reader: ContainerReader) -> Layout:
     try:
-        layout = Layout.model_validate(
-            {key: value for key, value in reader.static.items() if key in Layout.model_fields}
-        )
+        layout = Layout.model_validate({key: value for key, value in reader.static.items() if key not in BESIDE})
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

@@ -7,6 +7,7 @@ encrypted or sparse members, equal names, and bombs: far more content than the a
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import lzma
 import shutil
@@ -269,6 +270,7 @@ def _damage_named(archive: Path) -> Iterator[None]:
     except (NotImplementedError, RuntimeError, ValueError, OverflowError) as error:
         raise ArchiveError(f"{archive}: cannot be unpacked ({error})") from error
     except OSError as error:
-        if error.errno is None:  # gzip and bzip2 report damage so
+        # gzip and bzip2 report damage without a number; a zip may name a place before its start.
+        if error.errno in (None, errno.EINVAL):
             raise ArchiveError(f"{archive}: damaged or incomplete ({error})") from error
         raise
