@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -57,15 +56,10 @@ class Observers:
     """The observers of one training, each of which can fail alone. Used as a context that tells them of its end."""
 
     def __init__(
-        self, plugins: PluginManager, observers: Sequence[TrainingObserver | None], say: Callable[[str], None]
+        self, plugins: PluginManager, observers: Iterable[TrainingObserver | None], say: Callable[[str], None]
     ) -> None:
         self._plugins, self._say = plugins, say
         self._observers = [each for each in observers if each is not None]
-
-    @classmethod
-    def of(cls, plugins: PluginManager, training: StartedTraining | None, say: Callable[[str], None]) -> Observers:
-        """Ask every plugin for its observer of a training; None: a training that nobody is to watch."""
-        return cls(plugins, plugins.hook.run_started(training=training) if training is not None else [], say)
 
     def __bool__(self) -> bool:
         return bool(self._observers)
@@ -73,9 +67,7 @@ class Observers:
     def __enter__(self) -> Observers:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._tell(lambda observer: observer.finished())
 
     def after_step(self, model: SplatModel, record: StepRecord) -> None:
