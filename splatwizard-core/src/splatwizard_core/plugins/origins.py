@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import inspect
-from collections.abc import Mapping
 from typing import Any
 
 from splatwizard_core.plugins.manager import PluginManager
@@ -13,6 +12,7 @@ from splatwizard_core.plugins.manager import PluginManager
 Owner = tuple[str, str]
 """A distribution and its version."""
 NOBODY: Owner = ("", "")
+_packages = functools.cache(importlib.metadata.packages_distributions)
 
 
 class Origins:
@@ -47,8 +47,3 @@ class Origins:
             return NOBODY
         distribution = found.pop()
         return distribution, importlib.metadata.version(distribution)
-
-
-@functools.cache
-def _packages() -> Mapping[str, list[str]]:
-    return importlib.metadata.packages_distributions()

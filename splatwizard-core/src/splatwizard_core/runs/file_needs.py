@@ -65,7 +65,6 @@ def newer_than_installed(reader: ContainerReader, plugins: PluginManager) -> lis
 
 def upgrade_command(reader: ContainerReader, distribution: str, installed: str) -> str:
     """Return the command that gets a version of `distribution` which reads the file."""
-    for requirement in reader.requires:
-        if normal_name(requirement.distribution) == normal_name(distribution) and requirement.is_newer_than(installed):
-            return requirement.command
-    return f"pip install --upgrade {distribution}"
+    named = [each for each in reader.requires if normal_name(each.distribution) == normal_name(distribution)]
+    newer = (each.command for each in named if each.is_newer_than(installed))
+    return next(newer, f"pip install --upgrade {distribution}")

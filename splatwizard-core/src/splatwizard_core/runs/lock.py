@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import json
 import os
 import shlex
 import socket
@@ -18,11 +17,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, fields
 from datetime import datetime, timezone
 from pathlib import Path
 
 import psutil
+from pydantic import BaseModel
 
 from splatwizard_core.errors import RunLockedError
 
@@ -35,8 +34,7 @@ ADVICE = "wait for it, or choose another directory (--out)"
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 
 
-@dataclass(frozen=True)
-class Holder:
+class Holder(BaseModel, frozen=True):
     """The process that holds a directory.
 
     boot    identifies the running kernel: holders of one boot share their locks
@@ -44,10 +42,10 @@ class Holder:
     """
 
     pid: int
-    host: str
-    boot: str
-    since: str
-    command: str
+    host: str = "?"
+    boot: str = "?"
+    since: str = "?"
+    command: str = "?"
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host} since {self.since} (`{self.command}`)"
@@ -146,19 +144,17 @@ def _write_holder(descriptor: int) -> None:
     command = shlex.join(["sw", *sys.argv[1:]])
     if len(command) > COMMAND_CHARACTERS:
         command = f"{command[: COMMAND_CHARACTERS - 3]}..."
-    holder = Holder(os.getpid(), socket.gethostname(), _boot(), since, command)
+    holder = Holder(pid=os.getpid(), host=socket.gethostname(), boot=_boot(), since=since, command=command)
     os.ftruncate(descriptor, 0)
     with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, and reading needs no space
-        os.pwrite(descriptor, json.dumps(asdict(holder)).encode(), 0)
+        os.pwrite(descriptor, holder.model_dump_json().encode(), 0)
 
 
 def read_holder(path: Path) -> Holder | None:
     """Read the holder that a lock file names; None for nobody, or one that is just beginning or ending."""
-    try:
-        told = json.loads(path.read_text())
-        return Holder(int(told["pid"]), *(str(told.get(field.name, "?")) for field in fields(Holder)[1:]))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
+    with contextlib.suppress(OSError, ValueError):
+        return Holder.model_validate_json(path.read_text())
+    return None
 
 
 def _boot() -> str:

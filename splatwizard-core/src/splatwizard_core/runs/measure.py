@@ -86,7 +86,10 @@ def measure(
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
 
     report: SpeedReport | None = None
-    speed_views = views if len(views) >= FEWEST_SPEED_VIEWS else _all_views(scene)
+    speed_views = views
+    if len(views) < FEWEST_SPEED_VIEWS:
+        tested = {view.name for view in views}
+        speed_views = [*views, *(view for view in scene.train if view.name not in tested)]
     if speed and speed_views:
         cameras = [view.camera.to(device) for view in speed_views]
         report = measure_speed(
@@ -143,11 +146,6 @@ def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, d
         "device-bound": device_bound,
     }
     return [name for name, holds in told.items() if holds]
-
-
-def _all_views(scene: Scene) -> list[View]:
-    seen = {view.name for view in scene.test}
-    return [*scene.test, *(view for view in scene.train if view.name not in seen)]
 
 
 def opener(path: Path, session: Session) -> Callable[[], Opened]:

@@ -25,7 +25,7 @@ from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.pretrained import make_method, training_key
 from splatwizard_core.runs.session import Session, TrainedModel
-from splatwizard_core.runs.training import pretraining, train
+from splatwizard_core.runs.training import pretraining, total_seconds, train
 from splatwizard_core.runs.versions import changes, installed, providers
 from splatwizard_core.scene.images import check_pictures, decode_all
 from splatwizard_core.training.keys import dotted
@@ -167,11 +167,7 @@ def _eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
     ppl = resolved.ppl
     values: dict[str, Any] = {"seed": ppl.seed, "threads": ppl.threads}
     values |= {key: "none" if value is None else value for key, value in resolved.scene_options.items()}
-    values |= {
-        f"raster.{key}": ",".join(names)
-        for key, names in (("prefer", ppl.raster.prefer), ("forbid", ppl.raster.forbid))
-        if names
-    }
+    values |= {f"raster.{key}": ",".join(names) for key, names in ppl.raster if names}
     values |= dotted(resolved.metrics, METRICS)
     return ["--device", device, *(word for key, value in values.items() for word in ("--set", f"{key}={value}"))]
 
@@ -186,7 +182,8 @@ def _record(
 ) -> schema.Record:
     """Return the record from the facts of the steps: each block takes its fields from whatever step reported them."""
     entry = session.plugins.methods.entry(resolved.method)
-    before, seconds, unknown = _pretraining(training)
+    before, unknown = _pretraining(training)
+    started = {"pretraining": before, "with_pretraining_s": total_seconds(training)}
     steps = {**training, **measured, **encoding, **decoded}
     values = {
         **steps,
@@ -197,7 +194,7 @@ def _record(
         "config_hash": resolved.config_hash(),
         "file": schema.picked(schema.RecordFile, steps),
         "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
-        "train": schema.picked(schema.TrainBlock, training, {"pretraining": before, "with_pretraining_s": seconds}),
+        "train": schema.picked(schema.TrainBlock, training, started),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
         "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
         "unknown": {**measured["unknown"], **unknown},
@@ -206,16 +203,13 @@ def _record(
     return schema.complete_record(schema.picked(schema.Record, values))
 
 
-def _pretraining(training: dict[str, Any]) -> tuple[dict[str, Any], float | None, dict[str, str]]:
-    """Return what a run started from, the seconds of its training with theirs, and reasons for nulls by dotted name."""
-    found, total, unknown = {}, training["train_s"], dict[str, str]()
+def _pretraining(training: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what a run started from, and the reasons for what is null of it, by dotted name."""
+    found, unknown = {}, dict[str, str]()
     for name, facts in pretraining(training).items():
         found[name] = scene = schema.picked(schema.PretrainingBlock, {"file": {}, "made_by": {}}, facts)
         why = "it came from a file, which does not say" if scene["file"] else "a release that did not note it"
         unknown |= {f"train.pretraining.{name}.{key}": why for key, value in scene.items() if value is None}
         if scene["train_s"] is None:
             unknown["train.with_pretraining_s"] = f"the {name} scene that it started from came from a file"
-            total = None
-        elif total is not None:
-            total += scene["train_s"]
-    return found, total, unknown
+    return found, unknown

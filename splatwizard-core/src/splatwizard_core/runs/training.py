@@ -20,7 +20,7 @@ from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog
 from splatwizard_core.runs.lock import directory_lock, is_held
-from splatwizard_core.runs.observers import Observers, StartedTraining
+from splatwizard_core.runs.observers import StartedTraining, watched_by
 from splatwizard_core.runs.phases import StageParts
 from splatwizard_core.runs.record import PretrainingBlock, TrainBlock, picked
 from splatwizard_core.runs.session import Session, TrainedModel
@@ -212,7 +212,7 @@ class _StagesOfARun:
             decode_all(self.scene.test)  # here, so that they do not count as memory of the training
         started = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
         watching = session.plugins.hook.run_started(training=started) if watched else []
-        with Observers(session.plugins, watching, session.say) as observers:
+        with watched_by(watching, session.plugins, session.say) as after_step:
             outcome = train_stages(
                 self.stages,
                 lambda: self.method.create_model(self.scene, stream(resolved.ppl.seed, "init")).to(session.device),
@@ -232,7 +232,7 @@ class _StagesOfARun:
                 stop_after=stop_after,
                 resume=self.request.resume,
                 allow_changed_plan=self.request.allow_changed_plan,
-                on_step=observers.after_step if observers else None,
+                on_step=after_step,
                 evaluate=self._evaluate,
                 log_path=directory / LOG,
                 provided=self.parts.since_asked,
@@ -287,13 +287,17 @@ def _pretraining_facts(source: TrainedModel, base: ResolvedConfig) -> dict[str, 
     facts = source.facts
     if "file" in facts:
         return picked(PretrainingBlock, {"made_by": {}}, facts)
-    inner = [each["train_s"] for each in pretraining(facts).values()]
-    total = None if None in inner else facts["train_s"] + sum(inner)
-    told = {"file": {}, "preset": base.preset, "config": base.config.model_dump(mode="json"), "train_s": total}
-    return picked(PretrainingBlock, facts, told)
+    told = {"file": {}, "preset": base.preset, "config": base.config.model_dump(mode="json")}
+    return picked(PretrainingBlock, facts, told, {"train_s": total_seconds(facts)})
 
 
 def pretraining(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a training started from, by method; of one of an older release its seconds alone."""
     older = {name: {"train_s": seconds} for name, seconds in facts.get("pretraining_s", {}).items()}
     return dict(facts.get("pretraining", older))
+
+
+def total_seconds(facts: Mapping[str, Any]) -> float | None:
+    """Return the seconds of a training with those of what it started from; None if that came from a file."""
+    seconds = [facts["train_s"], *(each["train_s"] for each in pretraining(facts).values())]
+    return None if None in seconds else sum(seconds)
