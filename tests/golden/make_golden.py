@@ -191,7 +191,7 @@ def encoded(name: str) -> bytes:
     method = create_method(plugins, method_name, {**rates[rate], **values})
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.swz"
-        encode(method, model(), {"antialias": False}, path, torch.device("cpu"))
+        encode(method, model(), {"antialias": False}, path)
         return path.read_bytes()
 
 

@@ -22,6 +22,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs import measure
+from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
 from sw_hac import codec
 from sw_hac.method import HAC
@@ -253,7 +254,7 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
 @pytest.mark.parametrize(("mode", "flags"), [("exact", []), ("float", ["device-bound"])])
 def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path):
     (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
-    bound = measure.opener(tmp_path / "scene.swz", PLUGINS, torch.device("cpu"))().device_bound
+    bound = measure.opener(tmp_path / "scene.swz", Session(PLUGINS, torch.device("cpu"), print))().device_bound
     scene, quality = SimpleNamespace(protocol=Protocol("test")), SimpleNamespace(metrics={})
     assert measure._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
 

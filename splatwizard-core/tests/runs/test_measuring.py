@@ -10,9 +10,8 @@ from lpips_backbones import write_backbones
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
-from splatwizard_core.runs.measure import Scope
 from splatwizard_core.runs.record import Record, missing_reasons
-from splatwizard_core.runs.run import run
+from splatwizard_core.runs.run import measures, run
 from splatwizard_core.runs.session import Session
 
 pytestmark = pytest.mark.pipeline
@@ -102,15 +101,15 @@ def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):
 
 
 def test_an_earlier_measurement_counts_if_it_holds_all_that_is_asked():
-    asked = Scope(2, {"psnr": "core 1", "lpips_vgg": None})
+    asked = {"repeats": 2, "metrics": {"psnr": "core 1", "lpips_vgg": None}}
     held = {"repeats": 3, "metrics": {"psnr": "core 1", "lpips_vgg": "weights a"}}
-    assert asked.is_held_by(held)
-    assert asked.is_held_by(asked.as_dict())
-    assert not asked.is_held_by({**held, "repeats": 1})
-    assert not asked.is_held_by({**held, "metrics": {"psnr": "core 0"}})
-    assert not Scope(1, {"lpips_vgg": "weights b"}).is_held_by(held)
+    assert measures(held, asked)
+    assert measures(asked, asked)
+    assert not measures({**held, "repeats": 1}, asked)
+    assert not measures({**held, "metrics": {"psnr": "core 0"}}, asked)
+    assert not measures(held, {"repeats": 1, "metrics": {"lpips_vgg": "weights b"}})
     for damaged in (None, [], {}, {"repeats": "3", "metrics": {}}, {"repeats": 3, "metrics": None}):
-        assert not asked.is_held_by(damaged)
+        assert not measures(damaged, asked)
 
 
 def test_the_record_names_no_folder_of_this_machine(runs):

@@ -9,7 +9,7 @@ import torch
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
-from splatwizard_core.runs.observers import Observers
+from splatwizard_core.runs.observers import watched_by
 from splatwizard_core.runs.run import train_in, train_only
 from splatwizard_core.runs.session import Session
 
@@ -72,9 +72,10 @@ def test_an_observer_that_raises_is_told_with_its_package_and_dropped(helped_plu
 
 
 def test_those_who_do_not_watch_are_left_out(helped_plugins):
-    assert not Observers(helped_plugins, [None, None], print)
+    with watched_by([None, None], helped_plugins, print) as after_step:
+        assert after_step is None
     told = []
     observer = SimpleNamespace(after_step=lambda *_: random.random(), finished=lambda: told.append("finished"))
-    with Observers(helped_plugins, [None, observer], print) as observers:
-        assert observers
+    with watched_by([None, observer], helped_plugins, print) as after_step:
+        assert after_step is not None
     assert told == ["finished"]

@@ -131,7 +131,7 @@ def test_the_decoder_that_looks_around_fails_where_there_is_something_to_see(don
     _, _, out = done
     arguments = ["decode", "scene.swz", "--device", "cpu", "--repeats", "0", "--json"]
     with pytest.raises(FreshProcessError, match="AssertionError"):
-        run_fresh(arguments, cwd=out / "demo-tiny/toy/r2", hide_data=True)
+        run_fresh(arguments, alone_in=out / "demo-tiny/toy/r2")
 
 
 def test_a_directory_that_is_written_by_another_run_is_refused(toy_plugins: PluginManager, tmp_path: Path):
@@ -237,7 +237,8 @@ def test_a_decoded_model_is_kept_as_safetensors(done, tmp_path: Path, toy_plugin
     from safetensors import safe_open
 
     (_, record), _, out = done
-    model, report = timed_decode(out / "demo-tiny/toy/r2/scene.swz", toy_plugins, torch.device("cpu"), repeats=0)
+    session = Session(toy_plugins, torch.device("cpu"), print)
+    model, report = timed_decode(out / "demo-tiny/toy/r2/scene.swz", session, repeats=0)
     save_decoded(model, report, tmp_path / "m.safetensors", toy_plugins)
     with safe_open(tmp_path / "m.safetensors", "pt") as file:
         assert file.metadata()["digest"] == record.file.digest

@@ -156,10 +156,12 @@ def test_waiting_says_for_whom_and_gets_the_lock(tmp_path: Path, holder: subproc
         said.append(message)
         holder.kill()
 
-    with directory_lock(tmp_path / "run", wait=True, on_wait=tell):
+    with directory_lock(tmp_path / "run", wait=True, say=tell):
         pass
-    assert len(said) == 1
-    assert str(holder.pid) in said[0]
+    waited, ended = said
+    assert waited.startswith("waiting: ")
+    assert "ended without finishing" in ended
+    assert all(str(holder.pid) in line for line in said)
 
 
 def test_one_process_cannot_lock_twice(tmp_path: Path):

@@ -219,7 +219,7 @@ def test_an_interrupted_scene_is_gone_on_with(toy_plugins, tmp_path):
     invocation = Run(toy_plugins, tmp_path)
     resolved = invocation.resolved()
     base = base_config(toy_plugins, "toy", resolved)
-    directory = cached_directory(invocation.session, base, tmp_path, training_key(invocation.session, base))
+    directory = cached_directory(invocation.session, base, tmp_path)
     with pytest.raises(KeyboardInterrupt), directory_lock(directory):
         train(invocation.session, RunRequest(base, tmp_path), directory, stop_after=2)
     trained_scene(invocation.session, "toy", resolved, tmp_path)

@@ -24,7 +24,7 @@ from splatwizard_core.runs import file_digests
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
 from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
-from splatwizard_core.runs.file_digests import FileDigests
+from splatwizard_core.runs.file_digests import digests_of
 from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.scene_digest import picture_files, scene_digest
 from splatwizard_core.runs.session import Session
@@ -119,14 +119,14 @@ def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, monkeypatch
     a, b, store = tmp_path / "a", tmp_path / "b", tmp_path / "deep" / "store.json"
     a.write_bytes(b"abc")
     b.write_bytes(b"xyz")
-    first = FileDigests(store).of([a, b, a])
+    first = digests_of([a, b, a], store)
     assert sorted(read) == [a, b]
-    assert FileDigests(store).of([a, b]) == first
+    assert digests_of([a, b], store) == first
     assert len(read) == 2
     stamp = b.stat()
     b.write_bytes(b"XYZ")
     os.utime(b, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))  # size and time of content are as before
-    second = FileDigests(store).of([a, b])
+    second = digests_of([a, b], store)
     assert read[2:] == [b]
     assert second[a] == first[a]
     assert second[b] != first[b]
@@ -135,7 +135,7 @@ def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, monkeypatch
 def test_a_file_that_has_just_changed_is_read_again(tmp_path: Path):
     file = tmp_path / "a"
     file.write_bytes(b"abc")
-    FileDigests(tmp_path / "store").of([file])
+    digests_of([file], tmp_path / "store")
     assert json.loads((tmp_path / "store").read_text()) == {}
 
 
@@ -145,14 +145,14 @@ def test_a_damaged_store_costs_time_alone(tmp_path: Path, content: str):
     file.write_bytes(b"abc")
     store.write_text(content.replace('"a"', json.dumps(str(file))))
     # FIPS 180-2, example B.1
-    assert FileDigests(store).of([file])[file].startswith("ba7816bf")
-    unwritable = FileDigests(tmp_path / "a" / "store")
-    assert unwritable.of([file])[file].startswith("ba7816bf")
+    assert digests_of([file], store)[file].startswith("ba7816bf")
+    unwritable = tmp_path / "a" / "store"
+    assert digests_of([file], unwritable)[file].startswith("ba7816bf")
 
 
 def test_a_picture_that_is_gone_is_a_scene_error(tmp_path: Path):
     with pytest.raises(SceneError, match=r"absent.png: cannot be read"):
-        FileDigests(None).of([tmp_path / "absent.png"])
+        digests_of([tmp_path / "absent.png"])
 
 
 def test_changed_pictures_do_not_count_as_finished(photographs: Path, toy_plugins: PluginManager, tmp_path: Path):
@@ -214,12 +214,7 @@ def test_every_key_after_encoding_holds_the_versions(
 
     def keys() -> set[str]:
         facts = {"sha256": "0", "made_by": installed(toy_plugins, ["sw-toy"])}
-        session = invocation.session
-        return {
-            run_module._decode_key(session, facts),
-            run_module._evaluate_key(session, request.resolved, facts),
-            run_module._record_key(session, request, facts),
-        }
+        return set(run_module.step_keys(invocation.session, request.resolved, facts).values())
 
     before = keys()
     assert keys() == before

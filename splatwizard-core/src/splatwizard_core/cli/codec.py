@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +74,8 @@ def decode(file: str, out: str | None, repeats: int, as_json: bool, chosen: Choi
         output_file(out)
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method().ppl, plugins)
-    model, report = timed_decode(path, plugins, session.device, repeats=repeats, load_kernels=session.load_kernels)
-    facts: dict[str, Any] = report.as_dict()
+    model, report = timed_decode(path, session, repeats=repeats)
+    facts: dict[str, Any] = asdict(report)
     if out is not None:
         save_decoded(model, report, Path(out), plugins)
         facts["out"] = out

@@ -60,7 +60,6 @@ def evaluate(
     from splatwizard_core.runs.encode import encode_directory, load_finished
     from splatwizard_core.runs.fresh import decode_fresh
     from splatwizard_core.runs.measure import Opened, measure, opener
-    from splatwizard_core.scene.loading import load_scene
 
     path = existing(file)
     names = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
@@ -94,17 +93,13 @@ def evaluate(
             encode_directory(session, resolved, path, measured)
             digest = decode_fresh(measured, str(session.device))["digest"]
         facts: dict[str, Any] = measure(
-            open_trained if measured.is_dir() else opener(measured, plugins, session.device),
-            lambda: load_scene(resolved.scene_spec, resolved.scene, plugins),
-            plugins,
-            session.device,
-            resolved.ppl,
+            session,
+            resolved,
+            open_trained if measured.is_dir() else opener(measured, session),
             metrics=names,
-            metric_settings=resolved.metrics,
             speed=not no_speed,
             repeats=repeats,
             renders=Path(renders) if renders else None,
-            load_kernels=session.load_kernels,
         )
         size = None if measured.is_dir() else measured.stat().st_size
     if digest not in (None, facts["digest"]):

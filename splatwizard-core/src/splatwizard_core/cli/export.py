@@ -33,7 +33,7 @@ def export(file: str, out: str, exporter: str | None, as_json: bool, chosen: Cho
     output_file(out)
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method().ppl, plugins)
-    model = opener(path, plugins, session.device)().model
+    model = opener(path, session)().model
     name = export_model(model, Path(out), plugins, exporter)
     facts = {"file": out, "format": name, "bytes": Path(out).stat().st_size, "counts": model.counts()}
     if as_json:

@@ -36,12 +36,12 @@ def render(file: str, out: str, views: str, as_json: bool, chosen: Choices) -> N
     plugins = load_plugins()
     resolved = chosen.resolve_without_method()
     session = open_session(resolved.ppl, plugins)
-    opened = opener(path, plugins, session.device)()
+    opened = opener(path, session)()
     output_folder(out)  # only now: a file that cannot be opened leaves no empty folder
     scene = session.scene(resolved)
     wanted = {"test": scene.test, "train": scene.train, "all": [*scene.train, *scene.test]}[views]
     unique = list({view.name: view for view in wanted}.values())
-    files = render_views(opened, unique, scene.background, plugins, session.device, resolved.ppl, Path(out))
+    files = render_views(session, resolved, opened, unique, Path(out))
     if as_json:
         shared.print_json({"folder": out, "files": files})
     else:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 import inspect
-from collections.abc import Mapping
 from typing import Any
 
 from splatwizard_core.plugins.manager import PluginManager
@@ -13,22 +12,18 @@ from splatwizard_core.plugins.manager import PluginManager
 Owner = tuple[str, str]
 """A distribution and its version."""
 NOBODY: Owner = ("", "")
+_packages = functools.cache(importlib.metadata.packages_distributions)
 
 
 class Origins:
     """Answers for the modules of plugins and of the core; whatever else is installed is looked up in its metadata."""
 
     def __init__(self, plugins: PluginManager) -> None:
-        self._modules: dict[str, Owner] = {}
-        self._packages: dict[str, set[Owner]] = {}
+        self._owners: dict[str, set[Owner]] = {}  # of the modules that are named, and of their top-level packages
         for info in plugins.plugins:
-            self._add(info.module, (info.distribution, info.version))
-            for entry in plugins.provided_by(info):
-                self._add(entry.target.partition(":")[0], (info.distribution, info.version))
-
-    def _add(self, module: str, owner: Owner) -> None:
-        self._modules[module] = owner
-        self._packages.setdefault(module.partition(".")[0], set()).add(owner)
+            for module in (info.module, *(entry.target.partition(":")[0] for entry in plugins.provided_by(info))):
+                for name in (module, module.partition(".")[0]):
+                    self._owners.setdefault(name, set()).add((info.distribution, info.version))
 
     def of(self, thing: Any) -> Owner:
         """(distribution, version) of a class, a function (or a partial of one), or of the class of an object.
@@ -39,27 +34,16 @@ class Origins:
             thing = thing.func
         if not (inspect.isclass(thing) or inspect.isroutine(thing)):
             thing = type(thing)
-        return self.of_module(getattr(thing, "__module__", None) or "")
-
-    def of_module(self, module: str) -> Owner:
-        """The same for a module by name."""
+        module = getattr(thing, "__module__", None) or ""
         name = module
         while name:
-            if name in self._modules:
-                return self._modules[name]
+            owners = self._owners.get(name, set())
+            if len(owners) == 1:
+                return next(iter(owners))
             name = name.rpartition(".")[0]
-        package = module.partition(".")[0]
-        owners = self._packages.get(package, set())
-        if len(owners) == 1:
-            return next(iter(owners))
         # Several distributions in one namespace, or none that is a plugin.
-        found = set(_packages().get(package, ()))
+        found = set(_packages().get(module.partition(".")[0], ()))
         if len(found) != 1:
             return NOBODY
-        name = found.pop()
-        return name, importlib.metadata.version(name)
-
-
-@functools.cache
-def _packages() -> Mapping[str, list[str]]:
-    return importlib.metadata.packages_distributions()
+        distribution = found.pop()
+        return distribution, importlib.metadata.version(distribution)

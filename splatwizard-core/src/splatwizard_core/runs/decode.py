@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
 from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
+from splatwizard_core.runs.session import Session
 
 REPEATS = 3
 
@@ -53,9 +53,6 @@ class DecodeReport:
     peak_bytes: int
     memory_kind: str
     device: str
-
-    def as_dict(self) -> dict[str, Any]:
-        return asdict(self)
 
 
 def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
@@ -110,36 +107,27 @@ def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
     raise missing_plugin(reader, plugins, "method", name)
 
 
-def timed_decode(
-    path: str | Path,
-    plugins: PluginManager,
-    device: torch.device,
-    *,
-    repeats: int = REPEATS,
-    load_kernels: Callable[[], None] | None = None,
-) -> tuple[SplatModel, DecodeReport]:
-    """Decode once untimed and `repeats` times timed.
-
-    load_kernels    () -> every native module is loaded or compiled; before everything else, timed apart
+def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tuple[SplatModel, DecodeReport]:
+    """Decode once untimed and `repeats` times timed, after every native module was loaded or compiled, timed apart.
 
     Raises SplatwizardError if two decodes give different models.
     """
+    device = session.device
 
     def once() -> tuple[SplatModel, ContainerReader, float]:
         synchronize(device)
         began = time.perf_counter()
-        model, reader = open_model(path, plugins, device)
+        model, reader = open_model(path, session.plugins, device)
         synchronize(device)
         return model, reader, time.perf_counter() - began
 
-    import_method(path, plugins)
+    import_method(path, session.plugins)
     began = time.perf_counter()
-    if load_kernels is not None:
-        load_kernels()
+    session.load_kernels()
     jit_s = time.perf_counter() - began
     meter = MemoryMeter(device)
     meter.start()
-    with track(f"decode {Path(path).name}", total=1 + repeats) as bar:
+    with track(f"decode {path.name}", total=1 + repeats) as bar:
         model, reader, first = once()
         peak = meter.peak_bytes()
         digest = model.digest()

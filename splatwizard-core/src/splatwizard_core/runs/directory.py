@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -48,23 +49,42 @@ class StepLog:
 
     def __init__(self, directory: Path) -> None:
         self.path = directory / STEPS
-        self._steps: dict[str, Any] = {}
+
+    def _read(self) -> dict[str, Any]:
         try:
             content = json.loads(self.path.read_text())
         except (OSError, ValueError):
-            return  # none yet, or damaged: then the steps are done again
-        if isinstance(content, dict):
-            self._steps = {k: v for k, v in content.items() if isinstance(v, dict) and {"key", "facts"} <= set(v)}
+            return {}  # none yet, or damaged: then the steps are done again
+        if not isinstance(content, dict):
+            return {}
+        return {k: v for k, v in content.items() if isinstance(v, dict) and {"key", "facts"} <= set(v)}
 
     def done(self, step: str, key: str) -> dict[str, Any] | None:
         """Return the facts of a finished step, or None if it was not done from these inputs."""
-        found = self._steps.get(step)
+        found = self._read().get(step)
         return found["facts"] if found is not None and found["key"] == key else None
 
     def finish(self, step: str, key: str, facts: dict[str, Any]) -> None:
         """Remember a finished step."""
-        self._steps[step] = {"key": key, "facts": facts}
-        write_json(self.path, self._steps)
+        write_json(self.path, {**self._read(), step: {"key": key, "facts": facts}})
+
+    def once(
+        self,
+        step: str,
+        key: str,
+        do: Callable[[], dict[str, Any]],
+        *,
+        holds: Callable[[dict[str, Any]], bool] = lambda facts: True,
+    ) -> dict[str, Any]:
+        """Return the facts of a step as they are remembered; where they are not, do it and remember its facts.
+
+        holds   facts of the same inputs -> they still hold what is asked for
+        """
+        facts = self.done(step, key)
+        if facts is None or not holds(facts):
+            facts = do()
+            self.finish(step, key, facts)
+        return facts
 
 
 def run_directory(request: RunRequest) -> Path:
@@ -83,11 +103,15 @@ def run_directory(request: RunRequest) -> Path:
 
 
 def begin(directory: Path, request: RunRequest) -> None:
-    """Clear what is to be cleared, and what a killed process left half written."""
-    for folder in (directory, *(path for path in map(directory.joinpath, OWN_FILES) if path.is_dir())):
+    """Clear what is to be cleared, and what a killed process left half written; other files in the directory stay."""
+    own = [directory / name for name in OWN_FILES]
+    for folder in (directory, *(path for path in own if path.is_dir())):
         sweep(folder)
-    if not request.resume:
-        discard(directory)
+    for path in () if request.resume else own:
+        if path.is_dir() and not path.is_symlink():
+            remove_folder(path)
+        else:
+            path.unlink(missing_ok=True)
     if not (directory / CONFIG).exists():
         write_config(directory, request.resolved)
 
@@ -95,13 +119,3 @@ def begin(directory: Path, request: RunRequest) -> None:
 def write_config(directory: Path, resolved: ResolvedConfig) -> None:
     """Write config.toml, which repeats the run. A changed one replaces it only once its training is accepted."""
     write_atomic(directory / CONFIG, resolved.toml())
-
-
-def discard(directory: Path) -> None:
-    """Remove what a run wrote; anything else in the directory stays."""
-    for name in OWN_FILES:
-        path = directory / name
-        if path.is_dir() and not path.is_symlink():
-            remove_folder(path)
-        else:
-            path.unlink(missing_ok=True)

@@ -25,27 +25,24 @@ from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.phases import part_of, unique
-from splatwizard_core.runs.pretrained import make_method, training_key
+from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
-from splatwizard_core.runs.training import cached_directory, finished_directory, train
+from splatwizard_core.runs.training import finished_directory, train
 from splatwizard_core.runs.versions import made_by
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""
 
 
-def encode(
-    method: Method, model: SplatModel, raster: dict[str, Any], path: Path, device: torch.device
-) -> dict[str, Any]:
+def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path) -> dict[str, Any]:
     """Write one file; returns the facts of the encoding, for the record and for what is done again later.
 
     raster  what the header asks of a rasterizer
-    device  where the model is
 
     The clock runs from the trained model to the closed file. Raises SplatwizardError if the method changes the model.
     """
     before = model.digest()
-    synchronize(device)
+    synchronize(model.device)
     began = time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad(), method.plugins.recording() as loaded:
@@ -55,7 +52,7 @@ def encode(
         loaded.insert(0, method.plugins.methods.entry(method.name))
     writer.requires = requirements(loaded)
     size = writer.write(path)
-    synchronize(device)
+    synchronize(model.device)
     seconds = time.perf_counter() - began
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
@@ -85,11 +82,9 @@ def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -
     """Return the finished training of a run directory. Raises UserInputError if it is not finished."""
     parents = directory.resolve().parents
     request = RunRequest(resolved, parents[min(2, len(parents) - 1)])  # OUT/<scene>/<method>/<rate>
-    key = training_key(session, resolved)
-    cached = cached_directory(session, resolved, request.out, key)
 
     def check() -> None:
-        if finished_directory(directory, key, cached) is None:
+        if finished_directory(session, request, directory) is None:
             raise UserInputError(
                 f"{directory} holds no finished training of this configuration: `sw train --config "
                 f"{directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
@@ -107,7 +102,7 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
     inside = target.resolve().parent == directory.resolve()
     with directory_lock(directory) if inside else contextlib.nullcontext():
         method = make_method(session.plugins, resolved)
-        return encode(method, trained.model, trained.facts["raster"], target, session.device)
+        return encode(method, trained.model, trained.facts["raster"], target)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
@@ -122,6 +117,6 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     last = list(method.stages())[-1]
     raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))
     try:
-        return encode(method, model, raster, target, session.device)
+        return encode(method, model, raster, target)
     except (TypeError, AttributeError) as error:
         raise UserInputError(f"method '{method.name}' does not encode a .ply of explicit Gaussians: {error}") from error

@@ -19,60 +19,51 @@ SETTLED_SECONDS = 2.0  # a file that changed just now may change again within on
 THREADS = 4  # hashing lets go of the interpreter; more than a disk can feed are of no use
 
 
-class FileDigests:
-    """SHA-256 of files. One whose size, inode, and times of change of content and of inode are as before is not read.
+def digests_of(files: Iterable[Path], store: Path | None = None) -> dict[Path, str]:
+    """Map file to SHA-256, hexadecimal. Raises SceneError for one that cannot be read.
 
     store   JSON file that remembers; None: nothing is remembered. One that cannot be read or written costs time only.
+
+    A file whose size, inode, and times of change of content and of inode are as before is not read.
     """
-
-    def __init__(self, store: Path | None) -> None:
-        self._store = store
-        self._known: dict[str, Any] = {}
-        if store is not None:
-            with contextlib.suppress(OSError, ValueError):
-                known = json.loads(store.read_text())
-                self._known = known if isinstance(known, dict) else {}
-
-    def of(self, files: Iterable[Path]) -> dict[Path, str]:
-        """Map file to SHA-256, hexadecimal. Raises SceneError for one that cannot be read."""
-        found: dict[Path, str] = {}
-        unread: list[Path] = []
-        for file in dict.fromkeys(files):
-            known = self._known.get(str(file.absolute()))
-            if isinstance(known, list) and len(known) == 2 and known[0] == _stamp(file):
-                found[file] = str(known[1])
-            else:
-                unread.append(file)
-        if unread:
-            found |= self._read(unread)
-            self._remember()
+    known = _remembered(store)
+    stamps = {file: _stamp(file) for file in files}  # before they are read: what changes meanwhile is not known then
+    found: dict[Path, str] = {}
+    for file, stamp in stamps.items():
+        entry = known.get(str(file.absolute()))
+        if isinstance(entry, list) and len(entry) == 2 and entry[0] == stamp:
+            found[file] = str(entry[1])
+    unread = [file for file in stamps if file not in found]
+    if not unread:
         return found
+    with (
+        track("compare pictures", total=len(unread), unit="pictures") as bar,
+        ThreadPoolExecutor(max_workers=THREADS) as pool,
+    ):
+        for file, digest in zip(unread, pool.map(_read, unread), strict=True):
+            found[file], stamp = digest, stamps[file]
+            if stamp and time.time() - max(stamp[1:3]) / 1e9 > SETTLED_SECONDS:
+                known[str(file.absolute())] = [stamp, digest]
+            bar.advance()
+    if store is not None:
+        with contextlib.suppress(OSError, SplatwizardError):
+            store.parent.mkdir(parents=True, exist_ok=True)
+            write_json(store, known)
+    return found
 
-    def _read(self, files: list[Path]) -> dict[Path, str]:
-        def read(file: Path) -> tuple[Path, list[int], str]:
-            stamp = _stamp(file)  # before it is read: what changes meanwhile does not count as known
-            try:
-                return file, stamp, file_sha256(file)
-            except OSError as error:
-                raise SceneError(f"{file}: cannot be read: {error.strerror}", path=str(file)) from error
 
-        found = {}
-        with (
-            track("compare pictures", total=len(files), unit="pictures") as bar,
-            ThreadPoolExecutor(max_workers=THREADS) as pool,
-        ):
-            for file, stamp, digest in pool.map(read, files):
-                found[file] = digest
-                if stamp and time.time() - max(stamp[1:3]) / 1e9 > SETTLED_SECONDS:
-                    self._known[str(file.absolute())] = [stamp, digest]
-                bar.advance()
-        return found
+def _remembered(store: Path | None) -> dict[str, Any]:
+    with contextlib.suppress(OSError, ValueError):
+        known = json.loads(store.read_text()) if store is not None else {}
+        return known if isinstance(known, dict) else {}
+    return {}
 
-    def _remember(self) -> None:
-        if self._store is not None:
-            with contextlib.suppress(OSError, SplatwizardError):
-                self._store.parent.mkdir(parents=True, exist_ok=True)
-                write_json(self._store, self._known)
+
+def _read(file: Path) -> str:
+    try:
+        return file_sha256(file)
+    except OSError as error:
+        raise SceneError(f"{file}: cannot be read: {error.strerror}", path=str(file)) from error
 
 
 def _stamp(file: Path) -> list[int]:

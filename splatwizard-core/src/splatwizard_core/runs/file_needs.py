@@ -12,15 +12,14 @@ from splatwizard_core.plugins.catalogue import CORE, normal_name, package_of
 
 
 def missing_parts(reader: ContainerReader, plugins: PluginManager) -> list[tuple[str, str]]:
-    """List (kind, name) of the parts that the file was written with and nothing here provides."""
+    """List (kind, name) of the parts that the file was written with and nothing here provides.
+
+    What several installed plugins quarrel over is not missing.
+    """
+    registries = plugins.registries
+    there = {(kind, name) for kind, each in registries.items() for name in (*each.names, *each.clashes)}
     parts = [("method", reader.method), *(part for each in reader.requires for part in each.provided)]
-    return [(kind, name) for kind, name in dict.fromkeys(parts) if _is_missing(plugins, kind, name)]
-
-
-def _is_missing(plugins: PluginManager, kind: str, name: str) -> bool:
-    """Whether no installed plugin provides it, not even several that quarrel over its name."""
-    registry = plugins.registries.get(kind)
-    return registry is None or not (name in registry or name in registry.clashes)
+    return [part for part in dict.fromkeys(parts) if part not in there]
 
 
 def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, name: str) -> PluginError:
@@ -59,19 +58,13 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
 
 def newer_than_installed(reader: ContainerReader, plugins: PluginManager) -> list[tuple[Requirement, str]]:
     """List distributions that the file was written with and that are older here, with the version that is installed."""
-    found = []
-    for requirement in reader.requires:
-        for plugin in plugins.plugins:
-            if normal_name(plugin.distribution) == normal_name(requirement.distribution) and plugin.version:
-                if requirement.is_newer_than(plugin.version):
-                    found.append((requirement, plugin.version))
-                break
-    return found
+    installed = {normal_name(plugin.distribution): plugin.version for plugin in plugins.plugins}
+    pairs = [(each, installed.get(normal_name(each.distribution))) for each in reader.requires]
+    return [(each, have) for each, have in pairs if have and each.is_newer_than(have)]
 
 
 def upgrade_command(reader: ContainerReader, distribution: str, installed: str) -> str:
     """Return the command that gets a version of `distribution` which reads the file."""
-    for requirement in reader.requires:
-        if normal_name(requirement.distribution) == normal_name(distribution) and requirement.is_newer_than(installed):
-            return requirement.command
-    return f"pip install --upgrade {distribution}"
+    named = [each for each in reader.requires if normal_name(each.distribution) == normal_name(distribution)]
+    newer = (each.command for each in named if each.is_newer_than(installed))
+    return next(newer, f"pip install --upgrade {distribution}")

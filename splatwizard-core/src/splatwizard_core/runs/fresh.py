@@ -21,19 +21,27 @@ class FreshProcessError(SplatwizardError):
     """The other process failed; its own message stands on stderr already."""
 
 
-def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: bool = False) -> dict[str, Any]:
+def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None) -> dict[str, Any]:
     """Run `sw ARGUMENTS` in a new interpreter and return the JSON object that it prints.
 
-    cwd         working directory
-    hide_data   take SPLATWIZARD_DATA (where the scenes lie) out of its environment
+    alone_in    working directory of one that must not find data sets: what names their folders is not in its
+                environment; None: it has ours
 
     Its progress and messages go to our stderr. Raises UserInputError or FreshProcessError with its own message if
     it fails, KeyboardInterrupt if it was interrupted.
     """
-    environment = {k: v for k, v in os.environ.items() if not (hide_data and k in HIDDEN)}
+    environment = {k: v for k, v in os.environ.items() if alone_in is None or k not in HIDDEN}
     command = [sys.executable, "-m", "splatwizard_core.cli.fresh_child", *arguments]
-    # The display of a terminal must reach it live; anything else is kept for the message.
-    done = _ended_with_us(command, cwd, environment, None if sys.stderr.isatty() else subprocess.PIPE)
+    theirs, ours = os.pipe()  # it ends when we do: we hold the other end of its input, and the system closes it for us
+    try:
+        # The display of a terminal must reach it live; anything else is kept for the message.
+        done = subprocess.run(
+            command, cwd=alone_in, env=environment, stdin=theirs, stdout=subprocess.PIPE, text=True, check=False,
+            stderr=None if sys.stderr.isatty() else subprocess.PIPE,
+        )  # fmt: skip
+    finally:
+        os.close(ours)
+        os.close(theirs)
     told = (done.stderr or "").strip()
     name = f"sw {arguments[0]}"
     if done.returncode == 130:
@@ -51,21 +59,6 @@ def run_fresh(arguments: Sequence[str], *, cwd: Path | None = None, hide_data: b
     return content
 
 
-def _ended_with_us(
-    command: list[str], cwd: Path | None, environment: dict[str, str], errors: int | None
-) -> subprocess.CompletedProcess[str]:
-    """Run a command that ends when we do: we hold the other end of its input, and the system closes it for us."""
-    theirs, ours = os.pipe()
-    try:
-        return subprocess.run(
-            command, cwd=cwd, env=environment, stdin=theirs, stdout=subprocess.PIPE, stderr=errors, text=True,
-            check=False,
-        )  # fmt: skip
-    finally:
-        os.close(ours)
-        os.close(theirs)
-
-
 def decode_fresh(path: Path, device: str, *, repeats: int = 3) -> dict[str, Any]:
     """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight.
 
@@ -75,4 +68,4 @@ def decode_fresh(path: Path, device: str, *, repeats: int = 3) -> dict[str, Any]
         copy = folder / path.name
         shutil.copyfile(path, copy)
         arguments = ["decode", copy.name, "--device", device, "--repeats", str(repeats), "--json"]
-        return run_fresh(arguments, cwd=folder, hide_data=True)
+        return run_fresh(arguments, alone_in=folder)

@@ -10,7 +10,6 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
-import json
 import os
 import shlex
 import socket
@@ -18,9 +17,11 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+
+import psutil
+from pydantic import BaseModel
 
 from splatwizard_core.errors import RunLockedError
 
@@ -33,8 +34,7 @@ ADVICE = "wait for it, or choose another directory (--out)"
 _NO_LOCKS = (errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS, errno.EINVAL)
 
 
-@dataclass(frozen=True)
-class Holder:
+class Holder(BaseModel, frozen=True):
     """The process that holds a directory.
 
     boot    identifies the running kernel: holders of one boot share their locks
@@ -42,10 +42,10 @@ class Holder:
     """
 
     pid: int
-    host: str
-    boot: str
-    since: str
-    command: str
+    host: str = "?"
+    boot: str = "?"
+    since: str = "?"
+    command: str = "?"
 
     def __str__(self) -> str:
         return f"process {self.pid} on {self.host} since {self.since} (`{self.command}`)"
@@ -53,17 +53,12 @@ class Holder:
 
 @contextlib.contextmanager
 def directory_lock(
-    directory: Path,
-    *,
-    wait: bool = False,
-    on_wait: Callable[[str], None] | None = None,
-    say: Callable[[str], None] | None = None,
+    directory: Path, *, wait: bool = False, say: Callable[[str], None] = lambda line: None
 ) -> Iterator[None]:
     """Hold `directory` (made if needed) for this process while the block runs.
 
-    wait        wait for whoever holds it instead of giving up
-    on_wait     called once with a sentence about the holder before waiting
-    say         told in a sentence if the holder before ended without letting go
+    wait    wait for whoever holds it instead of giving up
+    say     told in a sentence who is waited for, and if the holder before ended without letting go
 
     Raises RunLockedError that names the holder, or says that the file system has no locks.
     """
@@ -71,20 +66,17 @@ def directory_lock(
     path = directory / NAME
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     try:
-        asked = False
-        while True:
-            refused = _try(descriptor, directory, path)
-            if refused is None:
-                break
+        told = False
+        while (refused := _try(descriptor, directory, path)) is not None:
             fact, advice = refused
             if not wait:
                 raise RunLockedError(f"{fact}: {advice}")
-            if on_wait is not None and not asked:
-                on_wait(f"waiting: {fact}")
-            asked = True
+            if not told:
+                say(f"waiting: {fact}")
+            told = True
             time.sleep(POLL_SECONDS)
         before = read_holder(path)
-        if before is not None and say is not None:
+        if before is not None:
             say(f"{before} ended without finishing {directory}; going on from what it left")
         _write_holder(descriptor)
         ended = threading.Event()
@@ -104,15 +96,7 @@ def directory_lock(
 def is_held(directory: Path) -> bool:
     """Whether a process of this machine seems to hold a directory. Takes no lock, so nobody is refused meanwhile."""
     holder = read_holder(directory / NAME)
-    if holder is None or holder.boot != _boot():
-        return False
-    try:
-        os.kill(holder.pid, 0)
-    except PermissionError:
-        return True  # it lives, and belongs to another user
-    except OSError:
-        return False
-    return True
+    return holder is not None and holder.boot == _boot() and psutil.pid_exists(holder.pid)
 
 
 def _try(descriptor: int, directory: Path, path: Path) -> tuple[str, str] | None:
@@ -122,11 +106,11 @@ def _try(descriptor: int, directory: Path, path: Path) -> tuple[str, str] | None
     except BlockingIOError:
         return f"{directory} is being written by {read_holder(path) or 'another process'}", ADVICE
     except OSError as error:
-        if error.errno in _NO_LOCKS:
-            raise RunLockedError(
-                f"{directory} lies on a file system without locks ({error.strerror}): choose a directory on another"
-            ) from error
-        raise
+        if error.errno not in _NO_LOCKS:
+            raise
+        raise RunLockedError(
+            f"{directory} lies on a file system without locks ({error.strerror}): choose a directory on another"
+        ) from error
     holder = read_holder(path)
     if holder is None or holder.boot == _boot():
         return None  # nobody, or one whose lock would be in our way if it were alive
@@ -157,24 +141,20 @@ def _beat(descriptor: int, ended: threading.Event) -> None:
 
 def _write_holder(descriptor: int) -> None:
     since = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    command = shlex.join(["sw" if i == 0 else word for i, word in enumerate(sys.argv)])
+    command = shlex.join(["sw", *sys.argv[1:]])
     if len(command) > COMMAND_CHARACTERS:
         command = f"{command[: COMMAND_CHARACTERS - 3]}..."
-    holder = Holder(os.getpid(), socket.gethostname(), _boot(), since, command)
+    holder = Holder(pid=os.getpid(), host=socket.gethostname(), boot=_boot(), since=since, command=command)
     os.ftruncate(descriptor, 0)
     with contextlib.suppress(OSError):  # a full disk: the lock holds all the same, and reading needs no space
-        os.pwrite(descriptor, json.dumps(asdict(holder)).encode(), 0)
+        os.pwrite(descriptor, holder.model_dump_json().encode(), 0)
 
 
 def read_holder(path: Path) -> Holder | None:
     """Read the holder that a lock file names; None for nobody, or one that is just beginning or ending."""
-    try:
-        told = json.loads(path.read_text())
-        return Holder(
-            int(told["pid"]), *(str(told.get(name, "?")) for name in ("host", "boot", "since", "command"))
-        )  # fmt: skip
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
-        return None
+    with contextlib.suppress(OSError, ValueError):
+        return Holder.model_validate_json(path.read_text())
+    return None
 
 
 def _boot() -> str:

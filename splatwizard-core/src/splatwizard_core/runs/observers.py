@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Protocol
 
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -17,6 +16,7 @@ from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.runs.record import Record
 from splatwizard_core.scene.scene import Scene
+from splatwizard_core.training.housekeeping import OnStep
 from splatwizard_core.training.trainer import StepRecord
 
 if TYPE_CHECKING:
@@ -53,47 +53,36 @@ class TrainingObserver(Protocol):
         ...
 
 
-class Observers:
-    """The observers of one training, each of which can fail alone. Used as a context that tells them of its end."""
+@contextlib.contextmanager
+def watched_by(
+    observers: Iterable[TrainingObserver | None], plugins: PluginManager, say: Callable[[str], None]
+) -> Iterator[OnStep | None]:
+    """Yield the function that tells the observers of a step (None: there are none), and tell them of the end.
 
-    def __init__(
-        self, plugins: PluginManager, observers: Sequence[TrainingObserver | None], say: Callable[[str], None]
-    ) -> None:
-        self._plugins, self._say = plugins, say
-        self._observers = [each for each in observers if each is not None]
+    Each can fail alone: what it raises is said with its package, and it is told of nothing more.
+    """
+    watching = [each for each in observers if each is not None]
 
-    @classmethod
-    def of(cls, plugins: PluginManager, training: StartedTraining | None, say: Callable[[str], None]) -> Observers:
-        """Ask every plugin for its observer of a training; None: a training that nobody is to watch."""
-        return cls(plugins, plugins.hook.run_started(training=training) if training is not None else [], say)
-
-    def __bool__(self) -> bool:
-        return bool(self._observers)
-
-    def __enter__(self) -> Observers:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._tell(lambda observer: observer.finished())
-
-    def after_step(self, model: SplatModel, record: StepRecord) -> None:
-        """Tell all of a step that is done."""
-        self._tell(lambda observer: observer.after_step(model, record))
-
-    def _tell(self, call: Callable[[TrainingObserver], None]) -> None:
-        for observer in list(self._observers):
+    def tell(call: Callable[[TrainingObserver], None]) -> None:
+        for observer in list(watching):
             try:
                 call(observer)
             except (Exception, SystemExit) as error:
                 log.debug("an observer of the training failed", exc_info=True)
-                self._observers.remove(observer)
-                distribution, version = Origins(self._plugins).of(observer)
+                watching.remove(observer)
+                distribution, version = Origins(plugins).of(observer)
                 whose = f" of {distribution} {version}" if distribution else ""
-                self._say(f"warning: observer {type(observer).__name__}{whose} is dropped: {one_line(error)}")
+                say(f"warning: observer {type(observer).__name__}{whose} is dropped: {one_line(error)}")
                 with contextlib.suppress(Exception, SystemExit):
                     observer.finished()
+
+    def after_step(model: SplatModel, record: StepRecord) -> None:
+        tell(lambda observer: observer.after_step(model, record))
+
+    try:
+        yield after_step if watching else None
+    finally:
+        tell(lambda observer: observer.finished())
 
 
 @dataclass(frozen=True)

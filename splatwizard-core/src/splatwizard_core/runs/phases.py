@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from splatwizard_core.plugins import Entry, PluginManager
-from splatwizard_core.plugins.origins import Origins
+from splatwizard_core.plugins.origins import NOBODY, Origins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers
@@ -34,22 +34,17 @@ def unique(parts: Iterable[Part]) -> list[Part]:
 
 def rasterizer_parts(plugins: PluginManager, names: Iterable[str]) -> list[Part]:
     """Return rasterizers, given by name, as parts; one that is not installed any more has no distribution."""
-    registry = plugins.registries["rasterizer"]
-    return unique(
-        part_of(registry.entry(name)) if name in registry else _part("rasterizer", name, "", "") for name in names
-    )
+    known = plugins.rasterizers
+    return unique(part_of(known.entry(name)) if name in known else _part("rasterizer", name) for name in names)
 
 
 def stage_parts(origins: Origins, stage: Stage, ppl: PipelineParams) -> list[Part]:
     """Return the stage itself, and the tasks of its plan that come from elsewhere."""
     own = origins.of(stage)
-    parts = [_part("stage", stage.name, *own)]
-    for scheduler in build_schedulers(stage, ppl):
-        for registration in scheduler.registrations:
-            owner = origins.of(registration.task)
-            if owner not in (own, ("", "")):
-                parts.append(_part("task", registration.name, *owner))
-    return unique(parts)
+    planned = [each for scheduler in build_schedulers(stage, ppl) for each in scheduler.registrations]
+    owned = [(each.name, origins.of(each.task)) for each in planned]
+    others = [_part("task", name, *owner) for name, owner in owned if owner not in (own, NOBODY)]
+    return unique([_part("stage", stage.name, *own), *others])
 
 
 class StageParts:
@@ -68,48 +63,40 @@ class StageParts:
         loaded: list[Entry],
         rasterizer: NegotiatedRasterizer,
     ) -> None:
-        self._plugins, self._stages, self._loaded, self._rasterizer = plugins, stages, loaded, rasterizer
+        self._plugins, self._loaded, self._rasterizer = plugins, loaded, rasterizer
         origins = Origins(plugins)
         self._fixed = [stage_parts(origins, stage, ppl) for stage in stages]
         self._common: list[Part] = []
-        for entry in loaded:
-            if entry.kind == "method":
-                continue  # a stage that is borrowed from it says so itself
-            holders = [i for i, stage in enumerate(stages) if _holds(stage, entry)]
-            for i in holders:
-                self._fixed[i].append(part_of(entry))
-            if not holders:
-                self._common.append(part_of(entry))
+        for entry in _without_methods(loaded):
+            holders = [parts for stage, parts in zip(stages, self._fixed, strict=True) if _holds(stage, entry)]
+            for parts in holders or [self._common]:
+                parts.append(part_of(entry))
         self._mark = len(loaded)
         self._pending: list[Part] = []
 
     def since_asked(self) -> list[Part]:
         """Return the parts that served since this was last asked."""
-        self._pending += [part_of(entry) for entry in self._loaded[self._mark :] if entry.kind != "method"]
-        self._mark = len(self._loaded)
-        self._pending += rasterizer_parts(self._plugins, sorted(self._rasterizer.served))
+        asked = map(part_of, _without_methods(self._loaded[self._mark :]))
+        found = unique([*self._pending, *asked, *rasterizer_parts(self._plugins, sorted(self._rasterizer.served))])
         self._rasterizer.served.clear()
-        found, self._pending = unique(self._pending), []
+        self._mark, self._pending = len(self._loaded), []
         return found
 
     @contextlib.contextmanager
     def elsewhere(self) -> Iterator[None]:
         """Leave out the parts that another training asks for meanwhile."""
         self._pending = self.since_asked()
-        try:
-            yield
-        finally:
-            self._mark = len(self._loaded)
+        yield
+        self._mark = len(self._loaded)
 
     def phases(self, provided: Mapping[str, Sequence[Part]]) -> list[dict[str, Any]]:
         """Return the phases of the training.
 
         provided    stage name -> the parts that `since_asked` told during it
         """
-        found = [_phase(TRAIN, self._common)] if self._common else []
-        for fixed, (name, parts) in zip(self._fixed, provided.items(), strict=True):
-            found.append(_phase(f"{TRAIN}: {name}", [*fixed, *parts]))
-        return found
+        common = [_phase(TRAIN, self._common)] if self._common else []
+        pairs = zip(self._fixed, provided.items(), strict=True)
+        return [*common, *(_phase(f"{TRAIN}: {name}", [*fixed, *parts]) for fixed, (name, parts) in pairs)]
 
 
 def phases_of_run(
@@ -132,8 +119,13 @@ def _phase(name: str, parts: Iterable[Part]) -> dict[str, Any]:
     return {"phase": name, "provided_by": unique(parts)}
 
 
-def _part(kind: str, name: str, distribution: str, version: str) -> Part:
+def _part(kind: str, name: str, distribution: str = "", version: str = "") -> Part:
     return {"kind": kind, "name": name, "distribution": distribution, "version": version}
+
+
+def _without_methods(entries: Iterable[Entry]) -> list[Entry]:
+    """Leave out methods: a stage that is borrowed from one says so itself."""
+    return [entry for entry in entries if entry.kind != "method"]
 
 
 def _holds(stage: Stage, entry: Entry) -> bool:

@@ -6,6 +6,8 @@ a finished one is not done again.
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -13,37 +15,17 @@ from typing import Any
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
 from splatwizard_core.files import file_sha256
+from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import METRICS, ResolvedConfig, content_hash
 from splatwizard_core.runs.decode import REPEATS
-from splatwizard_core.runs.directory import (
-    ENCODED,
-    RENDERS,
-    RunRequest,
-    StepLog,
-    begin,
-    run_directory,
-    write_config,
-)
+from splatwizard_core.runs.directory import ENCODED, RENDERS, RunRequest, StepLog, begin, run_directory, write_config
 from splatwizard_core.runs.encode import encode
 from splatwizard_core.runs.fresh import decode_fresh, run_fresh
 from splatwizard_core.runs.lock import directory_lock
-from splatwizard_core.runs.measure import Scope
 from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.pretrained import make_method, training_key
-from splatwizard_core.runs.record import (
-    FILE_NAME,
-    SCHEMA,
-    CodecBlock,
-    PretrainingBlock,
-    Record,
-    RecordFile,
-    TrainBlock,
-    complete_record,
-    picked,
-    read_record,
-)
 from splatwizard_core.runs.session import Session, TrainedModel
-from splatwizard_core.runs.training import pretraining, train
+from splatwizard_core.runs.training import pretraining, total_seconds, train
 from splatwizard_core.runs.versions import changes, installed, providers
 from splatwizard_core.scene.images import check_pictures, decode_all
 from splatwizard_core.training.keys import dotted
@@ -51,55 +33,72 @@ from splatwizard_core.training.keys import dotted
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 
 
-def run(session: Session, request: RunRequest) -> tuple[Record, Path]:
+def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
     """Run the whole chain for one scene, method and rate point; returns the record and the run directory.
 
     Raises RunLockedError if another process writes there, and whatever a step raises.
     """
     resolved = request.resolved
-    directory = run_directory(request)
-    _check_scene(session, request, directory)
-    with directory_lock(directory, say=session.say):
-        begin(directory, request)
-        steps = StepLog(directory)
-        train_key = training_key(session, resolved)
-        encoded = directory / ENCODED
-        encode_key = content_hash([train_key, resolved.config_content()])
-        encoding = _encoded(session, steps, encode_key, encoded)
-        if encoding is not None:
-            finished = _finished_record(session, directory, steps, request, encoding)
-            if finished is not None:
-                session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
-                return finished, directory
-        else:
+    with _held_directory(session, request) as directory:
+        steps, encoded = StepLog(directory), directory / ENCODED
+        train_key, repeats = training_key(session, resolved), max(REPEATS, request.repeats)
+
+        def encode_it() -> dict[str, Any]:
             trained = train_in(session, request, directory)
-            steps = StepLog(directory)  # training has written into it
             method = make_method(session.plugins, resolved)
-            encoding = encode(method, trained.model, trained.facts["raster"], encoded, session.device)
-            session.say(f"encoded {encoding['bytes']:,} bytes in {encoding['encode_s']:.2f} s")
-            steps.finish("encode", encode_key, encoding)
+            facts = encode(method, trained.model, trained.facts["raster"], encoded)
+            session.say(f"encoded {facts['bytes']:,} bytes in {facts['encode_s']:.2f} s")
+            return facts
+
+        def decode_it() -> dict[str, Any]:
+            facts = decode_fresh(encoded, str(session.device), repeats=repeats)
+            counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts["counts"].items())
+            session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {counted}")
+            return facts
+
+        def evaluate_it() -> dict[str, Any]:
+            arguments = ["eval", str(encoded), "--scene", resolved.absolute_scene]
+            arguments += _eval_options(resolved, str(session.device))
+            arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
+            return {**run_fresh(arguments), "asked": asked}
+
+        encoding = steps.once(
+            "encode", content_hash([train_key, resolved.config_content()]), encode_it,
+            holds=lambda facts: _is_current(session, encoded, facts),
+        )  # fmt: skip
+        keys = step_keys(session, resolved, encoding)
+        # The extent of the measurement, with the packages and weights that are there now.
+        setup = MetricSetup(session.device, resolved.metrics)
+        asked = {"repeats": request.repeats, "metrics": metric_identities(session.plugins.metrics, setup)}
+        finished = steps.done("record", keys["record"])
+        if finished is not None and measures(finished.get("asked"), asked):
+            with contextlib.suppress(UserInputError):  # a damaged record is written again
+                record = schema.read_record(directory / schema.FILE_NAME)
+                if record.file.sha256 == encoding["sha256"]:
+                    session.say(f"{directory} is finished; nothing to do (--fresh does it again)")
+                    return record, directory
         training = steps.done("train", train_key) or train_in(session, request, directory).facts
         write_config(directory, resolved)
-        decoded = _decode_step(session, steps, encoded, encoding, max(REPEATS, request.repeats))
-        measured = _evaluate_step(session, steps, request, directory, encoding)
+        decoded = steps.once(
+            "decode", keys["decode"], decode_it, holds=lambda facts: len(facts["decode_runs_s"]) >= repeats
+        )
+        measured = steps.once(
+            "evaluate", keys["evaluate"], evaluate_it, holds=lambda facts: measures(facts.get("asked"), asked)
+        )
         if decoded["digest"] != measured["digest"]:
             raise SplatwizardError(
                 f"{encoded}: the decoding and the evaluating process got different models from the same file; "
                 f"method '{resolved.method}' does not decode deterministically"
             )
         record = _record(session, resolved, training, encoding, decoded, measured)
-        record.write(directory / FILE_NAME)
-        key = _record_key(session, request, encoding)
-        steps.finish("record", key, {"sha256": encoding["sha256"], "asked": measured["asked"]})
+        record.write(directory / schema.FILE_NAME)
+        steps.finish("record", keys["record"], {"sha256": encoding["sha256"], "asked": measured["asked"]})
     return record, directory
 
 
 def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:
     """Do the training step of a run; `run` with the same request goes on from there."""
-    directory = run_directory(request)
-    _check_scene(session, request, directory)
-    with directory_lock(directory, say=session.say):
-        begin(directory, request)
+    with _held_directory(session, request) as directory:
         return train_in(session, request, directory), directory
 
 
@@ -110,109 +109,65 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
     return found
 
 
-def _check_scene(session: Session, request: RunRequest, directory: Path) -> None:
-    """Load the scene, and all pictures of a run that begins, before anything is written."""
+@contextlib.contextmanager
+def _held_directory(session: Session, request: RunRequest) -> Iterator[Path]:
+    """Hold the directory of a run, ready to be written to; before that load the scene, and check what begins."""
+    directory = run_directory(request)
     scene = session.scene(request.resolved)
     if not directory.exists() or not request.resume:
         decode_all(scene.train)  # training reads them anyway, and they stay
         check_pictures(scene.test)
+    with directory_lock(directory, say=session.say):
+        begin(directory, request)
+        yield directory
 
 
-def _encoded(session: Session, steps: StepLog, key: str, encoded: Path) -> dict[str, Any] | None:
-    """Return the facts of the encode step if its file is as it was written, and would be written the same today."""
-    facts = steps.done("encode", key)
-    if facts is None or not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
-        return None
+def _is_current(session: Session, encoded: Path, facts: dict[str, Any]) -> bool:
+    """Whether an encoded file is as it was written, and would be written the same today."""
+    if not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
+        return False
     changed = changes(session.plugins, facts.get("made_by"))
     if changed:
         session.say(f"{encoded} was made with {', '.join(changed)}: encoding again")
-        return None
-    return facts
+    return not changed
 
 
-def _decode_key(session: Session, encoding: dict[str, Any]) -> str:
-    return content_hash([encoding["sha256"], str(session.device), MEASURING, encoding["made_by"]])
-
-
-def _evaluate_key(session: Session, resolved: ResolvedConfig, encoding: dict[str, Any]) -> str:
+def step_keys(session: Session, resolved: ResolvedConfig, encoding: dict[str, Any]) -> dict[str, str]:
+    """Map each step after encoding to the key of what it is made from; the record's holds those before it."""
+    sha256, device = encoding["sha256"], str(session.device)
     used = installed(session.plugins, [*encoding["made_by"], *providers(session.plugins, "metric", "rasterizer")])
-    return content_hash(
+    decode = content_hash([sha256, device, MEASURING, encoding["made_by"]])
+    evaluate = content_hash(
         [
-            encoding["sha256"], session.scene_digest(resolved), str(session.device),
-            resolved.ppl.raster.model_dump(mode="json"), session.plugins.metrics.names, MEASURING, used,
+            sha256, session.scene_digest(resolved), device, resolved.ppl.raster.model_dump(mode="json"),
+            session.plugins.metrics.names, MEASURING, used,
         ]
     )  # fmt: skip
+    record = content_hash([training_key(session, resolved), resolved.config_hash(), decode, evaluate, schema.SCHEMA])
+    return {"decode": decode, "evaluate": evaluate, "record": record}
 
 
-def _record_key(session: Session, request: RunRequest, encoding: dict[str, Any]) -> str:
-    """Return the key of a record: the scene and the versions stand in the keys of the steps before."""
-    resolved = request.resolved
-    return content_hash(
-        [
-            training_key(session, resolved), resolved.config_hash(), _decode_key(session, encoding),
-            _evaluate_key(session, resolved, encoding), SCHEMA,
-        ]
-    )  # fmt: skip
+def measures(extent: Any, asked: Mapping[str, Any]) -> bool:
+    """Whether a measurement of this extent, as a step remembers it (or anything), holds all that is asked for.
 
-
-def _finished_record(
-    session: Session, directory: Path, steps: StepLog, request: RunRequest, encoding: dict[str, Any]
-) -> Record | None:
-    """Return the record of a run that was finished from the same inputs."""
-    facts = steps.done("record", _record_key(session, request, encoding))
-    if facts is None or not _scope(session, request).is_held_by(facts.get("asked")):
-        return None
+    One that holds more is kept: a run that was measured with LPIPS, or five times over, does not lose that because a
+    later command does not ask for it. An extent is `repeats` of the speed and `metrics`: name -> identity of what its
+    values depend on; None: it cannot be computed now.
+    """
     try:
-        record = read_record(directory / FILE_NAME)
-    except UserInputError:
-        return None  # it is written again
-    return record if record.file.sha256 == encoding["sha256"] else None
+        known = extent["metrics"]
+        wanted = {name: now for name, now in asked["metrics"].items() if now is not None}
+        return bool(extent["repeats"] >= asked["repeats"]) and all(known.get(name) == wanted[name] for name in wanted)
+    except (AttributeError, KeyError, TypeError):
+        return False  # damaged
 
 
-def _decode_step(
-    session: Session, steps: StepLog, encoded: Path, encoding: dict[str, Any], repeats: int
-) -> dict[str, Any]:
-    key = _decode_key(session, encoding)
-    facts = steps.done("decode", key)
-    if facts is None or len(facts["decode_runs_s"]) < repeats:
-        facts = decode_fresh(encoded, str(session.device), repeats=repeats)
-        counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts["counts"].items())
-        session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {counted}")
-        steps.finish("decode", key, facts)
-    return facts
-
-
-def _evaluate_step(
-    session: Session, steps: StepLog, request: RunRequest, directory: Path, encoding: dict[str, Any]
-) -> dict[str, Any]:
-    resolved = request.resolved
-    key = _evaluate_key(session, resolved, encoding)
-    facts, scope = steps.done("evaluate", key), _scope(session, request)
-    if facts is None or not scope.is_held_by(facts.get("asked")):
-        arguments = ["eval", str(directory / ENCODED), "--scene", resolved.absolute_scene]
-        arguments += eval_options(resolved, str(session.device))
-        arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
-        facts = {**run_fresh(arguments), "asked": scope.as_dict()}
-        steps.finish("evaluate", key, facts)
-    return facts
-
-
-def _scope(session: Session, request: RunRequest) -> Scope:
-    """Return the extent of the measurement, with the packages and weights that are there now."""
-    setup = MetricSetup(session.device, request.resolved.metrics)
-    return Scope(request.repeats, metric_identities(session.plugins.metrics, setup))
-
-
-def eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
+def _eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
     """Return the options that make `sw eval` see the scene, and set up its metrics, as this run does."""
     ppl = resolved.ppl
     values: dict[str, Any] = {"seed": ppl.seed, "threads": ppl.threads}
     values |= {key: "none" if value is None else value for key, value in resolved.scene_options.items()}
-    values |= {
-        f"raster.{key}": ",".join(names)
-        for key, names in (("prefer", ppl.raster.prefer), ("forbid", ppl.raster.forbid))
-        if names
-    }
+    values |= {f"raster.{key}": ",".join(names) for key, names in ppl.raster if names}
     values |= dotted(resolved.metrics, METRICS)
     return ["--device", device, *(word for key, value in values.items() for word in ("--set", f"{key}={value}"))]
 
@@ -224,10 +179,11 @@ def _record(
     encoding: dict[str, Any],
     decoded: dict[str, Any],
     measured: dict[str, Any],
-) -> Record:
+) -> schema.Record:
     """Return the record from the facts of the steps: each block takes its fields from whatever step reported them."""
     entry = session.plugins.methods.entry(resolved.method)
-    before, seconds, unknown = _pretraining(training)
+    before, unknown = _pretraining(training)
+    started = {"pretraining": before, "with_pretraining_s": total_seconds(training)}
     steps = {**training, **measured, **encoding, **decoded}
     values = {
         **steps,
@@ -236,28 +192,24 @@ def _record(
         "rate": resolved.rate,
         "config": resolved.as_dict(),
         "config_hash": resolved.config_hash(),
-        "environment": measured["environment"],
-        "file": picked(RecordFile, steps),
-        "codec": picked(CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
-        "train": picked(TrainBlock, training, {"pretraining": before, "with_pretraining_s": seconds}),
+        "file": schema.picked(schema.RecordFile, steps),
+        "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
+        "train": schema.picked(schema.TrainBlock, training, started),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
         "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
         "unknown": {**measured["unknown"], **unknown},
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
-    return complete_record(picked(Record, values))
+    return schema.complete_record(schema.picked(schema.Record, values))
 
 
-def _pretraining(training: dict[str, Any]) -> tuple[dict[str, Any], float | None, dict[str, str]]:
-    """Return what a run started from, the seconds of its training with theirs, and reasons for nulls by dotted name."""
-    found, total, unknown = {}, training["train_s"], dict[str, str]()
+def _pretraining(training: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Return what a run started from, and the reasons for what is null of it, by dotted name."""
+    found, unknown = {}, dict[str, str]()
     for name, facts in pretraining(training).items():
-        found[name] = scene = picked(PretrainingBlock, {"file": {}, "made_by": {}}, facts)
+        found[name] = scene = schema.picked(schema.PretrainingBlock, {"file": {}, "made_by": {}}, facts)
         why = "it came from a file, which does not say" if scene["file"] else "a release that did not note it"
         unknown |= {f"train.pretraining.{name}.{key}": why for key, value in scene.items() if value is None}
         if scene["train_s"] is None:
             unknown["train.with_pretraining_s"] = f"the {name} scene that it started from came from a file"
-            total = None
-        elif total is not None:
-            total += scene["train_s"]
-    return found, total, unknown
+    return found, unknown

@@ -9,16 +9,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from splatwizard_core.runs.file_digests import FileDigests
+from splatwizard_core.runs.file_digests import digests_of
 from splatwizard_core.scene.scene import Scene, View
 
 SAMPLED_PICTURES = 8
 
 
-def scene_digest(scene: Scene, digests: FileDigests | None = None) -> str:
+def scene_digest(scene: Scene, store: Path | None = None) -> str:
     """Return the SHA-256 over protocol, view names, cameras, start points, and what every picture and mask file holds.
 
-    digests     remembers checksums of files; None: they are read
+    store   remembers checksums of files, see `digests_of`
 
     Where the pictures come from no file that can be told (`picture_files`), their pixels count instead: all of them, or
     if the scene lies nowhere, since then it is drawn, and drawn alike each time, those of eight training views.
@@ -30,7 +30,7 @@ def scene_digest(scene: Scene, digests: FileDigests | None = None) -> str:
         sha.update(tensor.detach().cpu().contiguous().view(-1).view(torch.uint8).numpy().tobytes())
 
     files = {view: picture_files(view) for view in (*scene.train, *scene.test)}
-    contents = (digests or FileDigests(None)).of(file for found in files.values() for file in found)
+    contents = digests_of((file for found in files.values() for file in found), store)
     count = min(SAMPLED_PICTURES, len(scene.train))
     sampled = {scene.train[i * len(scene.train) // count] for i in range(count)} if scene.path is None else set(files)
     for part in (scene.train, scene.test):

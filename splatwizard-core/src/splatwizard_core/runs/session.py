@@ -18,7 +18,6 @@ from splatwizard_core.native.loader import cache_root
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.file_digests import FileDigests
 from splatwizard_core.runs.scene_digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
@@ -76,7 +75,7 @@ class Session:
 
         def digest() -> str:
             scene = self.scene(resolved)
-            return scene_digest(scene, FileDigests(_digest_store(scene)))
+            return scene_digest(scene, _digest_store(scene))
 
         return self._once(("digest", resolved.scene_spec, resolved.scene), digest)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -15,21 +16,12 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog
 from splatwizard_core.runs.lock import directory_lock, is_held
-from splatwizard_core.runs.observers import Observers, StartedTraining
+from splatwizard_core.runs.observers import StartedTraining, watched_by
 from splatwizard_core.runs.phases import StageParts
-from splatwizard_core.runs.pretrained import (
-    IDENTITY,
-    base_config,
-    check_model,
-    first_scene,
-    make_method,
-    named_scenes,
-    starts,
-    training_key,
-)
 from splatwizard_core.runs.record import PretrainingBlock, TrainBlock, picked
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.versions import changes, made_by
@@ -53,42 +45,47 @@ def train(session: Session, request: RunRequest, directory: Path, *, stop_after:
     stop_after  end the process's part of the training after this many steps (raises KeyboardInterrupt then)
     """
     resolved = request.resolved
-    key = training_key(session, resolved)
-    in_memory = session.kept("trained", key)
-    if in_memory is not None:
-        return _share(session, in_memory, directory, resolved)
-    cached = cached_directory(session, resolved, request.out, key)
-    # Starting again takes nothing old, least of all from a neighbour that the same command is about to clear.
-    home = (finished_directory(directory, key, cached) if request.resume else None) or directory
-    steps = StepLog(home)
-    done = steps.done(STEP, key) if holds_training(home, key) else None
+    key = pretrained.training_key(session, resolved)
+    found = session.kept("trained", key)
+    if found is None:
+        # Starting again takes nothing old, least of all from a neighbour that the same command is about to clear.
+        home = (finished_directory(session, request, directory) if request.resume else None) or directory
+        found = _trained_in(home, session, request, key, stop_after)
+        session.keep("trained", found)
+        if home != directory and home.parent.name == CACHE and not (directory / LOG).exists():
+            write_atomic(directory / LOG, (home / LOG).read_text("utf-8"))  # reports look for it here
+    steps = StepLog(directory)
+    if steps.done(STEP, key) is None:  # then it uses the training of another directory, which is noted in this one
+        other = found.facts.get("trained_in")
+        made = "that others started from" if other == resolved.rate else f"of {other}"
+        session.say(f"rate point {resolved.rate} shares the training {made}")
+        steps.finish(STEP, key, {**found.facts, "checkpoints": "elsewhere"})
+    return found
+
+
+def _trained_in(home: Path, session: Session, request: RunRequest, key: str, stop_after: int | None) -> TrainedModel:
+    """Train in the directory `home`, or load what is finished there."""
+    resolved, plugins = request.resolved, session.plugins
+    steps, done = StepLog(home), finished_training(home, key)
     resume = done is not None or (request.resume and not _is_of_an_older_release(session, home))
     if done is None:
         scene = session.scene(resolved)
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
         if not CheckpointStore(home / CHECKPOINTS).paths():  # those of another training are refused, and stay as is
             steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
-    with session.plugins.recording() as loaded:
+    with plugins.recording() as loaded:
         training = _StagesOfARun(session, replace(request, resume=resume), home, loaded)
         model, facts = training.train(stop_after=stop_after, watched=done is None)
     if done is None:
-        rasterizers = session.plugins.rasterizers
+        rasterizers = plugins.rasterizers
         served = [rasterizers.entry(name) for name in facts["rasterizers"].values() if name in rasterizers]
-        facts["made_by"] = made_by(session.plugins, [*loaded, *served])
-        facts["trained_in"] = resolved.rate
+        facts |= {"made_by": made_by(plugins, [*loaded, *served]), "trained_in": resolved.rate}
         steps.finish(STEP, key, facts)
-    else:
-        facts = done  # what was measured when it was trained, not when it was loaded
-        changed = changes(session.plugins, facts.get("made_by"))
-        if changed:
-            session.say(f"{home} was trained with {', '.join(changed)}; it is used as it is (--fresh trains again)")
-    found = TrainedModel(model, key, facts)
-    session.keep("trained", found)
-    if home == directory:
-        return found
-    if home == cached and not (directory / LOG).exists():
-        write_atomic(directory / LOG, (home / LOG).read_text("utf-8"))  # reports look for it here
-    return _share(session, found, directory, resolved)
+        return TrainedModel(model, key, facts)
+    changed = changes(plugins, done.get("made_by"))
+    if changed:
+        session.say(f"{home} was trained with {', '.join(changed)}; it is used as it is (--fresh trains again)")
+    return TrainedModel(model, key, done)  # with what was measured when it was trained, not when it was loaded
 
 
 def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path) -> TrainedModel:
@@ -97,18 +94,17 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
 
     Two processes that want the same one train it once: the second waits for the first.
     """
-    if outer.init and name == first_scene(make_method(session.plugins, outer)):
+    if outer.init and name == pretrained.first_scene(pretrained.make_method(session.plugins, outer)):
         session.say_once(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
         return _scene_of_file(session, Path(outer.init))
-    resolved = base_config(session.plugins, name, outer)
-    key = training_key(session, resolved)
+    resolved = pretrained.base_config(session.plugins, name, outer)
+    key = pretrained.training_key(session, resolved)
     kept = session.kept("start", key)
     if kept is not None:
         return kept
-    directory = _ordinary_run(out / session.scene(resolved).name / name, key)
-    if directory is None:
-        directory = cached_directory(session, resolved, out, key)
-    with directory_lock(directory, wait=True, on_wait=session.say, say=session.say):
+    ordinary = _ordinary_run(out / session.scene(resolved).name / name, key)
+    directory = ordinary or cached_directory(session, resolved, out)
+    with directory_lock(directory, wait=True, say=session.say):
         sweep(directory)
         if StepLog(directory).done(STEP, key) is not None:
             session.say_once(f"{outer.method} starts from the trained {name} scene in {directory}")
@@ -127,63 +123,57 @@ def _scene_of_file(session: Session, path: Path) -> TrainedModel:
     digest = session.file_digest(path)
     found = session.kept("file", digest)
     if found is None:
-        model = check_model(str(path)).to(session.device).eval().requires_grad_(False)
+        model = pretrained.check_model(str(path)).to(session.device).eval().requires_grad_(False)
         found = TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
         session.keep("file", found)
     return found
 
 
-def cached_directory(session: Session, resolved: ResolvedConfig, out: Path, key: str) -> Path:
+def cached_directory(session: Session, resolved: ResolvedConfig, out: Path) -> Path:
     """Return where the trained scene of a configuration is kept for those that start from it."""
+    key = pretrained.training_key(session, resolved)
     return out / CACHE / f"{session.scene(resolved).name}-{resolved.method}-{key[:16]}"
 
 
 def _ordinary_run(parent: Path, key: str) -> Path | None:
     """Find a run directory that holds this training, finished; else one in which another process is making it now."""
-    directories = sorted(parent.iterdir()) if parent.is_dir() else []
-    for directory in directories:
-        if holds_training(directory, key):
-            return directory
-    for directory in directories:
-        if StepLog(directory).done(BEGUN, key) is not None and is_held(directory):
-            return directory
-    return None
+    directories = _folders(parent)
+    finished = (each for each in directories if finished_training(each, key) is not None)
+    begun = (each for each in directories if StepLog(each).done(BEGUN, key) is not None and is_held(each))
+    return next(itertools.chain(finished, begun), None)
 
 
-def finished_directory(directory: Path, key: str, cached: Path) -> Path | None:
-    """Find the directory with this finished training: `directory`, that of a rate point beside it, or `cached`."""
-    beside = sorted(p for p in directory.parent.iterdir() if p.is_dir()) if directory.parent.is_dir() else []
-    candidates = dict.fromkeys([directory, *beside, cached])
-    return next((candidate for candidate in candidates if holds_training(candidate, key)), None)
+def finished_directory(session: Session, request: RunRequest, directory: Path) -> Path | None:
+    """Find the directory with the finished training of a request: `directory`, that of a rate point beside, or the
+    cache's."""
+    key = pretrained.training_key(session, request.resolved)
+    cached = cached_directory(session, request.resolved, request.out)
+    candidates = dict.fromkeys([directory, *_folders(directory.parent), cached])
+    return next((each for each in candidates if finished_training(each, key) is not None), None)
 
 
-def holds_training(directory: Path, key: str) -> bool:
-    """Whether a run directory holds this training, finished, with its own checkpoints."""
+def finished_training(directory: Path, key: str) -> dict[str, Any] | None:
+    """Return the facts of this training if a run directory holds it, finished, with its own checkpoints."""
     facts = StepLog(directory).done(STEP, key)
-    return facts is not None and "checkpoints" not in facts and bool(CheckpointStore(directory / CHECKPOINTS).paths())
+    if facts is None or "checkpoints" in facts or not CheckpointStore(directory / CHECKPOINTS).paths():
+        return None
+    return facts
+
+
+def _folders(parent: Path) -> list[Path]:
+    return sorted(each for each in parent.iterdir() if each.is_dir()) if parent.is_dir() else []
 
 
 def _is_of_an_older_release(session: Session, directory: Path) -> bool:
     """Whether the checkpoints of a directory do not say all that they were made from; told, since they go then."""
     identity = CheckpointStore(directory / CHECKPOINTS).identity()
-    if identity is None or identity.get("identity") == IDENTITY:
+    if identity is None or identity.get("identity") == pretrained.IDENTITY:
         return False
     session.say(
         f"{directory} was trained by a release that did not note what all pictures and input files hold: "
         "its checkpoints cannot be trusted to be of this scene, so it is trained again"
     )
     return True
-
-
-def _share(session: Session, found: TrainedModel, directory: Path, resolved: ResolvedConfig) -> TrainedModel:
-    """Note in this rate point's directory whose training it uses."""
-    steps = StepLog(directory)
-    if steps.done(STEP, found.key) is None:
-        other = found.facts.get("trained_in")
-        made = "that others started from" if other == resolved.rate else f"of {other}"
-        session.say(f"rate point {resolved.rate} shares the training {made}")
-        steps.finish(STEP, found.key, {**found.facts, "checkpoints": "elsewhere"})
-    return found
 
 
 class _StagesOfARun:
@@ -196,7 +186,7 @@ class _StagesOfARun:
         session.load_kernels()
         self.session, self.request, self.directory = session, request, directory
         self.resolved, self.scene = request.resolved, session.scene(request.resolved)
-        self.method: Method = make_method(session.plugins, self.resolved)
+        self.method: Method = pretrained.make_method(session.plugins, self.resolved)
         self.stages = list(self.method.stages())
         last = self.stages[-1]
         self.options = last.raster_options(last.iterations, self.scene.background)
@@ -217,14 +207,15 @@ class _StagesOfARun:
         watched     plugins may watch it; False: it is only loaded
         """
         session, resolved, directory = self.session, self.resolved, self.directory
-        scenes_before = starts(session, resolved)
+        scenes_before = pretrained.starts(session, resolved)
         if resolved.ppl.eval_every:
             decode_all(self.scene.test)  # here, so that they do not count as memory of the training
-        training = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
-        with Observers.of(session.plugins, training if watched else None, session.say) as observers:
+        started = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
+        watching = session.plugins.hook.run_started(training=started) if watched else []
+        with watched_by(watching, session.plugins, session.say) as after_step:
             outcome = train_stages(
                 self.stages,
-                self._create_model,
+                lambda: self.method.create_model(self.scene, stream(resolved.ppl.seed, "init")).to(session.device),
                 self.scene,
                 resolved.ppl,
                 self.rasterizer,
@@ -232,7 +223,7 @@ class _StagesOfARun:
                 # The content besides its key, so that a refused resume can say what differs.
                 identity={
                     **resolved.training_content(),
-                    "identity": IDENTITY,
+                    "identity": pretrained.IDENTITY,
                     "method_version": self.method.version,
                     "scene content": session.scene_digest(resolved),
                     **({"starts from": scenes_before} if scenes_before else {}),
@@ -241,7 +232,7 @@ class _StagesOfARun:
                 stop_after=stop_after,
                 resume=self.request.resume,
                 allow_changed_plan=self.request.allow_changed_plan,
-                on_step=observers.after_step if observers else None,
+                on_step=after_step,
                 evaluate=self._evaluate,
                 log_path=directory / LOG,
                 provided=self.parts.since_asked,
@@ -249,36 +240,30 @@ class _StagesOfARun:
         return outcome.model, self._facts(outcome)
 
     def _facts(self, outcome: TrainOutcome) -> dict[str, Any]:
-        measured = {
+        return {
             **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},
             "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
             "pretraining": self.before,
             "peak_bytes": outcome.peak_memory,
             "memory_kind": "cuda" if self.session.device.type == "cuda" else "rss",
             "breakdown_s": outcome.breakdown or None,
-        }
-        return {
-            **{name: measured[name] for name in TrainBlock.model_fields if name in measured},
             "plan": outcome.plan,
             "rasterizers": outcome.rasterizers,
             "phases": self.parts.phases(outcome.provided),
             "raster": raster_header(self.options),
         }
 
-    def _create_model(self) -> SplatModel:
-        generator = stream(self.resolved.ppl.seed, "init")
-        return self.method.create_model(self.scene, generator).to(self.session.device)
-
     def _frozen(self, name: str) -> SplatModel:
         """Return the trained scene that a stage starts from or is taught by."""
-        if name not in named_scenes(self.method):
+        if name not in pretrained.named_scenes(self.method):
             raise SplatwizardError(
                 f"a stage of '{self.resolved.method}' asks for a trained '{name}' scene, which no stage names in "
                 "`starts_from` or `taught_by`: its training could not be told from one with another such scene"
             )
         with self.parts.elsewhere():
             source = trained_scene(self.session, name, self.resolved, self.request.out)
-        self.before[name] = _pretraining_facts(source, base_config(self.session.plugins, name, self.resolved))
+        base = pretrained.base_config(self.session.plugins, name, self.resolved)
+        self.before[name] = _pretraining_facts(source, base)
         return source.model
 
     def _evaluate(self, model: SplatModel, step: int) -> dict[str, float]:
@@ -302,15 +287,17 @@ def _pretraining_facts(source: TrainedModel, base: ResolvedConfig) -> dict[str, 
     facts = source.facts
     if "file" in facts:
         return picked(PretrainingBlock, {"made_by": {}}, facts)
-    inner = [each["train_s"] for each in pretraining(facts).values()]
-    total = None if None in inner else facts["train_s"] + sum(inner)
-    told = {"file": {}, "preset": base.preset, "config": base.config.model_dump(mode="json"), "train_s": total}
-    return picked(PretrainingBlock, facts, told)
+    told = {"file": {}, "preset": base.preset, "config": base.config.model_dump(mode="json")}
+    return picked(PretrainingBlock, facts, told, {"train_s": total_seconds(facts)})
 
 
 def pretraining(facts: Mapping[str, Any]) -> dict[str, Any]:
     """Return what a training started from, by method; of one of an older release its seconds alone."""
-    if "pretraining" in facts:
-        found: dict[str, Any] = facts["pretraining"]
-        return found
-    return {name: {"train_s": seconds} for name, seconds in facts.get("pretraining_s", {}).items()}
+    older = {name: {"train_s": seconds} for name, seconds in facts.get("pretraining_s", {}).items()}
+    return dict(facts.get("pretraining", older))
+
+
+def total_seconds(facts: Mapping[str, Any]) -> float | None:
+    """Return the seconds of a training with those of what it started from; None if that came from a file."""
+    seconds = [facts["train_s"], *(each["train_s"] for each in pretraining(facts).values())]
+    return None if None in seconds else sum(seconds)
