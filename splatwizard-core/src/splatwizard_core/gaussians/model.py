@@ -130,16 +130,11 @@ class GaussianModel(SplatModel):
         The active SH degree starts at 0. Raises SceneError if no point is left.
         Source: 3DGS (arXiv 2308.04079), code of the authors.
         """
-        xyz = points.xyz.float()
-        rgb = points.rgb
-        finite = torch.isfinite(xyz).all(dim=1)
-        if rgb is not None:
-            finite &= torch.isfinite(rgb).all(dim=1)
-        dropped = int((~finite).sum())
-        if dropped:
-            log.warning("dropped %d of %d start points that are not finite", dropped, len(points))
-            xyz, rgb = xyz[finite], None if rgb is None else rgb[finite]
-        n = xyz.shape[0]
+        finite = points.finite()
+        n = len(finite)
+        if n < len(points):
+            log.warning("dropped %d of %d start points that are not finite", len(points) - n, len(points))
+        xyz, rgb = finite.xyz.float(), finite.rgb
         if n == 0:
             raise SceneError("the scene has no usable start point: 3DGS needs SfM points or random ones")
         if rgb is None:
