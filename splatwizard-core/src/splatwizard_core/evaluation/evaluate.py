@@ -22,9 +22,8 @@ from splatwizard_core.evaluation.metrics import (
     MetricSettings,
     MetricSetup,
     PreparedMetric,
-    default_metrics,
-    failure,
-    prepare_metrics,
+    noting_failure,
+    prepare_metric,
 )
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -153,8 +152,13 @@ def evaluate(
     """
     if not views:
         raise SceneError("there is no view to evaluate on")
-    wanted = [plugins.metrics.entry(n) for n in (default_metrics(plugins.metrics) if metrics is None else metrics)]
-    ready, missing = prepare_metrics(wanted, MetricSetup(device, metric_settings or {}))
+    wanted = [plugins.metrics.entry(name) for name in (plugins.metrics.names if metrics is None else metrics)]
+    setup = MetricSetup(device, metric_settings or {})
+    ready: dict[str, PreparedMetric] = {}
+    missing: dict[str, str] = {}
+    for entry in wanted:
+        with noting_failure(entry, missing):
+            ready[entry.name] = prepare_metric(entry, setup)
     values: dict[str, list[float]] = {entry.name: [] for entry in wanted}
     visible = drawn = 0
     names = png_names([view.name for view in views])
@@ -169,10 +173,8 @@ def evaluate(
             truth = view.image(options.background, device)
             for entry in (e for e in wanted if e.name not in missing):
                 drawn_image = exact if MetricInfo.of(entry).unrounded else image
-                try:
+                with noting_failure(entry, missing):
                     values[entry.name].append(float(ready[entry.name].compute(drawn_image, truth)))
-                except (Exception, SystemExit) as error:
-                    missing[entry.name] = failure(entry, error)
             visible += int(result.visible.sum())
             drawn += len(result.inputs)
             if save_to is not None:
@@ -203,11 +205,11 @@ def _summary(entry: Entry, values: list[float], ready: PreparedMetric | None, mi
 def png_names(views: Sequence[str]) -> list[str]:
     """File names for the renders of views: no folders, and unique also where stems are not."""
     flat = [name.replace("/", "__").replace(os.sep, "__") for name in views]
-    stems = Counter(name.rsplit(".", 1)[0] for name in flat)
+    stems = [name.rsplit(".", 1)[0] for name in flat]
+    count = Counter(stems)
     found: dict[str, None] = {}
-    for name in flat:
-        stem = name.rsplit(".", 1)[0]
-        chosen = stem if stems[stem] == 1 else name
+    for name, stem in zip(flat, stems, strict=True):
+        chosen = stem if count[stem] == 1 else name
         # Also where the one's folder is spelt in the other's name: a/b.png and a__b.png.
         free = itertools.chain([chosen], (f"{chosen}~{n}" for n in itertools.count(2)))
         found[next(candidate for candidate in free if candidate not in found)] = None

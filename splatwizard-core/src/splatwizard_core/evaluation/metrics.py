@@ -10,7 +10,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import difflib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
@@ -138,13 +138,10 @@ AnyMetric = Metric | MetricFactory
 """The target of a metric's entry."""
 
 
-def default_metrics(registry: TypedRegistry[AnyMetric], *, on_the_way: bool = False) -> list[str]:
-    """Names of the metrics that are computed when none are named: every one that is installed.
-
-    on_the_way  during training: only the quick ones whose value the log is read for
-    """
+def quick_metrics(registry: TypedRegistry[AnyMetric]) -> list[str]:
+    """Names of the metrics that are computed during training: the quick ones whose value the log is read for."""
     infos = {entry.name: MetricInfo.of(entry) for entry in registry}
-    return [name for name, info in infos.items() if not (on_the_way and (info.diagnostic or info.slow))]
+    return [name for name, info in infos.items() if not (info.diagnostic or info.slow)]
 
 
 def check_settings(registry: TypedRegistry[AnyMetric], settings: MetricSettings) -> dict[str, dict[str, Any]]:
@@ -176,41 +173,39 @@ def unavailable(entries: Iterable[Entry], setup: MetricSetup) -> list[str]:
 
     Raises UserInputError for settings that name something which is not there.
     """
-    lines: list[str | None] = []
-    for entry in entries:
-        with contextlib.suppress(PluginError):  # the record tells why it cannot be imported
-            ask = getattr(entry.load(), "unavailable", None)
-            try:
-                lines.append(ask(setup) if callable(ask) else None)
-            except (Exception, SystemExit) as error:
-                lines.append(failure(entry, error))
-    return [line for line in dict.fromkeys(lines) if line is not None]
-
-
-def prepare_metrics(entries: Iterable[Entry], setup: MetricSetup) -> tuple[dict[str, PreparedMetric], dict[str, str]]:
-    """The metrics that are ready, and of the others why not, both by name."""
-    ready: dict[str, PreparedMetric] = {}
-    missing: dict[str, str] = {}
+    lines: dict[str, str] = {}
     for entry in entries:
         try:
-            target = entry.load()
-            is_factory = isinstance(target, MetricFactory)
-            ready[entry.name] = target.prepare(setup) if is_factory else PreparedMetric(target)
-        except (Exception, SystemExit) as error:
-            missing[entry.name] = failure(entry, error)
-    return ready, missing
+            ask = getattr(entry.load(), "unavailable", None)
+        except PluginError:  # the record tells why it cannot be imported
+            continue
+        with noting_failure(entry, lines):
+            line = ask(setup) if callable(ask) else None
+            if line is not None:
+                lines[entry.name] = line
+    return list(dict.fromkeys(lines.values()))
 
 
-def failure(entry: Entry, error: BaseException) -> str:
-    """Why a metric has no value: what it says itself, or, where it broke, its package and the error.
+def prepare_metric(entry: Entry, setup: MetricSetup) -> PreparedMetric:
+    """The metric of an entry, ready. Raises what its import or its `prepare` raises."""
+    target: AnyMetric = entry.load()
+    return target.prepare(setup) if isinstance(target, MetricFactory) else PreparedMetric(target)
+
+
+@contextlib.contextmanager
+def noting_failure(entry: Entry, reasons: dict[str, str]) -> Iterator[None]:
+    """Note under the metric's name why it has no value: what it says itself, or, where it broke, package and error.
 
     Raises the error itself if it is for the user (damaged weights), or about a GPU without memory.
     """
-    if isinstance(error, (PluginError, CapabilityError)):
-        return str(error)
-    if isinstance(error, (SplatwizardError, torch.cuda.OutOfMemoryError)):
-        raise error
-    return f"metric '{entry.name}' of {entry.distribution} {entry.version} failed: {one_line(error)}"
+    try:
+        yield
+    except (PluginError, CapabilityError) as error:
+        reasons[entry.name] = str(error)
+    except (SplatwizardError, torch.cuda.OutOfMemoryError):
+        raise
+    except (Exception, SystemExit) as error:
+        reasons[entry.name] = f"metric '{entry.name}' of {entry.distribution} {entry.version} failed: {one_line(error)}"
 
 
 def metric_identities(registry: TypedRegistry[AnyMetric], setup: MetricSetup) -> dict[str, str | None]:

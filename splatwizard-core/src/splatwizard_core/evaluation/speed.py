@@ -78,7 +78,6 @@ def measure_speed(
     device: torch.device | str,
     *,
     repeats: int = 1,
-    max_rounds: int = 1000,
 ) -> SpeedReport:
     """Draw `views` by the protocol and report how fast that was.
 
@@ -117,8 +116,7 @@ def measure_speed(
         if on_cuda:
             # The first frame may load kernels, so the length of a round is taken from one that is warm.
             round_seconds = seconds_of(views)
-            enough = min(math.ceil(CUDA_FRAMES / len(views)), math.ceil(CUDA_SECONDS / max(round_seconds, 1e-6)))
-            rounds = max(1, min(enough, max_rounds))
+            rounds = min(math.ceil(CUDA_FRAMES / len(views)), math.ceil(CUDA_SECONDS / max(round_seconds, 1e-6)))
             warmup += len(views)
         measured = list(views) * rounds
         meter.start()

@@ -65,8 +65,11 @@ class SH:
             return rest
         return self.dc if rest is None else torch.cat([self.dc, rest], dim=1)
 
-    def check_form(self) -> None:
-        """Raise ShapeError unless exactly one storage form is there: two would leave open which one is drawn."""
+    def validate(self) -> None:
+        """Raise ShapeError unless exactly one storage form is there, with the coefficients of the active degree.
+
+        With two forms it would be open which one is drawn.
+        """
         stored = {k for k in ("dense", "dc", "rest", "codebook", "indices") if getattr(self, k) is not None}
         forms = ({"dense"}, {"dc"}, {"dc", "rest"}, {"codebook", "indices"}, {"dc", "codebook", "indices"})
         if stored not in forms:
@@ -74,11 +77,7 @@ class SH:
                 f"SH holds {', '.join(sorted(stored)) or 'nothing'}; it must be dense, or dc (and rest), "
                 "or codebook and indices (and dc)"
             )
-
-    def check_degree(self) -> None:
-        """Raise ShapeError unless the coefficients of the active degree are there."""
-        rest = next((t for t in (self.dense, self.rest, self.codebook) if t is not None), None)
-        held = (0 if self.dc is None else 1) + (0 if rest is None else rest.shape[1])
+        held = sum(t.shape[1] for t in (self.dense, self.dc, self.rest, self.codebook) if t is not None)
         needed = (self.active_degree + 1) ** 2
         if held < needed:
             raise ShapeError(f"SH degree {self.active_degree} needs {needed} coefficients, here are {held}")
@@ -92,10 +91,24 @@ def check_shape(name: str, tensor: Tensor, expected: tuple[int | str, ...]) -> N
         raise ShapeError(f"{name} must be [{wanted}], got {list(shape)}", actual=shape, expected=expected)
 
 
-_TENSORS = (
-    "means", "opacities", "scales", "quats", "cov3d", "geom_indices", "scale_factors", "colors", "features", "visible",
-)  # fmt: skip
-_SH_TENSORS = tuple((name, f"sh.{name}") for name in ("dense", "dc", "rest", "codebook", "indices"))
+_SIZES: dict[str, tuple[int | str, ...]] = {
+    "means": ("N", 3),
+    "opacities": ("N",),
+    "scales": ("rows", "2 or 3"),
+    "quats": ("rows", 4),
+    "cov3d": ("N", 6),
+    "geom_indices": ("N",),
+    "scale_factors": ("N",),
+    "colors": ("N", "C"),
+    "features": ("N", "E"),
+    "visible": ("N",),
+    "sh.dense": ("N", "K", 3),
+    "sh.dc": ("N", 1, 3),
+    "sh.rest": ("N", "K-1", 3),
+    "sh.codebook": ("M", "K", 3),
+    "sh.indices": ("N",),
+}
+"""The tensors of GaussianInputs and their sizes; "rows" is N, or M with `geom_indices`."""
 
 
 @dataclass
@@ -134,14 +147,10 @@ class GaussianInputs:
 
     def tensors(self) -> dict[str, Tensor]:
         """Every tensor that is present, by field name (`sh.dense`, `sh.dc`, ... for colours)."""
-        own = vars(self)
-        found = {name: own[name] for name in _TENSORS if own[name] is not None}
+        held = dict(vars(self))
         if self.sh is not None:
-            stored = vars(self.sh)
-            for name, full in _SH_TENSORS:
-                if stored[name] is not None:
-                    found[full] = stored[name]
-        return found
+            held |= {f"sh.{name}": stored for name, stored in vars(self.sh).items()}
+        return {name: held[name] for name in _SIZES if held.get(name) is not None}
 
     def gathered(
         self,
@@ -174,23 +183,14 @@ class GaussianInputs:
 
     def validate(self) -> None:
         """Raise ShapeError unless the fields fit together (values are the rasterizer's business)."""
-        n = self.means.shape[0]
-
-        def need(name: str, tensor: Tensor | None, *expected: int | str) -> None:
-            if tensor is not None and tensor.shape != expected:
-                check_shape(f"GaussianInputs.{name}", tensor, expected)
-
-        rows: int | str = n if self.geom_indices is None else "M"
-        need("means", self.means, n, 3)
-        need("opacities", self.opacities, n)
-        need("scales", self.scales, rows, "2 or 3")
-        need("quats", self.quats, rows, 4)
-        need("cov3d", self.cov3d, n, 6)
-        need("geom_indices", self.geom_indices, n)
-        need("scale_factors", self.scale_factors, n)
-        need("colors", self.colors, n, "C")
-        need("features", self.features, n, "E")
-        need("visible", self.visible, n)
+        rows = "M" if self.geom_indices is not None else len(self)
+        sizes: dict[int | str, int | str] = {"N": len(self), "rows": rows}
+        for name, tensor in self.tensors().items():
+            check_shape(f"GaussianInputs.{name}", tensor, tuple(sizes.get(size, size) for size in _SIZES[name]))
+            if tensor.device != self.means.device:
+                raise ShapeError(
+                    f"GaussianInputs mixes devices: {name} is on {tensor.device}, means on {self.means.device}"
+                )
         shaped = (self.scales, self.quats, self.geom_indices, self.scale_factors)
         if self.cov3d is not None:
             if any(t is not None for t in shaped):
@@ -207,14 +207,4 @@ class GaussianInputs:
         if (self.sh is None) == (self.colors is None):
             raise ShapeError("GaussianInputs needs either sh or colors")
         if self.sh is not None:
-            self.sh.check_form()
-            need("sh.dense", self.sh.dense, n, "K", 3)
-            need("sh.dc", self.sh.dc, n, 1, 3)
-            need("sh.rest", self.sh.rest, n, "K-1", 3)
-            need("sh.codebook", self.sh.codebook, "M", "K", 3)
-            need("sh.indices", self.sh.indices, n)
-            self.sh.check_degree()
-        device = self.means.device
-        for name, tensor in self.tensors().items():
-            if tensor.device != device:
-                raise ShapeError(f"GaussianInputs mixes devices: {name} is on {tensor.device}, means on {device}")
+            self.sh.validate()

@@ -86,13 +86,12 @@ class GaussianModel(SplatModel):
         for name, (tensor, tail) in tails.items():
             check_shape(f"GaussianModel.{name}", tensor, (n, *tail))
             self.register_parameter(name, nn.Parameter(tensor.detach()))
-        degree = math.isqrt(sh_rest.shape[1] + 1) - 1
+        degree = self.max_sh_degree
         if (degree + 1) ** 2 != sh_rest.shape[1] + 1 or degree > 3:
             raise ShapeError(
                 f"GaussianModel.sh_rest has {sh_rest.shape[1]} coefficients a channel; 0, 3, 8 or 15 are possible",
                 actual=sh_rest.shape,
             )
-        self.max_sh_degree = degree
         self.active_sh_degree = degree if active_sh_degree is None else active_sh_degree
         if not 0 <= self.active_sh_degree <= degree:
             raise ShapeError(f"active SH degree {active_sh_degree} is outside 0 .. {degree}")
@@ -130,16 +129,11 @@ class GaussianModel(SplatModel):
         The active SH degree starts at 0. Raises SceneError if no point is left.
         Source: 3DGS (arXiv 2308.04079), code of the authors.
         """
-        xyz = points.xyz.float()
-        rgb = points.rgb
-        finite = torch.isfinite(xyz).all(dim=1)
-        if rgb is not None:
-            finite &= torch.isfinite(rgb).all(dim=1)
-        dropped = int((~finite).sum())
-        if dropped:
-            log.warning("dropped %d of %d start points that are not finite", dropped, len(points))
-            xyz, rgb = xyz[finite], None if rgb is None else rgb[finite]
-        n = xyz.shape[0]
+        finite = PointCloud(points.xyz.float(), points.rgb).finite()
+        n = len(finite)
+        if n < len(points):
+            log.warning("dropped %d of %d start points that are not finite", len(points) - n, len(points))
+        xyz, rgb = finite.xyz, finite.rgb
         if n == 0:
             raise SceneError("the scene has no usable start point: 3DGS needs SfM points or random ones")
         if rgb is None:
@@ -160,6 +154,11 @@ class GaussianModel(SplatModel):
             quats,
             active_sh_degree=0,
         )
+
+    @property
+    def max_sh_degree(self) -> int:
+        """The highest SH band that is stored; K = (max_sh_degree + 1)^2."""
+        return math.isqrt(self.sh_rest.shape[1] + 1) - 1
 
     @property
     def opacities(self) -> Tensor:
@@ -201,8 +200,3 @@ class GaussianModel(SplatModel):
         self.active_sh_degree = int(extra["active_sh_degree"])
         self.split_seed = int(extra["split_seed"])
         self._splits = int(extra["splits"])
-
-    def load_resized(self, state: dict[str, Tensor]) -> None:
-        """Load a state whose row counts differ; the full SH degree becomes that of the state."""
-        super().load_resized(state)
-        self.max_sh_degree = math.isqrt(self.sh_rest.shape[1] + 1) - 1

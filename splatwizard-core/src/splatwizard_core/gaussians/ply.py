@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from plyfile import PlyData
 from torch import Tensor
 
@@ -110,40 +109,29 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
             f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera", path=str(path)
         )
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.write(ply_header(model.num_rows, model.sh_rest.shape[1]))
-        file.write(_rows(model).data)
+        file.writelines(_file_parts(model))
 
 
 def to_ply(model: GaussianModel) -> bytes:
     """The bytes that `export_ply` writes of a model."""
-    return ply_header(model.num_rows, model.sh_rest.shape[1]) + _rows(model).tobytes()
+    return b"".join(_file_parts(model))
 
 
-def ply_header(count: int, sh_rest: int) -> bytes:
-    """The text in front of the rows of `count` Gaussians with `sh_rest` = K - 1 higher SH coefficients a channel."""
-    properties = "".join(f"property float {name}\n" for name in property_names(sh_rest))
-    return f"ply\nformat binary_little_endian 1.0\nelement vertex {count}\n{properties}end_header\n".encode("ascii")
-
-
-def _rows(model: GaussianModel) -> NDArray[np.float32]:
-    """[N, 17 + 3 (K - 1)] little-endian, columns as `property_names`."""
-    n = model.num_rows
-    parts = [
+def _file_parts(model: GaussianModel) -> tuple[bytes, memoryview]:
+    """The header, and the rows [N, 17 + 3 (K - 1)] little-endian, columns as `property_names`."""
+    properties = "".join(f"property float {name}\n" for name in property_names(model.sh_rest.shape[1]))
+    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {model.num_rows}\n{properties}end_header\n"
+    columns = (
         model.means,
-        model.means.new_zeros(n, 3),
+        model.means.new_zeros(model.num_rows, 3),
         model.sh_dc[:, 0, :],
         model.sh_rest.transpose(1, 2).flatten(1),
         model.opacity_logits[:, None],
         model.log_scales,
         model.quats,
-    ]
-    table: NDArray[np.float32] = np.empty((n, sum(part.shape[1] for part in parts)), dtype="<f4")
-    column = 0
-    for part in parts:
-        width = part.shape[1]
-        table[:, column : column + width] = part.detach().cpu().float().numpy()
-        column += width
-    return table
+    )
+    rows = np.concatenate([each.detach().cpu().float().numpy() for each in columns], axis=1, dtype="<f4")
+    return header.encode("ascii"), rows.data
 
 
 def _check_header(head: bytes, size: int, path: str) -> int:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import functools
-import itertools
 import operator
 from typing import TYPE_CHECKING
 
@@ -66,38 +65,29 @@ class Feature(enum.Flag):
         asked: Feature | None = vars(opt).get("_asked")  # options do not change, and every step of a training asks
         if asked is None:
             asked = vars(opt)["_asked"] = _of_options(opt)
-        return asked if g is None else _union(asked, (*_shape_traits(g), *_other_traits(g)))
+        if g is None:
+            return asked
+        return _all_of(
+            asked,
+            cls.geometry_of(g),
+            cls.BACKWARD if g.requires_grad() else None,
+            cls.EXTRA_FEATURES if g.features is not None else None,
+            cls.COLORS_ND if g.colors is not None and g.colors.shape[-1] != 3 else None,
+            cls.INDEXED_SH if g.sh is not None and g.sh.codebook is not None else None,
+            cls.SPLIT_SH if g.sh is not None and g.sh.dc is not None else None,
+        )
 
     @classmethod
     def geometry_of(cls, g: GaussianInputs) -> Feature:
         """The features that reading the shapes of `g` needs, whatever is drawn."""
-        return _union(cls(0), _shape_traits(g))
+        return _all_of(
+            cls.COV3D if g.cov3d is not None else None,
+            cls.INDEXED_GEOM if g.geom_indices is not None or g.scale_factors is not None else None,
+            cls.SURFEL if g.scales is not None and g.scales.shape[-1] == 2 else None,
+            cls.FLOAT64 if g.means.dtype == torch.float64 else None,
+        )
 
 
-def _shape_traits(g: GaussianInputs) -> tuple[bool, ...]:
-    return (
-        g.cov3d is not None,
-        g.geom_indices is not None or g.scale_factors is not None,
-        g.scales is not None and g.scales.shape[-1] == 2,
-        g.means.dtype == torch.float64,
-    )
-
-
-def _other_traits(g: GaussianInputs) -> tuple[bool, ...]:
-    return (
-        g.requires_grad(),
-        g.features is not None,
-        g.colors is not None and g.colors.shape[-1] != 3,
-        g.sh is not None and g.sh.codebook is not None,
-        g.sh is not None and g.sh.dc is not None,
-    )
-
-
-_TRAITS = (
-    Feature.COV3D, Feature.INDEXED_GEOM, Feature.SURFEL, Feature.FLOAT64,
-    Feature.BACKWARD, Feature.EXTRA_FEATURES, Feature.COLORS_ND, Feature.INDEXED_SH, Feature.SPLIT_SH,
-)  # fmt: skip
-"""The features that the traits of inputs stand for, in their order."""
 _DEPTHS = {
     "inverse": Feature.DEPTH_INVERSE,
     "accumulated": Feature.DEPTH_ACCUM,
@@ -116,8 +106,8 @@ def _names(features: Feature) -> frozenset[str]:
 
 
 @functools.cache  # a training asks for the same at every step, and `|` of flags is slow
-def _union(asked: Feature, traits: tuple[bool, ...]) -> Feature:
-    return functools.reduce(operator.or_, itertools.compress(_TRAITS, traits), asked)
+def _all_of(*features: Feature | None) -> Feature:
+    return functools.reduce(operator.or_, filter(None, features), Feature(0))
 
 
 def _of_options(opt: RasterOptions) -> Feature:
@@ -130,18 +120,17 @@ def _of_options(opt: RasterOptions) -> Feature:
         for name in asked:
             if name not in known:
                 raise ValueError(f"unknown {what} '{name}': one of {', '.join(known)}")
-    needed = (
-        (opt.antialias, Feature.ANTIALIAS),
-        (opt.absgrad, Feature.ABSGRAD),
-        (opt.normals, Feature.NORMALS),
-        (opt.distortion, Feature.DISTORTION),
-        (opt.alpha, Feature.ALPHA_MAP),
-        (not opt.clamp_color, Feature.NO_COLOR_CLAMP),
-        (opt.fisher, Feature.FISHER),
-        (opt.dtype_out == "uint8", Feature.UINT8_OUT),
-        (opt.grad2d, Feature.BACKWARD),
-        (any(spec.pixel_weight is not None for spec in opt.scores), Feature.SCORE_PIXEL_WEIGHT),
-        *((True, _DEPTHS[mode]) for mode in opt.depth),
-        *((True, _SCORES[spec.kind]) for spec in opt.scores),
+    return _all_of(
+        Feature.ANTIALIAS if opt.antialias else None,
+        Feature.ABSGRAD if opt.absgrad else None,
+        Feature.NORMALS if opt.normals else None,
+        Feature.DISTORTION if opt.distortion else None,
+        Feature.ALPHA_MAP if opt.alpha else None,
+        None if opt.clamp_color else Feature.NO_COLOR_CLAMP,
+        Feature.FISHER if opt.fisher else None,
+        Feature.UINT8_OUT if opt.dtype_out == "uint8" else None,
+        Feature.BACKWARD if opt.grad2d else None,
+        Feature.SCORE_PIXEL_WEIGHT if any(spec.pixel_weight is not None for spec in opt.scores) else None,
+        *(_DEPTHS[mode] for mode in opt.depth),
+        *(_SCORES[spec.kind] for spec in opt.scores),
     )
-    return functools.reduce(operator.or_, (feature for asked, feature in needed if asked), Feature(0))

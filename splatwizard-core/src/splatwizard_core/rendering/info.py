@@ -6,9 +6,11 @@ import functools
 import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import torch
+from pydantic import TypeAdapter, ValidationError
 
 from splatwizard_core.errors import CapabilityError, ConfigError, PluginError, ShapeError
 from splatwizard_core.plugins.registry import Entry, Registry
@@ -21,11 +23,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class DeviceInfo:
-    """Differences of a rasterizer on one device: features it lacks there, another probe, another speed."""
+    """Differences of a rasterizer on one device: features it lacks there, another probe."""
 
     lacks: frozenset[str] = frozenset()
     available: str | None = None
-    speed: int | None = None
 
 
 @dataclass(frozen=True)
@@ -43,9 +44,9 @@ class RasterizerInfo:
     """
 
     name: str
-    devices: frozenset[str]
-    dtypes: frozenset[str]
-    features: frozenset[str]
+    devices: frozenset[str] = frozenset({"cpu"})
+    dtypes: frozenset[str] = frozenset({"float32"})
+    features: frozenset[str] = frozenset()
     available: str | None = None
     combos_forbidden: tuple[frozenset[str], ...] = ()
     exactness: str = "exact"
@@ -65,50 +66,32 @@ class RasterizerInfo:
     @classmethod
     def from_entry(cls, entry: Entry) -> RasterizerInfo:
         """The declaration in a registry entry. Raises PluginError for an unknown feature or a field of another kind."""
-        declared = entry.declared
-        features = frozenset(declared.get("features", ()))
-        unknown = sorted(features - {f.name for f in Feature})
-        if unknown:
-            raise PluginError(f"rasterizer '{entry.name}' of {entry.distribution} declares unknown features {unknown}")
-        min_cc = declared.get("min_cc")
+        whose = f"rasterizer '{entry.name}' of {entry.distribution}"
         try:
-            return cls(
-                name=entry.name,
-                devices=frozenset(declared.get("devices", ("cpu",))),
-                dtypes=frozenset(declared.get("dtypes", ("float32",))),
-                features=features,
-                available=declared.get("available"),
-                combos_forbidden=tuple(frozenset(combo) for combo in declared.get("combos_forbidden", ())),
-                exactness=declared.get("exactness", "exact"),
-                speed=int(declared.get("speed", 0)),
-                min_cc=None if min_cc is None else (int(min_cc[0]), int(min_cc[1])),
-                needs=frozenset(declared.get("needs", ())),
-                profiles=tuple(declared.get("profiles", ())),
-                per_device={
-                    device: DeviceInfo(frozenset(there.get("lacks", ())), there.get("available"), there.get("speed"))
-                    for device, there in declared.get("on", {}).items()
-                },
+            info = _adapter().validate_python(
+                {**entry.declared, "name": entry.name, "per_device": entry.declared.get("on", {})}
             )
-        except (TypeError, ValueError, IndexError, AttributeError) as error:
-            raise PluginError(
-                f"rasterizer '{entry.name}' of {entry.distribution} is declared wrongly: {error}"
-            ) from error
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"]))
+            raise PluginError(f"{whose} is declared wrongly: {where}: {first['msg']}") from error
+        unknown = sorted(info.features - {f.name for f in Feature})
+        if unknown:
+            raise PluginError(f"{whose} declares unknown features {unknown}")
+        return info
+
+    @cached_property
+    def _on(self) -> dict[str, RasterizerInfo]:
+        return {
+            device: replace(
+                self, features=self.features - here.lacks, available=here.available or self.available, per_device={}
+            )
+            for device, here in self.per_device.items()
+        }
 
     def on(self, device: str) -> RasterizerInfo:
         """The declaration for one kind of device ("cpu", "cuda")."""
-        here = self.per_device.get(device)
-        if here is None:
-            return self
-        known: dict[str, RasterizerInfo] = vars(self).setdefault("_on", {})  # asked for at every render
-        if device not in known:
-            known[device] = replace(
-                self,
-                features=self.features - here.lacks,
-                available=here.available or self.available,
-                speed=self.speed if here.speed is None else here.speed,
-                per_device={},
-            )
-        return known[device]
+        return self._on.get(device, self)
 
     def obstacle(self, device: torch.device | str) -> str | None:
         """The reason why it cannot run on `device`, as its own probe says, or None; compiles nothing.
@@ -189,6 +172,11 @@ class RasterizerInfo:
                     f"{name} is {_dtype_name(tensor.dtype)}"
                     + (f", means {_dtype_name(dtype)}" if name != "means" else "")
                 )
+
+
+@functools.cache
+def _adapter() -> TypeAdapter[RasterizerInfo]:
+    return TypeAdapter(RasterizerInfo)
 
 
 @functools.cache

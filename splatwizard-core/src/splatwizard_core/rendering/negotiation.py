@@ -6,7 +6,7 @@ import functools
 import logging
 import os
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import torch
@@ -25,15 +25,6 @@ from splatwizard_core.scene.camera import Camera
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class _Candidate:
-    """A rasterizer that can serve a request if `adapted` features are composed for it."""
-
-    info: RasterizerInfo
-    adapted: frozenset[str]
-    rank: tuple[int, ...]
 
 
 class NegotiatedRasterizer:
@@ -114,20 +105,19 @@ class NegotiatedRasterizer:
             return self._chosen[wanted]
         while True:
             best, passed_over = self._best(wanted)
-            name = best.info.name
             try:
-                rasterizer = self._make(name)
+                rasterizer = self._make(best.name)
                 break
             except SplatwizardError as error:
-                self._fail(name, error)
-        if best.adapted:
-            rasterizer = AdaptedRasterizer(rasterizer, best.adapted)
+                self._fail(best.name, error)
+        asked, composing = "+".join(sorted(wanted)) or "plain", ""
+        if missing := wanted - best.features:
+            rasterizer = AdaptedRasterizer(rasterizer, missing)
+            composing = f", composing {', '.join(sorted(missing))}"
         if passed_over is not None:
-            _warn_once(f"{passed_over}; rendering with '{name}' instead")
-        asked = "+".join(sorted(wanted)) or "plain"
-        adapted = f", composing {', '.join(sorted(best.adapted))}" if best.adapted else ""
-        log.info("%s on %s: rasterizer '%s' (%s)%s", asked, self.device, name, best.info.exactness, adapted)
-        self.choices[asked] = name
+            _warn_once(f"{passed_over}; rendering with '{best.name}' instead")
+        log.info("%s on %s: rasterizer '%s' (%s)%s", asked, self.device, best.name, best.exactness, composing)
+        self.choices[asked] = best.name
         self._chosen[wanted] = rasterizer
         return rasterizer
 
@@ -173,35 +163,31 @@ class NegotiatedRasterizer:
             _warn_once(f"{error}: it is not used")
             return None
 
+    def _accepts(self, info: RasterizerInfo) -> bool:
+        return info.exactness in self._exactness or info.name in self._prefer
+
     def _may_serve(self, info: RasterizerInfo) -> bool:
         """Whether device, the user's lists and the accepted exactness leave it."""
         if self._forced is not None:
             return info.name == self._forced
-        accepted = info.exactness in self._exactness or info.name in self._prefer
-        return self.device.type in info.devices and info.name not in self._forbid and accepted
+        return self.device.type in info.devices and info.name not in self._forbid and self._accepts(info)
 
-    def _best(self, wanted: frozenset[str]) -> tuple[_Candidate, str | None]:
+    def _best(self, wanted: frozenset[str]) -> tuple[RasterizerInfo, str | None]:
         """(the best that can run, why a better one cannot if the user should know)."""
-        candidates = [c for info in self._usable if (c := self._candidate(info, wanted)) is not None]
+
+        def rank(info: RasterizerInfo) -> tuple[int, bool, int, int, str]:
+            preferred = len(self._prefer) - self._prefer.index(info.name) if info.name in self._prefer else 0
+            return preferred, info.speed > 0, -len(wanted - info.features), info.speed, info.name
+
         passed_over: dict[str, str] = {}
-        for candidate in sorted(candidates, key=lambda c: (c.rank, c.info.name), reverse=True):
-            reason = self._unavailable(candidate.info)
+        for info in sorted((i for i in self._usable if _can_serve(i, wanted)), key=rank, reverse=True):
+            reason = self._unavailable(info)
             if reason is None:
                 # A failed build is news; what cannot run here by nature only if a slow oracle is all that remains.
-                news = [w for name, w in passed_over.items() if name in self._failed or candidate.info.speed <= 0]
-                return candidate, news[0] if news else None
-            passed_over[candidate.info.name] = reason
+                news = [w for name, w in passed_over.items() if name in self._failed or info.speed <= 0]
+                return info, news[0] if news else None
+            passed_over[info.name] = reason
         raise self._nothing(wanted, passed_over)
-
-    def _candidate(self, info: RasterizerInfo, wanted: frozenset[str]) -> _Candidate | None:
-        missing = wanted - info.features
-        needs = adapted_requirements(wanted, missing)
-        if needs is None or not info.needs <= needs <= info.features:
-            return None
-        if any(combo <= needs for combo in info.combos_forbidden):
-            return None
-        preferred = len(self._prefer) - self._prefer.index(info.name) if info.name in self._prefer else 0
-        return _Candidate(info, missing, (preferred, int(info.speed > 0), -len(missing), info.speed))
 
     def _unavailable(self, info: RasterizerInfo) -> str | None:
         """The reason why it cannot run here, or None; compiles nothing."""
@@ -219,13 +205,12 @@ class NegotiatedRasterizer:
 
         def shortcomings(info: RasterizerInfo) -> str:
             lacks, needs = wanted - info.features, info.needs - wanted
-            accepted = info.exactness in self._exactness or info.name in self._prefer
             return (
                 f"{info.name} ({'/'.join(sorted(info.devices))})"
                 + (f" lacks {', '.join(sorted(lacks))}" if lacks else "")
                 + (f" draws nothing without {', '.join(sorted(needs))}" if needs else "")
                 + (" is forbidden" if info.name in self._forbid else "")
-                + ("" if accepted else f" is {info.exactness}")
+                + ("" if self._accepts(info) else f" is {info.exactness}")
             )
 
         near = sorted(self._readable, key=lambda i: (len(wanted - i.features), -i.speed, i.name))[:3]
@@ -234,6 +219,14 @@ class NegotiatedRasterizer:
         if unavailable:
             message += f". Not usable here: {'; '.join(f'{name}: {why}' for name, why in unavailable.items())}"
         return CapabilityError(message, missing=wanted - near[0].features)
+
+
+def _can_serve(info: RasterizerInfo, wanted: frozenset[str]) -> bool:
+    """Whether it draws what is wanted, itself or with what it lacks composed from other features."""
+    needs = adapted_requirements(wanted, wanted - info.features)
+    if needs is None or any(combo <= needs for combo in info.combos_forbidden):
+        return False
+    return info.needs <= needs <= info.features
 
 
 def _how_to_get_one() -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, raster_header
-from splatwizard_core.evaluation.metrics import default_metrics
+from splatwizard_core.evaluation.metrics import quick_metrics
 from splatwizard_core.files import sweep, write_atomic
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
@@ -276,7 +276,7 @@ class _StagesOfARun:
             plugins,
             device=self.session.device,
             options=replace(self.options, background=self.scene.background),
-            metrics=default_metrics(plugins.metrics, on_the_way=True),
+            metrics=quick_metrics(plugins.metrics),
             label=f"evaluate at step {step:,}",
         )
         return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
@@ -59,13 +58,13 @@ def assemble_scene(
         except SceneError as error:
             raise refused(error) from error
     if points is not None:
-        finite = _finite(points)
-        bad = int((~finite).sum())
+        finite = points.finite()
+        bad = len(points) - len(finite)
         if bad and bad == len(points):
             raise refused(f"none of the {bad} points is finite; the reconstruction is broken")
         if bad:
             notes.append(f"dropped {bad} of {len(points)} points that are not finite")
-            points = PointCloud(points.xyz[finite], None if points.rgb is None else points.rgb[finite])
+        points = finite
     scene = Scene(name, train, test, points, protocol, path, dict(ground_truth or {}), notes)
     centers = torch.stack([view.camera.center.double().cpu() for view in train])
     if (centers == centers[0]).all():
@@ -83,9 +82,3 @@ def _camera_fault(view: View) -> str | None:
     if not all(math.isfinite(x) for x in numbers) or camera.fx <= 0 or camera.fy <= 0:
         return f"the intrinsics of image '{view.name}' make no sense: fx, fy, cx, cy = {numbers}"
     return None
-
-
-def _finite(points: PointCloud) -> Tensor:
-    """[P] bool: points whose position and colour are finite."""
-    finite = torch.isfinite(points.xyz).all(dim=1)
-    return finite if points.rgb is None else finite & torch.isfinite(points.rgb).all(dim=1)

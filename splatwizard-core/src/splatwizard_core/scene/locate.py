@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,40 +47,34 @@ def locate(spec: str, families: Families) -> tuple[Path, str | None]:
     root = Path(os.path.expanduser(named))
     if not os.path.isdir(root):
         raise _missing(spec, f", and ${DATA_VARIABLE} names no folder: {root}")
-    parts = path.parts
+    dataset, *inner = path.parts
     if os.path.exists(root / path):
-        return root / path, parts[0] if len(parts) == 2 else None
-    if len(parts) == 2:
-        prefix = families.entry(parts[0]).declared.get("prefix", "") if parts[0] in families else ""
-        for home in _homes(root, parts[0], families):
-            for scene in dict.fromkeys((parts[1], prefix + parts[1])):
-                if os.path.exists(root / home / scene):
-                    return root / home / scene, parts[0]
-    raise _missing(spec, _what_is_there(root, parts, families))
+        return root / path, dataset if len(inner) == 1 else None
+    declared = families.entry(dataset).declared if dataset in families else {}
+    known = (dataset, *declared.get("folders", ())) if dataset in families else ()
+    homes = [root / name for name in _folders(root) if name == dataset or name.lower() in known]
+    if len(inner) == 1:
+        names = dict.fromkeys((inner[0], declared.get("prefix", "") + inner[0]))
+        for place in (home / name for home in homes for name in names):
+            if os.path.exists(place):
+                return place, dataset
+    raise _missing(spec, _what_is_there(root, dataset, inner, homes))
 
 
 def _missing(spec: str, rest: str) -> SceneError:
     return SceneError(f"scene '{spec}' is not there{rest}", path=spec)
 
 
-def _homes(root: Path, dataset: str, families: Families) -> list[str]:
-    """The folders of `root` that hold scenes of a data set: its own, and those by whose names its family is known."""
-    known = (dataset, *families.entry(dataset).declared.get("folders", ())) if dataset in families else ()
-    return [name for name in _folders(root) if name == dataset or name.lower() in known]
-
-
-def _what_is_there(root: Path, parts: Sequence[str], families: Families) -> str:
+def _what_is_there(root: Path, dataset: str, inner: list[str], homes: list[Path]) -> str:
     """Rest of the message: how far the name leads, and what could be meant."""
-    if len(parts) == 1:
-        holders = [name for name in _folders(root) if os.path.isdir(root / name / parts[0])]
-        if holders:
-            return f": did you mean {holders[0]}/{parts[0]} (below ${DATA_VARIABLE})?"
-        return f", nor is {root / parts[0]}: datasets are named as dataset/scene; {_listed(root, parts[0])}"
-    homes = _homes(root, parts[0], families)
-    if not homes:
-        return f", nor is {root / Path(*parts)}: {_listed(root, parts[0])}"
-    home = root / homes[0]
-    return f", nor is {home / Path(*parts[1:])}: {_listed(home, parts[1])}"
+    if inner and homes:
+        return f", nor is {homes[0].joinpath(*inner)}: {_listed(homes[0], inner[0])}"
+    if inner:
+        return f", nor is {root.joinpath(dataset, *inner)}: {_listed(root, dataset)}"
+    holders = [name for name in _folders(root) if os.path.isdir(root / name / dataset)]
+    if holders:
+        return f": did you mean {holders[0]}/{dataset} (below ${DATA_VARIABLE})?"
+    return f", nor is {root / dataset}: datasets are named as dataset/scene; {_listed(root, dataset)}"
 
 
 def _listed(folder: Path, wanted: str) -> str:

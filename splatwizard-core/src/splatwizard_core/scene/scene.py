@@ -44,7 +44,9 @@ class View:
 
     def image(self, background: Tensor | None = None, device: torch.device | str = "cpu") -> Tensor:
         """float32 [3,H,W] in 0..1 on `device`; an RGBA picture is composited on `background` [3] (None: black)."""
-        pixels = self._pixels_on(torch.device(device))
+        device = torch.device(device)
+        kept = self.pixels if self._resident is None or device.type == "cpu" else self._resident
+        pixels = kept.to(device)
         if pixels.shape[0] == 3:
             if pixels.is_cuda:  # in one launch; on a CPU two passes are faster
                 return torch.div(pixels, 255, out=torch.empty(pixels.shape, device=pixels.device))
@@ -65,11 +67,6 @@ class View:
         """Device that `image` takes the picture from: a GPU after `keep_on`, else the host."""
         return torch.device("cpu") if self._resident is None else self._resident.device
 
-    def _pixels_on(self, device: torch.device) -> Tensor:
-        if self._resident is not None and self._resident.device.type == device.type:
-            return self._resident.to(device)
-        return self.pixels.to(device)
-
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
@@ -80,6 +77,13 @@ class PointCloud:
 
     def __len__(self) -> int:
         return self.xyz.shape[0]
+
+    def finite(self) -> PointCloud:
+        """The points whose position and colour are finite; itself if all are."""
+        kept = torch.isfinite(self.xyz).all(dim=1)
+        if self.rgb is not None:
+            kept &= torch.isfinite(self.rgb).all(dim=1)
+        return self if kept.all() else PointCloud(self.xyz[kept], None if self.rgb is None else self.rgb[kept])
 
 
 @dataclass(frozen=True)
