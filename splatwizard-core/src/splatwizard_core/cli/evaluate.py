@@ -15,6 +15,7 @@ from splatwizard_core.cli.paths import existing, output_folder
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices, warn_of_metrics
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.files import scratch_folder
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")
@@ -56,7 +57,6 @@ def evaluate(
     model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...), keys of
     the run (raster.prefer, threads, ...) and settings of metrics (metrics.GROUP.KEY).
     """
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.encode import encode_directory, load_finished
     from splatwizard_core.runs.fresh import decode_fresh
     from splatwizard_core.runs.measure import Opened, measure, opener
@@ -80,7 +80,7 @@ def evaluate(
         raise click.UsageError("--roundtrip is for a run directory; a file has been encoded already")
     else:
         resolved = chosen.resolve_without_method()
-    session = open_session(resolved.ppl, plugins)
+    session = open_session(resolved, plugins)
     warn_of_metrics(session, names, resolved.metrics, quiet=quiet)
 
     def open_trained() -> Opened:
@@ -130,10 +130,8 @@ def _print(facts: dict[str, Any]) -> None:
     rows.append(["visible, mean of views", f"{facts['visible_gaussians']:,.0f}"])
     if facts["speed"] is not None:
         speed, memory = facts["speed"], facts["memory"]
-        width, height = speed["image_size"]
-        rows.append(
-            ["speed", f"{speed['fps']:.1f} frames/s at {width}x{height}, median {speed['latency_ms_median']:.1f} ms"]
-        )
+        size = "x".join(map(str, speed["image_size"]))
+        rows.append(["speed", f"{speed['fps']:.1f} frames/s at {size}, median {speed['latency_ms_median']:.1f} ms"])
         if speed["spread"] is not None:
             fps = speed["spread"]["fps"]
             spread = f"deviation {fps['std']:.1f}, {fps['min']:.1f} to {fps['max']:.1f} frames/s"
