@@ -62,13 +62,10 @@ def evaluate(
     from splatwizard_core.runs.measure import Opened, measure, opener
     from splatwizard_core.scene.loading import load_scene
 
-    path = existing(file)
+    path, plugins = existing(file), load_plugins()
     names = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
     if names == []:
         raise click.UsageError("--metrics is empty: give names, or leave it out")
-    plugins = load_plugins()
-    for name in names or ():
-        plugins.metrics.entry(name)
     if renders is not None:
         output_folder(renders)
     if path.is_dir():
@@ -109,11 +106,7 @@ def evaluate(
         size = None if measured.is_dir() else measured.stat().st_size
     if digest not in (None, facts["digest"]):
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
-    facts = {"file": {"path": file, "bytes": size}, **facts}
-    if as_json:
-        shared.print_json(facts)
-    else:
-        _print(facts)
+    shared.print_facts({"file": {"path": file, "bytes": size}, **facts}, as_json, _print)
 
 
 def _print(facts: dict[str, Any]) -> None:

@@ -38,10 +38,7 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
         kind, facts = "ply", _ply_facts(where)
     else:
         kind, facts = "scene", _scene_facts(path, chosen)
-    if as_json:
-        shared.print_json({"kind": kind, **facts})
-    else:
-        show(facts)
+    shared.print_facts({"kind": kind, **facts}, as_json, show)
 
 
 def _starts_with(path: Path, magic: bytes) -> bool:
@@ -152,7 +149,7 @@ def _started_from(pretraining: dict[str, dict[str, Any]]) -> str:
 
 
 def _print_plain(facts: dict[str, Any]) -> None:
-    known = {name: value for name, value in facts.items() if value not in (None, "", [], {})}
+    known = {name: value for name, value in facts.items() if name != "kind" and value not in (None, "", [], {})}
     shared.print_table([], [[name.replace("_", " "), _shown(value)] for name, value in known.items()])
 
 

@@ -17,11 +17,7 @@ def list_plugins(as_json: bool) -> None:
 
     SW_PLUGINS=a,b in the environment restricts what is loaded (empty: the core alone).
     """
-    found = gather()
-    if as_json:
-        shared.print_json(found)
-    else:
-        _print(found)
+    shared.print_facts(gather(), as_json, _print)
 
 
 def gather() -> dict[str, Any]:

@@ -116,12 +116,14 @@ def print_json(content: Any) -> None:
     click.echo(json.dumps(content, indent=2, allow_nan=False))
 
 
-def print_facts(facts: dict[str, Any], as_json: bool, text: str) -> None:
-    """Print facts on stdout as one JSON object, or what `text` says of them."""
+def print_facts(facts: dict[str, Any], as_json: bool, told: str | Callable[[dict[str, Any]], None]) -> None:
+    """Print facts on stdout as one JSON object, or as `told` says: a text, or a function that prints them."""
     if as_json:
         print_json(facts)
+    elif isinstance(told, str):
+        click.echo(told)
     else:
-        click.echo(text)
+        told(facts)
 
 
 def counted(counts: dict[str, int]) -> str:
