@@ -48,11 +48,7 @@ class ShapeError(UserInputError):
     """A tensor does not have the shape, dtype or device that a function documents."""
 
     def __init__(
-        self,
-        message: str,
-        *,
-        actual: Sequence[int] | None = None,
-        expected: Sequence[int | str] | None = None,
+        self, message: str, *, actual: Sequence[int] | None = None, expected: Sequence[int | str] | None = None
     ) -> None:
         super().__init__(message)
         self.actual = tuple(actual) if actual is not None else None
@@ -99,11 +95,9 @@ class DiskFullError(SplatwizardError):
     """
 
     def __init__(self, path: str, reason: str, wanted: int | None = None, free: int | None = None) -> None:
-        known = (("bytes wanted", wanted), ("free", free))
-        figures = [f"{count:,} {what}" for what, count in known if count is not None]
-        told = f" ({', '.join(figures)})" if figures else ""
+        figures = _figures(("bytes wanted", wanted), ("free", free))
         super().__init__(
-            f"{path}: {reason}{told}; nothing half-written was kept. "
+            f"{path}: {reason}{f' ({figures})' if figures else ''}; nothing half-written was kept. "
             "Make space and give the same command again: a run goes on from what is there"
         )
         self.path, self.reason, self.wanted, self.free = path, reason, wanted, free
@@ -118,9 +112,8 @@ class DeviceMemoryError(SplatwizardError):
     def __init__(
         self, doing: str, advice: str, wanted: int | None = None, free: int | None = None, total: int | None = None
     ) -> None:
-        known = (("wanted at once", wanted), ("free", free), ("in all", total))
-        figures = [f"{count:,} bytes {what}" for what, count in known if count is not None]
-        super().__init__(f"the GPU has too little memory for {doing} ({', '.join(figures) or 'no figures'}); {advice}")
+        figures = _figures(("bytes wanted at once", wanted), ("bytes free", free), ("bytes in all", total))
+        super().__init__(f"the GPU has too little memory for {doing} ({figures or 'no figures'}); {advice}")
         self.wanted, self.free, self.total = wanted, free, total
 
 
@@ -157,3 +150,8 @@ class EmptyModel(SplatwizardError):  # noqa: N818 (the specification names it)
     def __init__(self, step: int) -> None:
         super().__init__(f"no primitive is left after pruning at step {step}; lower the pruning thresholds")
         self.step = step
+
+
+def _figures(*counts: tuple[str, int | None]) -> str:
+    """`1,024 bytes wanted, 12 free`, of what is known."""
+    return ", ".join(f"{count:,} {what}" for what, count in counts if count is not None)

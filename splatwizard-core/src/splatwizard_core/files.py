@@ -40,7 +40,6 @@ def replacing(path: str | os.PathLike[str], *, wanted: int | None = None, durabl
     earlier writes to `path` is removed. Raises DiskFullError; other errors of the system (OSError) pass through.
     """
     path = Path(path)
-    _remove_leftovers(path)
     temporary = _temporary(path)
     try:
         with naming_full_disk(path, wanted):
@@ -64,25 +63,15 @@ def naming_full_disk(path: str | os.PathLike[str], wanted: int | None = None) ->
     try:
         yield
     except Exception as error:
-        code = full_disk_code(error)
-        if code is None:
+        told = re.search(r"\(os error (\d+)\)", str(error))  # how libraries written in Rust pass it on
+        code = error.errno if isinstance(error, OSError) else int(told[1]) if told is not None else None
+        if code not in FULL:
             raise
-        raise DiskFullError(str(path), FULL[code], wanted, _free_bytes(Path(path), code)) from error
-
-
-def full_disk_code(error: BaseException) -> int | None:
-    """The errno if an error says that there is no space, else None."""
-    if isinstance(error, OSError):
-        return error.errno if error.errno in FULL else None
-    told = re.search(r"\(os error (\d+)\)", str(error))  # how libraries written in Rust pass it on
-    return int(told[1]) if told is not None and int(told[1]) in FULL else None
-
-
-def _free_bytes(path: Path, code: int) -> int | None:
-    """What is free where `path` lies; None if that is not what stands in the way, or cannot be asked."""
-    with contextlib.suppress(OSError):
-        return shutil.disk_usage(path.parent).free if code == errno.ENOSPC else None
-    return None
+        free = None
+        if code == errno.ENOSPC:
+            with contextlib.suppress(OSError):
+                free = shutil.disk_usage(Path(path).parent).free
+        raise DiskFullError(str(path), FULL[code], wanted, free) from error
 
 
 @contextlib.contextmanager
@@ -96,16 +85,14 @@ def new_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise FileExistsError(errno.EEXIST, "is there already and not empty", str(path))
     path.parent.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(path)
     temporary = _temporary(path)
     temporary.mkdir()
     try:
         with naming_full_disk(path):
             yield temporary
         os.rename(temporary, path)  # also over an empty folder, never over one that holds something
-    except BaseException:
+    finally:
         shutil.rmtree(temporary, ignore_errors=True)
-        raise
 
 
 def write_atomic(path: str | os.PathLike[str], content: str | bytes) -> None:
@@ -135,9 +122,7 @@ def scratch_folder(purpose: str) -> Iterator[Path]:
 
     Those of the same purpose that killed processes left are removed too.
     """
-    base = Path(tempfile.gettempdir()) / f"splatwizard-{purpose}"
-    _remove_leftovers(base)
-    folder = _temporary(base)
+    folder = _temporary(Path(tempfile.gettempdir()) / f"splatwizard-{purpose}")
     with naming_full_disk(folder):
         folder.mkdir(mode=0o700)
         try:
@@ -153,32 +138,27 @@ def remove_folder(path: Path) -> None:
     shutil.rmtree(away)
 
 
-def sweep(folder: Path) -> None:
-    """Remove the temporaries directly in `folder` that killed processes left, whatever they were to become."""
-    _remove_matching(folder, re.compile(r"\..+" + TEMPORARY))
+def sweep(folder: Path, name: str | None = None) -> None:
+    """Remove the temporaries directly in `folder` that killed processes left; others may be writing there.
 
-
-def _temporary(path: Path) -> Path:
-    """A new name beside `path`, as `TEMPORARY` describes it."""
-    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-
-
-def _remove_leftovers(path: Path) -> None:
-    """Remove the temporaries of `path` whose process has ended; others may be writing to the same place."""
-    _remove_matching(path.parent, re.compile(re.escape(f".{path.name}") + TEMPORARY))
-
-
-def _remove_matching(folder: Path, pattern: re.Pattern[str]) -> None:
+    name    what they were to become; None: anything
+    """
+    pattern = re.compile(rf"\.{'.+' if name is None else re.escape(name)}{TEMPORARY}")
     with contextlib.suppress(OSError):
-        for name in os.listdir(folder):
-            match = pattern.fullmatch(name)
-            left = folder / name
-            if match is None or _is_writing(int(match[1]), left):
+        for match in filter(None, map(pattern.fullmatch, os.listdir(folder))):
+            left = folder / match[0]
+            if _is_writing(int(match[1]), left):
                 continue
             if left.is_dir() and not left.is_symlink():
                 shutil.rmtree(left, ignore_errors=True)
             else:
                 left.unlink(missing_ok=True)
+
+
+def _temporary(path: Path) -> Path:
+    """A new name beside `path`, as `TEMPORARY` describes it, in place of those that killed processes left."""
+    sweep(path.parent, path.name)
+    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
 
 
 def _is_writing(process: int, file: Path) -> bool:

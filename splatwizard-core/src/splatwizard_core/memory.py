@@ -6,7 +6,7 @@ import re
 import resource
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import psutil
@@ -25,23 +25,18 @@ def rss_bytes() -> int:
 
 def peak_rss_bytes() -> int:
     """Largest resident set since the last `reset_peak_rss` (or since the process began), bytes."""
-    try:
-        for line in _STATUS.read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    except OSError:
-        pass
+    with suppress(OSError):
+        if (found := re.search(r"^VmHWM:\s*(\d+)", _STATUS.read_text(), re.MULTILINE)) is not None:
+            return int(found[1]) * 1024
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
 
 
 def reset_peak_rss() -> bool:
     """Let the peak start again from now; False where the system cannot (the peak then is the process's)."""
-    try:
-        _CLEAR.write_text("5")  # Linux: reset the high-water mark of the resident set
-    except OSError:
-        return False
-    return True
+    with suppress(OSError):
+        return bool(_CLEAR.write_text("5"))  # Linux: reset the high-water mark of the resident set
+    return False
 
 
 def synchronize(device: torch.device) -> None:
@@ -57,9 +52,7 @@ def out_of_memory(error: torch.cuda.OutOfMemoryError, doing: str, advice: str) -
     """The error that says what torch's does, and what was being done: counts, resolution, bytes."""
     found = re.search(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)", str(error))
     wanted = None if found is None else round(float(found[1]) * _UNITS[found[2]])
-    free = total = None
-    if torch.cuda.is_available():
-        free, total = torch.cuda.mem_get_info()
+    free, total = torch.cuda.mem_get_info() if torch.cuda.is_available() else (None, None)
     return DeviceMemoryError(doing, advice, wanted, free, total)
 
 
@@ -72,9 +65,7 @@ class MemoryMeter:
     def __init__(self, device: torch.device | str) -> None:
         self.device = torch.device(device)
         self.kind = "cuda" if self.device.type == "cuda" else "rss"
-        self._before = 0
-        self._peak = 0
-        self._peak_reserved = 0
+        self._before = self._peak = self._peak_reserved = 0
 
     def start(self) -> None:
         self._peak = self._peak_reserved = 0
@@ -82,13 +73,13 @@ class MemoryMeter:
         self._before = rss_bytes() if self.kind == "rss" else 0
 
     def peak_bytes(self) -> int:
-        return max(self._peak, self._peak_now())
+        now = torch.cuda.max_memory_allocated(self.device) if self.kind == "cuda" else peak_rss_bytes() - self._before
+        return max(self._peak, int(now))
 
     def current_bytes(self) -> int:
         """What is held now, above what was there at `start` (CUDA: all that is allocated)."""
-        if self.kind == "cuda":
-            return int(torch.cuda.memory_allocated(self.device))
-        return max(rss_bytes() - self._before, 0)
+        now = torch.cuda.memory_allocated(self.device) if self.kind == "cuda" else rss_bytes() - self._before
+        return max(int(now), 0)
 
     def peak_reserved_bytes(self) -> int | None:
         """CUDA: peak of the allocator's reserved pool; None on a CPU."""
@@ -115,8 +106,3 @@ class MemoryMeter:
             torch.cuda.reset_peak_memory_stats(self.device)
         else:
             reset_peak_rss()
-
-    def _peak_now(self) -> int:
-        if self.kind == "cuda":
-            return int(torch.cuda.max_memory_allocated(self.device))
-        return max(peak_rss_bytes() - self._before, 0)

@@ -6,7 +6,6 @@ Everything goes to stderr, so that stdout stays clean for results and `--json`.
 from __future__ import annotations
 
 import contextlib
-import itertools
 import sys
 import time
 from collections import deque
@@ -16,7 +15,7 @@ from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
-    from rich.progress import Progress, TaskID
+    from rich.progress import Progress
 
 REFRESH_SECONDS = 0.1  # a bar is redrawn at most ten times a second
 LINE_SECONDS = 5.0  # a plain line appears at most this often
@@ -34,13 +33,16 @@ class Bar:
     start   steps done before (a resumed run); they do not count for the rate
     """
 
+    _interval = LINE_SECONDS
+
     def __init__(self, label: str, total: int | None, start: int, *, unit: str, stream: TextIO) -> None:
         self.label, self.total, self.unit = label, total, unit
-        self.start = self.done = start
+        self.done = start
         self._stream = stream
         self._fields: dict[str, Any] = {}
-        self._began = self._drawn = time.monotonic()
-        self._marks: deque[tuple[float, int]] = deque([(self._began, start)])
+        self._drawn = time.monotonic()
+        self._began = (self._drawn, start)
+        self._marks = deque([self._began])
         self._lines = 0
 
     def advance(self, steps: int = 1, **fields: Any) -> None:
@@ -49,14 +51,21 @@ class Bar:
         fields  loss=..., gaussians=..., or any name: numbers or one-element tensors, read only when drawn
         """
         self.done += steps
-        if fields:
-            self._fields.update(fields)
+        self._fields.update(fields)
         now = time.monotonic()
-        if now - self._drawn >= self._interval:
-            self._drawn = now
-            self._mark(now)
-            with contextlib.suppress(OSError):  # a terminal that has closed must not end the work
-                self._draw()
+        if now - self._drawn < self._interval:
+            return
+        self._drawn = now
+        self._marks.append((now, self.done))
+        while len(self._marks) > 2 and now - self._marks[1][0] > RATE_WINDOW_SECONDS:
+            self._marks.popleft()
+        left = self.seconds_left
+        self._show(f"{duration(left)} left" if left else "")
+
+    def finish(self) -> None:
+        """Show the rate of the whole, and how long it took."""
+        self._marks = deque([self._began])
+        self._show(f"in {duration(time.monotonic() - self._began[0])}", finished=True)
 
     @property
     def rate(self) -> float | None:
@@ -71,34 +80,22 @@ class Bar:
 
     def facts(self) -> str:
         """Rate and fields: `8.1 it/s · loss 0.0345 · 120,331 Gaussians`."""
-        rate = self.rate
-        shown = (
-            [] if rate is None else [f"{rate:.1f} {self.unit}/s"] if rate >= 0.1 else [f"{1 / rate:.0f} s/{self.unit}"]
-        )
-        return " · ".join([*shown, *itertools.starmap(_shown, self._fields.items())])
+        shown, rate = [_shown(name, value) for name, value in self._fields.items()], self.rate
+        if rate is not None:
+            shown.insert(0, f"{rate:.1f} {self.unit}/s" if rate >= 0.1 else f"{1 / rate:.0f} s/{self.unit}")
+        return " · ".join(shown)
 
-    _interval = LINE_SECONDS
-
-    def _mark(self, now: float) -> None:
-        self._marks.append((now, self.done))
-        while len(self._marks) > 2 and now - self._marks[1][0] > RATE_WINDOW_SECONDS:
-            self._marks.popleft()
-
-    def _draw(self) -> None:
-        count = f"{self.done:,}" if self.total is None else f"{self.done:,}/{self.total:,}"
-        left = self.seconds_left
-        parts = [f"{self.label}: {count}", self.facts(), "" if not left else f"{duration(left)} left"]
-        print(" · ".join(p for p in parts if p), file=self._stream, flush=True)
+    def _show(self, time_told: str, *, finished: bool = False) -> None:
+        if finished:
+            if self._lines == 0 and time.monotonic() - self._began[0] < 1.0:
+                return  # a line for each blink of an eye is noise
+            parts = [f"{self.label}: {self.done:,} {time_told}", self.facts()]
+        else:
+            count = f"{self.done:,}" if self.total is None else f"{self.done:,}/{self.total:,}"
+            parts = [f"{self.label}: {count}", self.facts(), time_told]
+        with contextlib.suppress(OSError):  # a terminal that has closed must not end the work
+            print(" · ".join(p for p in parts if p), file=self._stream, flush=True)
         self._lines += 1
-
-    def _finish(self) -> None:
-        """Show the rate of the whole, and how long it took."""
-        seconds = time.monotonic() - self._began
-        if self._lines == 0 and seconds < 1.0:  # a line for each blink of an eye is noise
-            return
-        self._marks = deque([(self._began, self.start)])
-        parts = [f"{self.label}: {self.done:,} in {duration(seconds)}", self.facts()]
-        print(" · ".join(p for p in parts if p), file=self._stream, flush=True)
 
 
 class _RichBar(Bar):
@@ -108,19 +105,12 @@ class _RichBar(Bar):
 
     def __init__(self, display: Progress, label: str, total: int | None, start: int, *, unit: str) -> None:
         super().__init__(label, total, start, unit=unit, stream=sys.stderr)
-        self._progress = display
-        self._task: TaskID = display.add_task(label, total=total, completed=start, facts="", left="")
+        self._display = display
+        self.task = display.add_task(label, total=total, completed=start, facts="", left="")
 
-    def _draw(self) -> None:
-        left = self.seconds_left
-        self._show("" if left is None else f"{duration(left)} left")
-
-    def _finish(self) -> None:
-        self._marks = deque([(self._began, self.start)])
-        self._show(f"in {duration(time.monotonic() - self._began)}")
-
-    def _show(self, left: str) -> None:
-        self._progress.update(self._task, completed=self.done, facts=self.facts(), left=left, refresh=True)
+    def _show(self, time_told: str, *, finished: bool = False) -> None:
+        with contextlib.suppress(OSError):
+            self._display.update(self.task, completed=self.done, facts=self.facts(), left=time_told, refresh=True)
 
 
 @contextmanager
@@ -138,26 +128,22 @@ def track(
     unit    of the rate: "it", "views"
     stream  where to (default: stderr)
     """
-    out = stream or sys.stderr
+    out, outer = stream or sys.stderr, _display.get()
     if not out.isatty():
         bar = Bar(label, total, start, unit=unit, stream=out)
         yield bar
-        with contextlib.suppress(OSError):
-            bar._finish()
-        return
-    outer = _display.get()
-    if outer is not None:
+        bar.finish()
+    elif outer is not None:
         nested = _RichBar(outer, label, total, start, unit=unit)
         try:
             yield nested
         finally:
-            outer.remove_task(nested._task)
-        return
-    with _new_display(out) as display:
-        bar = _RichBar(display, label, total, start, unit=unit)
-        yield bar
-        with contextlib.suppress(OSError):
-            bar._finish()
+            outer.remove_task(nested.task)
+    else:
+        with _new_display(out) as display:
+            bar = _RichBar(display, label, total, start, unit=unit)
+            yield bar
+            bar.finish()
 
 
 @contextmanager
@@ -193,7 +179,5 @@ def duration(seconds: float) -> str:
     """`12.3 s`, `4 min 05 s`, `2 h 03 min`."""
     if seconds < 60:
         return f"{seconds:.1f} s"
-    whole = round(seconds)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    minutes, rest = divmod(round(seconds), 60)
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -36,7 +36,7 @@ MODULES = {
     "cli.options": "console debug_option json_option options print_json say set_option",
     "cli.complete": "complete_files complete_folders complete_image_folders complete_names complete_nothing",
     "cli.paths": "existing_file output_file output_folder",
-    "cli.setup": "assignments resolve_run_options",
+    "cli.setup": "Choices",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 

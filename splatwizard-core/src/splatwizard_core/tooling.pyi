@@ -13,8 +13,7 @@ from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.paths import output_file as output_file
 from splatwizard_core.cli.paths import output_folder as output_folder
-from splatwizard_core.cli.setup import assignments as assignments
-from splatwizard_core.cli.setup import resolve_run_options as resolve_run_options
+from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cores import available_cores as available_cores
 from splatwizard_core.errors import NativeBuildError as NativeBuildError
 from splatwizard_core.errors import PluginError as PluginError

@@ -199,7 +199,12 @@ def test_four_deaths_in_one_run_change_nothing_and_no_reader_sees_half_a_file(
     dice = random.Random(SEED)
     training = next(i for i, line in enumerate(undisturbed.writes) if "scene.swz" in line)
     life = Life(tmp_path)
-    deaths = [f"run:{dice.randrange(training)}", "run:splatwizard-decode", f"eval:{dice.randint(1, 4)}", "run:.metrics.json"]
+    deaths = [
+        f"run:{dice.randrange(training)}",
+        "run:splatwizard-decode",
+        f"eval:{dice.randint(1, 4)}",
+        "run:.metrics.json",
+    ]
     for death in deaths:
         assert life.live(death) == -signal.SIGKILL, (death, life.log[-1])
     assert life.live() == 0, life.log[-1]

@@ -101,9 +101,9 @@ def report(
 
 def open_scene(run: Run) -> Scene:
     """Read the scene of a run as the run read it. Raises what reading a scene raises."""
-    from splatwizard_core.tooling import existing_file, load_plugins, load_scene, resolve_run_options
+    from splatwizard_core.tooling import Choices, existing_file, load_plugins, load_scene
 
-    resolved = resolve_run_options(str(existing_file(str(run.directory / "config.toml"))), {})
+    resolved = Choices(config_file=str(existing_file(str(run.directory / "config.toml")))).resolve_without_method()
     return load_scene(resolved.scene_spec, resolved.scene, load_plugins())
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import click
 
 from splatwizard_core.cli import options as shared
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command("build-kernels", short_help="compile all native modules ahead of time")
@@ -34,16 +37,13 @@ def build_kernels(
     Without this they are compiled when first used.
     """
     from splatwizard_core.native.build import build_all
-    from splatwizard_core.plugins import load_plugins
 
     rows = build_all(
         load_plugins(), march="portable" if portable else "native", into_packages=into_packages, force=force, cuda=cuda,
         jobs=jobs, say=shared.say,
     )  # fmt: skip
     if as_json:
-        modules = [{name: getattr(row, name) for name in ("name", "state", "seconds", "error")} for row in rows]
-        paths = [None if row.path is None else str(row.path) for row in rows]
-        shared.print_json({"modules": [{**m, "path": p} for m, p in zip(modules, paths, strict=True)]})
+        shared.print_json({"modules": [{**asdict(row), "path": row.path and str(row.path)} for row in rows]})
     else:
         shared.print_table(["module", "state", "seconds"], [[r.name, r.state, f"{r.seconds:.1f}"] for r in rows])
         for row in (r for r in rows if r.error is not None):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
@@ -12,6 +11,7 @@ from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import complete_files
 from splatwizard_core.cli.paths import existing, existing_file, output_file
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command(short_help="a trained model to one file")
@@ -31,22 +31,18 @@ def encode(source: str, out: str | None, as_json: bool, chosen: Choices) -> None
     SOURCE is a run directory whose training is finished (its config.toml holds; --rate and --set change values of the
     codec), or a .ply of explicit Gaussians, for methods that encode such.
     """
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.encode import encode_directory, encode_ply
 
-    path = existing(source)
-    plugins = load_plugins()
+    path, plugins = existing(source), load_plugins()
     target = output_file(out if out is not None else (path if path.is_dir() else path.parent) / "scene.swz")
     if path.is_dir() and chosen.config_file is None:
         existing(str(path / "config.toml"))
         chosen = chosen.with_rate_of(path, plugins)
     resolved = chosen.resolve_one(plugins)
-    session = open_session(resolved.ppl, plugins)
+    session = open_session(resolved, plugins)
     facts = (encode_directory if path.is_dir() else encode_ply)(session, resolved, path, target)
-    if as_json:
-        shared.print_json({"file": str(target), **facts})
-    else:
-        click.echo(f"{facts['bytes']:,} bytes in {facts['encode_s']:.2f} s: {target}")
+    told = f"{facts['bytes']:,} bytes in {facts['encode_s']:.2f} s: {target}"
+    shared.print_facts({"file": str(target), **facts}, as_json, told)
 
 
 @click.command(short_help="a file back to a model, from nothing but itself")
@@ -66,23 +62,16 @@ def encode(source: str, out: str | None, as_json: bool, chosen: Choices) -> None
 @takes_choices
 def decode(file: str, out: str | None, repeats: int, as_json: bool, chosen: Choices) -> None:
     """Decode FILE.swz from nothing but itself; report time, counts and the digest of the model."""
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.decode import save_decoded, timed_decode
 
-    path = existing_file(file)
+    path, plugins = existing_file(file), load_plugins()
     if out is not None:
         output_file(out)
-    plugins = load_plugins()
-    session = open_session(chosen.resolve_without_method().ppl, plugins)
+    session = open_session(chosen.resolve_without_method(), plugins)
     model, report = timed_decode(path, session, repeats=repeats)
-    facts: dict[str, Any] = asdict(report)
+    facts = asdict(report)
     if out is not None:
         save_decoded(model, report, Path(out), plugins)
         facts["out"] = out
-    if as_json:
-        shared.print_json(facts)
-        return
-    click.echo(
-        f"{report.method}: {shared.counted(report.counts)}, decoded in {report.decode_s:.3f} s on {report.device}"
-    )
-    click.echo(f"model digest {report.digest}")
+    told = f"{shared.counted(report.counts)}, decoded in {report.decode_s:.3f} s on {report.device}"
+    shared.print_facts(facts, as_json, f"{report.method}: {told}\nmodel digest {report.digest}")

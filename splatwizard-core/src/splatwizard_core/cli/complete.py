@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -49,28 +49,27 @@ def complete_names(kind: str) -> Complete:
     """Make a completion that offers the registered names of a kind; in a comma list, for its last word."""
 
     def complete(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
-        return _in_list(incomplete, [(entry.name, entry.summary) for entry in _registered(kind)])
+        return _in_list(incomplete, {entry.name: entry.summary for entry in _registered(kind)})
 
     return complete
 
 
 def complete_rates(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Offer the rate points of the methods on the line, and the aliases."""
-    return _in_list(incomplete, [(name, None) for name in [*_declared(context, "rates"), *RATE_ALIASES]])
+    return _in_list(incomplete, dict.fromkeys([*_declared(context, "rates"), *RATE_ALIASES]))
 
 
 def complete_presets(context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Offer the presets of the methods on the line."""
-    return _starting(incomplete, [(name, None) for name in _declared(context, "presets") or COMMON_PRESETS])
+    return _starting(incomplete, dict.fromkeys(_declared(context, "presets") or COMMON_PRESETS))
 
 
 def complete_scenes(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[CompletionItem]:
     """Offer the default scene, dataset/scene below $SPLATWIZARD_DATA, and folders by the shell."""
-    default = [entry for entry in _registered("dataset") if entry.declared.get("default")]
-    found: list[tuple[str, str | None]] = [(entry.name, entry.summary) for entry in default]
+    found: dict[str, str | None] = {e.name: e.summary for e in _registered("dataset") if e.declared.get("default")}
     if root := os.environ.get(DATA):
         places = [(data, scene) for data in _folders_in(Path(root).expanduser()) for scene in _folders_in(data)]
-        found += [(f"{data.name}/{scene.name}", None) for data, scene in places[:MOST]]
+        found |= {f"{data.name}/{scene.name}": None for data, scene in places[:MOST]}
     return [CompletionItem(incomplete, type="dir"), *_starting(incomplete, found)]
 
 
@@ -89,7 +88,7 @@ def complete_image_folders(
     roots = [Path(root).expanduser() for root in (".", os.environ.get(DATA)) if root]
     places = [root / Path(scene).expanduser() for root in roots]
     names = next(([path.name for path in _folders_in(place)] for place in places if place.is_dir()), [])
-    return _starting(incomplete, [(name, None) for name in names if name.startswith("images")])
+    return _starting(incomplete, dict.fromkeys(name for name in names if name.startswith("images")))
 
 
 def _registered(kind: str) -> Iterable[Entry]:
@@ -116,12 +115,13 @@ def _folders_in(path: Path) -> list[Path]:
     return []
 
 
-def _in_list(incomplete: str, found: Iterable[tuple[str, str | None]]) -> list[CompletionItem]:
+def _in_list(incomplete: str, found: Mapping[str, str | None]) -> list[CompletionItem]:
     """Completions of the last word of a comma list; words that stand in it already are not offered again."""
     before, comma, _ = incomplete.rpartition(",")
     taken = set(before.split(","))
-    return _starting(incomplete, [(f"{before}{comma}{name}", about) for name, about in found if name not in taken])
+    return _starting(incomplete, {f"{before}{comma}{name}": found[name] for name in found if name not in taken})
 
 
-def _starting(incomplete: str, found: Iterable[tuple[str, str | None]]) -> list[CompletionItem]:
-    return [CompletionItem(name, help=about) for name, about in found if name.startswith(incomplete)][:MOST]
+def _starting(incomplete: str, found: Mapping[str, str | None]) -> list[CompletionItem]:
+    """Completions among names, each with a line about it where there is one."""
+    return [CompletionItem(name, help=found[name]) for name in found if name.startswith(incomplete)][:MOST]

@@ -20,26 +20,24 @@ def describe(scene: Scene) -> dict[str, Any]:
     extent          world units, from the training cameras
     masks, ground_truth, warnings
     """
-    views = list(scene.train)
-    seen = {id(view) for view in views}
-    views += [view for view in scene.test if id(view) not in seen]
+    views = list({id(view): view for view in (*scene.train, *scene.test)}.values())
     cameras = [view.camera for view in views]
     sizes = Counter((c.width, c.height) for c in cameras)
-    points = scene.points
+    points, protocol = scene.points, scene.protocol
     return {
         "name": scene.name,
         "path": scene.path,
-        "dataset": scene.protocol.dataset,
-        "protocol": scene.protocol.id,
-        "named_protocol": scene.protocol.name,
-        "background": scene.protocol.background,
-        "split": scene.protocol.split,
+        "dataset": protocol.dataset,
+        "protocol": protocol.id,
+        "named_protocol": protocol.name,
+        "background": protocol.background,
+        "split": protocol.split,
         "views": {"train": len(scene.train), "test": len(scene.test)},
         "resolutions": [{"width": w, "height": h, "views": n} for (w, h), n in sizes.most_common()],
         "cameras": {
             "intrinsics": len({(c.width, c.height, c.fx, c.fy, c.cx, c.cy) for c in cameras}),
-            "fov_x_deg": _range([c.fov_x for c in cameras], 180 / math.pi),
-            "fov_y_deg": _range([c.fov_y for c in cameras], 180 / math.pi),
+            "fov_x_deg": _degrees([c.fov_x for c in cameras]),
+            "fov_y_deg": _degrees([c.fov_y for c in cameras]),
         },
         "points": None
         if points is None
@@ -56,5 +54,6 @@ def describe(scene: Scene) -> dict[str, Any]:
     }
 
 
-def _range(values: list[float], factor: float) -> list[float]:
-    return [round(min(values) * factor, 3), round(max(values) * factor, 3)]
+def _degrees(angles: list[float]) -> list[float]:
+    """The smallest and the largest."""
+    return [round(angle * 180 / math.pi, 3) for angle in (min(angles), max(angles))]

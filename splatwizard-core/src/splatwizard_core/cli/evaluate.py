@@ -15,6 +15,7 @@ from splatwizard_core.cli.paths import existing, output_folder
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices, warn_of_metrics
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.files import scratch_folder
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")
@@ -56,18 +57,14 @@ def evaluate(
     model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...), keys of
     the run (raster.prefer, threads, ...) and settings of metrics (metrics.GROUP.KEY).
     """
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.encode import encode_directory, load_finished
     from splatwizard_core.runs.fresh import decode_fresh
     from splatwizard_core.runs.measure import Opened, measure, opener
 
-    path = existing(file)
+    path, plugins = existing(file), load_plugins()
     names = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
     if names == []:
         raise click.UsageError("--metrics is empty: give names, or leave it out")
-    plugins = load_plugins()
-    for name in names or ():
-        plugins.metrics.entry(name)
     if renders is not None:
         output_folder(renders)
     if path.is_dir():
@@ -79,7 +76,7 @@ def evaluate(
         raise click.UsageError("--roundtrip is for a run directory; a file has been encoded already")
     else:
         resolved = chosen.resolve_without_method()
-    session = open_session(resolved.ppl, plugins)
+    session = open_session(resolved, plugins)
     warn_of_metrics(session, names, resolved.metrics, quiet=quiet)
 
     def open_trained() -> Opened:
@@ -104,11 +101,7 @@ def evaluate(
         size = None if measured.is_dir() else measured.stat().st_size
     if digest not in (None, facts["digest"]):
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
-    facts = {"file": {"path": file, "bytes": size}, **facts}
-    if as_json:
-        shared.print_json(facts)
-    else:
-        _print(facts)
+    shared.print_facts({"file": {"path": file, "bytes": size}, **facts}, as_json, _print)
 
 
 def _print(facts: dict[str, Any]) -> None:
@@ -125,10 +118,8 @@ def _print(facts: dict[str, Any]) -> None:
     rows.append(["visible, mean of views", f"{facts['visible_gaussians']:,.0f}"])
     if facts["speed"] is not None:
         speed, memory = facts["speed"], facts["memory"]
-        width, height = speed["image_size"]
-        rows.append(
-            ["speed", f"{speed['fps']:.1f} frames/s at {width}x{height}, median {speed['latency_ms_median']:.1f} ms"]
-        )
+        size = "x".join(map(str, speed["image_size"]))
+        rows.append(["speed", f"{speed['fps']:.1f} frames/s at {size}, median {speed['latency_ms_median']:.1f} ms"])
         if speed["spread"] is not None:
             fps = speed["spread"]["fps"]
             spread = f"deviation {fps['std']:.1f}, {fps['min']:.1f} to {fps['max']:.1f} frames/s"

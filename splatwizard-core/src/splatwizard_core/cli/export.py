@@ -10,6 +10,7 @@ from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import complete_files, complete_names
 from splatwizard_core.cli.paths import existing_file, output_file
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command(short_help=".ply and other interchange formats")
@@ -25,18 +26,13 @@ from splatwizard_core.cli.setup import Choices, open_session, takes_choices
 @takes_choices
 def export(file: str, out: str, exporter: str | None, as_json: bool, chosen: Choices) -> None:
     """Decode FILE (.swz or .ply) and write it to OUT in another format, such as .ply."""
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.decode import export_model
     from splatwizard_core.runs.measure import opener
 
-    path = existing_file(file)
+    path, plugins = existing_file(file), load_plugins()
     output_file(out)
-    plugins = load_plugins()
-    session = open_session(chosen.resolve_without_method().ppl, plugins)
+    session = open_session(chosen.resolve_without_method(), plugins)
     model = opener(path, session)().model
     name = export_model(model, Path(out), plugins, exporter)
     facts = {"file": out, "format": name, "bytes": Path(out).stat().st_size, "counts": model.counts()}
-    if as_json:
-        shared.print_json(facts)
-    else:
-        click.echo(f"{facts['bytes']:,} bytes ({name}): {out}")
+    shared.print_facts(facts, as_json, f"{facts['bytes']:,} bytes ({name}): {out}")

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
@@ -13,9 +14,7 @@ from splatwizard_core.cli.paths import existing
 from splatwizard_core.cli.setup import Choices, takes_choices
 from splatwizard_core.cli.streams import without_orders
 from splatwizard_core.errors import UserInputError
-
-if TYPE_CHECKING:
-    from splatwizard_core.runs.record import Record
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command(short_help="what is in a file or scene")
@@ -30,22 +29,16 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
     where = Path(path)
     if (where / "scene.swz").is_file() and (where / "config.toml").is_file():
         where = where / "scene.swz"
+    show: Callable[[dict[str, Any]], None] = _print_plain
     if where.suffix == ".swz" or (where.is_file() and _starts_with(where, b"SPWZ")):
-        facts = {"kind": "file", **file_facts(where)}
+        kind, facts, show = "file", _file_facts(where), _print_file
     elif where.suffix == ".json" and where.is_file():
-        facts = {"kind": "record", **_record_facts(where)}
+        kind, facts, show = "record", _record_facts(where), _print_record
     elif where.suffix == ".ply":
-        facts = {"kind": "ply", **_ply_facts(where)}
+        kind, facts = "ply", _ply_facts(where)
     else:
-        facts = {"kind": "scene", **_scene_facts(path, chosen)}
-    if as_json:
-        shared.print_json(facts)
-    elif facts["kind"] == "file":
-        _print_file(facts)
-    elif facts["kind"] == "record":
-        _print_record(facts)
-    else:
-        _print_plain(facts)
+        kind, facts = "scene", _scene_facts(path, chosen)
+    shared.print_facts({"kind": kind, **facts}, as_json, show)
 
 
 def _starts_with(path: Path, magic: bytes) -> bool:
@@ -56,10 +49,9 @@ def _starts_with(path: Path, magic: bytes) -> bool:
         raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
 
 
-def file_facts(path: Path) -> dict[str, Any]:
+def _file_facts(path: Path) -> dict[str, Any]:
     """Header and bytes by section of a .swz, which sum to its size; and what is missing here to decode it, and why."""
     from splatwizard_core.coding.container import ContainerReader
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.file_needs import missing_parts, missing_plugin
 
     reader, plugins = ContainerReader.open(path), load_plugins()
@@ -72,19 +64,21 @@ def _record_facts(path: Path) -> dict[str, Any]:
     """The gist of a result record: what was run, its scores, and who served which phase."""
     from splatwizard_core.runs.record import read_record
 
-    record: Record = read_record(path)
-    gist = {"method", "distribution", "preset", "rate", "scene", "date", "counts"}
+    record = read_record(path).model_dump(mode="json")
+    means = {name: metric["mean"] for name, metric in record["metrics"].items() if not metric["diagnostic"]}
     return {
         "path": str(path),
-        **record.model_dump(mode="json", include=gist),
-        "protocol": record.protocol.id,
-        "metrics": {n: m.mean for n, m in record.metrics.items() if not m.diagnostic and m.mean is not None},
-        "bytes": record.file.bytes,
-        **record.model_dump(mode="json", include={"phases"}),
-        "train": record.train.model_dump(
-            mode="json", include={"steps", "train_s", "with_pretraining_s", "pretraining"}
-        ),
+        **_part(record, "method", "distribution", "preset", "rate", "scene", "counts", "date"),
+        "protocol": record["protocol"]["id"],
+        "metrics": {name: mean for name, mean in means.items() if mean is not None},
+        "bytes": record["file"]["bytes"],
+        "phases": record["phases"],
+        "train": _part(record["train"], "steps", "train_s", "with_pretraining_s", "pretraining"),
     }
+
+
+def _part(facts: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: facts[name] for name in names}
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:
@@ -108,7 +102,6 @@ def _ply_facts(path: Path) -> dict[str, Any]:
 
 def _scene_facts(spec: str, chosen: Choices) -> dict[str, Any]:
     from splatwizard_core.cli.describe_scene import describe
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.scene.loading import load_scene
 
     return describe(load_scene(spec, chosen.resolve_without_method().scene, load_plugins()))
@@ -127,15 +120,13 @@ def _print_file(facts: dict[str, Any]) -> None:
 
 
 def _print_record(facts: dict[str, Any]) -> None:
-    gist = {name: value for name, value in facts.items() if name not in ("phases", "train")}
-    gist["steps"] = facts["train"]["steps"]
-    gist["starts from"] = _started_from(facts["train"]["pretraining"] or {}) or None
-    _print_plain(gist)
-    if facts["phases"] is None:
+    train, phases = facts.pop("train"), facts.pop("phases")
+    _print_plain({**facts, "steps": train["steps"], "starts from": _started_from(train["pretraining"] or {})})
+    if phases is None:
         click.echo("who served which phase is not known of this record")
         return
     rows: list[list[str]] = []
-    for phase in facts["phases"]:
+    for phase in phases:
         served: dict[str, list[str]] = {}
         for part in phase["provided_by"]:
             owner = f"{part['distribution']} {part['version']}".strip() or "no distribution"
@@ -148,12 +139,11 @@ def _print_record(facts: dict[str, Any]) -> None:
 
 def _started_from(pretraining: dict[str, dict[str, Any]]) -> str:
     """What a training started from, in words; empty: nothing that was trained."""
+    forms = {"preset": "{} preset", "steps": "{:,} steps", "train_s": "{:.0f} s"}
     found = []
     for name, scene in pretraining.items():
-        known = [f"{scene['preset']} preset"] if scene["preset"] is not None else []
-        known += [f"{scene['steps']:,} steps"] if scene["steps"] is not None else []
-        known += [f"{scene['train_s']:.0f} s"] if scene["train_s"] is not None else []
-        origin = f"from the file {scene['file']['name']}" if "name" in scene["file"] else f"({', '.join(known)})"
+        known = ", ".join(form.format(scene[key]) for key, form in forms.items() if scene[key] is not None)
+        origin = f"from the file {scene['file']['name']}" if "name" in scene["file"] else f"({known})"
         found.append(f"a trained {name} scene {origin}")
     return "; ".join(found)
 
@@ -166,12 +156,10 @@ def _print_plain(facts: dict[str, Any]) -> None:
 def _shown(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, int):
-        return f"{value:,}"
+    if isinstance(value, (int, float)):
+        return f"{value:,}" if isinstance(value, int) else f"{value:.4g}"
     if isinstance(value, dict):
         return ", ".join(f"{k} {_shown(v)}" for k, v in value.items())
     if isinstance(value, (list, tuple)):
-        return "; ".join(map(_shown, value)) if value and isinstance(value[0], dict) else ", ".join(map(_shown, value))
+        return ("; " if value and isinstance(value[0], dict) else ", ").join(map(_shown, value))
     return str(value)

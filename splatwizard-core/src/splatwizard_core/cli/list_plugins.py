@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from splatwizard_core.cli import options as shared
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command("list-plugins", short_help="what is installed, what is broken and why")
@@ -16,17 +17,12 @@ def list_plugins(as_json: bool) -> None:
 
     SW_PLUGINS=a,b in the environment restricts what is loaded (empty: the core alone).
     """
-    found = gather()
-    if as_json:
-        shared.print_json(found)
-    else:
-        _print(found)
+    shared.print_facts(gather(), as_json, _print)
 
 
 def gather() -> dict[str, Any]:
     """Collect installed plugins, name clashes and commands as plain values."""
-    from splatwizard_core.cli.main import command_entries
-    from splatwizard_core.plugins import load_plugins
+    from splatwizard_core.cli.main import command_entries  # which finds this command
 
     plugins = load_plugins()
     rows = [
@@ -49,12 +45,8 @@ def gather() -> dict[str, Any]:
 
 def _print(found: dict[str, Any]) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
-    out = shared.console()
-    table = Table(title="Installed packages", title_justify="left")
-    for column in ("distribution", "version", "provides"):
-        table.add_column(column, overflow="fold")
+    rows = []
     for row in found["plugins"]:
         by_kind: dict[str, list[str]] = {}
         for entry in row["provides"]:
@@ -63,8 +55,9 @@ def _print(found: dict[str, Any]) -> None:
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if row["error"]:
             lines.append(f"[red]broken: {escape(row['error'])}[/red]")
-        table.add_row(escape(row["distribution"]), row["version"], "\n".join(lines) or "-")
-    out.print(table)
+        rows.append([escape(row["distribution"]), row["version"], "\n".join(lines) or "-"])
+    shared.print_table(["distribution", "version", "provides"], rows, title="Installed packages", markup=True)
+    out = shared.console()
     for clash in found["clashes"]:
         owners = " and ".join(clash["distributions"])
         out.print(

@@ -16,6 +16,8 @@ import click
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
 from splatwizard_core.errors import DiskFullError, SplatwizardError
 from splatwizard_core.files import FULL
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.catalogue import package_of
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import Entry
@@ -34,8 +36,6 @@ class LazyGroup(click.Group):
         return []
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        from splatwizard_core.plugins import load_plugins
-
         with _silent_for_completion(ctx):
             commands = load_plugins().commands
             if cmd_name in commands or cmd_name in commands.clashes:
@@ -61,8 +61,6 @@ class LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        from splatwizard_core.plugins.catalogue import package_of
-
         try:
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
@@ -76,19 +74,12 @@ class LazyGroup(click.Group):
 
 def command_entries() -> list[Entry]:
     """The commands in the order of the help: those with a declared `position` by it, then by name."""
-    from splatwizard_core.plugins import load_plugins
-
     return sorted(load_plugins().commands, key=lambda e: (e.declared.get("position", math.inf), e.name))
 
 
-@contextlib.contextmanager
-def _silent_for_completion(ctx: click.Context) -> Iterator[None]:
+def _silent_for_completion(ctx: click.Context) -> contextlib.AbstractContextManager[None]:
     """Swallow what is wrong with the plugins while the shell asks for completions: TAB is not the place to say so."""
-    try:
-        yield
-    except SplatwizardError:
-        if not ctx.resilient_parsing:
-            raise
+    return contextlib.suppress(SplatwizardError) if ctx.resilient_parsing else contextlib.nullcontext()
 
 
 @contextlib.contextmanager
@@ -100,18 +91,8 @@ def _ended_by_reader() -> Iterator[None]:
         raise click.exceptions.Exit(SIGPIPE_STATUS) from None
 
 
-def _version(ctx: click.Context, _param: click.Parameter, value: bool) -> None:
-    if value and not ctx.resilient_parsing:
-        import importlib.metadata
-
-        click.echo(importlib.metadata.version("splatwizard-core"))
-        ctx.exit()
-
-
 @click.group(cls=LazyGroup, context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 110})
-@click.option(
-    "--version", is_flag=True, is_eager=True, expose_value=False, callback=_version, help="Print the version."
-)
+@click.version_option(package_name="splatwizard-core", message="%(version)s", help="Print the version.")
 @click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails (any command).")
 def cli() -> None:
     """Splatwizard: train, compress, decode and measure 3D Gaussian Splatting scenes, any method, one protocol.
@@ -138,10 +119,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
-    if debug and not isinstance(error, (click.ClickException, click.Abort, SystemExit)):
-        traceback.print_exception(error)
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
+    if debug and not isinstance(error, (click.ClickException, click.Abort)):
+        traceback.print_exception(error)
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
         _say(f"interrupted (the same command{' without --fresh' if fresh else ''} resumes a run)")
         return 130
@@ -153,21 +134,19 @@ def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
         hint = f" (`{context.command_path} --help`)" if context is not None and context.command_path != "sw" else ""
         _say(f"error: {error.format_message()}{hint}")
         return error.exit_code
+    if isinstance(error, OSError) and error.errno in FULL:
+        # What did not go through our own writing may not say where.
+        error = DiskFullError(str(error.filename or "a file"), FULL[error.errno])
     if isinstance(error, SplatwizardError):
         _say(f"error: {error}")
         return error.exit_status
+    add_debug = "" if debug else " (a traceback: add --debug)"
     if isinstance(error, OSError) and error.strerror is not None:
-        if error.errno in FULL:
-            # What did not go through our own writing may not say where.
-            _say(f"error: {DiskFullError(str(error.filename or 'a file'), FULL[error.errno])}")
-            return DiskFullError.exit_status
         at = "" if error.filename is None else f"{error.filename}: "
-        _say(f"error: {at}{error.strerror}{'' if debug else ' (a traceback: add --debug)'}")
-        return 2 if isinstance(error, PATH_ERRORS) else 1
-    if not debug:
-        text = " ".join(str(error).split())
-        _say(f"error: {type(error).__name__}: {text:.500} (a traceback: add --debug)")
-    return 1
+        _say(f"error: {at}{error.strerror}{add_debug}")
+    elif not debug:
+        _say(f"error: {type(error).__name__}: {' '.join(str(error).split()):.500}{add_debug}")
+    return 2 if isinstance(error, PATH_ERRORS) else 1
 
 
 def _say(text: str) -> None:

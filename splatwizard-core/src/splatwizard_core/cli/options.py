@@ -116,6 +116,16 @@ def print_json(content: Any) -> None:
     click.echo(json.dumps(content, indent=2, allow_nan=False))
 
 
+def print_facts(facts: dict[str, Any], as_json: bool, told: str | Callable[[dict[str, Any]], None]) -> None:
+    """Print facts on stdout as one JSON object, or as `told` says: a text, or a function that prints them."""
+    if as_json:
+        print_json(facts)
+    elif isinstance(told, str):
+        click.echo(told)
+    else:
+        told(facts)
+
+
 def counted(counts: dict[str, int]) -> str:
     """`120,331 gaussians`, of all that a model counts."""
     return ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in counts.items())
@@ -145,12 +155,15 @@ def console() -> Console:
     return SafeConsole(highlight=False, width=None if sys.stdout.isatty() else 160)
 
 
-def print_table(columns: list[str], rows: list[list[str]], *, title: str | None = None, right: int = 0) -> None:
-    """Print a table on stdout as it is: brackets in its cells are no markup.
+def print_table(
+    columns: list[str], rows: list[list[str]], *, title: str | None = None, right: int = 0, markup: bool = False
+) -> None:
+    """Print a table on stdout.
 
     columns     headings; empty: a table without
     rows        an empty one is a line between sections
     right       columns at the end that are aligned to the right
+    markup      cells hold rich's markup; else brackets in them are no markup
     """
     from rich.markup import escape
     from rich.table import Table
@@ -161,7 +174,7 @@ def print_table(columns: list[str], rows: list[list[str]], *, title: str | None 
         table.add_column(heading, justify="right" if index >= width - right else "left", overflow="fold")
     for row in rows:
         if row:
-            table.add_row(*map(escape, row))
+            table.add_row(*(row if markup else map(escape, row)))
         else:
             table.add_section()
     console().print(table)

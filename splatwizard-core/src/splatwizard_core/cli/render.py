@@ -10,6 +10,7 @@ from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import complete_files, complete_folders
 from splatwizard_core.cli.paths import existing_file, output_folder
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices
+from splatwizard_core.plugins import load_plugins
 
 
 @click.command(short_help="draw an encoded scene as PNG")
@@ -29,20 +30,15 @@ from splatwizard_core.cli.setup import Choices, open_session, takes_choices
 @takes_choices
 def render(file: str, out: str, views: str, as_json: bool, chosen: Choices) -> None:
     """Draw FILE (.swz or .ply) from the cameras of a scene, as 8-bit PNG."""
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.measure import opener, render_views
 
-    path = existing_file(file)
-    plugins = load_plugins()
+    path, plugins = existing_file(file), load_plugins()
     resolved = chosen.resolve_without_method()
-    session = open_session(resolved.ppl, plugins)
+    session = open_session(resolved, plugins)
     opened = opener(path, session)()
     output_folder(out)  # only now: a file that cannot be opened leaves no empty folder
     scene = session.scene(resolved)
     wanted = {"test": scene.test, "train": scene.train, "all": [*scene.train, *scene.test]}[views]
     unique = list({view.name: view for view in wanted}.values())
     files = render_views(session, resolved, opened, unique, Path(out))
-    if as_json:
-        shared.print_json({"folder": out, "files": files})
-    else:
-        click.echo(f"{len(files)} pictures: {out}")
+    shared.print_facts({"folder": out, "files": files}, as_json, f"{len(files)} pictures: {out}")

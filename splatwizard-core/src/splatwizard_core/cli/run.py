@@ -10,7 +10,8 @@ import click
 
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.paths import output_folder
-from splatwizard_core.cli.setup import Choices, open_training_session, say_device, takes_choices, warn_of_metrics
+from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices, warn_of_metrics
+from splatwizard_core.plugins import load_plugins
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
@@ -31,7 +32,6 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     Finished steps are not done again; an interrupted run goes on from its last checkpoint. Installed packages make
     tables and pages of the finished runs; those about several runs go into the folder above theirs.
     """
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
     from splatwizard_core.runs.run import run as run_one
@@ -41,16 +41,13 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     output_folder(out)
     session = open_training_session(resolved, plugins)
     warn_of_metrics(session, None, resolved[0].metrics)
-    say_device(resolved[0].ppl, session)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
         shared.say("preset quick: the plan scaled down for a procedural scene (--preset paper runs it in full)")
     finished: list[FinishedRun] = []
     written: list[Path] = []
     console = None if as_json else shared.console()
     for each in resolved:
-        request = RunRequest(
-            each, Path(out), resume=resume, allow_changed_plan=allow_changed_plan, repeats=repeats,
-        )  # fmt: skip
+        request = RunRequest(each, Path(out), resume, allow_changed_plan, repeats)
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))
         plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, console, shared.say, written))

@@ -10,6 +10,7 @@ import click
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import complete_names, complete_presets
 from splatwizard_core.cli.setup import Choices, takes_choices
+from splatwizard_core.plugins import load_plugins
 
 if TYPE_CHECKING:
     from splatwizard_core.training.stage import Stage
@@ -32,7 +33,6 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
 
     A stage says what trained scene it starts from, and a stage or task of another package which one that is.
     """
-    from splatwizard_core.plugins import load_plugins
     from splatwizard_core.plugins.origins import Origins
     from splatwizard_core.runs.phases import stage_parts
     from splatwizard_core.training.plan import format_plan, plan_rows, row_facts
@@ -46,23 +46,22 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     found: list[dict[str, Any]] = []
     for stage in stages:
         pre, post = build_schedulers(stage, resolved.ppl)
-        parts = stage_parts(origins, stage, resolved.ppl)
         if as_json:
             plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
-            rows = [row_facts(row, verbose=verbose) for row in plan]
             found.append(
                 {
                     "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,
-                    "taught_by": list(stage.taught_by), "provided_by": parts, "plan": rows,
+                    "taught_by": list(stage.taught_by), "provided_by": stage_parts(origins, stage, resolved.ppl),
+                    "plan": [row_facts(row, verbose=verbose) for row in plan],
                 }
             )  # fmt: skip
             continue
-        notes = _notes(stage, (entry.distribution, entry.version), origins.of(stage))
+        own = origins.of(stage)
+        notes = _notes(stage, (entry.distribution, entry.version), own)
         if len(stages) > 1 or notes:
             click.echo(f"{stage.name}: {'; '.join([f'{stage.iterations:,} steps', *notes])}")
-        own = origins.of(stage)[0]
 
-        def owner(task: Any, own: str = own) -> str:
+        def owner(task: Any, own: str = own[0]) -> str:
             found = origins.of(task)[0]
             return "" if found == own else found
 
@@ -73,11 +72,9 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
 
 def _notes(stage: Stage, method: tuple[str, str], owner: tuple[str, str]) -> list[str]:
     """Notes beside the plan of a stage: what it starts from, and whose it is if not the method's own."""
-    notes = []
-    if stage.starts_from is not None:
-        notes.append(f"starts from a trained {stage.starts_from} scene")
-    if stage.taught_by:
-        notes.append(f"taught by a trained {' and '.join(stage.taught_by)} scene")
-    if owner not in (method, ("", "")):
-        notes.append(f"of {' '.join(owner)}")
-    return notes
+    notes = {
+        f"starts from a trained {stage.starts_from} scene": stage.starts_from is not None,
+        f"taught by a trained {' and '.join(stage.taught_by)} scene": bool(stage.taught_by),
+        f"of {' '.join(owner)}": owner not in (method, ("", "")),
+    }
+    return [note for note, holds in notes.items() if holds]

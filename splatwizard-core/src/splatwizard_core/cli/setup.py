@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.runs.config import ResolvedConfig
     from splatwizard_core.runs.session import Session
-    from splatwizard_core.training.params import PipelineParams
 
 
 @dataclass(frozen=True)
@@ -37,9 +36,18 @@ class Choices:
     below: Mapping[str, Any] = field(default_factory=dict)  # values that hold where --set gives no other
 
     def values(self) -> dict[str, Any]:
-        """The values of --set and of the options that stand for a key."""
-        named = assignments(self.sets, images=self.images, device=self.device, seed=self.seed, init=self.init)
-        return {**self.below, **named}
+        """The values of --set together with those of the options that stand for a key."""
+        from splatwizard_core.runs.config import parse_set
+
+        given: dict[str, Any] = dict(parse_set(self.sets))
+        for key in ("images", "device", "seed", "init"):
+            value = getattr(self, key)
+            if value is None:
+                continue
+            if str(given.get(key, value)) != str(value):
+                raise ConfigError(f"--{key} {value} contradicts --set {key}={given[key]}: give one of them", key=key)
+            given[key] = value
+        return {**self.below, **given}
 
     def method_names(self, plugins: PluginManager) -> list[str]:
         """The methods that `--method a,b --method c` names, else the one of the configuration file, else the default.
@@ -67,12 +75,12 @@ class Choices:
         from splatwizard_core.runs.config import rate_points, resolve
         from splatwizard_core.runs.pretrained import checked_start
 
-        values, found = self.values(), []
-        for method in map(plugins.methods.load, self.method_names(plugins)):
-            for rate in [None] if self.rate is None else rate_points(method, self.rate):
-                found.append(
-                    resolve(method, self.preset, rate, self.config_file, values, scene=self.scene, plugins=plugins)
-                )
+        values = self.values()
+        found = [
+            resolve(method, self.preset, rate, self.config_file, values, scene=self.scene, plugins=plugins)
+            for method in map(plugins.methods.load, self.method_names(plugins))
+            for rate in ([None] if self.rate is None else rate_points(method, self.rate))
+        ]
         return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
@@ -83,8 +91,30 @@ class Choices:
         return found[0]
 
     def resolve_without_method(self) -> ResolvedConfig:
-        """The configuration of a command that needs no method: how a scene is read, and the keys of a run."""
-        return resolve_run_options(self.config_file, self.values(), scene=self.scene)
+        """The configuration of a command that needs no method: how a scene is read, and the keys of a run.
+
+        Keys of a method in the file are passed over; in `sets` they are a ConfigError.
+        """
+        from splatwizard_core.method import Method
+        from splatwizard_core.runs.config import RESERVED, SCENE_KEYS, read_config_file, resolve
+        from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten
+        from splatwizard_core.training.params import OptimizationParams, PipelineParams
+
+        class NoMethod(Method):
+            name = "none"
+
+        file, values = self.config_file, self.values()
+        tables = read_config_file(file) if file else {}
+        for name in (n for n in RESERVED if not isinstance(tables.get(n, ""), str)):
+            raise ConfigError(f"bad value {tables[name]!r} for '{name}' in {file}: expected a name", key=name)
+        for key in (k for k in values if k in OptimizationParams.model_fields):
+            known = ", ".join(sorted({*SCENE_KEYS, *block_keys(PipelineParams)}))
+            raise ConfigError(f"key '{key}' in --set is of no use here: one of {known}", key=key)
+        from_file = dotted({"metrics": tables.pop("metrics", {})}, "")
+        for key, value in flatten(PipelineParams, tables).items():
+            if key not in RESERVED and (key in SCENE_KEYS or field_at(PipelineParams, key) is not None):
+                from_file[key] = value
+        return resolve(NoMethod, "paper", sets={**from_file, **values}, scene=self.scene or tables.get("scene"))
 
     def with_rate_of(self, directory: Path, plugins: PluginManager) -> Choices:
         """The same for a run directory: its config.toml, with what another rate point would change in it."""
@@ -97,9 +127,8 @@ class Choices:
         (name,) = chosen.method_names(plugins)
         method = plugins.methods.load(name)
         wanted = resolve(method, str(read_config_file(directory / "config.toml").get("preset", "paper")), self.rate)
-        keys = dict.fromkeys(key for values in method.RATES.values() for key in values)
-        below = {key: value_at(wanted.config, key) for key in keys if field_at(method.Config, key) is not None}
-        return replace(chosen, rate=None, below=below)
+        keys = {key for values in method.RATES.values() for key in values if field_at(method.Config, key) is not None}
+        return replace(chosen, rate=None, below={key: value_at(wanted.config, key) for key in keys})
 
 
 def takes_choices(function: Callable[..., None]) -> Callable[..., None]:
@@ -113,72 +142,28 @@ def takes_choices(function: Callable[..., None]) -> Callable[..., None]:
     return call
 
 
-def assignments(sets: Sequence[str], **named: Any) -> dict[str, Any]:
-    """The values of --set together with those that have an option of their own (None: not given)."""
-    from splatwizard_core.runs.config import parse_set
-
-    values: dict[str, Any] = dict(parse_set(sets))
-    for key, value in named.items():
-        if value is None:
-            continue
-        if key in values and str(values[key]) != str(value):
-            raise ConfigError(f"--{key} {value} contradicts --set {key}={values[key]}: give one of them", key=key)
-        values[key] = value
-    return values
-
-
 def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
     """Of several methods, take --init and `pretrained.KEY` from those that start from nothing trained."""
     from splatwizard_core.runs.pretrained import unused_start
 
-    alone: dict[str, dict[str, Any]] = {"init": {"pretrained": {}}, "pretrained": {"init": ""}}
-    without: dict[str, dict[str, Any]] = {"init": {"init": ""}, "pretrained": {"pretrained": {}}}
-    for what in alone:
-        useless = {
-            each.method: error
-            for each in found
-            if (error := unused_start(plugins, replace(each, **alone[what]))) is not None
-        }
-        if len(useless) < len({each.method for each in found}):  # else it is wrong, and told so
+    nothing: dict[str, Any] = {"init": "", "pretrained": {}}
+    for what, other in (("init", "pretrained"), ("pretrained", "init")):
+        alone = {each.method: unused_start(plugins, replace(each, **{other: nothing[other]})) for each in found}
+        useless = {method: error for method, error in alone.items() if error is not None}
+        if len(useless) < len(alone):  # else it is wrong, and told so
             for name, error in useless.items():
                 say(f"{name} does not start from a trained scene: '{error.key}' is for the others")
-            found = [replace(each, **without[what]) if each.method in useless else each for each in found]
+            without = {what: nothing[what]}
+            found = [replace(each, **without) if each.method in useless else each for each in found]
     return found
 
 
-def resolve_run_options(config_file: str | None, values: dict[str, Any], *, scene: str | None = None) -> ResolvedConfig:
-    """The configuration of a command that needs no method: how a scene is read, and the keys of a run.
-
-    Keys of a method in the file are passed over; in `values` they are a ConfigError.
-    """
-    from splatwizard_core.method import Method
-    from splatwizard_core.runs.config import RESERVED, SCENE_KEYS, read_config_file, resolve
-    from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-
-    class NoMethod(Method):
-        name = "none"
-        Config = OptimizationParams
-
-    tables = read_config_file(config_file) if config_file else {}
-    for name in (n for n in RESERVED if not isinstance(tables.get(n, ""), str)):
-        raise ConfigError(f"bad value {tables[name]!r} for '{name}' in {config_file}: expected a name", key=name)
-    for key in values:
-        if key in OptimizationParams.model_fields:
-            known = ", ".join(sorted({*SCENE_KEYS, *block_keys(PipelineParams)}))
-            raise ConfigError(f"key '{key}' in --set is of no use here: one of {known}", key=key)
-    from_file = dotted({"metrics": tables.pop("metrics", {})}, "")
-    for key, value in flatten(PipelineParams, tables).items():
-        if key not in RESERVED and (key in SCENE_KEYS or field_at(PipelineParams, key) is not None):
-            from_file[key] = value
-    return resolve(NoMethod, "paper", "r1", sets={**from_file, **values}, scene=scene or tables.get("scene"))
-
-
-def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
+def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
     """Threads and device as asked. Raises PluginError for rasterizers that are not installed, CapabilityError."""
     from splatwizard_core.runs.device import choose_device, set_threads
     from splatwizard_core.runs.session import Session
 
+    ppl = resolved.ppl
     for name in (*ppl.raster.prefer, *ppl.raster.forbid):
         plugins.rasterizers.entry(name)
     set_threads(ppl.threads)
@@ -186,18 +171,17 @@ def open_session(ppl: PipelineParams, plugins: PluginManager) -> Session:
 
 
 def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> Session:
-    """The session of trainings, with their scenes loaded: what is wrong with one is told before anything else is."""
-    session = open_session(resolved[0].ppl, plugins)
-    for each in resolved:
-        session.scene(each)
-    return session
+    """The session of trainings, with their scenes loaded: what is wrong with one is told before anything else is.
 
-
-def say_device(ppl: PipelineParams, session: Session) -> None:
-    """Tell where a training computes, and why there."""
+    Tells where they compute, and why there.
+    """
     from splatwizard_core.runs.device import device_reason
 
-    say(device_reason(ppl.device, session.device, session.plugins))
+    session = open_session(resolved[0], plugins)
+    for each in resolved:
+        session.scene(each)
+    say(device_reason(resolved[0].ppl.device, session.device, plugins))
+    return session
 
 
 def warn_of_metrics(session: Session, names: Sequence[str] | None, settings: Any, *, quiet: bool = False) -> None:

@@ -23,12 +23,11 @@ def open_streams() -> None:
             os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this one
-    # They last as long as the process.
-    if sys.stdout is None:
-        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
-    if sys.stderr is None:
-        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
-    for stream in (sys.stdout, sys.stderr):
+    for descriptor, name in ((1, "stdout"), (2, "stderr")):
+        stream = getattr(sys, name)
+        if stream is None:
+            stream = open(descriptor, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 (as long as the process)
+            setattr(sys, name, stream)
         if isinstance(stream, io.TextIOWrapper):
             # What cannot be shown is escaped. Bytes of a file name that are no text pass where UTF-8 lets them.
             passes = stream.errors == "surrogateescape" and codecs.lookup(stream.encoding).name == "utf-8"
@@ -61,15 +60,12 @@ def ended_like_ctrl_c() -> Iterator[None]:
     So a training that a cluster stops writes a checkpoint first, also where Ctrl-C itself is ignored, as it is for what
     a script starts in the background. What ignores SIGHUP already (`nohup`) goes on so.
     """
-
-    previous = {}
-    if threading.current_thread() is threading.main_thread():
-        for name in ("SIGTERM", "SIGHUP"):
-            number = getattr(signal, name, None)
-            if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-                previous[number] = signal.signal(number, signal.default_int_handler)
+    signals = [signal.SIGTERM, signal.SIGHUP] if threading.current_thread() is threading.main_thread() else []
+    ended = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]
+    for number in ended:
+        signal.signal(number, signal.default_int_handler)
     try:
         yield
     finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+        for number in ended:
+            signal.signal(number, signal.SIG_DFL)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.tooling import (
-    assignments,
+    Choices,
     complete_folders,
     complete_image_folders,
     console,
@@ -18,7 +18,6 @@ from splatwizard_core.tooling import (
     options,
     output_folder,
     print_json,
-    resolve_run_options,
     say,
     set_option,
 )
@@ -323,7 +322,7 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise UserInputError(f"{out} is not an empty folder: choose another one")
     output_folder(target)
-    scene_options = resolve_run_options(None, assignments(sets)).scene
+    scene_options = Choices(sets=sets).resolve_without_method().scene
     scene = load_scene("demo" if size == "demo" else f"demo:{size}", scene_options, load_plugins())
     say(f"drawing {len(scene.train) + len(scene.test)} views")
     write_scene(scene, target, layout, text=text)
