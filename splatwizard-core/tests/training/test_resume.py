@@ -135,8 +135,8 @@ def test_ctrl_c_finishes_the_step_and_saves_it(toy, whole, tmp_path):
             return super().render(g, cam, opt)
 
     done = []
+    steps = Interrupted()
     with pytest.raises(KeyboardInterrupt):
-        steps = Interrupted()
         toy.train(iterations=200, directory=tmp_path, rasterizer=steps, on_step=lambda _, r: done.append(r.step))
     assert done[-1] == 121
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

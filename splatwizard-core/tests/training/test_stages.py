@@ -210,10 +210,10 @@ class Louder(WrappedStage):
 def test_a_wrapped_stage_trains_as_the_stage_inside_but_for_what_it_overrides(toy):
     opt = OptimizationParams(iterations=40)
     plain, losses = toy.train([toy.Stage(opt)]), {}
-    wrapped = toy.train([WrappedStage(toy.Stage(opt))], on_step=lambda r: losses.setdefault(r.step, float(r.total)))
+    wrapped = toy.train([WrappedStage(toy.Stage(opt))], on_step=lambda _, r: losses.setdefault(r.step, float(r.total)))
     assert wrapped.model.digest() == plain.model.digest()
     louder = {}
-    toy.train([Louder(toy.Stage(opt))], on_step=lambda r: louder.setdefault(r.step, float(r.total)))
+    toy.train([Louder(toy.Stage(opt))], on_step=lambda _, r: louder.setdefault(r.step, float(r.total)))
     assert louder[1] == pytest.approx(2 * losses[1])
 
 

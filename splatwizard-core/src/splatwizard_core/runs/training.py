@@ -36,7 +36,7 @@ from splatwizard_core.runs.versions import changes, made_by
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
-from splatwizard_core.training.pipeline import TrainOutcome, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainOutcome
 
 STEP = "train"
 BEGUN = "begun"
@@ -222,7 +222,7 @@ class _StagesOfARun:
             decode_all(self.scene.test)  # here, so that they do not count as memory of the training
         training = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
         with Observers.of(session.plugins, training if watched else None, session.say) as observers:
-            outcome = train_stages(
+            outcome = TrainingRun(
                 self.stages,
                 self._create_model,
                 self.scene,
@@ -245,7 +245,7 @@ class _StagesOfARun:
                 evaluate=self._evaluate,
                 log_path=directory / LOG,
                 provided=self.parts.since_asked,
-            )
+            ).train()
         return outcome.model, self._facts(outcome)
 
     def _facts(self, outcome: TrainOutcome) -> dict[str, Any]:
