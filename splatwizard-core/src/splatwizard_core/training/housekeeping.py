@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -59,7 +58,7 @@ class Progress:
 
 
 class Housekeeping:
-    """The work between the steps of one stage. Used as a context around `Trainer.run`; `after_step` is its callback.
+    """The work between the steps of one stage. `Trainer.run` runs inside `around`, and calls `after_step`.
 
     name        of the stage in records (unique in the run)
     """
@@ -70,30 +69,24 @@ class Housekeeping:
         self.clock = LoopClock(run.progress.stage_seconds.get(name, 0.0))
         self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
         self._saved_at = -1
-        self._stack = ExitStack()
 
-    def __enter__(self) -> Housekeeping:
+    @contextmanager
+    def around(self) -> Iterator[None]:
+        """The loop, timed and on display; a Ctrl-C waits for the end of its step."""
         run, trainer = self.run, self.trainer
+        write, index = run.run_log.write, trainer.index
         for scheduler in (trainer.pre, trainer.post):
-            scheduler.on_log = self._log_task
+            # Knows nothing of the trainer: a ring of references would keep the optimizer's memory for a while.
+            scheduler.on_log = lambda step, name: write(index, step, task=name)
         label = f"train {run.identity.get('method', self.name)}"
         if len(run.stages) > 1:
-            label += f": {self.name} ({trainer.index + 1} of {len(run.stages)})"
-        self._stack.enter_context(self.guard)
-        self._bar = self._stack.enter_context(track(label, total=trainer.stage.iterations, start=trainer.step))
-        self._stack.enter_context(self.clock.running(trainer.device))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            self._write_lines()
-        finally:
-            self._stack.__exit__(kind, error, trace)
-            for scheduler in (self.trainer.pre, self.trainer.post):
-                scheduler.on_log = None  # a ring of references would keep the optimizer's memory for a while
-        self._account()
+            label += f": {self.name} ({index + 1} of {len(run.stages)})"
+        bar = track(label, total=trainer.stage.iterations, start=trainer.step)
+        with self.guard, bar as self._bar, self.clock.running(trainer.device):
+            try:
+                yield
+            finally:
+                self._write_lines()
 
     def after_step(self, record: StepRecord) -> None:
         """Do everything that is due after this step."""
@@ -167,9 +160,6 @@ class Housekeeping:
                     module.training = mode
         if metrics:
             self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics))
-
-    def _log_task(self, step: int, name: str) -> None:
-        self.run.run_log.write(self.trainer.index, step, task=name)
 
     def _log_step(self, record: StepRecord) -> None:
         if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every:

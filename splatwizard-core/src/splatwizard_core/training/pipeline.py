@@ -209,7 +209,7 @@ class TrainingRun:
             decode_all(self.scene.train)  # reading pictures is not training time
             self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
             try:
-                with housekeeping:
+                with housekeeping.around():
                     trainer.run(until, housekeeping.after_step, housekeeping.guard)
             finally:
                 keep_pictures(self.scene.train, "cpu")
