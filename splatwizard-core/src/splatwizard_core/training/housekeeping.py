@@ -82,34 +82,39 @@ class Housekeeping:
         if len(run.stages) > 1:
             label += f": {self.name} ({index + 1} of {len(run.stages)})"
         bar = track(label, total=trainer.stage.iterations, start=trainer.step)
-        with self.guard, bar as self._bar, self.clock.running(trainer.device):
+        with self.guard, bar as self._bar:
+            self.clock.start()
             try:
                 yield
+                synchronize(trainer.device)
             finally:
+                self.clock.stop()
                 self._write_lines()
 
     def after_step(self, record: StepRecord) -> None:
         """Do everything that is due after this step."""
         run, ppl, model = self.run, self.run.ppl, self.trainer.model
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
-        with self.clock.paused():
-            try:
-                self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
-                if run.on_step is not None:
-                    with rng.preserved():
-                        run.on_step(model, record)
-                self._log_step(record)
-                if run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0:
-                    self._evaluate(run.evaluate, record.step)
-                if not last and record.step % ppl.checkpoint_every == 0:
-                    self.save()
-                if self.guard.pending:
-                    raise KeyboardInterrupt
-            except KeyboardInterrupt:
-                # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
-                # over: a resumed run must neither train past a STOP nor find that there is nothing to do.
-                self.save(finished=last)
-                raise
+        self.clock.stop()
+        try:
+            self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
+            if run.on_step is not None:
+                with rng.preserved():
+                    run.on_step(model, record)
+            self._log_step(record)
+            if run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0:
+                self._evaluate(run.evaluate, record.step)
+            if not last and record.step % ppl.checkpoint_every == 0:
+                self.save()
+            if self.guard.pending:
+                raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
+            # over: a resumed run must neither train past a STOP nor find that there is nothing to do.
+            self.save(finished=last)
+            raise
+        finally:
+            self.clock.start()
 
     def save(self, *, finished: bool = False) -> None:
         """Write a checkpoint of the last step, unless it is there or a task that it cannot hold is still to run."""

@@ -135,7 +135,9 @@ class Trainer:
         mark("pre")
 
         view = self._view = self.sampler.next(step)
-        background = self._next_background()
+        background = self._background
+        if self.ppl.random_background:
+            background = torch.rand(3, generator=self.streams("background")).to(self.device, non_blocking=True)
         camera = self._camera(view)
         inputs = self.model.gaussians(camera, self.rasterizer)
         result = self.rasterizer.render(inputs, camera, self.stage.raster_options(step, background))
@@ -233,11 +235,6 @@ class Trainer:
     def _check_rows(self, step: int) -> None:
         if self.model.ROWS and self.model.num_rows == 0:
             raise EmptyModel(step)
-
-    def _next_background(self) -> Tensor:
-        if self.ppl.random_background:
-            return torch.rand(3, generator=self.streams("background")).to(self.device, non_blocking=True)
-        return self._background
 
     def _camera(self, view: View) -> Camera:
         """Return the view's camera on the model's device, where it is moved once."""
