@@ -48,9 +48,9 @@ from splatwizard_core.training.trainer import StepRecord
 WINDOW = 40  # steps that are timed, and as many after them that are profiled
 MIB = 1 << 20
 SSIM_FOR_GSPLAT = """
-from splatwizard_core.training.losses import ssim
+from splatwizard_core.training.losses import photometric_loss
 def fused_ssim(img1, img2, padding="same", train=True):
-    return ssim(img1, img2, padding=padding)
+    return 1 - photometric_loss(img1, img2, lambda_dssim=1.0, padding=padding).total
 """
 
 
