@@ -49,8 +49,6 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
         )  # fmt: skip
         for u in together:
             torch.autograd.graph.increment_version(u.param)  # the kernels write behind autograd's back
-        if not left and len(together) == len(updates):
-            return
         updates = [u for u in updates if not u.param.is_cuda] + [together[i] for i in left]
     for u in updates:
         _step(u)

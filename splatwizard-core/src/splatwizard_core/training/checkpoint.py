@@ -259,8 +259,6 @@ def join_tensors(value: Any, tensors: Mapping[str, Tensor]) -> Any:
 def _crc(tensor: Tensor) -> int:
     """CRC-32 of shape, dtype and bytes."""
     head = zlib.crc32(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
-    if not tensor.numel():
-        return head
     content: Any = tensor.reshape(-1).view(torch.uint8).numpy()  # a buffer, which numpy's types do not say
     return zlib.crc32(content, head)
 

@@ -196,28 +196,25 @@ class Trainer:
         if self.device.type == "cpu":
             self.check_losses()
         elif len(self._unchecked) >= CHECK_EVERY:
-            self._ask_verdict()
+            self._look()
         return record
 
     def check_losses(self) -> None:
         """Raise TrainingDiverged if a loss since the last look is not finite. Waits for the device."""
-        self._ask_verdict()
-        self._hear_verdict()
+        self._look()
+        self._look()  # hears what the first has asked
 
-    def _ask_verdict(self) -> None:
-        self._hear_verdict()
-        records, self._unchecked = self._unchecked, []
-        if records:
-            self._asked = Verdict([r.total for r in records]), records
-
-    def _hear_verdict(self) -> None:
+    def _look(self) -> None:
+        """Hear what was asked at the last look, or raise TrainingDiverged; ask about the losses since."""
         asked, self._asked = self._asked, None
-        if asked is None or asked[0].fine():
-            return
-        record = next(r for r in asked[1] if not math.isfinite(r.total.item()))
-        values = {name: part.item() for name, part in {**record.parts, "total": record.total}.items()}
-        part = next(name for name, value in values.items() if not math.isfinite(value))
-        raise TrainingDiverged(record.step, record.view, part, values[part])
+        if asked is not None and not asked[0].fine():
+            record = next(r for r in asked[1] if not math.isfinite(r.total.item()))
+            values = {name: part.item() for name, part in {**record.parts, "total": record.total}.items()}
+            part = next(name for name, value in values.items() if not math.isfinite(value))
+            raise TrainingDiverged(record.step, record.view, part, values[part])
+        if self._unchecked:
+            self._asked = Verdict([r.total for r in self._unchecked]), self._unchecked
+            self._unchecked = []
 
     def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         view, rows = self._view, f"{self._num_rows():,} {self.model.ROW_LABEL}"
@@ -238,10 +235,9 @@ class Trainer:
 
     def _camera(self, view: View) -> Camera:
         """Return the view's camera on the model's device, where it is moved once."""
-        camera = self._cameras.get(view)
-        if camera is None:
-            camera = self._cameras[view] = view.camera.to(self.device)
-        return camera
+        if view not in self._cameras:
+            self._cameras[view] = view.camera.to(self.device)
+        return self._cameras[view]
 
     def plan_lines(self) -> list[str]:
         """Return what identifies the plan of the stage."""
