@@ -137,7 +137,7 @@ def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: W
         directory=None,
         identity={"method": "3dgs"},
         trained=_no_other,
-        on_step=watch,
+        on_step=None if watch is None else lambda _, record: watch(record),
     ).train()
     options = stages[-1].raster_options(iterations, scene.background.cuda())
     options = replace(options, grad2d=False, absgrad=False)

@@ -107,7 +107,7 @@ def test_a_student_that_is_its_teacher_stays_it(toy, teacher):
     stage = Taught(OptimizationParams(iterations=10), RATES)
     losses = []
     toy.train([stage], model=lambda: copy.deepcopy(teacher).requires_grad_(True), trained=lambda name: teacher,
-              on_step=lambda record: losses.append(float(record.total)))  # fmt: skip
+              on_step=lambda _, record: losses.append(float(record.total)))  # fmt: skip
     assert losses[0] == pytest.approx(0, abs=1e-6)
 
 
@@ -125,7 +125,7 @@ def test_a_student_comes_nearer_to_its_teacher_and_leaves_it_alone(toy, teacher,
     losses = []
     outcome = toy.train(
         [Taught(OptimizationParams(iterations=60), rates, distill_loss=kind)],
-        model=lambda: student, trained=trained, on_step=lambda record: losses.append(float(record.total)),
+        model=lambda: student, trained=trained, on_step=lambda _, record: losses.append(float(record.total)),
     )  # fmt: skip
     assert sum(losses[-6:]) < 0.7 * sum(losses[:6])
     assert asked == ["3dgs"]
@@ -181,7 +181,7 @@ def test_the_teacher_is_clamped_where_the_student_is(toy, teacher):
         toy.train(
             [Taught(OptimizationParams(iterations=2), RATES)],
             model=lambda: copy.deepcopy(bright).requires_grad_(True), trained=lambda name: bright,
-            ppl=PipelineParams(clamp_render=clamp), on_step=lambda r, clamp=clamp: losses.setdefault(clamp, r.total),
+            ppl=PipelineParams(clamp_render=clamp), on_step=lambda _, r, clamp=clamp: losses.setdefault(clamp, r.total),
         )  # fmt: skip
     assert float(losses[True]) == pytest.approx(0, abs=1e-6)
     assert float(losses[False]) == pytest.approx(0, abs=1e-6)

@@ -46,7 +46,7 @@ def train(scene, rasterizer, directory=None, stop_after=None, **values):
     outcome = TrainingRun(
         made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
         directory=directory, identity={}, trained=None, stop_after=stop_after,
-        on_step=lambda record: losses.append({name: float(part) for name, part in record.parts.items()}),
+        on_step=lambda _, record: losses.append({name: float(part) for name, part in record.parts.items()}),
     ).train()  # fmt: skip
     return outcome.model.eval(), losses, made
 

@@ -119,7 +119,7 @@ def test_without_degree_3_there_is_nothing_to_lose_by_dropping_it(train, toy):
     losses = {}
     for name, model in (("flat", flat), ("full", toy.truth)):
         train(only=1, start=model, teacher=model, iterations=1,
-              on_step=lambda record, name=name: losses.setdefault(name, float(record.total)))  # fmt: skip
+              on_step=lambda _, record, name=name: losses.setdefault(name, float(record.total)))  # fmt: skip
     assert losses["flat"] == pytest.approx(0, abs=1e-6)
     assert losses["full"] > 1e-3
 
@@ -127,7 +127,7 @@ def test_without_degree_3_there_is_nothing_to_lose_by_dropping_it(train, toy):
 def test_distilling_comes_nearer_to_the_teacher(train, toy):
     losses = []
     train(only=1, start=toy.truth, iterations=60, distill__lr__sh_rest=0.02, distill__lr__sh_dc=0.01,
-          on_step=lambda record: losses.append(float(record.total)))  # fmt: skip
+          on_step=lambda _, record: losses.append(float(record.total)))  # fmt: skip
     assert sum(losses[-10:]) < 0.8 * sum(losses[:10])
 
 

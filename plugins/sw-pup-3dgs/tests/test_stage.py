@@ -191,7 +191,7 @@ def test_counts_and_nothing_is_updated_in_the_step_of_a_removal(scene, rasterize
     model, counts = toy_model(), {}
     stage = stage_of(iterations=8, prune__steps=[1, 5], prune__resolution=1)
     found = trained(
-        stage, model, scene, rasterizer, on_step=lambda record: counts.update({record.step: record.num_rows})
+        stage, model, scene, rasterizer, on_step=lambda _, record: counts.update({record.step: record.num_rows})
     )
     assert counts == {1: 40, 2: 40, 3: 40, 4: 40, 5: 20, 6: 20, 7: 20, 8: 20}
     assert found.num_rows == 20
