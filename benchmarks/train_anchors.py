@@ -327,7 +327,7 @@ def anchors(method: str, args: argparse.Namespace, session: Session, folder: str
 
 
 def trainer_of(stage: Any, model: Any, scene: Scene, ppl: Any, rasterizer: Any) -> Trainer:
-    """As `train_stages` makes it."""
+    """As `TrainingRun` makes it."""
     streams = Streams(ppl.seed)
 
     def none(name: str) -> Any:

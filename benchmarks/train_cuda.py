@@ -42,15 +42,15 @@ from splatwizard_core.runs.device import device_reason
 from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session
 from splatwizard_core.streams import stream
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.trainer import StepRecord
 
 WINDOW = 40  # steps that are timed, and as many after them that are profiled
 MIB = 1 << 20
 SSIM_FOR_GSPLAT = """
-from splatwizard_core.training.losses import ssim
+from splatwizard_core.training.losses import photometric_loss
 def fused_ssim(img1, img2, padding="same", train=True):
-    return ssim(img1, img2, padding=padding)
+    return 1 - photometric_loss(img1, img2, lambda_dssim=1.0, padding=padding).total
 """
 
 
@@ -128,7 +128,7 @@ def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: W
     rasterizer = NegotiatedRasterizer(plugins, device=session.device)
     ppl = resolved.ppl
     stages = list(method.stages())
-    outcome = train_stages(
+    outcome = TrainingRun(
         stages,
         lambda: method.create_model(scene, stream(ppl.seed, "init")).to(session.device),
         scene,
@@ -137,8 +137,8 @@ def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: W
         directory=None,
         identity={"method": "3dgs"},
         trained=_no_other,
-        on_step=watch,
-    )
+        on_step=None if watch is None else lambda _, record: watch(record),
+    ).train()
     options = stages[-1].raster_options(iterations, scene.background.cuda())
     options = replace(options, grad2d=False, absgrad=False)
     result = evaluate(

@@ -14,7 +14,7 @@ from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
 
@@ -53,7 +53,7 @@ def method(**values) -> ThreeDGS:
 
 def train(scene, rasterizer, **values):
     made = method(**values)
-    return train_stages(
+    return TrainingRun(
         made.stages(),
         lambda: made.create_model(scene, stream(0, "init")),
         scene,
@@ -62,7 +62,7 @@ def train(scene, rasterizer, **values):
         directory=None,
         identity={},
         trained=no_trained_scene,
-    )
+    ).train()
 
 
 @torch.no_grad()
@@ -142,10 +142,10 @@ def test_sparse_adam_trains_and_resumes(scene, rasterizer, tmp_path, correction)
 
     def stopped_after(stop, directory):
         made = method(**values)
-        return train_stages(
+        return TrainingRun(
             made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
             directory=directory, identity={}, trained=no_trained_scene, stop_after=stop,
-        )  # fmt: skip
+        ).train()  # fmt: skip
 
     whole = train(scene, rasterizer, **values)
     start = method().create_model(scene, stream(0, "init"))

@@ -14,7 +14,7 @@ from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingRun
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.method import Cat3DGS
 
@@ -74,10 +74,10 @@ def rasterizer() -> NegotiatedRasterizer:
 def train(scene, rasterizer):
     def run(directory=None, stop_after=None, **values):
         made = make_method(**values)
-        return train_stages(
+        return TrainingRun(
             made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
             directory=directory, identity={}, trained=None, stop_after=stop_after,
-        )  # fmt: skip
+        ).train()  # fmt: skip
 
     return run
 

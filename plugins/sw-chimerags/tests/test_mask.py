@@ -13,7 +13,7 @@ from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingRun
 from sw_chimerags.method import ChimeraGS
 from sw_chimerags.model import LOWER, MaskedGaussians
 
@@ -120,10 +120,10 @@ def distilled(plugins, rasterizer, student, teacher, **sets):
         **{k.replace("__", "."): v for k, v in sets.items()},
     }
     method = ChimeraGS(plugins, resolve(ChimeraGS, "paper", sets=values).config)
-    return train_stages(
+    return TrainingRun(
         method.stages()[-1:], lambda: copy.deepcopy(student), scene_of(), PipelineParams(), rasterizer,
         directory=None, identity={}, trained=lambda name: teacher,
-    ).model  # fmt: skip
+    ).train().model  # fmt: skip
 
 
 def test_a_heavy_penalty_turns_every_mask_off(plugins, rasterizer):
@@ -154,9 +154,9 @@ def test_the_student_may_teach_itself(plugins, rasterizer):
     assert stage.taught_by == ()
     student = splats()
     student.active_sh_degree = 1
-    train_stages(
+    TrainingRun(
         [stage], lambda: student, scene_of(), PipelineParams(), rasterizer, directory=None, identity={}, trained=refuse
-    )
+    ).train()
     assert stage.teacher.active_sh_degree == 3
     assert not any(p.requires_grad for p in stage.teacher.parameters())
     assert torch.equal(stage.teacher.sh_dc, splats().sh_dc)

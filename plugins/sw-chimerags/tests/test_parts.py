@@ -17,7 +17,7 @@ from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_chimerags.method import ChimeraGS
 
@@ -146,10 +146,10 @@ def test_student_teacher_score_and_coder_of_others_need_names_alone(everybody, s
         return GaussianModel.from_points(scene.points).requires_grad_(False)
 
     rasterizer = NegotiatedRasterizer(everybody, device="cpu")
-    model = train_stages(
+    model = TrainingRun(
         [first, second], lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
         directory=None, identity={}, trained=trained,
-    ).model  # fmt: skip
+    ).train().model  # fmt: skip
     assert asked == ["theirs"]
     assert torch.equal(model.importance, torch.arange(model.num_rows).float())
     writer = ContainerWriter("chimerags", 1)
@@ -171,11 +171,11 @@ SHORT = {
 def run(plugins, scene, directory=None, stop_after=None):
     method = ChimeraGS(plugins, resolve(ChimeraGS, "quick", sets=SHORT).config)
     teacher = GaussianModel.from_points(scene.points).requires_grad_(False)
-    model = train_stages(
+    model = TrainingRun(
         method.stages(), lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(),
         NegotiatedRasterizer(plugins, device="cpu"), directory=directory, identity={}, trained=lambda name: teacher,
         stop_after=stop_after,
-    ).model  # fmt: skip
+    ).train().model  # fmt: skip
     return method, model
 
 

@@ -13,7 +13,7 @@ from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import train_stages
+from splatwizard_core.training.pipeline import TrainingRun
 
 WIDTH, HEIGHT = 12, 10
 ORIGIN, UP = torch.zeros(3), torch.tensor([0.0, 0.0, 1.0])
@@ -52,13 +52,13 @@ def rasterizer():
 
 @pytest.fixture
 def toy(rasterizer):
-    """The scene, `make_scene()`, `make_model(scene)`, and `train(stages, **options)`, which runs train_stages."""
+    """The scene, `make_scene()`, `make_model(scene)`, and `train(stages, **options)`, which runs TrainingRun."""
     scene = make_scene()
 
     def train(stages, *, scene=scene, model=None, ppl=None, **options):
         create_model = model or (lambda: make_model(scene))
         options = {"directory": None, "identity": {"method": "toy"}, "trained": None, **options}
         ppl = ppl or PipelineParams(checkpoint_every=1000)
-        return train_stages(stages, create_model, scene, ppl, rasterizer, **options)
+        return TrainingRun(stages, create_model, scene, ppl, rasterizer, **options).train()
 
     return SimpleNamespace(scene=scene, make_scene=make_scene, make_model=make_model, train=train)

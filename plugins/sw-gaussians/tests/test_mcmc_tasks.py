@@ -16,7 +16,7 @@ from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_3dgs.method import ThreeDGS
 
@@ -45,7 +45,7 @@ def scene() -> Scene:
 
 def train(scene: Scene, *, directory=None, stop_after=None, seed=0, **sets):
     made = method(**sets)
-    return train_stages(
+    return TrainingRun(
         made.stages(),
         lambda: made.create_model(scene, stream(seed, "init")),
         scene,
@@ -55,7 +55,7 @@ def train(scene: Scene, *, directory=None, stop_after=None, seed=0, **sets):
         identity={},
         trained=lambda name: pytest.fail(f"asked for '{name}'"),
         stop_after=stop_after,
-    )
+    ).train()
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from sw_hac import codec
 
 pytestmark = pytest.mark.pipeline
@@ -43,11 +43,11 @@ def rasterizer():
 def train(scene, rasterizer, directory=None, stop_after=None, **values):
     made = method(**{key.replace(".", "__"): value for key, value in {**SMALL, **values}.items()})
     losses = []
-    outcome = train_stages(
+    outcome = TrainingRun(
         made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
         directory=directory, identity={}, trained=None, stop_after=stop_after,
         on_step=lambda _, record: losses.append({name: float(part) for name, part in record.parts.items()}),
-    )  # fmt: skip
+    ).train()  # fmt: skip
     return outcome.model.eval(), losses, made
 
 

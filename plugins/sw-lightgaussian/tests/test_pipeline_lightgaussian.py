@@ -12,7 +12,7 @@ from splatwizard_core.errors import BitstreamError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.stage import CameraIterator
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.method import LightGaussian
@@ -31,12 +31,12 @@ def train(plugins, rasterizer, toy):
         values = {**SHORT, **{key.replace("__", "."): value for key, value in values.items()}}
         method = LightGaussian(plugins, apply_overrides(LightGaussianConfig(), values, source="test"))
         stages = list(method.stages())
-        outcome = train_stages(
+        outcome = TrainingRun(
             stages if only is None else stages[only : only + 1],
             lambda: copy.deepcopy(start).requires_grad_(True), toy.scene, PipelineParams(checkpoint_every=5),
             rasterizer, directory=directory, identity={}, trained={"3dgs": teacher or toy.truth}.__getitem__,
             stop_after=stop_after, on_step=on_step,
-        )  # fmt: skip
+        ).train()  # fmt: skip
         return method, outcome.model
 
     return run

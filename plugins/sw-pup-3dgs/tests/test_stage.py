@@ -14,7 +14,7 @@ from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.method import Pup3DGS
@@ -73,11 +73,11 @@ def scene(rasterizer):
 
 
 def trained(stage, model, scene, rasterizer, on_step=None, directory=None, stop_after=None):
-    return train_stages(
+    return TrainingRun(
         [stage], lambda: pytest.fail("it starts from a trained scene"), scene, PipelineParams(), rasterizer,
         directory=directory, identity={}, trained=lambda name: {"3dgs": model}[name], on_step=on_step,
         stop_after=stop_after,
-    ).model  # fmt: skip
+    ).train().model  # fmt: skip
 
 
 def test_the_plan_is_the_papers():

@@ -13,7 +13,7 @@ from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from sw_speedy_splat.method import SpeedySplat
 
 pytestmark = pytest.mark.pipeline
@@ -37,11 +37,11 @@ def rasterizer():
 
 def train(scene, rasterizer, directory=None, stop_after=None, **sets):
     method = SpeedySplat(load_plugins(), resolve(SpeedySplat, "quick", sets={**SHORT, **sets}).config)
-    return train_stages(
+    return TrainingRun(
         method.stages(), lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
         directory=directory, identity={}, trained=lambda name: pytest.fail(f"asked for '{name}'"),
         stop_after=stop_after,
-    )  # fmt: skip
+    ).train()  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +52,10 @@ def trained(scene, rasterizer):
 def test_it_ends_with_fewer_gaussians_than_3dgs_alone(scene, rasterizer, trained):
     values = {key.removeprefix("base."): value for key, value in SHORT.items() if not key.startswith("prune")}
     plain = create_method(load_plugins(), "3dgs", values, preset="quick")
-    alone = train_stages(
+    alone = TrainingRun(
         plain.stages(), lambda: plain.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
         directory=None, identity={}, trained=lambda name: None,
-    )  # fmt: skip
+    ).train()  # fmt: skip
     assert trained.model.num_rows < alone.model.num_rows / 2
     assert all(bool(torch.isfinite(parameter).all()) for parameter in trained.model.parameters())
 
@@ -65,10 +65,10 @@ def test_without_removals_it_is_3dgs_bit_for_bit(scene, rasterizer):
     ours = train(scene, rasterizer, **short, **{"prune.soft": 0.0, "prune.hard": 0.0})
     values = {key.removeprefix("base."): value for key, value in SHORT.items() if not key.startswith("prune")}
     plain = create_method(load_plugins(), "3dgs", {**values, **short}, preset="quick")
-    alone = train_stages(
+    alone = TrainingRun(
         plain.stages(), lambda: plain.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
         directory=None, identity={}, trained=lambda name: None,
-    )  # fmt: skip
+    ).train()  # fmt: skip
     assert ours.model.digest() == alone.model.digest()
 
 

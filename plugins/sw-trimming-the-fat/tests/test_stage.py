@@ -16,7 +16,7 @@ from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingStopped, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator
 from splatwizard_core.training.tasks import TaskContext
@@ -82,10 +82,10 @@ def pictured(model, rasterizer, count=6):
 
 
 def trained(stage, model, scene, rasterizer, directory=None, stop_after=None):
-    return train_stages(
+    return TrainingRun(
         [stage], lambda: pytest.fail("it starts from a trained scene"), scene, PipelineParams(), rasterizer,
         directory=directory, identity={}, trained=lambda name: {"3dgs": model}[name], stop_after=stop_after,
-    ).model  # fmt: skip
+    ).train().model  # fmt: skip
 
 
 def test_the_plan_is_the_papers_table():

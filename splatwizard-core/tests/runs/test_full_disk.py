@@ -133,19 +133,16 @@ def test_every_file_of_a_run_may_meet_a_full_disk(
 def test_a_log_line_without_space_names_the_log(tmp_path: Path):
     if not Path("/dev/full").exists():
         pytest.skip("no /dev/full here")
-    with (
-        RunLog(Path("/dev/full")) as log,
-        pytest.raises(DiskFullError, match=r"^/dev/full: the disk is full \(.* bytes wanted"),
-    ):
-        log.write(0, 1, loss=0.5)
+    with pytest.raises(DiskFullError, match=r"^/dev/full: the disk is full \(.* bytes wanted"):
+        RunLog(Path("/dev/full")).write(0, 1, loss=0.5)
     path = tmp_path / "log.jsonl"
-    with RunLog(path) as log:
-        log.write(0, 1, loss=0.5)
-        whole = path.read_bytes()
-        with files_of_at_most(len(whole) + 5), pytest.raises(DiskFullError):
-            log.write(0, 2, loss=0.5)
-        assert path.read_bytes() == whole
+    log = RunLog(path)
+    log.write(0, 1, loss=0.5)
+    whole = path.read_bytes()
+    with files_of_at_most(len(whole) + 5), pytest.raises(DiskFullError):
         log.write(0, 2, loss=0.5)
+    assert path.read_bytes() == whole
+    log.write(0, 2, loss=0.5)
     assert path.read_bytes() == whole + whole.replace(b'"step": 1', b'"step": 2')
 
 

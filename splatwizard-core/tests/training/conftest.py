@@ -161,8 +161,8 @@ def one_thread():
 
 @pytest.fixture
 def toy(tmp_path):
-    """Everything by name, and `train(**overrides)`, which runs train_stages on it."""
-    from splatwizard_core.training.pipeline import train_stages
+    """Everything by name, and `train(**overrides)`, which runs TrainingRun on it."""
+    from splatwizard_core.training.pipeline import TrainingRun
 
     scene = make_scene()
 
@@ -170,14 +170,14 @@ def toy(tmp_path):
         if stages is None:
             stages = [ToyStage(OptimizationParams(iterations=iterations))]
         options = {"directory": None, "identity": {"method": "toy"}, "trained": None, **options}
-        return train_stages(
+        return TrainingRun(
             stages,
             (lambda: make_model(scene)) if model is None else model,
             scene,
             ppl or PipelineParams(checkpoint_every=1000),
             rasterizer or SoftRasterizer(),
             **options,
-        )
+        ).train()
 
     return SimpleNamespace(
         train=train,

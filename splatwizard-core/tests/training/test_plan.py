@@ -1,6 +1,7 @@
 """The forms of a plan: which steps they mean, how they are scaled and printed."""
 
 import json
+from dataclasses import replace
 
 import pytest
 from hypothesis import given
@@ -8,7 +9,6 @@ from hypothesis import strategies as st
 
 from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.plan import (
-    Registration,
     check_when,
     describe_when,
     plan_digest,
@@ -16,7 +16,6 @@ from splatwizard_core.training.plan import (
     plan_rows,
     row_facts,
     scaled,
-    steps_of,
 )
 from splatwizard_core.training.scheduler import Scheduler, format_plan
 
@@ -32,8 +31,9 @@ def naive(when):
 
 
 def registration(when, *, after=0):
-    when = check_when(when)
-    return Registration("pre", when, steps_of(when), print, "it", 0, 0, after=after)
+    scheduler = Scheduler("pre")
+    scheduler.register_task(when, noop)
+    return replace(scheduler.registrations[0], after=after)
 
 
 def noop():
@@ -42,7 +42,7 @@ def noop():
 
 @given(plans)
 def test_membership_is_that_of_the_naive_set(when):
-    found = steps_of(check_when(when))
+    found = registration(when).steps
     assert {s for s in range(-1, 70) if s in found} == naive(when)
 
 

@@ -28,7 +28,7 @@ from splatwizard_core.runs.versions import changes, made_by
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
-from splatwizard_core.training.pipeline import TrainOutcome, train_stages
+from splatwizard_core.training.pipeline import TrainingRun, TrainOutcome
 
 STEP = "train"
 BEGUN = "begun"
@@ -213,7 +213,7 @@ class _StagesOfARun:
         started = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
         watching = session.plugins.hook.run_started(training=started) if watched else []
         with watched_by(watching, session.plugins, session.say) as after_step:
-            outcome = train_stages(
+            outcome = TrainingRun(
                 self.stages,
                 lambda: self.method.create_model(self.scene, stream(resolved.ppl.seed, "init")).to(session.device),
                 self.scene,
@@ -236,7 +236,7 @@ class _StagesOfARun:
                 evaluate=self._evaluate,
                 log_path=directory / LOG,
                 provided=self.parts.since_asked,
-            )
+            ).train()
         return outcome.model, self._facts(outcome)
 
     def _facts(self, outcome: TrainOutcome) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -50,8 +49,6 @@ def adam_steps(updates: Sequence[AdamUpdate]) -> None:
         )  # fmt: skip
         for u in together:
             torch.autograd.graph.increment_version(u.param)  # the kernels write behind autograd's back
-        if not left and len(together) == len(updates):
-            return
         updates = [u for u in updates if not u.param.is_cuda] + [together[i] for i in left]
     for u in updates:
         _step(u)
@@ -71,18 +68,13 @@ def _step(u: AdamUpdate) -> None:
         raise ValueError(f"Adam's step counts from 1, got {u.step}")
     grad = u.grad.contiguous()
     tensors = (param, grad, exp_avg, exp_avg_sq)
-    if not all(t.is_contiguous() for t in tensors):
-        exp_avg.lerp_(grad, 1.0 - u.beta1)
-        exp_avg_sq.mul_(u.beta2).addcmul_(grad, grad, value=1.0 - u.beta2)
-        denominator = exp_avg_sq.sqrt().div_(math.sqrt(1.0 - u.beta2**u.step)).add_(u.eps)
-        param.addcdiv_(exp_avg, denominator, value=-u.lr / (1.0 - u.beta1**u.step))
-        return
-    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and TRAINING.try_load():
+    whole = all(t.is_contiguous() for t in tensors)
+    if whole and all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and TRAINING.try_load():
         torch.ops.splatwizard_training.adam(*tensors, u.lr, u.beta1, u.beta2, u.eps, u.step)
     else:
         count = torch.tensor(float(u.step - 1), device=param.device)  # steps done; torch counts this one itself
         adam(
-            [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=True, amsgrad=False, maximize=False,
-            weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
+            [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=whole, foreach=False, amsgrad=False,
+            maximize=False, weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
         )  # fmt: skip
     torch.autograd.graph.increment_version(param)

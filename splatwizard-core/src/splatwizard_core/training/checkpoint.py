@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import itertools
 import json
 import logging
 import os
@@ -34,10 +35,9 @@ log = logging.getLogger(__name__)
 FORMAT = 1
 TENSOR_KEY = "$tensor"
 SHOWN_CHARACTERS = 40  # of a value that differs
-_NAME = re.compile(r"(\d{2})-(\d{7})\.json")
-_STEM = r"\d{2}-\d{7}"
-_OURS = re.compile(rf"\.?({_STEM})(-[0-9a-f]{{8}})?\.(json|safetensors)({TEMPORARY}|\.damaged)?")
-_TENSORS = re.compile(rf"({_STEM})(-[0-9a-f]{{8}})?\.safetensors")
+_JSON = re.compile(r"\d{2}-\d{7}\.json")
+_TENSORS = re.compile(r"\d{2}-\d{7}(-[0-9a-f]{8})?\.safetensors")
+_OURS = re.compile(rf"\.?({_JSON.pattern}|{_TENSORS.pattern})({TEMPORARY}|\.damaged)?")
 
 
 class DamagedCheckpointError(CheckpointError):
@@ -109,16 +109,15 @@ class CheckpointStore:
                 save_file(tensors, tensors_beside, {"pair": pair})
                 beside.write_text(text)
         except BaseException:
-            if _names(path) != tensor_path.name:  # a Ctrl-C may have come when all was done
+            if _content(path).get("pair") != pair:  # a Ctrl-C may have come when all was done
                 tensor_path.unlink(missing_ok=True)
             raise
-        self._prune(checkpoint.stage, tensor_path.name)
+        self._prune(checkpoint.stage)
         return path
 
     def paths(self) -> list[Path]:
         """The JSON files, newest first."""
-        found = self.directory.iterdir() if self.directory.is_dir() else ()
-        return sorted((p for p in found if _NAME.fullmatch(p.name)), key=lambda p: p.name, reverse=True)
+        return sorted((p for p in self.directory.glob("*.json") if _JSON.fullmatch(p.name)), reverse=True)
 
     def newest(self) -> Checkpoint | None:
         """Return the newest checkpoint that can be read, or None if there is none.
@@ -156,45 +155,33 @@ class CheckpointStore:
 
     def identity(self) -> dict[str, Any] | None:
         """Return the identity in the newest checkpoint; None if there is none, or none that can be read."""
-        for path in self.paths()[:1]:
-            with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-                found = json.loads(path.read_text())["content"]["identity"]
-                return found if isinstance(found, dict) else None
-        return None
+        return next((_content(path).get("identity") for path in self.paths()), None)
 
     def clear(self) -> None:
         """Remove every checkpoint file of the directory, and what was to become one."""
-        if self.directory.is_dir():
-            # What makes a pair valid goes first: a process that ends here leaves no half of one.
-            for path in sorted(self.directory.iterdir(), key=lambda p: p.suffix != ".json"):
-                if _OURS.fullmatch(path.name):
-                    path.unlink()
+        # What makes a pair valid goes first: a process that ends here leaves no half of one.
+        for path in sorted(self.directory.glob("*"), key=lambda p: p.suffix != ".json"):
+            if _OURS.fullmatch(path.name):
+                path.unlink()
 
-    def _prune(self, stage: int, tensors: str) -> None:
-        """Remove what is not kept any more; `tensors` is the file of the checkpoint that was just written."""
-        by_stage: dict[int, list[Path]] = {}
-        for path in self.paths():
-            by_stage.setdefault(int(path.name[:2]), []).append(path)
-        kept = {
-            path.stem for number, paths in by_stage.items() for path in paths[: self.keep if number == stage else 1]
-        }
-        written = tensors[: len("00-0000000")]
+    def _prune(self, stage: int) -> None:
+        """Remove what is not kept any more, now that a checkpoint of `stage` is written."""
+        kept = set()
+        for number, paths in itertools.groupby(self.paths(), key=lambda path: int(path.name[:2])):
+            for path in itertools.islice(paths, self.keep if number == stage else 1):
+                kept |= {path.name, _content(path).get("file", f"{path.stem}.safetensors")}
         for path in self.directory.iterdir():
             # Also what a killed process left half written; what was set aside as damaged stays.
-            match = _OURS.fullmatch(path.name)
-            if match is None or path.suffix == ".damaged":
-                continue
-            replaced = match[1] == written and path.suffix == ".safetensors" and path.name != tensors
-            if match[1] not in kept or replaced or path.suffix == ".tmp":
+            if _OURS.fullmatch(path.name) and path.suffix != ".damaged" and path.name not in kept:
                 path.unlink()
 
 
-def _names(path: Path) -> str | None:
-    """The file of tensors that a JSON file names; None if there is none."""
-    try:
-        return str(json.loads(path.read_text())["content"]["file"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
+def _content(path: Path) -> dict[str, Any]:
+    """What a JSON file says, unverified; nothing if it is missing or cannot be read."""
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        found = json.loads(path.read_text())["content"]
+        return found if isinstance(found, dict) else {}
+    return {}
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
@@ -272,8 +259,6 @@ def join_tensors(value: Any, tensors: Mapping[str, Tensor]) -> Any:
 def _crc(tensor: Tensor) -> int:
     """CRC-32 of shape, dtype and bytes."""
     head = zlib.crc32(f"{tuple(tensor.shape)}{tensor.dtype}".encode())
-    if not tensor.numel():
-        return head
     content: Any = tensor.reshape(-1).view(torch.uint8).numpy()  # a buffer, which numpy's types do not say
     return zlib.crc32(content, head)
 
@@ -294,9 +279,7 @@ def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Seque
             lines.append(f"{key}: {_short(before)} -> {_short(now)}")
     if abs(checkpoint.extent - extent) > 1e-6 * max(abs(extent), 1e-12):
         lines.append(f"scene extent: {checkpoint.extent:.6g} -> {extent:.6g}")
-    if plan_digest(checkpoint.plan) != plan_digest(plan):
-        changed = (d for d in difflib.ndiff(checkpoint.plan, list(plan)) if d[0] in "+-")
-        lines += [f"plan {line}" for line in changed]
+    lines += [f"plan {line}" for line in difflib.ndiff(checkpoint.plan, list(plan)) if line[0] in "+-"]
     return lines
 
 

@@ -3,23 +3,25 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
-from dataclasses import dataclass, field
-from types import TracebackType
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
 
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter, synchronize
+from splatwizard_core.memory import synchronize
 from splatwizard_core.progress import track
 from splatwizard_core.training import rng
+from splatwizard_core.training.checkpoint import Checkpoint, normalised
 from splatwizard_core.training.interrupt import InterruptGuard
-from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scalars import read_scalars
 from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
+
+if TYPE_CHECKING:
+    from splatwizard_core.training.pipeline import TrainingRun
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +41,7 @@ class Progress:
     peak_memory     bytes
     rasterizers     features asked for -> who served them
     pictures_in     where the training pictures were: "host" or "cuda"
-    provided        stage name -> the rasterizers, pruners, ... that served it, as `train_stages(provided=...)` tells
+    provided        stage name -> the rasterizers, pruners, ... that served it, as `TrainingRun.provided` tells
     """
 
     stage_seconds: dict[str, float] = field(default_factory=dict)
@@ -56,81 +58,67 @@ class Progress:
 
 
 class Housekeeping:
-    """The work between the steps of one stage. Used as a context around `Trainer.run`; `after_step` is its callback.
+    """The work between the steps of one stage. `Trainer.run` runs inside `around`, and calls `after_step`.
 
     name        of the stage in records (unique in the run)
-    save        (finished) -> writes a checkpoint of the trainer as it is
     """
 
-    def __init__(
-        self,
-        trainer: Trainer,
-        name: str,
-        progress: Progress,
-        run_log: RunLog,
-        save: Callable[[bool], None],
-        meter: MemoryMeter,
-        *,
-        label: str,
-        on_step: OnStep | None = None,
-        evaluate: Evaluate | None = None,
-    ) -> None:
-        self.trainer, self.name, self.progress, self.run_log = trainer, name, progress, run_log
-        self.on_step, self.evaluate, self.meter = on_step, evaluate, meter
+    def __init__(self, run: TrainingRun, trainer: Trainer, name: str) -> None:
+        self.run, self.trainer, self.name = run, trainer, name
         self.guard = InterruptGuard()
-        self.clock = LoopClock(progress.stage_seconds.get(name, 0.0))
-        self._save, self._label = save, label
+        self.clock = LoopClock(run.progress.stage_seconds.get(name, 0.0))
         self._unread: list[tuple[StepRecord, dict[str, Any]]] = []
         self._saved_at = -1
-        self._stack = ExitStack()
 
-    def __enter__(self) -> Housekeeping:
-        trainer = self.trainer
+    @contextmanager
+    def around(self) -> Iterator[None]:
+        """The loop, timed and on display; a Ctrl-C waits for the end of its step."""
+        run, trainer = self.run, self.trainer
+        write, index = run.run_log.write, trainer.index
         for scheduler in (trainer.pre, trainer.post):
-            scheduler.on_log = self._log_task
-        self._stack.enter_context(self.guard)
-        iterations = trainer.stage.iterations
-        self._bar = self._stack.enter_context(track(self._label, total=iterations, start=trainer.step))
-        self._stack.enter_context(self.clock.running(trainer.device))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            self._write_lines()
-        finally:
-            self._stack.__exit__(kind, error, trace)
-            for scheduler in (self.trainer.pre, self.trainer.post):
-                scheduler.on_log = None  # a ring of references would keep the optimizer's memory for a while
-        self._account()
+            # Knows nothing of the trainer: a ring of references would keep the optimizer's memory for a while.
+            scheduler.on_log = lambda step, name: write(index, step, task=name)
+        label = f"train {run.identity.get('method', self.name)}"
+        if len(run.stages) > 1:
+            label += f": {self.name} ({index + 1} of {len(run.stages)})"
+        bar = track(label, total=trainer.stage.iterations, start=trainer.step)
+        with self.guard, bar as self._bar:
+            self.clock.start()
+            try:
+                yield
+                synchronize(trainer.device)
+            finally:
+                self.clock.stop()
+                self._write_lines()
 
     def after_step(self, record: StepRecord) -> None:
         """Do everything that is due after this step."""
+        run, ppl, model = self.run, self.run.ppl, self.trainer.model
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
-        with self.clock.paused():
-            try:
-                self._bar.advance(1, loss=record.total, **{self.trainer.model.ROW_LABEL: record.num_rows})
-                if self.on_step is not None:
-                    with rng.preserved():
-                        self.on_step(self.trainer.model, record)
-                self._log_step(record)
-                every = self.trainer.ppl.eval_every
-                if self.evaluate is not None and every and record.step % every == 0:
-                    self._evaluate(self.evaluate, record.step)
-                if not last and record.step % self.trainer.ppl.checkpoint_every == 0:
-                    self.save()
-                if self.guard.pending:
-                    raise KeyboardInterrupt
-            except KeyboardInterrupt:
-                # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
-                # over: a resumed run must neither train past a STOP nor find that there is nothing to do.
-                self.save(finished=last)
-                raise
+        self.clock.stop()
+        try:
+            self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
+            if run.on_step is not None:
+                with rng.preserved():
+                    run.on_step(model, record)
+            self._log_step(record)
+            if run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0:
+                self._evaluate(run.evaluate, record.step)
+            if not last and record.step % ppl.checkpoint_every == 0:
+                self.save()
+            if self.guard.pending:
+                raise KeyboardInterrupt
+        except KeyboardInterrupt:
+            # Between steps the state is whole, so nothing that is done is lost. After the last one the stage is
+            # over: a resumed run must neither train past a STOP nor find that there is nothing to do.
+            self.save(finished=last)
+            raise
+        finally:
+            self.clock.start()
 
     def save(self, *, finished: bool = False) -> None:
         """Write a checkpoint of the last step, unless it is there or a task that it cannot hold is still to run."""
-        trainer = self.trainer
+        run, trainer = self.run, self.trainer
         if self._saved_at == trainer.step and not finished:
             return
         if not finished and (trainer.pre.pending_late(trainer.step) or trainer.post.pending_late(trainer.step)):
@@ -141,25 +129,34 @@ class Housekeeping:
         trainer.check_losses()
         self._write_lines()
         self._account()
-        with self.meter.excluded():
-            self._save(finished)
+        if run.store is not None:
+            with run.meter.excluded():
+                run.store.write(
+                    Checkpoint(
+                        trainer.index, trainer.stage.name, trainer.step, finished, normalised(run.identity),
+                        trainer.plan_lines(), run.scene.extent, asdict(run.progress), trainer.state_dict(),
+                    )
+                )  # fmt: skip
         self._saved_at = trainer.step
 
     def _account(self) -> None:
         """Bring the accumulated figures up to date."""
-        self.progress.rasterizers |= getattr(self.trainer.rasterizer, "choices", {})
-        self.progress.stage_seconds[self.name] = self.clock.seconds
-        self.progress.stage_steps[self.name] = self.trainer.step
-        self.progress.peak_memory = max(self.progress.peak_memory, self.meter.peak_bytes())
+        progress = self.run.progress
+        progress.rasterizers |= getattr(self.run.rasterizer, "choices", {})
+        progress.stage_seconds[self.name] = self.clock.seconds
+        progress.stage_steps[self.name] = self.trainer.step
+        progress.peak_memory = max(progress.peak_memory, self.run.meter.peak_bytes())
         if self.trainer.stage_clock is not None:
-            self.progress.breakdown[self.name] = dict(self.trainer.stage_clock.totals)
+            progress.breakdown[self.name] = dict(self.trainer.stage_clock.totals)
+        known = progress.provided.setdefault(self.name, [])
+        known += [part for part in self.run.provided() if part not in known]
 
     def _evaluate(self, evaluate: Evaluate, step: int) -> None:
         model = self.trainer.model
         synchronize(self.trainer.device)
         modes = {module: module.training for module in model.modules()}
         # Peak memory is that of the loop alone; an evaluation measures memory of its own.
-        with self.meter.excluded(), rng.preserved(), torch.no_grad():
+        with self.run.meter.excluded(), rng.preserved(), torch.no_grad():
             model.eval()
             try:
                 metrics = evaluate(model, step)
@@ -167,13 +164,10 @@ class Housekeeping:
                 for module, mode in modes.items():
                     module.training = mode
         if metrics:
-            self.run_log.write(self.trainer.index, step, metrics=dict(metrics))
-
-    def _log_task(self, step: int, name: str) -> None:
-        self.run_log.write(self.trainer.index, step, task=name)
+            self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics))
 
     def _log_step(self, record: StepRecord) -> None:
-        if record.step not in (1, record.iterations) and record.step % self.trainer.ppl.log_every:
+        if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every:
             return
         groups = self.trainer.optimizer.groups.values()
         facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
@@ -190,5 +184,5 @@ class Housekeeping:
             line["parts"] = {name: next(values) for name in record.parts}
             if record.seconds:
                 line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
-            self.run_log.write(record.stage, record.step, **line, **facts)
+            self.run.run_log.write(record.stage, record.step, **line, **facts)
         self._unread.clear()

@@ -29,25 +29,6 @@ class LossPack:
     parts: dict[str, Tensor] = field(default_factory=dict)
 
 
-def ssim(x: Tensor, y: Tensor, *, padding: Padding = "same") -> Tensor:
-    """Return the mean structural similarity of two images in 0..1, window 11 x 11 Gaussian with sigma 1.5, per channel.
-
-    x, y        [..., H, W] float32 or float64, alike in shape, dtype and device
-    padding     "same": zeros beside the image (3DGS training); "valid": only where the window fits
-
-    Returns a scalar, differentiable; moments as E[ab] - E[a]E[b], not clamped. In float32 fused
-    kernels compute it (differentiable in `x` alone; if `y` needs a gradient the torch path is taken).
-    Raises ShapeError if the images differ, or if the window does not fit a "valid" one.
-    Source: Wang et al. 2004; padding as in 3DGS (arXiv 2308.04079).
-    """
-    _check(x, y, padding)
-    node = _fused(x, y)
-    if node is None:
-        return _ssim_torch(x, y, padding)
-    result: Tensor = node.apply(x, y, padding == "valid", 0.0, 1.0, 0.0)[0]  # type: ignore[no-untyped-call]
-    return result
-
-
 def photometric_loss(
     image: Tensor,
     target: Tensor,
@@ -58,16 +39,21 @@ def photometric_loss(
 ) -> LossPack:
     """Return the 3DGS loss (1 - lambda) mean|image - target| + lambda (1 - SSIM).
 
-    image           [3,H,W] the render, differentiable
-    target          [3,H,W] the photograph, 0..1
+    SSIM is the mean over window 11 x 11 Gaussian with sigma 1.5, per channel; moments as E[ab] - E[a]E[b], not clamped.
+    In float32 fused kernels compute both (differentiable in `image` alone; if `target` needs a gradient the torch path
+    is taken).
+
+    image           [..., H, W] the render, float32 or float64, differentiable
+    target          the photograph, 0..1, alike in shape, dtype and device
     lambda_dssim    weight of the SSIM term, 0..1
     clamp           clamp the render to 0..1 first, with no gradient outside (the 2024 code of 3DGS); the paper's
                     code did not
     padding         of SSIM: "same" as published, zeros beside the image; "valid" as some fast trainers: only where
                     the window fits
 
-    Returns the total and, detached, the parts "l1" and "ssim". Raises ShapeError as `ssim` does.
-    Source: 3DGS (arXiv 2308.04079), equation 7.
+    Returns the total and, detached, the parts "l1" and "ssim". Raises ShapeError if the images differ, or if the window
+    does not fit a "valid" one.
+    Source: 3DGS (arXiv 2308.04079), equation 7; Wang et al. 2004.
     """
     _check(image, target, padding)
     if clamp:

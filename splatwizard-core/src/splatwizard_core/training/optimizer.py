@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -44,10 +45,6 @@ class AdamState:
 
     step: int
     tensors: dict[str, Tensor]
-
-    def change(self, function: Callable[[Tensor], Tensor]) -> None:
-        """Replace each tensor by `function` of it."""
-        self.tensors = {name: function(tensor) for name, tensor in self.tensors.items()}
 
 
 class SplatOptimizer:
@@ -130,16 +127,14 @@ class SplatOptimizer:
 
         New rows get zero moments; step counters stay. Raises ShapeError if rows do not fit.
         """
-        prefix = self._prefix(model)
         count = self._check_rows(model, rows)
+
+        def longer(tensor: Tensor, new: Tensor | None = None) -> Tensor:
+            added = tensor.new_zeros(count, *tensor.shape[1:]) if new is None else new.detach().to(tensor)
+            return torch.cat([tensor, added])
+
         for name in model.ROWS:
-            old = _attribute(model, name)
-            new = rows.get(name)
-            new = old.new_zeros(count, *old.shape[1:]) if new is None else new.detach().to(old)
-            self._put(model, name, torch.cat([old.detach(), new]))
-            state = self.states.get(prefix + name)
-            if state is not None:
-                state.change(lambda t: torch.cat([t, t.new_zeros(count, *t.shape[1:])]))
+            self._put(model, name, longer(attrgetter(name)(model).detach(), rows.get(name)), longer)
 
     def _check_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> int:
         counts = set()
@@ -147,7 +142,7 @@ class SplatOptimizer:
             if name not in model.ROWS:
                 raise ShapeError(f"append_rows: '{name}' is not among the rows of {type(model).__name__}")
         for name in model.ROWS:
-            old = _attribute(model, name)
+            old = attrgetter(name)(model)
             new = rows.get(name)
             if new is None:
                 if isinstance(old, nn.Parameter):
@@ -176,7 +171,6 @@ class SplatOptimizer:
                 actual=mask.shape,
                 expected=(model.num_rows,),
             )
-        prefix = self._prefix(model)
         index = mask.nonzero().squeeze(1)
         everything = index.numel() == mask.numel()
 
@@ -184,14 +178,10 @@ class SplatOptimizer:
             return tensor if everything else tensor.index_select(0, index)
 
         for name in model.ROWS:
-            old = _attribute(model, name)
-            grad = old.grad if carry_grad and isinstance(old, nn.Parameter) else None
-            self._put(model, name, kept(old.detach()))
-            if grad is not None:
-                _attribute(model, name).grad = kept(grad)
-            state = self.states.get(prefix + name)
-            if state is not None:
-                state.change(kept)
+            old = attrgetter(name)(model)
+            self._put(model, name, kept(old.detach()), kept)
+            if carry_grad and isinstance(old, nn.Parameter) and old.grad is not None:
+                attrgetter(name)(model).grad = kept(old.grad)
 
     @torch.no_grad()
     def set_rows(self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor]) -> None:
@@ -204,7 +194,7 @@ class SplatOptimizer:
         model is a new tensor afterwards: none is updated in this step. Raises ShapeError if rows do not fit.
         """
         for name, new in rows.items():
-            expected = (len(index), *_attribute(model, name).shape[1:]) if name in model.ROWS else None
+            expected = (len(index), *attrgetter(name)(model).shape[1:]) if name in model.ROWS else None
             if expected is None or new.shape != expected:
                 raise ShapeError(
                     f"set_rows: '{name}' must be one of the rows of {type(model).__name__} and "
@@ -212,25 +202,18 @@ class SplatOptimizer:
                     actual=new.shape,
                     expected=expected,
                 )
-        prefix = self._prefix(model)
         for name in model.ROWS:
-            old = _attribute(model, name)
+            new = attrgetter(name)(model).detach()
             if name in rows:
-                self._put(model, name, old.detach().index_copy(0, index, rows[name].detach().to(old)))
-            elif isinstance(old, nn.Parameter):
-                self._put(model, name, old.detach())
-            state = self.states.get(prefix + name)
-            if state is not None:
-                state.change(lambda t: t.index_fill(0, index, 0))
+                new = new.index_copy(0, index, rows[name].detach().to(new))
+            self._put(model, name, new, lambda t: t.index_fill(0, index, 0))
 
     @torch.no_grad()
     def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
         """Give one parameter (or buffer) a new value; its moments become zero, its step counter stays."""
-        old = _attribute(model, name)
-        self._put(model, name, tensor.detach().to(old))
+        fresh = self._put(model, name, tensor.detach().to(attrgetter(name)(model)))
         state = self.states.get(self._prefix(model) + name)
         if state is not None:
-            fresh = _attribute(model, name)
             state.tensors = {"exp_avg": _zeros(fresh), "exp_avg_sq": _zeros(fresh)}
 
     def moments(self, name: str) -> tuple[Tensor, Tensor, int] | None:
@@ -275,15 +258,23 @@ class SplatOptimizer:
                 return f"{path}." if path else ""
         raise ValueError(f"this {type(model).__name__} is not part of the model that is being optimised")
 
-    @staticmethod
-    def _put(model: SplatModel, name: str, tensor: Tensor) -> None:
-        """Set an attribute; a parameter becomes a new one without gradient, so this step skips it."""
+    def _put(
+        self, model: SplatModel, name: str, tensor: Tensor, change: Callable[[Tensor], Tensor] | None = None
+    ) -> Tensor:
+        """Set an attribute and return it; a parameter becomes a new one without gradient, so this step skips it.
+
+        change  of what the state of the parameter holds
+        """
+        state = self.states.get(self._prefix(model) + name)
         owner_name, _, leaf = name.rpartition(".")
         owner = model.get_submodule(owner_name)
         old = getattr(owner, leaf)
         if isinstance(old, nn.Parameter):
             tensor = nn.Parameter(tensor, requires_grad=old.requires_grad)
         setattr(owner, leaf, tensor)
+        if state is not None and change is not None:
+            state.tensors = {key: change(each) for key, each in state.tensors.items()}
+        return tensor
 
 
 def _parameter(model: SplatModel, name: str) -> nn.Parameter:
@@ -293,12 +284,6 @@ def _parameter(model: SplatModel, name: str) -> nn.Parameter:
     for part in path:
         owner = owner._modules[part]
     found: nn.Parameter = owner._parameters[leaf]
-    return found
-
-
-def _attribute(model: SplatModel, name: str) -> Tensor:
-    owner_name, _, leaf = name.rpartition(".")
-    found: Tensor = getattr(model.get_submodule(owner_name), leaf)
     return found
 
 

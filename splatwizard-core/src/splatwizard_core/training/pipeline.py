@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import copy
-import functools
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training import rng
-from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences, normalised
+from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows, row_facts
@@ -28,7 +27,7 @@ from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
 
-__all__ = ["TrainOutcome", "TrainingStopped", "train_stages"]
+__all__ = ["TrainOutcome", "TrainingRun", "TrainingStopped"]
 
 log = logging.getLogger(__name__)
 
@@ -55,164 +54,8 @@ class TrainOutcome(Progress):
 
 
 @dataclass
-class _Run:
-    """The parts that all stages of one run share, see `train_stages`."""
-
-    stages: Sequence[Stage]
-    create_model: Callable[[], SplatModel]
-    scene: Scene
-    ppl: PipelineParams
-    rasterizer: Rasterizer
-    identity: Mapping[str, Any]
-    trained: Callable[[str], SplatModel]
-    store: CheckpointStore | None
-    run_log: RunLog
-    stop_after: int | None
-    allow_changed_plan: bool
-    on_step: OnStep | None
-    evaluate: Evaluate | None
-    provided: Callable[[], list[dict[str, str]]]
-    progress: Progress = field(default_factory=Progress)
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the stages, made unique."""
-        names: list[str] = []
-        for stage in self.stages:
-            names.append(f"{stage.name}-{len(names)}" if stage.name in names else stage.name)
-        return names
-
-    def streams(self, index: int) -> Streams:
-        """Return the streams of a stage; a later stage does not repeat the draws of the first."""
-        return Streams(self.ppl.seed, "" if index == 0 else f"{index}/")
-
-    def trainer(self, index: int, model: SplatModel | None) -> Trainer:
-        """Return the trainer of a stage before its first step.
-
-        model   as the stage before left it; None: this stage does not need one, or is the first
-        """
-        stage, streams = self.stages[index], self.streams(index)
-        if stage.starts_from is not None:
-            # A copy: the trained scene stays with the runner, and other stages may be taught by it.
-            model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True).train()
-        elif model is None:
-            model = self.create_model()
-        model = stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))
-        clock = None
-        if self.ppl.profile == "stages":
-            clock = StageClock(model.device, self.progress.breakdown.get(self.names[index]))
-        return Trainer(stage, model, self.scene, self.ppl, self.rasterizer, streams, index=index, stage_clock=clock)
-
-    def before(self, index: int) -> SplatModel | None:
-        """Return the model that a stage begins with, rebuilt from the last checkpoints of the stages before it."""
-        if index == 0 or self.stages[index].starts_from is not None:
-            return None
-        assert self.store is not None
-        trainer = self.restore(self.store.last_of(index - 1))
-        return trainer.stage.finish(trainer.model, self.scene)
-
-    def restore(self, saved: Checkpoint) -> Trainer:
-        """Return the trainer of a checkpoint's stage as it was after the checkpoint's step. Raises CheckpointError."""
-        if saved.stage >= len(self.stages):
-            raise CheckpointError(f"the checkpoint is of stage {saved.stage}, this run has {len(self.stages)} stages")
-        trainer = self.trainer(saved.stage, self.before(saved.stage))
-        changed = self._check(saved, trainer)
-        try:
-            trainer.load_state_dict(saved.state, saved.step)
-        except (KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-            raise CheckpointError(
-                f"the checkpoint of stage '{saved.stage_name}', step {saved.step}, does not fit this run: {error}"
-            ) from error
-        # A stage that was finished under another plan may have steps left under this one.
-        trainer.stopped = saved.finished and not changed
-        rng.restore(saved.state["rng"])
-        return trainer
-
-    def _check(self, saved: Checkpoint, trainer: Trainer) -> list[str]:
-        """Return what differs from what the checkpoint was made with; raise CheckpointError unless that is allowed."""
-        changed = differences(saved, self.identity, plan_of(trainer), self.scene.extent)
-        if changed and not self.allow_changed_plan:
-            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
-            raise CheckpointError(
-                f"the checkpoint of stage '{saved.stage_name}', step {saved.step}, was made by another plan or "
-                f"configuration ({'; '.join(changed[:3])}{more}): resume with --allow-changed-plan, or use --fresh"
-            )
-        for line in changed:
-            log.warning("resuming with a changed plan or configuration: %s", line)
-        return changed
-
-    def describe(self, index: int) -> dict[str, Any]:
-        """Return a stage's plan for the record."""
-        stage = self.stages[index]
-        pre, post = build_schedulers(stage, self.ppl)
-        rows = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
-        return {"stage": self.names[index], "iterations": stage.iterations, "tasks": [row_facts(r) for r in rows]}
-
-    def save(self, trainer: Trainer, finished: bool) -> None:
-        """Write a checkpoint of the trainer as it is."""
-        known = self.progress.provided.setdefault(self.names[trainer.index], [])
-        known += [part for part in self.provided() if part not in known]
-        if self.store is not None:
-            state = {**trainer.state_dict(), "rng": rng.capture()}
-            self.store.write(
-                Checkpoint(
-                    trainer.index, trainer.stage.name, trainer.step, finished, normalised(self.identity),
-                    plan_of(trainer), self.scene.extent, asdict(self.progress), state,
-                )
-            )  # fmt: skip
-
-    def run_stage(self, trainer: Trainer, meter: MemoryMeter) -> None:
-        """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
-        index, iterations, name = trainer.index, trainer.stage.iterations, self.names[trainer.index]
-        before = self.progress.steps - self.progress.stage_steps.get(name, 0)
-        stop_after = self.stop_after
-        until = iterations if stop_after is None else min(iterations, stop_after - before)
-        label = f"train {self.identity.get('method', name)}"
-        if len(self.stages) > 1:
-            label += f": {name} ({index + 1} of {len(self.stages)})"
-        housekeeping = Housekeeping(
-            trainer, name, self.progress, self.run_log, functools.partial(self.save, trainer), meter,
-            label=label, on_step=self.on_step, evaluate=self.evaluate,
-        )  # fmt: skip
-        if until > trainer.step or stop_after is None:
-            decode_all(self.scene.train)  # reading pictures is not training time
-            self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
-            try:
-                with housekeeping:
-                    trainer.run(until, housekeeping.after_step, housekeeping.guard)
-            finally:
-                keep_pictures(self.scene.train, "cpu")
-        finished = trainer.stopped or trainer.step >= iterations
-        housekeeping.save(finished=finished)
-        done, last = before + trainer.step, finished and index == len(self.stages) - 1
-        if stop_after is not None and done >= stop_after and not last:
-            raise TrainingStopped(f"stopped after step {done}; run again to go on")
-
-
-def plan_of(trainer: Trainer) -> list[str]:
-    """Return what identifies the plan of a stage."""
-    return [*trainer.pre.plan_lines(), *trainer.post.plan_lines()]
-
-
-def train_stages(
-    stages: Sequence[Stage],
-    create_model: Callable[[], SplatModel],
-    scene: Scene,
-    ppl: PipelineParams,
-    rasterizer: Rasterizer,
-    *,
-    directory: Path | None,
-    identity: Mapping[str, Any],
-    trained: Callable[[str], SplatModel],
-    stop_after: int | None = None,
-    resume: bool = True,
-    allow_changed_plan: bool = False,
-    on_step: OnStep | None = None,
-    evaluate: Evaluate | None = None,
-    log_path: Path | None = None,
-    provided: Callable[[], list[dict[str, str]]] = list,
-) -> TrainOutcome:
-    """Train all stages, or what an earlier process has left of them; a run that is finished is only loaded.
+class TrainingRun:
+    """All stages of a run: `train` trains them, or what an earlier process has left; a finished run is only loaded.
 
     create_model    () -> the model before the first step, on the device that trains it
     directory       where checkpoints are written and looked for; None: nothing is kept
@@ -227,50 +70,151 @@ def train_stages(
                     in eval mode, with the process-wide random states kept
     log_path        of log.jsonl; default: in `directory`
     provided        () -> what served (rasterizers, pruners, ...) since it was last asked: kept by stage
-
-    A Ctrl-C is answered after the step with a checkpoint of it, then KeyboardInterrupt. On a CPU, stopping and
-    resuming gives bit for bit what an uninterrupted run gives.
-    Raises NothingToDo if a checkpoint lies at or past the end of a stage that it did not finish; CheckpointError,
-    TrainingDiverged, EmptyModel, TaskError.
     """
-    if not stages:
-        raise ValueError("a training needs at least one stage")
-    if log_path is None and directory is not None:
-        log_path = directory / "log.jsonl"
-    store = None if directory is None else CheckpointStore(directory, ppl.keep_checkpoints)
-    run_log = RunLog(log_path)
-    run = _Run(
-        stages, create_model, scene, ppl, rasterizer, identity, trained, store, run_log, stop_after,
-        allow_changed_plan, on_step, evaluate, provided,
-    )  # fmt: skip
-    if not resume and store is not None:
-        store.clear()
-    saved = store.newest() if store is not None else None
-    meter = MemoryMeter("cpu")
-    meter.start()
-    trainer: Trainer | None = None
-    model: SplatModel | None = None
-    with rng.seeded(ppl.seed):
-        if saved is None:
-            run_log.clear()
-        else:
-            run.progress = Progress(**saved.progress)
-            trainer = run.restore(saved)
-            run_log.rewind(saved.stage, saved.step)
-            provided()  # what began the stage is known from the process that began it
-        plans = [run.describe(index) for index in range(0 if saved is None else saved.stage)]
-        saved = None  # its tensors are as large as the model and its optimizer
-        with run_log:
-            for index in range(len(plans), len(stages)):
-                trainer = trainer or run.trainer(index, model)
-                if meter.kind == "rss" and trainer.device.type == "cuda":
-                    meter = MemoryMeter(trainer.device)
-                    meter.start()
-                plans.append(run.describe(index))
+
+    stages: Sequence[Stage]
+    create_model: Callable[[], SplatModel]
+    scene: Scene
+    ppl: PipelineParams
+    rasterizer: Rasterizer
+    _: KW_ONLY
+    directory: Path | None
+    identity: Mapping[str, Any]
+    trained: Callable[[str], SplatModel]
+    stop_after: int | None = None
+    resume: bool = True
+    allow_changed_plan: bool = False
+    on_step: OnStep | None = None
+    evaluate: Evaluate | None = None
+    log_path: Path | None = None
+    provided: Callable[[], list[dict[str, str]]] = list
+
+    def __post_init__(self) -> None:
+        if not self.stages:
+            raise ValueError("a training needs at least one stage")
+        self.store = None if self.directory is None else CheckpointStore(self.directory, self.ppl.keep_checkpoints)
+        if self.log_path is None and self.directory is not None:
+            self.log_path = self.directory / "log.jsonl"
+        self.run_log = RunLog(self.log_path)
+        self.progress = Progress()
+        self.meter = MemoryMeter("cpu")
+        self.names: list[str] = []  # of the stages, made unique
+        for stage in self.stages:
+            self.names.append(f"{stage.name}-{len(self.names)}" if stage.name in self.names else stage.name)
+
+    def train(self) -> TrainOutcome:
+        """Train all stages.
+
+        A Ctrl-C is answered after the step with a checkpoint of it, then KeyboardInterrupt. On a CPU, stopping and
+        resuming gives bit for bit what an uninterrupted run gives.
+        Raises NothingToDo if a checkpoint lies at or past the end of a stage that it did not finish; CheckpointError,
+        TrainingDiverged, EmptyModel, TaskError.
+        """
+        saved = None
+        if self.store is not None:
+            if not self.resume:
+                self.store.clear()
+            saved = self.store.newest()
+        self.meter.start()
+        trainer: Trainer | None = None
+        model: SplatModel | None = None
+        first = 0
+        with rng.seeded(self.ppl.seed):
+            if saved is None:
+                self.run_log.clear()
+            else:
+                first = saved.stage
+                self.progress = Progress(**saved.progress)
+                trainer = self._restore(saved)
+                self.run_log.rewind(saved.stage, saved.step)
+                self.provided()  # what began the stage is known from the process that began it
+                saved = None  # its tensors are as large as the model and its optimizer
+            for index in range(first, len(self.stages)):
+                trainer = trainer or self._trainer(index, model)
+                if self.meter.kind == "rss" and trainer.device.type == "cuda":
+                    self.meter = MemoryMeter(trainer.device)
+                    self.meter.start()
                 if not trainer.stopped:
-                    run.run_stage(trainer, meter)
-                model = trainer.stage.finish(trainer.model, scene)
+                    self._run_stage(trainer)
+                model = trainer.stage.finish(trainer.model, self.scene)
                 trainer = None
-    assert model is not None
-    run.progress.provided = {name: run.progress.provided.get(name, []) for name in run.names}
-    return TrainOutcome(**vars(run.progress), model=model, plan=plans)
+        assert model is not None
+        self.progress.provided = {name: self.progress.provided.get(name, []) for name in self.names}
+        plan = [self._describe(stage, name) for stage, name in zip(self.stages, self.names, strict=True)]
+        return TrainOutcome(**vars(self.progress), model=model, plan=plan)
+
+    def _trainer(self, index: int, model: SplatModel | None) -> Trainer:
+        """Return the trainer of a stage before its first step.
+
+        model   as the stage before left it; None: this stage does not need one, or is the first
+        """
+        stage = self.stages[index]
+        streams = Streams(self.ppl.seed, f"{index}/" if index else "")  # none repeats the draws of the first stage
+        if stage.starts_from is not None:
+            # A copy: the trained scene stays with the runner, and other stages may be taught by it.
+            model = copy.deepcopy(self.trained(stage.starts_from)).requires_grad_(True).train()
+        elif model is None:
+            model = self.create_model()
+        model = stage.begin(StageContext(model, self.scene, self.ppl, self.rasterizer, streams, self.trained))
+        clock = None
+        if self.ppl.profile == "stages":
+            clock = StageClock(model.device, self.progress.breakdown.get(self.names[index]))
+        return Trainer(stage, model, self.scene, self.ppl, self.rasterizer, streams, index=index, stage_clock=clock)
+
+    def _before(self, index: int) -> SplatModel | None:
+        """Return the model that a stage begins with, rebuilt from the last checkpoints of the stages before it."""
+        if index == 0 or self.stages[index].starts_from is not None:
+            return None
+        assert self.store is not None
+        trainer = self._restore(self.store.last_of(index - 1))
+        return trainer.stage.finish(trainer.model, self.scene)
+
+    def _restore(self, saved: Checkpoint) -> Trainer:
+        """Return the trainer of a checkpoint's stage as it was after the checkpoint's step. Raises CheckpointError."""
+        if saved.stage >= len(self.stages):
+            raise CheckpointError(f"the checkpoint is of stage {saved.stage}, this run has {len(self.stages)} stages")
+        trainer = self._trainer(saved.stage, self._before(saved.stage))
+        where = f"the checkpoint of stage '{saved.stage_name}', step {saved.step},"
+        changed = differences(saved, self.identity, trainer.plan_lines(), self.scene.extent)
+        if changed and not self.allow_changed_plan:
+            more = f" and {len(changed) - 3} more" if len(changed) > 3 else ""
+            raise CheckpointError(
+                f"{where} was made by another plan or configuration ({'; '.join(changed[:3])}{more}): "
+                "resume with --allow-changed-plan, or use --fresh"
+            )
+        for line in changed:
+            log.warning("resuming with a changed plan or configuration: %s", line)
+        try:
+            trainer.load_state_dict(saved.state, saved.step)
+        except (KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
+            raise CheckpointError(f"{where} does not fit this run: {error}") from error
+        # A stage that was finished under another plan may have steps left under this one.
+        trainer.stopped = saved.finished and not changed
+        return trainer
+
+    def _describe(self, stage: Stage, name: str) -> dict[str, Any]:
+        """Return a stage's plan for the record."""
+        pre, post = build_schedulers(stage, self.ppl)
+        rows = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
+        return {"stage": name, "iterations": stage.iterations, "tasks": [row_facts(r) for r in rows]}
+
+    def _run_stage(self, trainer: Trainer) -> None:
+        """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""
+        index, iterations, name = trainer.index, trainer.stage.iterations, self.names[trainer.index]
+        before = self.progress.steps - self.progress.stage_steps.get(name, 0)
+        stop_after = self.stop_after
+        until = iterations if stop_after is None else min(iterations, stop_after - before)
+        housekeeping = Housekeeping(self, trainer, name)
+        if until > trainer.step or stop_after is None:
+            decode_all(self.scene.train)  # reading pictures is not training time
+            self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
+            try:
+                with housekeeping.around():
+                    trainer.run(until, housekeeping.after_step, housekeeping.guard)
+            finally:
+                keep_pictures(self.scene.train, "cpu")
+        finished = trainer.stopped or trainer.step >= iterations
+        housekeeping.save(finished=finished)
+        done, last = before + trainer.step, finished and index == len(self.stages) - 1
+        if stop_after is not None and done >= stop_after and not last:
+            raise TrainingStopped(f"stopped after step {done}; run again to go on")

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import bisect
+import functools
 import hashlib
 import math
 import numbers
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from splatwizard_core.training.tasks import Binding
 
 When = int | range | list[int] | tuple[int, ...] | set[int] | frozenset[int]
 """One step, every step of a range (end excluded), or each listed step once. Step 0 is legal and never fires."""
@@ -43,20 +48,11 @@ def _step(value: Any) -> int:
     return int(value)
 
 
-def steps_of(when: When) -> Collection[int]:
-    """Return the steps of a checked plan in a form that answers `step in steps` at once; nothing is expanded."""
-    if isinstance(when, range):
-        return when
-    return frozenset((when,)) if isinstance(when, int) else frozenset(when)
-
-
 def describe_when(when: When) -> str:
     """Return the registered form, `range(500, 15000, 100)` (with as few arguments as say the same), `7` or `[1, 2]`."""
-    if isinstance(when, range):
-        if when.step != 1:
-            return f"range({when.start}, {when.stop}, {when.step})"
-        return f"range({when.stop})" if when.start == 0 else f"range({when.start}, {when.stop})"
-    if isinstance(when, int):
+    if isinstance(when, range) and when.start == 0 and when.step == 1:
+        return f"range({when.stop})"
+    if isinstance(when, int | range):
         return str(when)
     steps = sorted(when) if isinstance(when, set | frozenset) else list(when)
     shown = [str(s) for s in steps[:LISTED_ENTRIES]]
@@ -90,34 +86,36 @@ class Registration:
 
     stage       "pre" or "post"
     when        the plan as given (scaled, if the run asks for it)
+    binding     the task with its arguments resolved
     order       how many registrations came before it
     after       steps up to here are over (registered late); 0 for what stands in the plan
     """
 
     stage: str
     when: When
-    steps: Collection[int]
     task: Callable[..., Any]
     name: str
+    binding: Binding
     priority: int
     order: int
     log: bool = False
     after: int = 0
+
+    @functools.cached_property
+    def steps(self) -> Collection[int]:
+        """The plan in a form that answers `step in steps` at once; a range is not expanded."""
+        if isinstance(self.when, range):
+            return self.when
+        return frozenset((self.when,) if isinstance(self.when, int) else self.when)
 
     def due(self, step: int) -> bool:
         return step > self.after and step in self.steps
 
     def fires_in(self, start: int, total: int | None) -> list[int] | range:
         """Return the steps s at which it runs, start < s <= total (None: no end), ascending."""
-        low, high = max(start, self.after, 0) + 1, math.inf if total is None else total
-        if isinstance(self.steps, range):
-            steps = self.steps
-            if steps and steps[0] < low:
-                steps = steps[-(-(low - steps.start) // steps.step) :]
-            if total is not None and steps and steps[-1] > total:
-                steps = steps[: max(0, (total - steps.start) // steps.step + 1)]
-            return steps
-        return sorted(s for s in self.steps if low <= s <= high)
+        steps = self.steps if isinstance(self.steps, range) else sorted(self.steps)
+        first = bisect.bisect_right(steps, max(start, self.after, 0))
+        return steps[first : None if total is None else max(first, bisect.bisect_right(steps, total))]
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,6 @@ import json
 import math
 import os
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from splatwizard_core.files import naming_full_disk, write_atomic
@@ -25,7 +24,6 @@ class RunLog:
 
     def __init__(self, path: Path | None) -> None:
         self.path = path
-        self._descriptor: int | None = None
 
     def rewind(self, stage: int, step: int) -> None:
         """Drop the lines after this step of this stage (and a last line that was cut off)."""
@@ -46,33 +44,19 @@ class RunLog:
         if self.path is not None:
             self.path.unlink(missing_ok=True)
 
-    def __enter__(self) -> RunLog:
-        if self.path is not None:
-            self.path.parent.mkdir(parents=True, exist_ok=True)
-            self._descriptor = os.open(self.path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC, 0o644)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._descriptor is not None:
-            os.close(self._descriptor)
-            self._descriptor = None
-
     def write(self, stage: int, step: int, **content: Any) -> None:
         """Append one line; a number that is not finite becomes null. Raises DiskFullError; then no part of it stays."""
-        if self._descriptor is None or self.path is None:
+        if self.path is None:
             return
         line = (json.dumps(_finite({"stage": stage, "step": step, **content})) + "\n").encode()
-        before = os.fstat(self._descriptor).st_size
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        before = self.path.stat().st_size if self.path.exists() else 0
         try:
-            with naming_full_disk(self.path, len(line)):
-                written = 0
-                while written < len(line):  # a disk that is nearly full takes a part first
-                    written += os.write(self._descriptor, line[written:])
+            with naming_full_disk(self.path, len(line)), self.path.open("ab") as file:
+                file.write(line)
         except BaseException:
             with contextlib.suppress(OSError):
-                os.ftruncate(self._descriptor, before)
+                os.truncate(self.path, before)
             raise
 
 

@@ -9,19 +9,13 @@ from torch import Tensor
 
 
 def read_scalars(scalars: Sequence[Tensor]) -> list[float]:
-    """Return the values of one-element tensors, in order; each GPU among their devices is waited for once."""
-    found = [0.0] * len(scalars)
-    elsewhere: dict[torch.device, list[int]] = {}
-    for i, scalar in enumerate(scalars):
-        if scalar.device.type == "cpu":
-            found[i] = scalar.item()
-        else:
-            elsewhere.setdefault(scalar.device, []).append(i)
-    for at in elsewhere.values():
-        values = torch.stack([scalars[i].detach().reshape(()).double() for i in at]).tolist()
-        for i, value in zip(at, values, strict=True):
-            found[i] = value
-    return found
+    """Return the values of one-element tensors, in order; a GPU among their devices is waited for once."""
+    gpu = next((scalar.device for scalar in scalars if scalar.device.type != "cpu"), None)
+    if gpu is None:
+        return [scalar.item() for scalar in scalars]
+    on_gpu = [scalar.detach().reshape(()).to(gpu, torch.float64) for scalar in scalars]
+    values: list[float] = torch.stack(on_gpu).tolist()
+    return values
 
 
 class Verdict:

@@ -7,6 +7,7 @@ import inspect
 import logging
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any, Final
 
 import torch
@@ -14,9 +15,9 @@ import torch
 from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines, steps_of
+from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines
 from splatwizard_core.training.stage import Stage
-from splatwizard_core.training.tasks import POST_ONLY, SOURCES, Binding, TaskContext, bind
+from splatwizard_core.training.tasks import POST_ONLY, SOURCES, TaskContext, bind
 
 __all__ = ["STOP", "PhaseSwitch", "Scheduler", "build_schedulers", "format_plan"]
 
@@ -36,6 +37,7 @@ class Scheduler:
     """The tasks that run before rendering ("pre") or between backward and the optimizer step ("post").
 
     stage   "pre" or "post"
+    registrations   in order of execution
     """
 
     STOP: Final = STOP
@@ -45,7 +47,7 @@ class Scheduler:
             raise ValueError(f"a scheduler's stage is 'pre' or 'post', not '{stage}'")
         self.stage = stage
         self.on_log: Callable[[int, str], None] | None = None
-        self._entries: list[tuple[Registration, Binding]] = []
+        self.registrations: list[Registration] = []
         self._step: int | None = None  # while a step's tasks run
 
     def register_task(
@@ -71,30 +73,23 @@ class Scheduler:
         """
         plan = check_when(when)
         name = task_name(task) if name is None else name
-        binding = bind(task, self.stage, name, (*SOURCES, (Scheduler, "scheduler")))
-        entry = Registration(
-            self.stage, plan, steps_of(plan), task, name, priority, len(self._entries), log, self._step or 0
-        )
+        binding, order = bind(task, self.stage, name), len(self.registrations)
+        entry = Registration(self.stage, plan, task, name, binding, priority, order, log, self._step or 0)
         # A new list: exec may be iterating over the old one.
-        self._entries = sorted([*self._entries, (entry, binding)], key=_order)
+        self.registrations = sorted([*self.registrations, entry], key=_order)
 
     def reprioritise(self, kind: type, priority: int) -> None:
         """Give all registered tasks that are instances of `kind` another priority.
 
         So a stage that wraps another one makes room between the tasks that it has taken over.
         """
-        changed = [(replace(e, priority=priority) if isinstance(e.task, kind) else e, b) for e, b in self._entries]
-        self._entries = sorted(changed, key=_order)
-
-    @property
-    def registrations(self) -> list[Registration]:
-        """All registrations in order of execution."""
-        return [entry for entry, _ in self._entries]
+        changed = [replace(e, priority=priority) if isinstance(e.task, kind) else e for e in self.registrations]
+        self.registrations = sorted(changed, key=_order)
 
     def check(self, context: TaskContext) -> None:
         """Raise TaskSignatureError now for what would otherwise fail at the step that first needs it."""
-        for _, binding in self._entries:
-            binding.check(context, skip=(*POST_ONLY, "scheduler"))
+        for entry in self.registrations:
+            entry.binding.check(context, skip=(*POST_ONLY, "scheduler"))
 
     def exec(self, step: int, context: TaskContext) -> bool:
         """Run what is due at `step`; returns whether a task asked to stop. Past the last plan it does nothing.
@@ -102,12 +97,12 @@ class Scheduler:
         Raises TaskError that names the task, the cause chained.
         """
         stop = False
-        for entry, binding in self._entries:
+        for entry in self.registrations:
             if not entry.due(step):
                 continue
             context.step, context.scheduler, self._step = step, self, step
             try:
-                result = binding(context)
+                result = entry.binding(context)
             except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.cuda.OutOfMemoryError):
                 raise
             except Exception as error:
@@ -133,8 +128,9 @@ class Scheduler:
         return plan_lines([e for e in self.registrations if e.after == 0])
 
 
-def _order(entry: tuple[Registration, Binding]) -> tuple[int, int]:
-    return entry[0].priority, entry[0].order
+SOURCES[Scheduler] = "scheduler"
+
+_order = attrgetter("priority", "order")
 
 
 class PhaseSwitch:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -55,17 +55,8 @@ class CameraSampler:
         self.generator.set_state(state["generator"])
 
 
-class CameraIterator:
+class CameraIterator(list[View]):
     """Training views in order, for schedule tasks to iterate over; independent of the training sampler."""
-
-    def __init__(self, views: list[View]) -> None:
-        self.views = views
-
-    def __iter__(self) -> Iterator[View]:
-        return iter(self.views)
-
-    def __len__(self) -> int:
-        return len(self.views)
 
 
 @dataclass

@@ -45,21 +45,21 @@ class TaskContext:
     scheduler: Any = None
 
 
-SOURCES: tuple[tuple[type, str], ...] = (
-    (RenderResult, "result"),
-    (LossPack, "loss"),
-    (PipelineParams, "ppl"),
-    (OptimizationParams, "opt"),
-    (SplatModel, "model"),
-    (Scene, "scene"),
-    (SplatOptimizer, "optimizer"),
-    (CameraIterator, "cameras"),
-    (Rasterizer, "rasterizer"),
-)
-"""Annotation class (or a subclass of it) -> field of TaskContext."""
+SOURCES: dict[type, str] = {
+    RenderResult: "result",
+    LossPack: "loss",
+    PipelineParams: "ppl",
+    OptimizationParams: "opt",
+    SplatModel: "model",
+    Scene: "scene",
+    SplatOptimizer: "optimizer",
+    CameraIterator: "cameras",
+    Rasterizer: "rasterizer",
+}
+"""Annotation class (or a subclass of it) -> field of TaskContext. The module of the scheduler adds that."""
 
-SUPERCLASSES: dict[type, str] = {nn.Module: "model"}
-"""Superclasses of a source that are clear enough to stand for it."""
+EXACTLY: dict[type, str] = {int: "step", nn.Module: "model"}
+"""Classes that stand for a field themselves, but not by their subclasses."""
 
 POST_ONLY = ("result", "loss")
 
@@ -79,11 +79,13 @@ class Argument:
     keyword: bool
 
 
+@dataclass(frozen=True)
 class Binding:
     """A task with its arguments resolved once, at registration."""
 
-    def __init__(self, task: Callable[..., Any], name: str, arguments: Sequence[Argument]) -> None:
-        self.task, self.name, self.arguments = task, name, tuple(arguments)
+    task: Callable[..., Any]
+    name: str
+    arguments: Sequence[Argument]
 
     def check(self, context: TaskContext, *, skip: Sequence[str] = ()) -> None:
         """Raise TaskSignatureError if the context holds something else than a parameter is annotated with."""
@@ -103,7 +105,7 @@ class Binding:
         return self.task(*positional, **named)
 
 
-def bind(task: Callable[..., Any], stage: str, name: str, sources: Sequence[tuple[type, str]] = SOURCES) -> Binding:
+def bind(task: Callable[..., Any], stage: str, name: str) -> Binding:
     """Resolve where each parameter of `task` comes from.
 
     task    function, bound method, functools.partial or object with __call__; no decorator is needed
@@ -129,10 +131,10 @@ def bind(task: Callable[..., Any], stage: str, name: str, sources: Sequence[tupl
                 f"task '{name}': {stars}{p.name} cannot be supplied; name and annotate the parameters"
             )
         classes = () if p.name in given else _classes(p, name, namespace)
-        field = _field_of(classes, sources)
+        field = _field_of(classes)
         if field is None:
             if p.default is p.empty:
-                raise TaskSignatureError(_unusable(p, name, sources))
+                raise TaskSignatureError(_unusable(p, name))
             by_keyword = True
             continue
         if field in POST_ONLY and stage != "post":
@@ -186,26 +188,19 @@ def _classes(p: inspect.Parameter, name: str, namespace: dict[str, Any]) -> tupl
     return () if p.annotation is p.empty else members(resolve(p.annotation))
 
 
-def _field_of(classes: Sequence[Any], sources: Sequence[tuple[type, str]]) -> str | None:
+def _field_of(classes: Sequence[Any]) -> str | None:
     """Return the one field that all the classes (but NoneType) select, or None."""
-    fields = {_field(c, sources) for c in classes if c is not types.NoneType}
+    fields: set[str | None] = set()
+    for found in classes:
+        # By the MRO, since a protocol with attributes (Rasterizer) refuses issubclass().
+        bases = found.__mro__ if isinstance(found, type) else ()
+        if found is not types.NoneType:
+            fields.add(next((SOURCES[base] for base in bases if base in SOURCES), EXACTLY.get(found)))
     return fields.pop() if len(fields) == 1 else None
 
 
-def _field(annotation: Any, sources: Sequence[tuple[type, str]]) -> str | None:
-    if annotation is int:
-        return "step"
-    if not isinstance(annotation, type):
-        return None
-    for base, field in sources:
-        # By the MRO, since a protocol with attributes (Rasterizer) refuses issubclass().
-        if base in annotation.__mro__:
-            return field
-    return SUPERCLASSES.get(annotation)
-
-
-def _unusable(p: inspect.Parameter, name: str, sources: Sequence[tuple[type, str]]) -> str:
-    known = ", ".join(["int (the step)", *(base.__name__ for base, _ in sources)])
+def _unusable(p: inspect.Parameter, name: str) -> str:
+    known = ", ".join(["int (the step)", *(base.__name__ for base in SOURCES)])
     if p.annotation is p.empty:
         return f"task '{name}': parameter '{p.name}' has no annotation; annotate it with one of {known}"
     shown = p.annotation if isinstance(p.annotation, str) else getattr(p.annotation, "__name__", repr(p.annotation))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import torch
 
@@ -28,26 +26,13 @@ class LoopClock:
     def seconds(self) -> float:
         return self._seconds + (0.0 if self._since is None else time.perf_counter() - self._since)
 
-    @contextmanager
-    def running(self, device: torch.device) -> Iterator[None]:
-        """The loop; waits for the device at its end."""
+    def start(self) -> None:
+        """The loop begins, or goes on after housekeeping."""
         self._since = time.perf_counter()
-        try:
-            yield
-            synchronize(device)
-        finally:
-            self._seconds = self.seconds
-            self._since = None
 
-    @contextmanager
-    def paused(self) -> Iterator[None]:
-        """Housekeeping inside the loop."""
-        self._seconds = self.seconds
-        self._since = None
-        try:
-            yield
-        finally:
-            self._since = time.perf_counter()
+    def stop(self) -> None:
+        """Housekeeping inside the loop begins, or the loop ends."""
+        self._seconds, self._since = self.seconds, None
 
 
 class StageClock:

@@ -21,6 +21,7 @@ from splatwizard_core.memory import out_of_memory
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
+from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
@@ -57,6 +58,7 @@ class StepRecord:
     seconds: dict[str, float] = field(default_factory=dict)
 
 
+@dataclass
 class Trainer:
     """Runs the steps of one stage on a model.
 
@@ -67,32 +69,28 @@ class Trainer:
     stopped     a task asked to end the stage
     """
 
-    def __init__(
-        self,
-        stage: Stage,
-        model: SplatModel,
-        scene: Scene,
-        ppl: PipelineParams,
-        rasterizer: Rasterizer,
-        streams: Streams,
-        *,
-        index: int = 0,
-        stage_clock: StageClock | None = None,
-    ) -> None:
-        self.stage, self.model, self.scene, self.ppl = stage, model, scene, ppl
-        self.rasterizer, self.streams, self.index = rasterizer, streams, index
-        self.stage_clock = stage_clock
+    stage: Stage
+    model: SplatModel
+    scene: Scene
+    ppl: PipelineParams
+    rasterizer: Rasterizer
+    streams: Streams
+    index: int = 0
+    stage_clock: StageClock | None = None
+    step: int = field(default=0, init=False)
+    stopped: bool = field(default=False, init=False)
+
+    def __post_init__(self) -> None:
+        stage, model, scene = self.stage, self.model, self.scene
         self.device = model.device
         self.optimizer = stage.create_optimizer(model, scene)
-        self.sampler = stage.create_sampler(scene, streams("sampler"))
-        self.pre, self.post = build_schedulers(stage, ppl)
+        self.sampler = stage.create_sampler(scene, self.streams("sampler"))
+        self.pre, self.post = build_schedulers(stage, self.ppl)
         self.context = TaskContext(
-            ppl, stage.opt, model, scene, self.optimizer, CameraIterator(scene.train), rasterizer
+            self.ppl, stage.opt, model, scene, self.optimizer, CameraIterator(scene.train), self.rasterizer
         )
         self.pre.check(self.context)
         self.post.check(self.context)
-        self.step = 0
-        self.stopped = False
         self._view: View | None = None
         self._one = torch.ones((), device=self.device)
         self._background = scene.background.to(self.device)
@@ -127,52 +125,53 @@ class Trainer:
         self.check_losses()
 
     def _run_step(self, step: int) -> StepRecord:
-        clock, context = self.stage_clock, self.context
-        if clock:
-            clock.start()
+        context, mark = self.context, self._mark
+        if self.stage_clock is not None:
+            self.stage_clock.start()
         context.result = context.loss = None
         with torch.no_grad():
             stop = self.pre.exec(step, context)
         self._check_rows(step)
-        if clock:
-            clock.mark("pre")
+        mark("pre")
 
         view = self._view = self.sampler.next(step)
-        background = self._next_background()
+        background = self._background
+        if self.ppl.random_background:
+            background = torch.rand(3, generator=self.streams("background")).to(self.device, non_blocking=True)
         camera = self._camera(view)
         inputs = self.model.gaussians(camera, self.rasterizer)
         result = self.rasterizer.render(inputs, camera, self.stage.raster_options(step, background))
         if self.ppl.clamp_render:
             result.image = result.image.clamp(0, 1)
-        if clock:
-            clock.mark("render")
+        mark("render")
 
         loss = self.stage.loss(self.model, view, result, background, step)
         record = self._record(step, view, loss)
-        if clock:
-            clock.mark("loss")
+        mark("loss")
         self._backward(loss.total)
-        if clock:
-            clock.mark("backward")
+        mark("backward")
 
         context.result, context.loss = result, loss
         with torch.no_grad():
             stop = self.post.exec(step, context) or stop
         self._check_rows(step)
-        if clock:
-            clock.mark("post")
+        mark("post")
 
         if step < self.stage.iterations:
             self.optimizer.step(result)
         self.optimizer.zero_grad()
-        if clock:
-            clock.mark("optimize")
-            record.seconds = clock.last_step
+        mark("optimize")
+        if self.stage_clock is not None:
+            record.seconds = self.stage_clock.last_step
         # The graph and its buffers end with the step, not with the next one's render.
         context.result = context.loss = None
         self.stopped = stop
         record.num_rows = self._num_rows()
         return record
+
+    def _mark(self, part: str) -> None:
+        if self.stage_clock is not None:
+            self.stage_clock.mark(part)
 
     def _backward(self, total: Tensor) -> None:
         if total.dim() > 0 or total.dtype != self._one.dtype or total.device != self._one.device:
@@ -188,42 +187,34 @@ class Trainer:
             )  # fmt: skip
 
     def _record(self, step: int, view: View, loss: LossPack) -> StepRecord:
+        parts = {name: part.detach() for name, part in loss.parts.items()}
         record = StepRecord(
-            self.index,
-            self.stage.name,
-            step,
-            self.stage.iterations,
-            view.name,
-            loss.total.detach(),
-            {name: part.detach() for name, part in loss.parts.items()},
+            self.index, self.stage.name, step, self.stage.iterations, view.name, loss.total.detach(), parts
         )
         self._unchecked.append(record)
         # On a CPU a look costs a microsecond, so it happens before a bad gradient can spread.
         if self.device.type == "cpu":
             self.check_losses()
         elif len(self._unchecked) >= CHECK_EVERY:
-            self._ask_verdict()
+            self._look()
         return record
 
     def check_losses(self) -> None:
         """Raise TrainingDiverged if a loss since the last look is not finite. Waits for the device."""
-        self._ask_verdict()
-        self._hear_verdict()
+        self._look()
+        self._look()  # hears what the first has asked
 
-    def _ask_verdict(self) -> None:
-        self._hear_verdict()
-        records, self._unchecked = self._unchecked, []
-        if records:
-            self._asked = Verdict([r.total for r in records]), records
-
-    def _hear_verdict(self) -> None:
+    def _look(self) -> None:
+        """Hear what was asked at the last look, or raise TrainingDiverged; ask about the losses since."""
         asked, self._asked = self._asked, None
-        if asked is None or asked[0].fine():
-            return
-        record = next(r for r in asked[1] if not math.isfinite(r.total.item()))
-        values = {name: part.item() for name, part in {**record.parts, "total": record.total}.items()}
-        part = next(name for name, value in values.items() if not math.isfinite(value))
-        raise TrainingDiverged(record.step, record.view, part, values[part])
+        if asked is not None and not asked[0].fine():
+            record = next(r for r in asked[1] if not math.isfinite(r.total.item()))
+            values = {name: part.item() for name, part in {**record.parts, "total": record.total}.items()}
+            part = next(name for name, value in values.items() if not math.isfinite(value))
+            raise TrainingDiverged(record.step, record.view, part, values[part])
+        if self._unchecked:
+            self._asked = Verdict([r.total for r in self._unchecked]), self._unchecked
+            self._unchecked = []
 
     def _out_of_memory(self, error: torch.cuda.OutOfMemoryError) -> DeviceMemoryError:
         view, rows = self._view, f"{self._num_rows():,} {self.model.ROW_LABEL}"
@@ -242,17 +233,15 @@ class Trainer:
         if self.model.ROWS and self.model.num_rows == 0:
             raise EmptyModel(step)
 
-    def _next_background(self) -> Tensor:
-        if self.ppl.random_background:
-            return torch.rand(3, generator=self.streams("background")).to(self.device, non_blocking=True)
-        return self._background
-
     def _camera(self, view: View) -> Camera:
         """Return the view's camera on the model's device, where it is moved once."""
-        camera = self._cameras.get(view)
-        if camera is None:
-            camera = self._cameras[view] = view.camera.to(self.device)
-        return camera
+        if view not in self._cameras:
+            self._cameras[view] = view.camera.to(self.device)
+        return self._cameras[view]
+
+    def plan_lines(self) -> list[str]:
+        """Return what identifies the plan of the stage."""
+        return [*self.pre.plan_lines(), *self.post.plan_lines()]
 
     def state_dict(self) -> dict[str, Any]:
         """Return all that the next step depends on, tensors and JSON-able values in nested dicts; no copies."""
@@ -262,6 +251,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "sampler": self.sampler.state_dict(),
             "streams": self.streams.state_dict(),
+            "rng": rng.capture(),
         }
 
     def load_state_dict(self, state: dict[str, Any], step: int) -> None:
@@ -272,4 +262,5 @@ class Trainer:
         # The sampler's generator is one of the streams: both hold the same state.
         self.streams.load_state_dict(state["streams"])
         self.sampler.load_state_dict(state["sampler"])
+        rng.restore(state["rng"])
         self.step = step

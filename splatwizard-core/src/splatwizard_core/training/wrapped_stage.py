@@ -2,21 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+import functools
+from typing import Any
 
-import torch
-from torch import Tensor
-
-from splatwizard_core.training.stage import CameraSampler, Stage, StageContext
-
-if TYPE_CHECKING:
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
-    from splatwizard_core.scene.scene import Scene, View
-    from splatwizard_core.training.losses import LossPack
-    from splatwizard_core.training.optimizer import SplatOptimizer
-    from splatwizard_core.training.params import OptimizationParams, PipelineParams
-    from splatwizard_core.training.scheduler import Scheduler
+from splatwizard_core.training.params import OptimizationParams
+from splatwizard_core.training.stage import Stage
 
 
 class WrappedStage(Stage):
@@ -31,42 +21,20 @@ class WrappedStage(Stage):
         self.inner = inner
         self.name = inner.name
 
-    @property
-    def iterations(self) -> int:
-        return self.inner.iterations
 
-    @property
-    def starts_from(self) -> str | None:
-        return self.inner.starts_from
+def _of_inner(name: str, member: Any) -> Any:
+    """Return a property or method of `Stage` as the stage inside has it."""
+    if isinstance(member, property):
+        return property(lambda stage: getattr(stage.inner, name), doc=member.__doc__)
 
-    @property
-    def taught_by(self) -> tuple[str, ...]:
-        return self.inner.taught_by
+    @functools.wraps(member)
+    def method(stage: WrappedStage, *args: Any, **kwargs: Any) -> Any:
+        return getattr(stage.inner, name)(*args, **kwargs)
 
-    @property
-    def prefer(self) -> tuple[str, ...]:
-        return self.inner.prefer
+    return method
 
-    def begin(self, context: StageContext) -> SplatModel:
-        return self.inner.begin(context)
 
-    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
-        return self.inner.create_optimizer(model, scene)
-
-    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        return self.inner.create_sampler(scene, generator)
-
-    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        self.inner.register_pre_task(scheduler, ppl, opt)
-
-    def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        self.inner.register_post_task(scheduler, ppl, opt)
-
-    def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        return self.inner.raster_options(step, background)
-
-    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        return self.inner.loss(model, view, result, background, step)
-
-    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
-        return self.inner.finish(model, scene)
+for _name, _member in vars(Stage).items():
+    # `when` scales by the hyper-parameters of the stage that asks.
+    if not _name.startswith("_") and _name not in ("name", "when"):
+        setattr(WrappedStage, _name, _of_inner(_name, _member))
