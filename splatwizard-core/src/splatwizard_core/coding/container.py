@@ -216,14 +216,14 @@ class ContainerReader:
 
     def _header(self, file: BinaryIO) -> dict[str, Any]:
         version, length = self._prefix(file.read(PREFIX.size))
-        raw, stored = file.read(length), file.read(CRC.size)
-        whole = len(raw) == length and len(stored) == CRC.size
+        raw = file.read(length)
+        sound = CRC.pack(zlib.crc32(raw)) == file.read(CRC.size)
         if version > VERSION:
-            raise self._too_new(version, raw if whole and zlib.crc32(raw) == CRC.unpack(stored)[0] else b"")
-        if not whole:
-            start = PREFIX.size + length + CRC.size
+            raise self._too_new(version, raw if sound else b"")
+        start = PREFIX.size + length + CRC.size
+        if self.size < start:
             raise self._damage(f"the file ends inside its header ({self.size:,} of {start:,} bytes): it is truncated")
-        if zlib.crc32(raw) != CRC.unpack(stored)[0]:
+        if not sound:
             raise self._damage("the CRC-32 of the header does not match: the file is damaged", "header")
         try:
             header = load_strict(raw)

@@ -170,7 +170,7 @@ class NativeModule:
         return None
 
     def state(self) -> dict[str, Any]:
-        """Facts for `sw doctor`: name, state (prebuilt, cached, damaged, not built), loaded, path, target (cpu, cuda).
+        """Facts for `sw doctor`: state (prebuilt, cached, damaged, not built), path, target (cpu, cuda).
 
         damaged: there is a library for this machine and these sources, but not the one that the build wrote.
         """
@@ -179,13 +179,8 @@ class NativeModule:
             state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
         else:
             state = "damaged" if any(library.exists() for library in self._places()) else "not built"
-        return {
-            "name": self.name,
-            "state": state,
-            "loaded": self._session.loaded is not None,
-            "path": None if path is None else str(path),
-            "target": "cuda" if (self._with_cuda() if path is None else _architectures(path)) else "cpu",
-        }
+        cuda = self._with_cuda() if path is None else bool(_architectures(path))
+        return {"state": state, "path": None if path is None else str(path), "target": "cuda" if cuda else "cpu"}
 
     def is_built(self, march: str, folder: Path | None = None) -> bool:
         """Whether `build` with these arguments would find the library there and undamaged."""
@@ -215,11 +210,10 @@ class NativeModule:
                 if force or not _intact(library):
                     self._compile(library, march, tools or Toolchain(), say or _say)
         except NativeBuildError as error:
-            raise NativeBuildError(self._explain(error)) from error
+            raise self._failure(error) from error
         except OSError as error:
-            raise NativeBuildError(
-                self._explain(f"cannot write {folder} ({error.strerror}): set SPLATWIZARD_CACHE to a writable folder")
-            ) from error
+            advice = "set SPLATWIZARD_CACHE to a writable folder"
+            raise self._failure(f"cannot write {folder} ({error.strerror}): {advice}") from error
         return library
 
     @property
@@ -259,7 +253,7 @@ class NativeModule:
 
     def _load(self, say: Say | None) -> None:
         if _disabled():
-            raise NativeBuildError(self._explain(SWITCHED_OFF))
+            raise self._failure(SWITCHED_OFF)
         try:
             if self.load_built():
                 return
@@ -268,7 +262,7 @@ class NativeModule:
         library = self.build(force=self.is_built("native"), say=say)
         problem = _load_library(library)
         if problem is not None:
-            raise NativeBuildError(self._explain(f"{library} was compiled but does not load: {problem}"))
+            raise self._failure(f"{library} was compiled but does not load: {problem}")
         self._session.loaded = library
 
     def _existing(self) -> Iterator[Path]:
@@ -379,9 +373,9 @@ class NativeModule:
                         "add it to headers"
                     )
 
-    def _explain(self, reason: object) -> str:
-        text = f"kernels '{self.name}' are not available: {reason}"
-        return f"{text}\nwithout them: {self.without}" if self.without else text
+    def _failure(self, reason: object) -> NativeBuildError:
+        without = f"\nwithout them: {self.without}" if self.without else ""
+        return NativeBuildError(f"kernels '{self.name}' are not available: {reason}{without}")
 
 
 def _say(message: str) -> None:
