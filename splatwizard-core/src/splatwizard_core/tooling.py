@@ -31,7 +31,7 @@ MODULES = {
     "errors": "NativeBuildError PluginError RunLockedError",
     "native.loader": "cache_root",
     "native.build": "declared_modules",
-    "native.toolchain": "installed_compilers",
+    "native.toolchain": "find_compiler find_nvcc nvcc_version",
     "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": "console debug_option json_option options print_json say set_option",
     "cli.complete": "complete_files complete_folders complete_image_folders complete_names complete_nothing",

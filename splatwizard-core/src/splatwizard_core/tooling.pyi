@@ -28,7 +28,9 @@ from splatwizard_core.files import write_atomic as write_atomic
 from splatwizard_core.files import write_json as write_json
 from splatwizard_core.native.build import declared_modules as declared_modules
 from splatwizard_core.native.loader import cache_root as cache_root
-from splatwizard_core.native.toolchain import installed_compilers as installed_compilers
+from splatwizard_core.native.toolchain import find_compiler as find_compiler
+from splatwizard_core.native.toolchain import find_nvcc as find_nvcc
+from splatwizard_core.native.toolchain import nvcc_version as nvcc_version
 from splatwizard_core.plugins.check import Check as Check
 from splatwizard_core.plugins.check import State as State
 from splatwizard_core.plugins.loading import PluginInfo as PluginInfo

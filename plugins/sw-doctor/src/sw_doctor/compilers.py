@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.tooling import Check, installed_compilers
+from splatwizard_core.tooling import Check, NativeBuildError, find_compiler, find_nvcc, nvcc_version
 from sw_doctor.text import one_line
 
 GROUP = "compilers"
@@ -34,11 +34,11 @@ CUDA_LINES = "__global__ void doctor(float *x) { x[threadIdx.x] += 1.0f; }\n"
 
 def check_cxx() -> Check:
     """Compile and link a shared library of a few lines, with the flags that kernels need."""
-    found = installed_compilers()
-    command = found.cxx
-    if command is None:
+    try:
+        command = find_compiler()
+    except NativeBuildError as error:
         if os.environ.get("CXX", "").strip():
-            return Check(GROUP, "C++", "broken", one_line(found.problem), "unset CXX, or set it to a compiler")
+            return Check(GROUP, "C++", "broken", one_line(error), "unset CXX, or set it to a compiler")
         return Check(GROUP, "C++", "missing", "no g++, c++ or clang++ on the PATH", how_to_get_a_compiler())
     flags = ["-std=c++20", "-O1", "-fPIC", "-shared", *(["-fopenmp"] if sys.platform != "darwin" else [])]
     problem = _compile(command, flags, CXX_LINES, "doctor.cpp")
@@ -57,10 +57,10 @@ def check_nvcc() -> Check:
 
     Whether the release fits torch is for `judge_nvcc` to say.
     """
-    found = installed_compilers()
-    nvcc, version = found.nvcc, found.nvcc_release
+    nvcc = find_nvcc()
     if nvcc is None:
         return Check(GROUP, "nvcc", "missing", "no CUDA compiler on the PATH, in $CUDA_HOME or in /usr/local/cuda")
+    version = nvcc_version(nvcc)
     release = None if version is None else f"{version[0]}.{version[1]}"
     facts = {"path": nvcc, "release": release}
     problem = None if _torch_is_cpu_build() else _compile([nvcc], ["-c"], CUDA_LINES, "doctor.cu")

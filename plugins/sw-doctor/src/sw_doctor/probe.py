@@ -147,17 +147,16 @@ def check_kernels(target: str) -> Check:
         return Check("kernels", target, "broken", detail, "install the package again")
     build = "sw build-kernels"
     try:
-        state = module.state()
+        facts = module.state()
         loaded = module.load_built()
     except NativeBuildError as error:
         switched_off = "SPLATWIZARD_NATIVE" in str(error)
         mend = "unset SPLATWIZARD_NATIVE" if switched_off else f"{build} --force"
         return Check("kernels", module.name, "missing" if switched_off else "broken", one_line(error), mend)
-    facts = {"state": state["state"], "path": state["path"], "target": state["target"]}
     if loaded:
-        detail = f"{state['state']} build for {state['target']}, loaded"
+        detail = f"{facts['state']} build for {facts['target']}, loaded"
         return Check("kernels", module.name, "ok", detail, facts=facts)
-    if state["state"] == "damaged":
+    if facts["state"] == "damaged":
         detail = "the build in the cache is damaged"
         return Check("kernels", module.name, "broken", detail, f"{build} --force", facts=facts)
     detail = f"not built; compiled when first used (about {module.seconds} s)"

@@ -9,21 +9,9 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-# Codes are part of the file format: never renumber, only add.
-DTYPES: dict[int, np.dtype[Any]] = {
-    1: np.dtype("<u1"),
-    2: np.dtype("<i1"),
-    3: np.dtype("<u2"),
-    4: np.dtype("<i2"),
-    5: np.dtype("<u4"),
-    6: np.dtype("<i4"),
-    7: np.dtype("<u8"),
-    8: np.dtype("<i8"),
-    9: np.dtype("<f2"),
-    10: np.dtype("<f4"),
-    11: np.dtype("<f8"),
-    12: np.dtype("?"),
-}
+# Their codes, 1 to 12, are part of the file format: never reorder, only add.
+STORED = ("<u1", "<i1", "<u2", "<i2", "<u4", "<i4", "<u8", "<i8", "<f2", "<f4", "<f8", "?")
+DTYPES: dict[int, np.dtype[Any]] = dict(enumerate(map(np.dtype, STORED), start=1))
 CODES = {dtype: code for code, dtype in DTYPES.items()}
 MAX_NDIM = 8
 MAX_ARRAY_BYTES = 1 << 33
@@ -67,7 +55,7 @@ def unpack_array(data: bytes) -> npt.NDArray[Any]:
         raise ValueError(f"{len(data) - start:,} bytes of values, shape {list(shape)} of {dtype} needs {expected:,}")
     if math.prod(n for n in shape if n) * dtype.itemsize > MAX_ARRAY_BYTES:
         raise ValueError(f"shape {list(shape)} is too large")
-    if code == 12 and data[start:].translate(None, b"\x00\x01"):
+    if dtype.kind == "b" and data[start:].translate(None, b"\x00\x01"):
         raise ValueError("a boolean array holds bytes other than 0 and 1")
     array = np.frombuffer(data, dtype, offset=start).reshape(shape)
     return array.astype(dtype.newbyteorder("="), copy=True)

@@ -47,6 +47,7 @@ NAME = re.compile(r"(?!header$)[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}")  # "header" w
 METHOD_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,63}")
 PREFIX = struct.Struct("<4sHI")
 CRC = struct.Struct("<I")
+HEADER = {"method": str, "method_version": int, "raster": dict, "static": dict, "sections": list}
 
 
 def decoded_limit(size: int) -> int:
@@ -114,7 +115,7 @@ class ContainerWriter:
         A method that decodes to far more than it stores calls it at the end of `encode`, so that it writes no file
         which its own `decode` (`ContainerReader.allow`) refuses.
         """
-        size = sum(map(len, self._sections.values()))
+        size = sum(self.sections.values())
         if decoded > decoded_limit(size):
             raise SplatwizardError(
                 f"{what} of {decoded:,} bytes in {size:,} bytes of file is more than a reader accepts "
@@ -215,30 +216,23 @@ class ContainerReader:
 
     def _header(self, file: BinaryIO) -> dict[str, Any]:
         version, length = self._prefix(file.read(PREFIX.size))
-        raw, stored = file.read(length), file.read(CRC.size)
-        whole = len(raw) == length and len(stored) == CRC.size
+        raw = file.read(length)
+        sound = CRC.pack(zlib.crc32(raw)) == file.read(CRC.size)
         if version > VERSION:
-            raise self._too_new(version, raw if whole and zlib.crc32(raw) == CRC.unpack(stored)[0] else b"")
-        if not whole:
-            start = PREFIX.size + length + CRC.size
+            raise self._too_new(version, raw if sound else b"")
+        start = PREFIX.size + length + CRC.size
+        if self.size < start:
             raise self._damage(f"the file ends inside its header ({self.size:,} of {start:,} bytes): it is truncated")
-        if zlib.crc32(raw) != CRC.unpack(stored)[0]:
+        if not sound:
             raise self._damage("the CRC-32 of the header does not match: the file is damaged", "header")
         try:
             header = load_strict(raw)
         except ValueError as error:
             raise self._damage(f"header is not acceptable JSON: {error}", "header") from error
-        kinds: dict[str, type] = {
-            "method": str,
-            "method_version": int,
-            "raster": dict,
-            "static": dict,
-            "sections": list,
-        }
-        if not isinstance(header, dict) or set(header) - {"requires"} != set(kinds):
-            raise self._damage(f"header must hold exactly {', '.join(kinds)}, and it may hold requires", "header")
-        for key, kind in kinds.items():
-            if not isinstance(header[key], kind) or isinstance(header[key], bool):
+        if not isinstance(header, dict) or set(header) - {"requires"} != set(HEADER):
+            raise self._damage(f"header must hold exactly {', '.join(HEADER)}, and it may hold requires", "header")
+        for key, kind in HEADER.items():
+            if type(header[key]) is not kind:
                 raise self._damage(f"header value '{key}' is not of type {kind.__name__}", "header")
         if not METHOD_NAME.fullmatch(header["method"]) or not 0 <= header["method_version"] < 1 << 31:
             raise self._damage("header names no valid method and version", "header")
@@ -248,9 +242,8 @@ class ContainerReader:
         """Of a later container version only the key `requires` of the header is looked at: it keeps its form."""
         command = "pip install --upgrade splatwizard-core"
         with contextlib.suppress(ValueError, AttributeError):
-            needed = {each.distribution: each for each in parse_requirements(load_strict(raw).get("requires"))}
-            if "splatwizard-core" in needed:
-                command = needed["splatwizard-core"].command
+            needed = parse_requirements(load_strict(raw).get("requires"))
+            command = {each.distribution: each.command for each in needed}.get("splatwizard-core", command)
         return BitstreamError(
             f"{self.name}: container version {version} is newer than {VERSION}, the newest that this installation "
             f"reads: upgrade splatwizard-core with {command}"
@@ -282,9 +275,8 @@ class ContainerReader:
         return payload
 
     def _damage(self, reason: str, section: str | None = None) -> BitstreamError:
-        if section is None or section == "header":
-            return BitstreamError(f"{self.name}: {reason}", section=section)
-        return BitstreamError(f"{self.name}: section '{section}': {reason}", section=section)
+        where = self.name if section in (None, "header") else f"{self.name}: section '{section}'"
+        return BitstreamError(f"{where}: {reason}", section=section)
 
     @property
     def made_on(self) -> str | None:

@@ -31,15 +31,12 @@ class Quantizer(Protocol):
 
     def forward(self, x: Tensor) -> Tensor:
         """The quantized values in the shape of x, with a gradient to x."""
-        ...
 
     def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Symbols int64 on the device of x, and what `decode` needs besides: JSON values or numpy arrays."""
-        ...
 
     def decode(self, symbols: Tensor, side: dict[str, Any]) -> Tensor:
         """Values float32, those of `forward` without noise; needs no state: a new object gives the same ones."""
-        ...
 
 
 @runtime_checkable
@@ -52,15 +49,12 @@ class EntropyModel(Protocol):
 
     def bits(self, symbols: Tensor, context: Any) -> Tensor:
         """Bits of each symbol in the shape of `symbols`; differentiable where the model is trained."""
-        ...
 
     def encode(self, symbols: np.ndarray, context: Any) -> bytes:
         """The bytes of integer symbols."""
-        ...
 
     def decode(self, data: bytes, context: Any) -> np.ndarray:
         """The symbols, integers or bool."""
-        ...
 
 
 @runtime_checkable
@@ -73,7 +67,6 @@ class ContextModel(Protocol):
 
     def __call__(self, *inputs: Any, **options: Any) -> Tensor | tuple[Tensor, ...]:
         """Differentiable features or parameters for each row (or place) of the inputs."""
-        ...
 
 
 @runtime_checkable
@@ -88,11 +81,9 @@ class EntropyCoder(Protocol):
 
     def encode(self, symbols: np.ndarray, model: Any) -> bytes:
         """The bytes of symbols [n] integers within the domain of the model; none for none."""
-        ...
 
     def decode(self, data: bytes, n: int, model: Any) -> np.ndarray:
         """The n symbols, int32 [n]."""
-        ...
 
 
 @runtime_checkable
@@ -104,15 +95,12 @@ class PositionCodec(Protocol):
 
     def sort(self, points: Points) -> Points:
         """Indices int64 [N] that bring points [N,3] into the order of `encode`; attributes follow them."""
-        ...
 
     def encode(self, points: np.ndarray, bits: int) -> bytes:
         """The bytes of points [N,3] integer, 0 <= p < 2^bits, bits 1..21, in order; duplicates are kept."""
-        ...
 
     def decode(self, data: bytes) -> np.ndarray:
         """Points int64 [N,3], in order."""
-        ...
 
 
 @runtime_checkable
@@ -121,11 +109,9 @@ class ArrayCoder(Protocol):
 
     def encode(self, array: np.ndarray) -> bytes:
         """The bytes of an array [N, ...] of a dtype that the coder takes."""
-        ...
 
     def decode(self, data: bytes, dtype: npt.DTypeLike, shape: Sequence[int]) -> np.ndarray:
         """The array in native byte order, writable. A shape from a file is held against `reader.allow` first."""
-        ...
 
 
 @runtime_checkable
@@ -139,11 +125,9 @@ class VectorCoder(Protocol):
 
     def encode(self, vectors: np.ndarray, importance: np.ndarray, seed: int = 0) -> dict[str, bytes]:
         """Named parts for vectors [n,d] and their importance [n]."""
-        ...
 
     def decode(self, parts: Mapping[str, bytes], n: int, d: int) -> np.ndarray:
         """Vectors float32 [n,d]. An n from a file is held against `reader.allow` first."""
-        ...
 
 
 @runtime_checkable
@@ -156,8 +140,6 @@ class GaussianCodec(Protocol):
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         """Write everything that `decode` needs; leaves the model as it is."""
-        ...
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
         """The model; the settings of the encoder are not needed."""
-        ...

@@ -12,6 +12,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from packaging.version import Version
+
 MAX_DISTRIBUTIONS = 64
 MAX_PROVIDED = 256
 DISTRIBUTION = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
@@ -87,10 +89,7 @@ def requirement_of(requirements: Sequence[Requirement], kind: str, name: str) ->
     return next((each for each in requirements if (kind, name) in each.provided), None)
 
 
-def _release(version: str) -> tuple[int, ...]:
-    """Numbers of the release segment, such as (0, 2, 1); what follows (rc1, .dev3, +local) does not count."""
+def _release(version: str) -> Version:
+    """The release segment, such as 0.2.1; what follows (rc1, .dev3, +local) does not count."""
     numbers = re.match(r"[0-9]+(?:\.[0-9]+)*", version.rpartition("!")[2])
-    parts = [int(part) for part in numbers.group().split(".")] if numbers else [0]
-    while len(parts) > 1 and parts[-1] == 0:
-        parts.pop()
-    return tuple(parts)
+    return Version(numbers.group() if numbers else "0")

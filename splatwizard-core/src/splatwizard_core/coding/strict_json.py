@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from typing import Any
 
 MAX_DEPTH = 32
 MAX_INTEGER = 2**63 - 1  # what every JSON reader that uses 64-bit integers can hold
 MAX_STRING = 1 << 16
 
-_Path = tuple[Any, Any]
-"""(path of the parent or None, key or index)"""
+SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 def dump_strict(value: Any) -> bytes:
@@ -26,60 +26,46 @@ def dump_strict(value: Any) -> bytes:
 def load_strict(data: bytes) -> Any:
     """The value in `data`. Raises ValueError with the reason; time and memory grow linearly with len(data)."""
     try:
-        value = json.loads(
-            data.decode(),  # UnicodeDecodeError is a ValueError
-            object_pairs_hook=_unique_keys,
-            parse_int=_bounded_int,
-            parse_constant=_refuse_constant,
-        )
+        text = data.decode()  # UnicodeDecodeError is a ValueError
+        value = json.loads(text, object_pairs_hook=_unique_keys, parse_int=_bounded_int)
     except RecursionError:
         raise ValueError(f"nested deeper than {MAX_DEPTH} levels") from None
     check_json(value)
     return value
 
 
-def check_json(value: Any, path: _Path | None = None, depth: int = 0) -> None:
+def check_json(value: Any, place: str = "", depth: int = 0) -> None:
     """Raise ValueError if `value` is not plain JSON data within the bounds of this module.
 
-    path, depth     where it stands; a path is spelled out only for a message
+    place   where it stands, for messages, such as `static.sizes[3]`; long keys are cut
     """
-    if isinstance(value, (list, tuple, dict)):
-        if depth >= MAX_DEPTH:
-            raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
-        for step, each in value.items() if isinstance(value, dict) else enumerate(value):
-            if isinstance(value, dict):
-                if not isinstance(step, str):
-                    raise ValueError(f"'{_place(path)}': key {step!r} is not a string")
-                _check_text(step, path)
-            check_json(each, (path, step), depth + 1)
+    problem = None
+    if isinstance(value, (list, tuple, dict)) and depth >= MAX_DEPTH:
+        raise ValueError(f"nested deeper than {MAX_DEPTH} levels")
+    if isinstance(value, dict):
+        for key, each in value.items():
+            if not isinstance(key, str):
+                raise ValueError(f"'{place}': key {key!r} is not a string")
+            check_json(key, place)
+            check_json(each, f"{place}.{key[:80]}" if place else key[:80], depth + 1)
+    elif isinstance(value, (list, tuple)):
+        for i, each in enumerate(value):
+            check_json(each, f"{place}[{i}]", depth + 1)
     elif isinstance(value, str):
-        _check_text(value, path)
+        if len(value) > MAX_STRING:
+            problem = f"a string of {len(value):,} characters is longer than {MAX_STRING:,}"
+        elif SURROGATE.search(value):
+            problem = "a string holds a lone surrogate"
     elif isinstance(value, float):
         if not math.isfinite(value):
-            raise ValueError(f"'{_place(path)}': {value} is not a finite number")
+            problem = f"{value} is not a finite number"
     elif isinstance(value, int):  # bool among them
         if abs(value) > MAX_INTEGER:
-            raise ValueError(f"'{_place(path)}': an integer does not fit 64 bits")
+            problem = "an integer does not fit 64 bits"
     elif value is not None:
-        raise ValueError(f"'{_place(path)}': {type(value).__name__} is not JSON data")
-
-
-def _place(path: _Path | None) -> str:
-    """Such as `static.sizes[3]`; long keys are cut."""
-    steps: list[str] = []
-    while path is not None:
-        path, step = path
-        steps.append(f"[{step}]" if isinstance(step, int) else f".{step[:80]}")
-    return "".join(reversed(steps)).removeprefix(".")
-
-
-def _check_text(text: str, path: _Path | None) -> None:
-    if len(text) > MAX_STRING:
-        raise ValueError(f"'{_place(path)}': a string of {len(text):,} characters is longer than {MAX_STRING:,}")
-    try:
-        text.encode()
-    except UnicodeEncodeError:
-        raise ValueError(f"'{_place(path)}': a string holds a lone surrogate") from None
+        problem = f"{type(value).__name__} is not JSON data"
+    if problem is not None:
+        raise ValueError(f"'{place}': {problem}")
 
 
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -95,7 +81,3 @@ def _bounded_int(digits: str) -> int:
     if len(digits) > 20:  # int() of a very long string takes quadratic time on older interpreters
         raise ValueError("an integer does not fit 64 bits")
     return int(digits)
-
-
-def _refuse_constant(name: str) -> Any:
-    raise ValueError(f"{name} is not a finite number")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -32,22 +32,20 @@ class BuildRow:
     error: str | None = None
 
 
-def declared_modules(plugins: PluginManager) -> dict[str, str]:
-    """Target "module:attribute" -> who declares it: the core's own, then every registry entry with `native`."""
-    targets = dict.fromkeys(CORE_MODULES, "splatwizard-core")
+def declared_modules(plugins: PluginManager) -> list[str]:
+    """Targets "module:attribute", each once: the core's own, then those that registry entries declare as `native`."""
+    targets = [*CORE_MODULES]
     for registry in plugins.registries.values():
         for entry in registry:
             declared = entry.declared.get("native") or ()
-            for target in (declared,) if isinstance(declared, str) else declared:
-                targets.setdefault(target, entry.distribution)
-    return targets
+            targets += [declared] if isinstance(declared, str) else declared
+    return list(dict.fromkeys(targets))
 
 
 def resolve_module(target: str) -> NativeModule:
     """The NativeModule that "module:attribute" names. Raises NativeBuildError."""
-    module, _, attribute = target.partition(":")
     try:
-        found = getattr(importlib.import_module(module), attribute)
+        found = pkgutil.resolve_name(target)
     except Exception as error:
         raise NativeBuildError(f"native module {target} cannot be imported: {type(error).__name__}: {error}") from error
     if not isinstance(found, NativeModule):
@@ -90,6 +88,6 @@ def build_all(
             return BuildRow(target, "failed", time.monotonic() - started, None, str(error))
         return BuildRow(module.name, "up to date" if fresh else "built", time.monotonic() - started, path)
 
-    targets = list(declared_modules(plugins))
+    targets = declared_modules(plugins)
     with ThreadPoolExecutor(max_workers=len(targets)) as pool:
         return list(pool.map(build, targets))

@@ -3,19 +3,11 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from splatwizard_core.errors import NativeBuildError
-
-try:
-    import fcntl
-except ImportError:  # Windows: builds are not serialised there; the atomic rename of the result keeps them safe.
-    fcntl = None  # type: ignore[assignment]
-
-POLL_SECONDS = 0.1
 
 
 @contextmanager
@@ -26,35 +18,23 @@ def build_lock(path: Path, *, timeout: float, say: Callable[[str], None]) -> Ite
     crashed build left behind blocks nobody. `say` gets one line when there is something to wait for.
     Raises NativeBuildError that names the file and the process if the wait is too long.
     """
-    with open(path, "a+", encoding="ascii") as handle:
-        waited_since = time.monotonic()
-        announced = False
-        while not _try_lock(handle.fileno()):
-            holder = _holder(path)
-            if not announced:
-                say(f"waiting for {holder} that is compiling the same kernels ...")
-                announced = True
-            if time.monotonic() - waited_since > timeout:
-                raise NativeBuildError(
-                    f"{holder} has held {path} for over {timeout:g} s: end that process, or wait longer with "
-                    "SPLATWIZARD_BUILD_TIMEOUT=<seconds>"
-                )
-            time.sleep(POLL_SECONDS)
-        handle.seek(0)
-        handle.truncate()
-        handle.write(str(os.getpid()))
-        handle.flush()
-        yield
+    from filelock import FileLock, Timeout
 
-
-def _try_lock(descriptor: int) -> bool:
-    if fcntl is None:
-        return True
+    lock = FileLock(path)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
+        held = lock.acquire(timeout=0)
+    except Timeout:
+        say(f"waiting for {_holder(path)} that is compiling the same kernels ...")
+        try:
+            held = lock.acquire(timeout=max(0.0, timeout))
+        except Timeout:
+            raise NativeBuildError(
+                f"{_holder(path)} has held {path} for over {timeout:g} s: end that process, or wait longer with "
+                "SPLATWIZARD_BUILD_TIMEOUT=<seconds>"
+            ) from None
+    with held:
+        path.write_text(str(os.getpid()), encoding="ascii")
+        yield
 
 
 def _holder(path: Path) -> str:

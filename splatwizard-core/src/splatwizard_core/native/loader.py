@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import itertools
 import json
 import logging
 import os
@@ -51,7 +52,10 @@ def cache_root() -> Path:
 
 @dataclass
 class _Session:
-    """State of a module in this process, shared by all: a loaded library cannot be unloaded."""
+    """State of a module in this process, shared by all: a loaded library cannot be unloaded.
+
+    cuda    whether it holds CUDA kernels; None: nobody has asked yet
+    """
 
     loaded: Path | None = None
     error: NativeBuildError | None = None
@@ -70,7 +74,7 @@ class NativeModule:
                     they see no torch header
     headers         every header that the files above include from the package; globs are allowed
     cuda_sources    .cu files, compiled (with SW_WITH_CUDA defined everywhere) only if torch has CUDA and nvcc is there
-    cflags          more flags for sources and kernels, `cuda_cflags` for cuda_sources, `ldflags` for the linker
+    cflags          more flags for sources and kernels
     seconds         about how long it takes to compile, told to the user
     without         what happens without this module, told to the user when it cannot be built
     """
@@ -82,8 +86,6 @@ class NativeModule:
     cuda_sources: tuple[str, ...] = ()
     cflags: tuple[str, ...] = ()
     kernels: tuple[str, ...] = ()
-    cuda_cflags: tuple[str, ...] = ()
-    ldflags: tuple[str, ...] = ()
     seconds: int = 30
     without: str = ""
     _session: _Session = field(default_factory=_Session, init=False, repr=False, compare=False)
@@ -96,13 +98,13 @@ class NativeModule:
         session = self._session
         if session.loaded is not None:
             return
-        if session.error is None:
-            try:
-                session.loaded = self._load(say or _say)
-                return
-            except NativeBuildError as error:
-                session.error = error
-        raise session.error
+        if session.error is not None:
+            raise session.error
+        try:
+            self._load(say)
+        except NativeBuildError as error:
+            session.error = error
+            raise
 
     def try_load(self) -> bool:
         """Load, and say whether it worked; if not, warn once in this process. For code that has a torch fallback."""
@@ -117,11 +119,12 @@ class NativeModule:
 
     def has_cuda(self) -> bool:
         """Load, and say whether there are CUDA kernels; if not, warn once. For code that has a torch fallback."""
-        if self._session.cuda is None:
-            self._session.cuda = self.try_load() and self._holds_cuda(self._session.loaded)
-            if not self._session.cuda and self._session.loaded is not None:
+        session = self._session
+        if session.cuda is None:
+            session.cuda = self.try_load() and bool(_architectures(session.loaded))
+            if not session.cuda and session.loaded is not None:
                 log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, self._without_cuda(), self.without)
-        return self._session.cuda
+        return session.cuda
 
     def load_built(self) -> bool:
         """Load a build that is there already, and say whether there was one; compiles nothing.
@@ -131,8 +134,14 @@ class NativeModule:
         if self._session.loaded is None:
             if _disabled():
                 raise NativeBuildError(SWITCHED_OFF)
-            self._session.loaded, problems = self._load_existing()
-            if self._session.loaded is None and problems:
+            problems = []
+            for library in self._existing():
+                problem = _load_library(library)
+                if problem is None:
+                    self._session.loaded = library
+                    return True
+                problems.append(f"{library} does not load: {problem}")
+            if problems:
                 raise NativeBuildError("; ".join(problems))
         return self._session.loaded is not None
 
@@ -146,7 +155,7 @@ class NativeModule:
             return str(session.error)
         try:
             found = session.loaded or next(self._existing(), None)
-            if cuda and not session.cuda and not self._holds_cuda(found):
+            if cuda and not _architectures(found):
                 if session.loaded is not None:
                     return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
                 missing = self._without_cuda()
@@ -161,22 +170,17 @@ class NativeModule:
         return None
 
     def state(self) -> dict[str, Any]:
-        """Facts for `sw doctor`: name, state (prebuilt, cached, damaged, not built), loaded, path, target (cpu, cuda).
+        """Facts for `sw doctor`: state (prebuilt, cached, damaged, not built), path, target (cpu, cuda).
 
         damaged: there is a library for this machine and these sources, but not the one that the build wrote.
         """
-        found = next(self._existing(), None)
-        path = self._session.loaded or found
-        state = "damaged" if any(library.exists() for library in self._places()) else "not built"
+        path = self._session.loaded or next(self._existing(), None)
         if path is not None:
             state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
-        return {
-            "name": self.name,
-            "state": state,
-            "loaded": self._session.loaded is not None,
-            "path": None if path is None else str(path),
-            "target": "cuda" if (self._with_cuda() if path is None else self._holds_cuda(path)) else "cpu",
-        }
+        else:
+            state = "damaged" if any(library.exists() for library in self._places()) else "not built"
+        cuda = self._with_cuda() if path is None else bool(_architectures(path))
+        return {"state": state, "path": None if path is None else str(path), "target": "cuda" if cuda else "cpu"}
 
     def is_built(self, march: str, folder: Path | None = None) -> bool:
         """Whether `build` with these arguments would find the library there and undamaged."""
@@ -200,18 +204,16 @@ class NativeModule:
         """
         folder = folder or self.cache_folder
         library = self._library(folder, march)
-        say = say or _say
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with build_lock(library.with_suffix(".lock"), timeout=_timeout(), say=say):
+            with build_lock(library.with_suffix(".lock"), timeout=_timeout(), say=say or _say):
                 if force or not _intact(library):
-                    self._compile(library, march, tools or Toolchain(), say)
+                    self._compile(library, march, tools or Toolchain(), say or _say)
         except NativeBuildError as error:
-            raise NativeBuildError(self._explain(error)) from error
+            raise self._failure(error) from error
         except OSError as error:
-            raise NativeBuildError(
-                self._explain(f"cannot write {folder} ({error.strerror}): set SPLATWIZARD_CACHE to a writable folder")
-            ) from error
+            advice = "set SPLATWIZARD_CACHE to a writable folder"
+            raise self._failure(f"cannot write {folder} ({error.strerror}): {advice}") from error
         return library
 
     @property
@@ -233,15 +235,14 @@ class NativeModule:
         import torch
 
         cuda = self._with_cuda() if cuda is None else cuda
-        digest = hashlib.sha256()
+        # The empty flags at the two ends are those of linker and nvcc: modules had some, and older builds stay valid.
         facts: list[object] = [
             self.name, str(torch.__version__), toolchain.common_flags(), platform.system(), platform.machine(), march,
-            toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "",
-            self.cflags, self.ldflags,
+            toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
         if cuda:
-            facts += [torch.version.cuda, () if any_gpu else toolchain.cuda_architectures(), self.cuda_cflags]
-        digest.update(repr(facts).encode())
+            facts += [torch.version.cuda, () if any_gpu else toolchain.cuda_architectures(), ()]
+        digest = hashlib.sha256(repr(facts).encode())
         for path in self._files(cuda):
             try:
                 content = path.read_bytes()
@@ -250,55 +251,40 @@ class NativeModule:
             digest.update(f"\0{path.name}\0{len(content)}\0".encode() + content)
         return digest.hexdigest()[:16]
 
-    def _load(self, say: Say) -> Path:
+    def _load(self, say: Say | None) -> None:
         if _disabled():
-            raise NativeBuildError(self._explain(SWITCHED_OFF))
-        library, _ = self._load_existing()
-        if library is not None:
-            return library
-        library = self.build(force=_intact(self._library(self.cache_folder, "native")), say=say)
+            raise self._failure(SWITCHED_OFF)
         try:
-            _load_library(library)
-        except (OSError, RuntimeError) as error:
-            raise NativeBuildError(
-                self._explain(f"{library} was compiled but does not load: {error.__cause__ or error}")
-            ) from error
-        return library
-
-    def _load_existing(self) -> tuple[Path | None, list[str]]:
-        """(the first build that is there and loads, why others before it do not load)."""
-        problems: list[str] = []
-        for library in self._existing():
-            try:
-                _load_library(library)
-                return library, problems
-            except (OSError, RuntimeError) as error:
-                log.debug("%s does not load: %s", library, error)
-                problems.append(f"{library} does not load: {error.__cause__ or error}")
-        return None, problems
+            if self.load_built():
+                return
+        except NativeBuildError as error:
+            log.debug("%s", error)
+        library = self.build(force=self.is_built("native"), say=say)
+        problem = _load_library(library)
+        if problem is not None:
+            raise self._failure(f"{library} was compiled but does not load: {problem}")
+        self._session.loaded = library
 
     def _existing(self) -> Iterator[Path]:
         """Undamaged libraries for this machine and these sources, best first."""
-        return (library for library in self._places() if _intact(library) and self._suits_gpus(library))
+        for library in self._places():
+            if _intact(library):
+                held = _architectures(library)
+                if not held or all(any(toolchain.runs_on(a, gpu) for a in held) for gpu in toolchain.gpus()):
+                    yield library
 
     def _places(self) -> Iterator[Path]:
         """Where a library for this machine and these sources may be, best first."""
+        import torch
+
         # One without CUDA only where none with it can be built: else an old build would hide the GPU for ever.
-        for cuda in (True,) if self._with_cuda() else (True, False) if self._wants_cuda() else (False,):
-            for folder in (self.prebuilt_folder, self.cache_folder):
-                for march in MARCHES:
-                    yield self._library(folder, march, cuda)
+        prebuilt_for_cuda = self.cuda_sources and torch.version.cuda is not None
+        wanted = (True,) if self._with_cuda() else (True, False) if prebuilt_for_cuda else (False,)
+        for cuda, folder, march in itertools.product(wanted, (self.prebuilt_folder, self.cache_folder), MARCHES):
+            yield self._library(folder, march, cuda)
 
     def _library(self, folder: Path, march: str, cuda: bool | None = None) -> Path:
         return folder / f"{self.name}-{self.key(march, cuda, any_gpu=folder == self.prebuilt_folder)}.so"
-
-    def _holds_cuda(self, library: Path | None) -> bool:
-        return library is not None and self._wants_cuda() and bool(_facts(library).get("architectures"))
-
-    def _suits_gpus(self, library: Path) -> bool:
-        """Whether the library's CUDA kernels run on every GPU here."""
-        held = _facts(library).get("architectures") or []
-        return not held or all(any(toolchain.runs_on(a, gpu) for a in held) for gpu in toolchain.gpus())
 
     def _root(self) -> Path:
         spec = importlib.util.find_spec(self.package)
@@ -317,11 +303,6 @@ class NativeModule:
     def _with_cuda(self) -> bool:
         return self._without_cuda() is None
 
-    def _wants_cuda(self) -> bool:
-        import torch
-
-        return bool(self.cuda_sources) and torch.version.cuda is not None
-
     def _without_cuda(self) -> str | None:
         """The reason why a build here holds no CUDA kernels, or None."""
         if not self.cuda_sources:
@@ -331,32 +312,31 @@ class NativeModule:
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), self._with_cuda()
         variants = toolchain.arch_variants(march)
-        shared = [*toolchain.common_flags(), *(("-DSW_WITH_CUDA",) if cuda else ())]
+        shared = [*toolchain.common_flags()]
+        if cuda:
+            shared.append("-DSW_WITH_CUDA")
         if "arch_v2" in variants:
             shared.append("-DSW_PORTABLE_X86")
         # The binding runs on every machine that the binary is for, so it gets the lowest of the variants.
         lowest = next(iter(variants.values()))
-        binding = (*shared, *lowest, *toolchain.include_flags(torch_headers=True, cuda=cuda), *self.cflags)
-        kernel = (*shared, *toolchain.include_flags(torch_headers=False, cuda=False), *self.cflags)
+        include = toolchain.SHARED_INCLUDE_FLAGS
+        binding = (*shared, *lowest, *include, *toolchain.torch_include_flags(cuda=cuda), *self.cflags)
         jobs = [Job(root / s, objects / f"{i}.o", binding) for i, s in enumerate(self.sources)]
         # Lowest level first: of inline functions that several objects emit the linker keeps the first, and that
         # one must run on every machine.
         for arch, flags in variants.items():
-            jobs += [
-                Job(root / s, objects / f"{arch}-{i}.o", (*kernel, *flags, f"-DSW_ARCH={arch}"))
-                for i, s in enumerate(self.kernels)
-            ]
+            kernel = (*shared, *include, *self.cflags, *flags, f"-DSW_ARCH={arch}")
+            jobs += [Job(root / s, objects / f"{arch}-{i}.o", kernel) for i, s in enumerate(self.kernels)]
         if cuda:
             plain = [a.replace(".", "") for a in toolchain.cuda_architectures()]
             gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in plain]
-            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode)
-            flags = (*flags, *toolchain.include_flags(torch_headers=False, cuda=False), *self.cuda_cflags)
+            flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode, *include)
             jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
         return jobs
 
     def _compile(self, library: Path, march: str, tools: Toolchain, say: Say) -> None:
         say(f"compiling kernels '{self.name}' (once, about {self.seconds} s) ...")
-        started = time.monotonic()
+        started, cuda = time.monotonic(), self._with_cuda()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
         with tempfile.TemporaryDirectory(dir=library.parent, prefix=f".{self.name}-") as scratch:
@@ -364,7 +344,7 @@ class NativeModule:
             built = Path(scratch) / library.name
             try:
                 tools.compile(jobs, build_log)
-                tools.link([j.output for j in jobs], built, build_log, cuda=self._with_cuda(), ldflags=self.ldflags)
+                tools.link([j.output for j in jobs], built, build_log, cuda=cuda)
             except NativeBuildError as error:
                 raise NativeBuildError(f"\n{error}\nfull log: {build_log}") from error
             self._check_headers(jobs)
@@ -374,7 +354,7 @@ class NativeModule:
                 "seconds": seconds,
                 "compiler": tools.version(),
                 "march": march,
-                "architectures": toolchain.cuda_architectures() if self._with_cuda() else [],
+                "architectures": toolchain.cuda_architectures() if cuda else [],
             }
             os.replace(built, library)
             write_json(library.with_suffix(".json"), facts)
@@ -393,21 +373,25 @@ class NativeModule:
                         "add it to headers"
                     )
 
-    def _explain(self, reason: object) -> str:
-        text = f"kernels '{self.name}' are not available: {reason}"
-        return f"{text}\nwithout them: {self.without}" if self.without else text
+    def _failure(self, reason: object) -> NativeBuildError:
+        without = f"\nwithout them: {self.without}" if self.without else ""
+        return NativeBuildError(f"kernels '{self.name}' are not available: {reason}{without}")
 
 
 def _say(message: str) -> None:
     """Progress to whoever sits at the terminal; logging would hide it unless configured."""
-    sys.stderr.write(f"{message}\n")
-    sys.stderr.flush()
+    print(message, file=sys.stderr, flush=True)
 
 
-def _load_library(library: Path) -> None:
+def _load_library(library: Path) -> str | None:
+    """Load the ops into torch; the reason if that fails."""
     import torch
 
-    torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
+    try:
+        torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
+    except (OSError, RuntimeError) as error:
+        return str(error.__cause__ or error)
+    return None
 
 
 def _disabled() -> bool:
@@ -428,6 +412,11 @@ def _facts(library: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return facts if isinstance(facts, dict) else {}
+
+
+def _architectures(library: Path | None) -> list[str]:
+    """Compute capabilities that the library's CUDA kernels are compiled for; empty if it has none."""
+    return [] if library is None else _facts(library).get("architectures") or []
 
 
 def _intact(library: Path) -> bool:

@@ -14,9 +14,8 @@ import shlex
 import shutil
 import subprocess
 import sys
-import threading
 from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import NativeBuildError
 
 SHARED_INCLUDE = Path(__file__).parent / "include"
+SHARED_INCLUDE_FLAGS = ("-isystem", str(SHARED_INCLUDE))
 SHOWN_LINES = 10
 COMPILERS = ("g++", "c++", "clang++")
 
@@ -51,14 +51,6 @@ class Job:
     output: Path
     flags: tuple[str, ...]
     cuda: bool = False
-
-
-def cores() -> int:
-    """Number of compilers that may run at once: $MAX_JOBS, else the cores that this process may use."""
-    limit = os.environ.get("MAX_JOBS", "")
-    if limit.isdigit() and int(limit) > 0:
-        return int(limit)
-    return available_cores()
 
 
 def find_compiler() -> list[str]:
@@ -101,32 +93,6 @@ def nvcc_version(nvcc: str) -> tuple[int, int] | None:
     return None if found is None else (int(found[1]), int(found[2]))
 
 
-@dataclass(frozen=True)
-class Compilers:
-    """The compilers that builds would use on this machine.
-
-    cxx             command of the C++ compiler; None: there is none, and `problem` says why
-    nvcc            path of the CUDA compiler, None if there is none
-    nvcc_release    (major, minor) of it, None if it does not say
-    """
-
-    cxx: list[str] | None
-    problem: str | None
-    nvcc: str | None
-    nvcc_release: tuple[int, int] | None
-
-
-def installed_compilers() -> Compilers:
-    """Look for the C++ and the CUDA compiler; neither is run on anything."""
-    cxx, problem = None, None
-    try:
-        cxx = find_compiler()
-    except CompilerMissingError as error:
-        problem = str(error)
-    nvcc = find_nvcc()
-    return Compilers(cxx, problem, nvcc, None if nvcc is None else nvcc_version(nvcc))
-
-
 def cuda_mismatch() -> str | None:
     """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
     import torch
@@ -134,19 +100,20 @@ def cuda_mismatch() -> str | None:
     wanted = torch.version.cuda
     if wanted is None:
         return "this torch is built without CUDA: install a CUDA build of torch"
+    major = wanted.partition(".")[0]
     nvcc = find_nvcc()
     if nvcc is None:
         return (
             f"no CUDA compiler was found (looked for nvcc in $CUDA_HOME, $CUDA_PATH, the PATH and /usr/local/cuda): "
-            f"install the CUDA {wanted.partition('.')[0]} toolkit"
+            f"install the CUDA {major} toolkit"
         )
     version = nvcc_version(nvcc)
     if version is None:
         return f"{nvcc} does not run: correct $CUDA_HOME"
-    if version[0] != int(wanted.partition(".")[0]):
+    if version[0] != int(major):
         return (
             f"torch is built for CUDA {wanted}, {nvcc} is of CUDA {version[0]}.{version[1]}: install a toolkit of CUDA "
-            f"{wanted.partition('.')[0]} and point CUDA_HOME at it, or install torch for CUDA {version[0]}"
+            f"{major} and point CUDA_HOME at it, or install torch for CUDA {version[0]}"
         )
     return None
 
@@ -187,14 +154,10 @@ def cpu_identity() -> str:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
         return platform.processor() or platform.machine()
+    told = dict(re.findall(r"^(.*?)\s*:(.*)$", text.partition("\n\n")[0], re.MULTILINE))
     # Model too: the compiler tunes for it.
-    wanted = ("flags", "Features", "model name", "CPU part")
-    facts = {}
-    for line in text.split("\n\n", 1)[0].splitlines():
-        key, _, value = line.partition(":")
-        if key.strip() in wanted:
-            facts[key.strip()] = " ".join(sorted(value.split()))
-    return repr(sorted(facts.items()))
+    wanted = ("CPU part", "Features", "flags", "model name")
+    return repr([(key, " ".join(sorted(told[key].split()))) for key in wanted if key in told])
 
 
 def common_flags() -> tuple[str, ...]:
@@ -207,14 +170,12 @@ def common_flags() -> tuple[str, ...]:
     return tuple(flags)
 
 
-def include_flags(*, torch_headers: bool, cuda: bool) -> tuple[str, ...]:
-    """-isystem flags: our shared headers, torch's (and CUDA's) where asked for."""
+def torch_include_flags(*, cuda: bool) -> tuple[str, ...]:
+    """-isystem flags for torch's headers, and CUDA's where asked for."""
     import torch
 
-    paths = [SHARED_INCLUDE]
-    if torch_headers:
-        base = Path(torch.__file__).parent / "include"
-        paths += [base, base / "torch" / "csrc" / "api" / "include"]
+    base = Path(torch.__file__).parent / "include"
+    paths = [base, base / "torch" / "csrc" / "api" / "include"]
     nvcc = find_nvcc() if cuda else None
     if nvcc is not None:
         paths.append(_cuda_home(nvcc) / "include")
@@ -223,20 +184,23 @@ def include_flags(*, torch_headers: bool, cuda: bool) -> tuple[str, ...]:
 
 def arch_variants(march: str) -> dict[str, tuple[str, ...]]:
     """Kernel namespace -> flags, for march "native" (this machine) or "portable" (any machine of this kind)."""
+    x86 = platform.machine() in ("x86_64", "AMD64")
     if march == "native":
-        wide = ("-mprefer-vector-width=512",) if platform.machine() in ("x86_64", "AMD64") else ()
-        return {"arch_native": ("-march=native", *wide)}
+        return {"arch_native": ("-march=native", "-mprefer-vector-width=512") if x86 else ("-march=native",)}
     if march == "portable":
-        return dict(X86_LEVELS) if platform.machine() in ("x86_64", "AMD64") else {"arch_native": ()}
+        return dict(X86_LEVELS) if x86 else {"arch_native": ()}
     raise ValueError(f"march is '{march}'; it must be 'native' or 'portable'")
 
 
 class Toolchain:
-    """Runs compilers, at most `jobs` at a time over all modules that share this object."""
+    """Runs compilers, at most `jobs` at a time over all modules that share this object.
+
+    jobs    None: $MAX_JOBS, else the cores that this process may use
+    """
 
     def __init__(self, jobs: int | None = None) -> None:
-        self.jobs = jobs or cores()
-        self._slots = threading.Semaphore(self.jobs)
+        limit = os.environ.get("MAX_JOBS", "")
+        self._pool = ThreadPoolExecutor(jobs or (int(limit) if limit.isdigit() else 0) or available_cores())
         self.compiler = find_compiler()
 
     def version(self) -> str:
@@ -246,18 +210,16 @@ class Toolchain:
 
     def compile(self, jobs: Sequence[Job], log: Path) -> None:
         """Compile all files. Raises NativeBuildError with the first compiler error; everything goes to `log`."""
-        with ThreadPoolExecutor(max_workers=max(1, len(jobs))) as pool:
-            futures = [pool.submit(self._run, self._command(job), log) for job in jobs]
-            errors = [f.exception() for f in futures]
-        for error in errors:
-            if error is not None:
-                raise error
+        runs = []
+        for job in jobs:
+            compiler = [str(find_nvcc())] if job.cuda else self.compiler
+            written = ["-MD", "-MF", f"{job.output}.d", "-c", str(job.source), "-o", str(job.output)]
+            runs.append(self._pool.submit(_run, [*compiler, *job.flags, *written], log))
+        wait(runs)
+        for run in runs:
+            run.result()
 
-    def _command(self, job: Job) -> list[str]:
-        compiler = [str(find_nvcc())] if job.cuda else self.compiler
-        return [*compiler, *job.flags, "-MD", "-MF", f"{job.output}.d", "-c", str(job.source), "-o", str(job.output)]
-
-    def link(self, objects: Iterable[Path], output: Path, log: Path, *, cuda: bool, ldflags: Sequence[str]) -> None:
+    def link(self, objects: Iterable[Path], output: Path, log: Path, *, cuda: bool) -> None:
         """Link a shared library against torch's libraries."""
         import torch
 
@@ -266,20 +228,21 @@ class Toolchain:
         if nvcc is not None:
             libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(_cuda_home(nvcc) / "lib64"), "-lcudart"]
         extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
-        self._run([*self.compiler, "-shared", *map(str, objects), "-o", str(output), *extra, *libraries, *ldflags], log)
+        command = [*self.compiler, "-shared", *map(str, objects), "-o", str(output), *extra, *libraries]
+        self._pool.submit(_run, command, log).result()
 
-    def _run(self, command: list[str], log: Path) -> None:
-        with self._slots:
-            result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
-        text = result.stdout.decode("utf-8", errors="replace")
-        with open(log, "a", encoding="utf-8") as handle:
-            handle.write(f"$ {shlex.join(command)}\n{text}\n")
-        if result.returncode < 0:
-            raise NativeBuildError(
-                f"the compiler was killed by signal {-result.returncode} (out of memory?): try again with MAX_JOBS=1"
-            )
-        if result.returncode != 0:
-            raise NativeBuildError(_excerpt(text))
+
+def _run(command: list[str], log: Path) -> None:
+    result = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, check=False)
+    text = result.stdout.decode("utf-8", errors="replace")
+    with open(log, "a", encoding="utf-8") as handle:
+        handle.write(f"$ {shlex.join(command)}\n{text}\n")
+    if result.returncode < 0:
+        raise NativeBuildError(
+            f"the compiler was killed by signal {-result.returncode} (out of memory?): try again with MAX_JOBS=1"
+        )
+    if result.returncode != 0:
+        raise NativeBuildError(_excerpt(text))
 
 
 def _excerpt(text: str) -> str:
