@@ -11,31 +11,23 @@ from typing import Annotated, Any, Union
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.training.params import PipelineParams, ReadsFile
+from splatwizard_core.training.params import PipelineParams, ReadsFile, SceneParams
 
 
-def strip(annotation: Any) -> Any:
-    """Return the type inside Annotated[...]."""
-    while typing.get_origin(annotation) is Annotated:
-        annotation = typing.get_args(annotation)[0]
-    return annotation
-
-
-def members(annotation: Any) -> tuple[Any, ...]:
-    """Return the alternatives of a union (NoneType among them), or the one type."""
-    annotation = strip(annotation)
-    if typing.get_origin(annotation) in (Union, types.UnionType):
-        return tuple(strip(a) for a in typing.get_args(annotation))
-    return (annotation,)
+def members(annotation: Any) -> list[Any]:
+    """Return the alternatives of a union (NoneType among them), or the one type, without Annotated[...] around it."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return members(arguments[0])
+    if origin in (Union, types.UnionType):
+        return [member for argument in arguments for member in members(argument)]
+    return [annotation]
 
 
 def block_of(annotation: Any) -> type[BaseModel] | None:
     """Return the block class of a field that holds one, else None."""
-    for member in members(annotation):
-        if isinstance(member, type) and issubclass(member, BaseModel):
-            return member
-    return None
+    blocks = (m for m in members(annotation) if isinstance(m, type) and issubclass(m, BaseModel))
+    return next(blocks, None)
 
 
 def leaves(cls: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
@@ -128,9 +120,7 @@ def suggest(key: str, known: Sequence[str]) -> str | None:
 
 def is_beside_method(config: type[BaseModel], key: str) -> bool:
     """Whether a key is none of a method's `config` but one of the run or of how the scene is read."""
-    return field_at(config, key) is None and (
-        field_at(PipelineParams, key) is not None or key in SceneOptions.__dataclass_fields__
-    )
+    return field_at(config, key) is None and any(field_at(beside, key) for beside in (PipelineParams, SceneParams))
 
 
 def value_at(config: BaseModel, key: str) -> Any:
