@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.errors import ConfigError, PluginError
+from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
 from splatwizard_core.files import file_sha256
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
@@ -22,7 +23,6 @@ from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
 
 if TYPE_CHECKING:
-    from splatwizard_core.evaluation.metrics import MetricSettings
     from splatwizard_core.method import Method
 
 if sys.version_info >= (3, 11):
@@ -37,7 +37,6 @@ SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
 METRICS = "metrics."  # keys of the settings of metrics: metrics.GROUP.KEY
 INIT = "init"  # a .ply in place of that scene; a method that has a key of this name means its own
-RATE_ALIASES = ("low", "default", "high", "all")
 TABLES = ("pretrained", "metrics")
 # What else stands at the top of a configuration: a method's own key of such a name would hide it. INIT may be both.
 TAKEN = {*RESERVED, *SCENE_KEYS, *PipelineParams.model_fields, *TABLES}
@@ -187,13 +186,13 @@ def check_own_keys(method: type[Method]) -> None:
 def rate_points(method: type[Method], asked: str) -> list[str]:
     """Return the rate points that "r1,r3", "low", "default", "high" or "all" mean, in the method's order."""
     names = list(method.RATES)
-    aliases = {"low": [names[0]], "high": [names[-1]], "default": [method.DEFAULT_RATE], "all": names}
+    aliases = {"low": [names[0]], "default": [method.DEFAULT_RATE], "high": [names[-1]], "all": names}
     found: list[str] = []
     for word in (w.strip() for w in asked.split(",")):
         if word not in aliases and word not in names:
             raise ConfigError(
                 f"method '{method.name}' has no rate point '{word}': "
-                f"one of {', '.join(names)}, or {', '.join(RATE_ALIASES)}",
+                f"one of {', '.join(names)}, or {', '.join(aliases)}",
                 key="rate",
             )
         found += aliases.get(word, [word])
@@ -201,15 +200,19 @@ def rate_points(method: type[Method], asked: str) -> list[str]:
 
 
 def read_config_file(path: str | Path) -> dict[str, Any]:
-    """Read the tables of a TOML file. Raises ConfigError that names the line."""
+    """Read the tables of a TOML file, its names checked. Raises ConfigError that names the line or the key."""
     try:
         with open(path, "rb") as file:
             tables: dict[str, Any] = tomllib.load(file)
-            return tables
     except OSError as error:
         raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    for name in RESERVED:
+        value = tables.get(name, "a name")
+        if not isinstance(value, str) or not value.strip():
+            raise ConfigError(f"bad value {value!r} for '{name}' in {path}: expected a name", key=name)
+    return tables
 
 
 def parse_set(assignments: Sequence[str]) -> dict[str, str]:
@@ -248,10 +251,10 @@ def resolve(
     check_own_keys(method)
     plugins = plugins or load_plugins()
     tables = read_config_file(config_file) if config_file is not None else {}
-    said = {name: tables.pop(name) for name in RESERVED if name in tables}
+    said: dict[str, str] = {name: tables.pop(name) for name in RESERVED if name in tables}
     _check_names(said, config_file, method=method.name, preset=preset, rate=rate, scene=scene)
     tables |= dotted({name: tables.pop(name) for name in TABLES if name in tables}, "")
-    scene_spec = scene or str(said.get("scene", plugins.datasets.default or ""))
+    scene_spec = scene or said.get("scene") or plugins.datasets.default or ""
     procedural = is_procedural(plugins.datasets, scene_spec.partition(":")[0])
     preset = preset or said.get("preset") or ("quick" if procedural else "paper")
     if preset not in method.PRESETS:
@@ -292,27 +295,18 @@ def resolve(
     scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
-        _checked_settings(plugins, settings), procedural,
+        check_settings(plugins.metrics, settings) if settings else {}, procedural,
     )  # fmt: skip
 
 
-def _checked_settings(plugins: PluginManager, settings: MetricSettings) -> MetricSettings:
-    if not settings:
-        return {}
-    from splatwizard_core.evaluation.metrics import check_settings
-
-    return check_settings(plugins.metrics, settings)
-
-
-def _check_names(said: Mapping[str, Any], config_file: str | Path | None, **asked: str | None) -> None:
-    """Raise ConfigError for empty names, and for a file that was written for others than the options ask for."""
-    for name, value in said.items():
-        if not isinstance(value, str) or not value.strip():
-            raise ConfigError(f"bad value {value!r} for '{name}' in {config_file}: expected a name", key=name)
+def _check_names(said: Mapping[str, str], config_file: str | Path | None, **asked: str | None) -> None:
+    """Raise ConfigError for empty options, and for a file that was written for others than they ask for."""
     for name, option in asked.items():
-        if option is not None and not option.strip():
+        if option is None:
+            continue
+        if not option.strip():
             raise ConfigError(f"--{name} is empty: give a name, or leave it out", key=name)
-        if option is not None and name != "scene" and said.get(name, option) != option:
+        if name != "scene" and said.get(name, option) != option:
             raise ConfigError(
                 f"{config_file} was written for {name} '{said[name]}', not '{option}': "
                 f"leave out --{name}, or take the key '{name}' and the values that follow from it out of the file",
