@@ -63,12 +63,9 @@ def field_at(cls: type[BaseModel], key: str) -> Any:
                 return None
             annotation = block.model_fields[part].annotation
             continue
-        mapping = next((m for m in members(annotation) if typing.get_origin(m) is dict), None)
-        if mapping is None:
-            return None
-        annotation = typing.get_args(mapping)[1]
-        if annotation is Any:
-            return Any
+        annotation = next((typing.get_args(m)[1] for m in members(annotation) if typing.get_origin(m) is dict), None)
+        if annotation is None or annotation is Any:
+            return annotation
     return annotation
 
 
@@ -108,9 +105,7 @@ def dotted(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 def suggest(key: str, known: Sequence[str]) -> str | None:
     """Find the nearest valid key: one that ends in it, or one that is spelt like it."""
     ends = [k for k in known if k.endswith(f".{key}")]
-    if ends:
-        return ends[0]
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    near = ends or difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     if near:
         return near[0]
     ends_of = {k.rpartition(".")[2]: k for k in known}
