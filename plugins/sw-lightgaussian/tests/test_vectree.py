@@ -5,7 +5,6 @@ import pytest
 import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
 from splatwizard_core.errors import BitstreamError, SplatwizardError
 from splatwizard_core.gaussians.model import GaussianModel
 from sw_lightgaussian.stages import ScoredGaussians, truncated
@@ -22,8 +21,13 @@ def scored(make, n=300, degree=2, seed=0):
 
 def written(plugins, model, **settings):
     writer = ContainerWriter("lightgaussian", 1)
-    encode_gaussians(plugins, "vectree", model, writer, **{**QUICK, **settings})
+    writer.static["codec"] = "vectree"
+    plugins.gaussian_codecs.load("vectree")(plugins, **{**QUICK, **settings}).encode(model, writer)
     return writer
+
+
+def decoded_from(plugins, reader):
+    return plugins.gaussian_codecs.load("vectree")(plugins).decode(reader)
 
 
 def reread(writer):
@@ -39,7 +43,7 @@ def rows(model, *names):
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_positions_are_exact_the_rest_is_rounded_and_colours_are_shared(plugins, make, degree):
     model = scored(make, degree=degree)
-    decoded = decode_gaussians(plugins, reread(written(plugins, model)))
+    decoded = decoded_from(plugins, reread(written(plugins, model)))
     assert (decoded.max_sh_degree, decoded.active_sh_degree) == (degree, degree)
     names = ("means", "opacity_logits", "log_scales", "quats")
     expected, found = rows(model, *names), rows(decoded, *names)
@@ -61,7 +65,7 @@ def test_positions_are_exact_the_rest_is_rounded_and_colours_are_shared(plugins,
 
 
 def test_the_order_is_that_of_morton_codes(plugins, make):
-    decoded = decode_gaussians(plugins, reread(written(plugins, scored(make))))
+    decoded = decoded_from(plugins, reread(written(plugins, scored(make))))
     means = decoded.means.detach().double()
     low, width = means.amin(0), means.amax(0) - means.amin(0)
     cells = ((means - low) / width * (2**21 - 1)).long().tolist()
@@ -80,7 +84,7 @@ def test_sections_and_their_sizes(plugins, make):
 
 def test_a_decoded_model_is_written_again_byte_for_byte(plugins, make):
     first = written(plugins, scored(make))
-    decoded = decode_gaussians(plugins, reread(first))
+    decoded = decoded_from(plugins, reread(first))
     second = ContainerWriter("lightgaussian", 1)
     second.static["codec"] = "vectree"
     VecTree(plugins).encode_from_decoded(decoded, second)
@@ -93,7 +97,7 @@ def test_a_decoded_model_is_written_again_byte_for_byte(plugins, make):
 
 def test_all_sections_but_the_trained_ones_are_the_same_when_it_is_encoded_anew(plugins, make):
     first = written(plugins, scored(make))
-    second = written(plugins, decode_gaussians(plugins, reread(first)))
+    second = written(plugins, decoded_from(plugins, reread(first)))
     for name in ("xyz", "attr"):
         assert reread(second).section(name) == reread(first).section(name)
 
@@ -112,14 +116,14 @@ def test_without_scores_opacity_and_volume_rank(plugins, make):
     assert np.argsort(found).tolist() == expected.detach().argsort().tolist()
     never_scored = ScoredGaussians(*(p.detach() for p in plain.parameters()))
     assert np.array_equal(importance_of(never_scored), found)
-    decoded = decode_gaussians(plugins, reread(written(plugins, plain))).requires_grad_(False)
+    decoded = decoded_from(plugins, reread(written(plugins, plain))).requires_grad_(False)
     assert float(decoded.opacities[decoded.code < 0].mean()) > float(decoded.opacities[decoded.code >= 0].mean())
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 3])
 @pytest.mark.parametrize("ratio", [0.0, 0.6, 1.0])
 def test_a_handful_of_gaussians(plugins, make, n, ratio):
-    decoded = decode_gaussians(plugins, reread(written(plugins, make.cloud(n), ratio=ratio)))
+    decoded = decoded_from(plugins, reread(written(plugins, make.cloud(n), ratio=ratio)))
     assert decoded.num_rows == n
     assert all(bool(p.isfinite().all()) for p in decoded.parameters())
 
@@ -170,7 +174,7 @@ def test_an_opacity_of_one_is_an_infinite_logit_and_fits(plugins, make):
     model = scored(make)
     with torch.no_grad():
         model.opacity_logits[0] = torch.inf
-    decoded = decode_gaussians(plugins, reread(written(plugins, model)))
+    decoded = decoded_from(plugins, reread(written(plugins, model)))
     assert float(decoded.opacities.detach().max()) == 1
 
 
@@ -186,7 +190,7 @@ def with_static(writer, **values):
 )  # fmt: skip
 def test_a_header_that_does_not_fit_its_sections_is_refused(plugins, make, values):
     with pytest.raises(BitstreamError):
-        decode_gaussians(plugins, with_static(written(plugins, scored(make)), **values))
+        decoded_from(plugins, with_static(written(plugins, scored(make)), **values))
 
 
 def test_a_flipped_byte_and_a_truncated_file_are_refused(plugins, make):
@@ -195,7 +199,7 @@ def test_a_flipped_byte_and_a_truncated_file_are_refused(plugins, make):
         flipped = bytearray(data)
         flipped[at] ^= 1
         with pytest.raises(BitstreamError):
-            decode_gaussians(plugins, ContainerReader(bytes(flipped), "file.swz"))
+            decoded_from(plugins, ContainerReader(bytes(flipped), "file.swz"))
     with pytest.raises(BitstreamError):
         ContainerReader(data[:-1], "file.swz")
 
@@ -213,7 +217,7 @@ def test_a_section_that_is_missing_short_or_full_of_noise_is_blamed(plugins, mak
             elif content is not None:
                 writer.add(name, content)
         with pytest.raises(BitstreamError, match=section):
-            decode_gaussians(plugins, reread(writer))
+            decoded_from(plugins, reread(writer))
 
 
 def test_values_that_are_not_finite_are_refused(plugins, make):
@@ -228,12 +232,12 @@ def test_values_that_are_not_finite_are_refused(plugins, make):
         for name in whole.sections:
             writer.add(name, planes.encode(array) if name == section else whole.section(name))
         with pytest.raises(BitstreamError, match="finite"):
-            decode_gaussians(plugins, reread(writer))
+            decoded_from(plugins, reread(writer))
 
 
 @pytest.mark.cuda
 def test_a_model_on_a_gpu_is_written_and_read_on_a_cpu(plugins, make):
     model = scored(make).cuda()
-    decoded = decode_gaussians(plugins, reread(written(plugins, model)))
+    decoded = decoded_from(plugins, reread(written(plugins, model)))
     assert decoded.device.type == "cpu"
     assert torch.equal(rows(decoded, "means"), rows(model.cpu(), "means"))

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.coding.gaussian_codec import check_gaussian_codec, decode_gaussians, encode_gaussians
-from splatwizard_core.errors import SceneError
+from splatwizard_core.errors import ConfigError, SceneError
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.method import Method
 
 if TYPE_CHECKING:
@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.scene.scene import Scene
     from splatwizard_core.training.params import OptimizationParams
+
+HEADER_KEY = "codec"
+"""Header value that names the codec."""
 
 
 class GaussianMethod(Method):
@@ -34,8 +37,13 @@ class GaussianMethod(Method):
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
         """Raise ConfigError for a codec that is not installed: now, and not when all is trained."""
         super().__init__(plugins, config)
-        if config is not None:
-            check_gaussian_codec(plugins, self.codec_choice()[0], self.CODEC_KEY)
+        if config is None:
+            return
+        name, known = self.codec_choice()[0], plugins.gaussian_codecs.names
+        if name not in known:
+            raise ConfigError(
+                f"no codec for Gaussians is called '{name}'; installed: {', '.join(known)}", key=self.CODEC_KEY
+            )
 
     def codec_choice(self) -> tuple[str, Mapping[str, Any]]:
         """Return the name of the codec and its settings, from the config."""
@@ -48,11 +56,18 @@ class GaussianMethod(Method):
         raise SceneError(f"{self.name} starts from {start}, not from points", path=scene.path)
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        """Write `model` with the chosen codec. Raises TypeError if it is no GaussianModel."""
+        """Write `model` with the chosen codec, whose name goes into the header.
+
+        Raises TypeError if it is no GaussianModel, PluginError if the codec cannot be loaded.
+        """
+        if not isinstance(model, GaussianModel):
+            raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
         name, settings = self.codec_choice()
-        encode_gaussians(self.plugins, name, model, writer, **settings)
+        writer.static[HEADER_KEY] = name
+        self.plugins.gaussian_codecs.load(name)(self.plugins, **settings).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         """Return the model, by whichever codec has written it. Raises BitstreamError."""
         self.check_version(reader)
-        return decode_gaussians(self.plugins, reader)
+        name = reader.text(HEADER_KEY, choices=self.plugins.gaussian_codecs.names)
+        return self.plugins.gaussian_codecs.load(name)(self.plugins).decode(reader)

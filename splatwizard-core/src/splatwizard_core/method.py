@@ -69,14 +69,13 @@ class Method:
     def check_version(self, reader: ContainerReader) -> None:
         """Raise BitstreamError for another layout version than the method's own: for a `decode` that reads no other."""
         if reader.version != self.version:
+            methods = self.plugins.methods
+            known = self.name in methods
+            package = methods.entry(self.name).distribution if known else f"the package of {self.name}"
             raise BitstreamError(
                 f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade {self._distribution()}"
+                f"{self.version}: upgrade {package}"
             )
-
-    def _distribution(self) -> str:
-        methods = self.plugins.methods
-        return methods.entry(self.name).distribution if self.name in methods else f"the package of {self.name}"
 
 
 def create_method(

@@ -7,11 +7,12 @@ import pytest
 import torch
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.coding.gaussian_codec import decode_gaussians, encode_gaussians
 from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.training.params import OptimizationParams
 
 
 @pytest.fixture(scope="module")
@@ -29,17 +30,31 @@ def model():
     )  # fmt: skip
 
 
+class SomeMethod(GaussianMethod):
+    """Writes with whichever codec it is told."""
+
+    name = "some-method"
+
+    def codec_choice(self):
+        return self.choice
+
+
 def written(plugins, name, model, **settings):
     writer = ContainerWriter("some-method", 1)
-    encode_gaussians(plugins, name, model, writer, **settings)
+    method = type("Chosen", (SomeMethod,), {"choice": (name, settings)})
+    method(plugins, OptimizationParams()).encode(model, writer)
     return writer
+
+
+def decoded_from(plugins, reader):
+    return SomeMethod(plugins, None).decode(reader)
 
 
 def test_each_codec_that_says_it_codes_gaussians_decodes_what_it_encodes(plugins, model):
     assert {"gaussians-exact", "gaussians-quantized"} <= set(plugins.gaussian_codecs.names)
     for name in plugins.gaussian_codecs.names:
         reader = ContainerReader(written(plugins, name, model).to_bytes(), "file.swz")
-        decoded = decode_gaussians(plugins, reader)
+        decoded = decoded_from(plugins, reader)
         assert isinstance(decoded, GaussianModel)
         assert 0 < decoded.num_rows <= model.num_rows
         for parameter in decoded.parameters():
@@ -48,7 +63,7 @@ def test_each_codec_that_says_it_codes_gaussians_decodes_what_it_encodes(plugins
 
 def test_exact_is_bit_for_bit(plugins, model):
     data = written(plugins, "gaussians-exact", model).to_bytes()
-    decoded = decode_gaussians(plugins, ContainerReader(data, "file.swz"))
+    decoded = decoded_from(plugins, ContainerReader(data, "file.swz"))
     for (name, a), (_, b) in zip(model.named_parameters(), decoded.named_parameters(), strict=True):
         assert torch.equal(a, b), name
 
@@ -69,7 +84,7 @@ def test_a_file_may_name_only_codecs_of_gaussians(plugins, model, claimed):
     writer = written(plugins, "gaussians-exact", model)
     writer.static["codec"] = claimed
     with pytest.raises(BitstreamError, match="codec"):
-        decode_gaussians(plugins, ContainerReader(writer.to_bytes(), "file.swz"))
+        decoded_from(plugins, ContainerReader(writer.to_bytes(), "file.swz"))
 
 
 def rows(model):
@@ -83,7 +98,7 @@ def test_ply_is_the_file_that_is_exported(plugins, model, tmp_path):
     reader = ContainerReader(written(plugins, "gaussians-ply", model).to_bytes(), "file.swz")
     assert reader.section("ply") == (tmp_path / "model.ply").read_bytes()
     assert len(reader.section("ply")) == pytest.approx(248 * model.num_rows, abs=1600)
-    decoded = decode_gaussians(plugins, reader)
+    decoded = decoded_from(plugins, reader)
     for (name, a), (_, b) in zip(model.named_parameters(), decoded.named_parameters(), strict=True):
         assert torch.equal(a, b), name
 
@@ -91,7 +106,7 @@ def test_ply_is_the_file_that_is_exported(plugins, model, tmp_path):
 def test_ply_writes_inactive_bands_as_zeros_and_leaves_the_model_alone(plugins, model):
     partly = GaussianModel(*(p.detach() for p in model.parameters()), active_sh_degree=1)
     before = partly.digest()
-    decoded = decode_gaussians(plugins, ContainerReader(written(plugins, "gaussians-ply", partly).to_bytes(), "f"))
+    decoded = decoded_from(plugins, ContainerReader(written(plugins, "gaussians-ply", partly).to_bytes(), "f"))
     assert partly.digest() == before
     assert decoded.active_sh_degree == 3
     assert torch.equal(decoded.sh_rest[:, :3], model.sh_rest[:, :3])
@@ -107,7 +122,7 @@ def test_zstd_gives_every_bit_back_in_spatial_order(plugins, model, degree):
         m.means[3, 0], m.means[4, 1], m.means[5, 2] = math.nan, math.inf, -0.0
         m.opacity_logits[7] = -math.inf
     data = written(plugins, "gaussians-zstd", m).to_bytes()
-    decoded = decode_gaussians(plugins, ContainerReader(data, "file.swz"))
+    decoded = decoded_from(plugins, ContainerReader(data, "file.swz"))
     assert rows(decoded) == rows(m)
     assert len(data) < len(written(plugins, "gaussians-exact", m).to_bytes())
     before, after = (each.means.detach().diff(dim=0).nan_to_num(0, 0, 0).abs().mean() for each in (m, decoded))
@@ -118,7 +133,7 @@ def test_zstd_gives_every_bit_back_in_spatial_order(plugins, model, degree):
 def test_no_gaussians_and_one(plugins, model, codec):
     for n in (0, 1):
         few = GaussianModel(*(p.detach()[:n] for p in model.parameters()))
-        decoded = decode_gaussians(plugins, ContainerReader(written(plugins, codec, few).to_bytes(), "file.swz"))
+        decoded = decoded_from(plugins, ContainerReader(written(plugins, codec, few).to_bytes(), "file.swz"))
         assert rows(decoded) == rows(few)
 
 
@@ -155,7 +170,7 @@ def test_a_file_that_contradicts_itself_is_refused_before_memory_is_taken(plugin
     tracemalloc.start()
     try:
         with pytest.raises(BitstreamError, match=r"file\.swz"):
-            decode_gaussians(plugins, reader)
+            decoded_from(plugins, reader)
         assert tracemalloc.get_traced_memory()[1] < 4 * 236 * model.num_rows + 100_000
     finally:
         tracemalloc.stop()
@@ -166,4 +181,4 @@ def test_a_ply_with_another_header_is_refused(plugins, model):
         sections["ply"] = sections["ply"].replace(b"property float nx", b"property float x2")
 
     with pytest.raises(BitstreamError, match=r"section 'ply': is no \.ply of 500 Gaussians"):
-        decode_gaussians(plugins, rewritten(written(plugins, "gaussians-ply", model).to_bytes(), swap))
+        decoded_from(plugins, rewritten(written(plugins, "gaussians-ply", model).to_bytes(), swap))

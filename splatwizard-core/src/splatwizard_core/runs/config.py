@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import hashlib
 import json
 import os
 import sys
-import typing
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.errors import ConfigError, PluginError
+from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
 from splatwizard_core.files import file_sha256
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.locate import is_procedural
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
-from splatwizard_core.training.overrides import apply_overrides, checked_value, unknown_key
-from splatwizard_core.training.params import OptimizationParams, PipelineParams
+from splatwizard_core.training.overrides import apply_overrides, unknown_key
+from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
 
 if TYPE_CHECKING:
-    from splatwizard_core.evaluation.metrics import MetricSettings
     from splatwizard_core.method import Method
 
 if sys.version_info >= (3, 11):
@@ -34,15 +33,13 @@ else:
 __all__ = ["ResolvedConfig", "apply_overrides", "parse_set", "rate_points", "read_config_file", "resolve"]
 
 RESERVED = ("method", "preset", "rate", "scene")
-# The seed of a scene's start points is the seed of the run.
-SCENE_KEYS = tuple(f.name for f in dataclasses.fields(SceneOptions) if f.name != "seed")
+SCENE_KEYS = tuple(SceneParams.model_fields)
 PRETRAINED = "pretrained."  # keys of the method whose trained scene a run starts from
 METRICS = "metrics."  # keys of the settings of metrics: metrics.GROUP.KEY
 INIT = "init"  # a .ply in place of that scene; a method that has a key of this name means its own
-RATE_ALIASES = ("low", "default", "high", "all")
-TABLES = (PRETRAINED, METRICS)
+TABLES = ("pretrained", "metrics")
 # What else stands at the top of a configuration: a method's own key of such a name would hide it. INIT may be both.
-TAKEN = {*RESERVED, *SCENE_KEYS, *PipelineParams.model_fields, *(prefix.rstrip(".") for prefix in TABLES)}
+TAKEN = {*RESERVED, *SCENE_KEYS, *PipelineParams.model_fields, *TABLES}
 
 
 @dataclass(frozen=True)
@@ -87,7 +84,7 @@ class ResolvedConfig:
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values by block, None included, as the record keeps them."""
-        found = {
+        return {
             "method": self.method,
             "preset": self.preset,
             "rate": self.rate,
@@ -95,20 +92,16 @@ class ResolvedConfig:
             "pipeline": self.ppl.model_dump(mode="json"),
             "scene": self.scene_options,
             "provenance": dict(self.provenance),
+            **self._beside_blocks(self.init),
         }
-        if self.init:
-            found["init"] = self.init
-        return found | self._tables()
 
-    def _tables(self) -> dict[str, Any]:
-        """Return the tables beside the blocks, of those that have values."""
+    def _beside_blocks(self, init: str) -> dict[str, Any]:
+        """Return what no block holds, of that which is given."""
         pretrained: dict[str, Any] = {}
         for key, value in self.pretrained.items():
             set_at(pretrained, key, value)
-        return {
-            **({"pretrained": pretrained} if pretrained else {}),
-            **({"metrics": {group: dict(values) for group, values in self.metrics.items()}} if self.metrics else {}),
-        }
+        found = {INIT: init, "pretrained": pretrained, "metrics": dict(self.metrics)}
+        return {name: value for name, value in found.items() if value}
 
     def toml(self) -> str:
         """Return a file that makes the same run again when given as `--config`."""
@@ -121,9 +114,8 @@ class ResolvedConfig:
         config = self.config.model_dump(mode="json")
         for key, path in self._input_files().items():
             set_at(config, key, os.path.abspath(path))
-        if self.init:
-            content[INIT] = os.path.abspath(self.init)
-        return tomli_w.dumps(_spell_none(content | self._tables() | config))
+        content |= self._beside_blocks(os.path.abspath(self.init) if self.init else "")
+        return tomli_w.dumps(_spell_none(content | config))
 
     def training_content(self) -> dict[str, Any]:
         """Return everything that training depends on: not the `ENCODING` fields, the device or the rate's name.
@@ -161,16 +153,7 @@ class ResolvedConfig:
 
         Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
         """
-        content = self.as_dict()
-        for key in ("provenance", "metrics"):
-            content.pop(key, None)
-        return content_hash(content)
-
-
-def is_procedural(plugins: PluginManager, scene_spec: str) -> bool:
-    """Whether a scene is made on the spot: the name of a dataset that declares it, alone or before `:variant`."""
-    name = scene_spec.partition(":")[0]
-    return name in plugins.datasets and bool(plugins.datasets.entry(name).declared.get("procedural"))
+        return content_hash({k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")})
 
 
 def content_hash(content: Any) -> str:
@@ -203,13 +186,13 @@ def check_own_keys(method: type[Method]) -> None:
 def rate_points(method: type[Method], asked: str) -> list[str]:
     """Return the rate points that "r1,r3", "low", "default", "high" or "all" mean, in the method's order."""
     names = list(method.RATES)
-    aliases = {"low": [names[0]], "high": [names[-1]], "default": [method.DEFAULT_RATE], "all": names}
+    aliases = {"low": [names[0]], "default": [method.DEFAULT_RATE], "high": [names[-1]], "all": names}
     found: list[str] = []
     for word in (w.strip() for w in asked.split(",")):
         if word not in aliases and word not in names:
             raise ConfigError(
                 f"method '{method.name}' has no rate point '{word}': "
-                f"one of {', '.join(names)}, or {', '.join(RATE_ALIASES)}",
+                f"one of {', '.join(names)}, or {', '.join(aliases)}",
                 key="rate",
             )
         found += aliases.get(word, [word])
@@ -217,15 +200,19 @@ def rate_points(method: type[Method], asked: str) -> list[str]:
 
 
 def read_config_file(path: str | Path) -> dict[str, Any]:
-    """Read the tables of a TOML file. Raises ConfigError that names the line."""
+    """Read the tables of a TOML file, its names checked. Raises ConfigError that names the line or the key."""
     try:
         with open(path, "rb") as file:
             tables: dict[str, Any] = tomllib.load(file)
-            return tables
     except OSError as error:
         raise ConfigError(f"cannot read --config {path}: {error.strerror or error}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path} is not valid TOML: {error}") from error
+    for name in RESERVED:
+        value = tables.get(name, "a name")
+        if not isinstance(value, str) or not value.strip():
+            raise ConfigError(f"bad value {value!r} for '{name}' in {path}: expected a name", key=name)
+    return tables
 
 
 def parse_set(assignments: Sequence[str]) -> dict[str, str]:
@@ -264,26 +251,23 @@ def resolve(
     check_own_keys(method)
     plugins = plugins or load_plugins()
     tables = read_config_file(config_file) if config_file is not None else {}
-    said = {name: tables.pop(name) for name in RESERVED if name in tables}
-    _check_names(method, said, config_file, preset=preset, rate=rate, scene=scene)
-    scene_spec = scene or str(said.get("scene", plugins.datasets.default or ""))
-    procedural = is_procedural(plugins, scene_spec)
+    said: dict[str, str] = {name: tables.pop(name) for name in RESERVED if name in tables}
+    _check_names(said, config_file, method=method.name, preset=preset, rate=rate, scene=scene)
+    tables |= dotted({name: tables.pop(name) for name in TABLES if name in tables}, "")
+    scene_spec = scene or said.get("scene") or plugins.datasets.default or ""
+    procedural = is_procedural(plugins.datasets, scene_spec.partition(":")[0])
     preset = preset or said.get("preset") or ("quick" if procedural else "paper")
     if preset not in method.PRESETS:
         raise ConfigError(
             f"method '{method.name}' has no preset '{preset}': one of {', '.join(method.PRESETS)}", key="preset"
         )
-    rate = rate or said.get("rate") or method.DEFAULT_RATE
-    points = rate_points(method, rate)
-    if len(points) != 1:
-        raise ConfigError(f"one rate point is needed here, not '{rate}'", key="rate")
-    (rate,) = points
+    asked = rate or said.get("rate") or method.DEFAULT_RATE
+    rate, *others = rate_points(method, asked)
+    if others:
+        raise ConfigError(f"one rate point is needed here, not '{asked}'", key="rate")
 
-    config: OptimizationParams = method.Config()
+    config, ppl, reading = method.Config(), PipelineParams(), SceneParams()
     init, pretrained, settings = "", dict[str, Any](), dict[str, Any]()
-    ppl, scene_options = PipelineParams(), SceneOptions()
-    known = {**dict.fromkeys(SCENE_KEYS, ""), **block_keys(PipelineParams), **block_keys(method.Config)}
-    hints = typing.get_type_hints(SceneOptions)
     provenance: dict[str, str] = {}
     for source, layer in (
         (f"preset '{preset}'", method.PRESETS[preset]),
@@ -291,16 +275,11 @@ def resolve(
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
     ):
-        of_method: dict[str, Any] = {}
-        of_run: dict[str, Any] = {}
-        of_scene: dict[str, Any] = {}
-        for key, value in _with_dotted_tables(layer).items():
-            if field_at(method.Config, key) is not None:
-                of_method[key] = value
-            elif field_at(PipelineParams, key) is not None:
-                of_run[key] = value
-            elif key in SCENE_KEYS:
-                of_scene[key] = checked_value(hints[key], key, value, source=source)
+        given: dict[type[Params], dict[str, Any]] = {method.Config: {}, PipelineParams: {}, SceneParams: {}}
+        for key, value in layer.items():
+            block = next((block for block in given if field_at(block, key) is not None), None)
+            if block is not None:
+                given[block][key] = value
             elif key == INIT and isinstance(value, str):
                 init = value
             elif key.startswith(PRETRAINED) and key != PRETRAINED:
@@ -308,51 +287,28 @@ def resolve(
             elif key.startswith(METRICS) and key.count(".") > 1:
                 set_at(settings, key.removeprefix(METRICS), value)
             else:
-                raise unknown_key(key, known, source)
+                raise unknown_key(key, [k for block in reversed(given) for k in block_keys(block)], source)
             provenance[key] = source
-        config = apply_overrides(config, of_method, source=source)
-        ppl = apply_overrides(ppl, of_run, source=source)
-        scene_options = dataclasses.replace(scene_options, **of_scene)
-    scene_options = dataclasses.replace(scene_options, seed=ppl.seed)
+        config = apply_overrides(config, given[method.Config], source=source)
+        ppl = apply_overrides(ppl, given[PipelineParams], source=source)
+        reading = apply_overrides(reading, given[SceneParams], source=source)
+    scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
-        _checked_settings(plugins, settings), procedural,
+        check_settings(plugins.metrics, settings) if settings else {}, procedural,
     )  # fmt: skip
 
 
-def _checked_settings(plugins: PluginManager, settings: MetricSettings) -> MetricSettings:
-    if not settings:
-        return {}
-    from splatwizard_core.evaluation.metrics import check_settings
-
-    return check_settings(plugins.metrics, settings)
-
-
-def _check_names(
-    method: type[Method], said: Mapping[str, Any], config_file: str | Path | None, **asked: str | None
-) -> None:
-    """Raise ConfigError for empty names, and for a file that was written for others than the options ask for."""
-    for name, value in said.items():
-        if not isinstance(value, str) or not value.strip():
-            raise ConfigError(f"bad value {value!r} for '{name}' in {config_file}: expected a name", key=name)
+def _check_names(said: Mapping[str, str], config_file: str | Path | None, **asked: str | None) -> None:
+    """Raise ConfigError for empty options, and for a file that was written for others than they ask for."""
     for name, option in asked.items():
-        if option is not None and not option.strip():
+        if option is None:
+            continue
+        if not option.strip():
             raise ConfigError(f"--{name} is empty: give a name, or leave it out", key=name)
-    for name, option in (("method", method.name), ("preset", asked["preset"]), ("rate", asked["rate"])):
-        if option is not None and said.get(name, option) != option:
+        if name != "scene" and said.get(name, option) != option:
             raise ConfigError(
                 f"{config_file} was written for {name} '{said[name]}', not '{option}': "
                 f"leave out --{name}, or take the key '{name}' and the values that follow from it out of the file",
                 key=name,
             )
-
-
-def _with_dotted_tables(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values with the tables `pretrained` and `metrics` of a file as dotted keys."""
-    found = dict(values)
-    for prefix in TABLES:
-        table = found.get(prefix.rstrip("."))
-        if isinstance(table, Mapping):
-            del found[prefix.rstrip(".")]
-            found |= dotted(table, prefix)
-    return found

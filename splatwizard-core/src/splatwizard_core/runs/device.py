@@ -17,15 +17,10 @@ def choose_device(asked: str, plugins: PluginManager) -> torch.device:
 
     Raises CapabilityError if CUDA is asked for and there is none.
     """
-    if asked == "cpu":
-        return torch.device("cpu")
-    if asked == "cuda":
-        if not torch.cuda.is_available():
-            raise CapabilityError("--device cuda: torch sees no CUDA device here; use --device cpu", missing=["cuda"])
-        return torch.device("cuda")
-    if torch.cuda.is_available() and cuda_rasterizers(plugins):
-        return torch.device("cuda")
-    return torch.device("cpu")
+    there = asked != "cpu" and torch.cuda.is_available()
+    if asked == "cuda" and not there:
+        raise CapabilityError("--device cuda: torch sees no CUDA device here; use --device cpu", missing=["cuda"])
+    return torch.device("cuda" if there and (asked == "cuda" or cuda_rasterizers(plugins)) else "cpu")
 
 
 def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> str:

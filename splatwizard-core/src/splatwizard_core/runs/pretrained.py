@@ -31,8 +31,7 @@ PRESET = "preset"  # `pretrained.preset`: of the method that is started from
 
 def make_method(plugins: PluginManager, resolved: ResolvedConfig) -> Method:
     """Return the configured method."""
-    method: Method = plugins.methods.load(resolved.method)(plugins, resolved.config)
-    return method
+    return plugins.methods.load(resolved.method)(plugins, resolved.config)
 
 
 def named_scenes(method: Method) -> list[str]:
@@ -94,10 +93,8 @@ def starts(session: Session, resolved: ResolvedConfig) -> dict[str, dict[str, An
 def training_key(session: Session, resolved: ResolvedConfig) -> str:
     """Return the key of everything a training is made from: equal keys mean an interchangeable model."""
     cls = session.plugins.methods.load(resolved.method)
-    content: list[Any] = [
-        IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version
-    ]  # fmt: skip
     before = starts(session, resolved)
+    content = [IDENTITY, resolved.training_hash(), session.scene_digest(resolved), cls.name, cls.version]
     return content_hash([*content, before] if before else content)
 
 
@@ -126,7 +123,18 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
     if unused is not None:
         raise unused
     if resolved.pretrained:
-        resolved = _with_parsed_values(plugins, resolved)
+        method, parsed = make_method(plugins, resolved), dict(resolved.pretrained)
+        names, first = named_scenes(method), first_scene(method)
+        if resolved.init and names == [first]:
+            key = f"pretrained.{next(iter(parsed))}"
+            raise ConfigError(
+                f"'{key}' is about training a {first} scene, and 'init' ({resolved.init}) is one: give one of them",
+                key=key,
+            )
+        for base in (base_config(plugins, name, resolved) for name in names):
+            parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}
+            checked_start(plugins, base)
+        resolved = replace(resolved, pretrained=parsed)
     own = str(value_at(resolved.config, INIT)) if INIT in input_files(type(resolved.config)) else ""
     for path in filter(None, (resolved.init, own)):
         stamp = os.stat(path).st_mtime_ns if os.path.exists(path) else 0
@@ -137,22 +145,6 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
 @functools.cache
 def _checked_once(path: str, stamp: int) -> None:
     check_model(path)
-
-
-def _with_parsed_values(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
-    method = make_method(plugins, resolved)
-    names, first = named_scenes(method), first_scene(method)
-    key = f"pretrained.{next(iter(resolved.pretrained))}"
-    if resolved.init and names == [first]:
-        raise ConfigError(
-            f"'{key}' is about training a {first} scene, and 'init' ({resolved.init}) is one: give one of them", key=key
-        )
-    parsed = dict(resolved.pretrained)
-    for name in names:
-        base = base_config(plugins, name, resolved)
-        parsed |= {k: value_at(base.config, k) for k in parsed if field_at(type(base.config), k) is not None}
-        checked_start(plugins, base)
-    return replace(resolved, pretrained=parsed)
 
 
 def check_model(path: str) -> GaussianModel:

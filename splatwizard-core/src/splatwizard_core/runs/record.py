@@ -20,6 +20,7 @@ from splatwizard_core.runs.record_versions import upgraded
 
 SCHEMA: Literal[3] = 3
 FILE_NAME = "metrics.json"
+DESCRIBED_ELSEWHERE = ("config", "environment")  # fields whose nulls need no reason here
 
 
 @dataclass(frozen=True)
@@ -33,15 +34,6 @@ class Part(BaseModel):
     """Base of the record's blocks: nothing unknown, nothing that is not a number."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-    def nulls(self, prefix: str = "") -> Iterator[tuple[str, str]]:
-        """Yield dotted name and reason of each null that is marked with one."""
-        for name, field in type(self).model_fields.items():
-            value = getattr(self, name)
-            if isinstance(value, Part):
-                yield from value.nulls(f"{prefix}{name}.")
-            elif value is None:
-                yield from ((prefix + name, mark.reason) for mark in field.metadata if isinstance(mark, WhyNull))
 
 
 def picked(block: type[Part], *sources: Mapping[str, Any]) -> dict[str, Any]:
@@ -258,7 +250,7 @@ def complete_record(values: Mapping[str, Any]) -> Record:
     """Return the record of these values, each null with its reason. Raises SplatwizardError for a null without one."""
     record = Record.model_validate(values)
     told = record.unknown
-    marked = {name: reason for name, reason in record.nulls() if name not in told}
+    marked = {name: mark.reason for name, mark in _nulls(record) if mark is not None and name not in told}
     record = record.model_copy(update={"unknown": {**told, **marked}})
     without = missing_reasons(record)
     if without:
@@ -268,18 +260,15 @@ def complete_record(values: Mapping[str, Any]) -> Record:
 
 def missing_reasons(record: Record) -> list[str]:
     """List the dotted names of values that are null without a reason; a valid record has none."""
-    content = record.model_dump()
-    for free in ("config", "environment", "unknown", "flags", "plan"):  # what they hold is described elsewhere
-        if content.get(free) is not None:
-            content.pop(free)
-    for scene in (content["train"]["pretraining"] or {}).values():
-        scene.update(config={} if scene["config"] is not None else None)
-    return [name for name in _null_names(content, "") if name not in record.unknown]
+    return [name for name, _ in _nulls(record) if name not in record.unknown]
 
 
-def _null_names(value: Any, name: str) -> Iterator[str]:
-    if value is None:
-        yield name
-    elif isinstance(value, dict):
-        for key, inner in value.items():
-            yield from _null_names(inner, f"{name}.{key}" if name else key)
+def _nulls(values: Part | dict[str, Any], prefix: str = "") -> Iterator[tuple[str, WhyNull | None]]:
+    """Yield the dotted name of each null, and the mark of its field; not what blocks hold that others describe."""
+    fields = type(values).model_fields if isinstance(values, Part) else {}
+    for name, value in values.items() if isinstance(values, dict) else values:
+        if value is None:
+            marks = fields[name].metadata if name in fields else []
+            yield prefix + name, next((mark for mark in marks if isinstance(mark, WhyNull)), None)
+        elif isinstance(value, Part | dict) and not (isinstance(values, Part) and name in DESCRIBED_ELSEWHERE):
+            yield from _nulls(value, f"{prefix}{name}.")

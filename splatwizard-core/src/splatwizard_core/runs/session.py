@@ -92,14 +92,11 @@ class Session:
 
         One that cannot be built is told once; whoever needs it falls back or says so.
         """
-        self._once("kernels", self._load_kernels)
-
-    def _load_kernels(self) -> None:
         for target in declared_modules(self.plugins):
             try:
                 resolve_module(target).try_load()
             except NativeBuildError as error:
-                self.say(f"warning: {error}")
+                self.say_once(f"warning: {error}")
 
     def keep(self, role: Role, model: TrainedModel) -> None:
         """Keep one model of each role: the next rate point often wants it again."""

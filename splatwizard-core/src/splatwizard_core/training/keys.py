@@ -11,31 +11,23 @@ from typing import Annotated, Any, Union
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.training.params import PipelineParams, ReadsFile
+from splatwizard_core.training.params import PipelineParams, ReadsFile, SceneParams
 
 
-def strip(annotation: Any) -> Any:
-    """Return the type inside Annotated[...]."""
-    while typing.get_origin(annotation) is Annotated:
-        annotation = typing.get_args(annotation)[0]
-    return annotation
-
-
-def members(annotation: Any) -> tuple[Any, ...]:
-    """Return the alternatives of a union (NoneType among them), or the one type."""
-    annotation = strip(annotation)
-    if typing.get_origin(annotation) in (Union, types.UnionType):
-        return tuple(strip(a) for a in typing.get_args(annotation))
-    return (annotation,)
+def members(annotation: Any) -> list[Any]:
+    """Return the alternatives of a union (NoneType among them), or the one type, without Annotated[...] around it."""
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if origin is Annotated:
+        return members(arguments[0])
+    if origin in (Union, types.UnionType):
+        return [member for argument in arguments for member in members(argument)]
+    return [annotation]
 
 
 def block_of(annotation: Any) -> type[BaseModel] | None:
     """Return the block class of a field that holds one, else None."""
-    for member in members(annotation):
-        if isinstance(member, type) and issubclass(member, BaseModel):
-            return member
-    return None
+    blocks = (m for m in members(annotation) if isinstance(m, type) and issubclass(m, BaseModel))
+    return next(blocks, None)
 
 
 def leaves(cls: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
@@ -71,12 +63,9 @@ def field_at(cls: type[BaseModel], key: str) -> Any:
                 return None
             annotation = block.model_fields[part].annotation
             continue
-        mapping = next((m for m in members(annotation) if typing.get_origin(m) is dict), None)
-        if mapping is None:
-            return None
-        annotation = typing.get_args(mapping)[1]
-        if annotation is Any:
-            return Any
+        annotation = next((typing.get_args(m)[1] for m in members(annotation) if typing.get_origin(m) is dict), None)
+        if annotation is None or annotation is Any:
+            return annotation
     return annotation
 
 
@@ -116,9 +105,7 @@ def dotted(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 def suggest(key: str, known: Sequence[str]) -> str | None:
     """Find the nearest valid key: one that ends in it, or one that is spelt like it."""
     ends = [k for k in known if k.endswith(f".{key}")]
-    if ends:
-        return ends[0]
-    near = difflib.get_close_matches(key, known, n=1, cutoff=0.6)
+    near = ends or difflib.get_close_matches(key, known, n=1, cutoff=0.6)
     if near:
         return near[0]
     ends_of = {k.rpartition(".")[2]: k for k in known}
@@ -128,9 +115,7 @@ def suggest(key: str, known: Sequence[str]) -> str | None:
 
 def is_beside_method(config: type[BaseModel], key: str) -> bool:
     """Whether a key is none of a method's `config` but one of the run or of how the scene is read."""
-    return field_at(config, key) is None and (
-        field_at(PipelineParams, key) is not None or key in SceneOptions.__dataclass_fields__
-    )
+    return field_at(config, key) is None and any(field_at(beside, key) for beside in (PipelineParams, SceneParams))
 
 
 def value_at(config: BaseModel, key: str) -> Any:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping
 from typing import Any, TypeVar
 
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, ValidationError
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.training.keys import block_keys, field_at, set_at, suggest
@@ -28,46 +28,31 @@ def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -
         annotation = field_at(cls, key)
         if annotation is None:
             raise unknown_key(key, block_keys(cls), source)
-        set_at(content, key, _parsed(annotation, key, value, source))
+        try:
+            set_at(content, key, parse_text(annotation, value) if isinstance(value, str) else value)
+        except ValueError as error:
+            raise ConfigError(f"bad value '{value}' for '{key}' in {source}: {error}", key=key) from None
     try:
         return cls.model_validate(content)
     except ValidationError as error:
         raise _bad_value(error, values, source, block_keys(cls)) from None
 
 
-def checked_value(annotation: Any, key: str, value: Any, *, source: str) -> Any:
-    """Return one value as the type `annotation` has it. Raises ConfigError."""
-    try:
-        return TypeAdapter(annotation).validate_python(_parsed(annotation, key, value, source))
-    except ValidationError as error:
-        raise ConfigError(f"bad value {value!r} for '{key}' in {source}: must be {_reason(error)}", key=key) from None
-
-
-def unknown_key(key: str, known: Mapping[str, str] | Sequence[str], source: str) -> ConfigError:
+def unknown_key(key: str, known: Collection[str], source: str) -> ConfigError:
     """Make the error for a key that nothing has: it names the nearest valid one."""
     near = suggest(key, list(known))
     hint = f"did you mean '{near}'?" if near else _keys_beside(key, known)
     return ConfigError(f"unknown key '{key}' in {source}: {hint}", key=key)
 
 
-def _parsed(annotation: Any, key: str, value: Any, source: str) -> Any:
-    if not isinstance(value, str):
-        return value
-    try:
-        return parse_text(annotation, value)
-    except ValueError as error:
-        raise ConfigError(f"bad value '{value}' for '{key}' in {source}: {error}", key=key) from None
-
-
 def _bad_value(
     error: ValidationError, values: Mapping[str, Any], source: str, described: Mapping[str, str]
 ) -> ConfigError:
     first = error.errors()[0]
-    location = [str(part) for part in first["loc"]]
     # The culprit is the longest given key that the location starts with; a check over several fields has no location.
-    path = ".".join(location)
+    path = ".".join(map(str, first["loc"]))
     key = max((k for k in values if path == k or path.startswith(f"{k}.")), key=len, default=path)
-    reason = _reason(error)
+    reason = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
     if not key:
         return ConfigError(f"bad combination of values in {source}: {reason}")
     value = values.get(key, first.get("input"))
@@ -75,12 +60,7 @@ def _bad_value(
     return ConfigError(f"bad value {value!r} for '{key}' in {source}: must be {reason}{about}", key=key)
 
 
-def _reason(error: ValidationError) -> str:
-    message: str = error.errors()[0]["msg"]
-    return message.removeprefix("Input should be ").removeprefix("Value error, ")
-
-
-def _keys_beside(key: str, known: Mapping[str, str] | Sequence[str]) -> str:
+def _keys_beside(key: str, known: Collection[str]) -> str:
     """List what there is instead: the keys of the block that it names, else those at the top."""
     block = key.rpartition(".")[0]
     inside = sorted(k for k in known if block and k.startswith(f"{block}."))

@@ -1,8 +1,12 @@
 """Typed configuration: what belongs to the run, and what belongs to the method."""
 
-from typing import Annotated, ClassVar, Literal
+import dataclasses
+import typing
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, create_model
+
+from splatwizard_core.scene.dataset import SceneOptions
 
 
 class ReadsFile:
@@ -42,6 +46,13 @@ class PipelineParams(Params):
     clamp_render: bool = Field(False, description="clamp the render to [0,1] before the loss (inria 2024)")
     profile: Literal["none", "stages"] = Field("none", description="stages: time each stage of a step")
     raster: RasterParams = Field(RasterParams(), description="which rasterizers may serve")
+
+
+_types = typing.get_type_hints(SceneOptions)
+_fields: dict[str, Any] = {f.name: (_types[f.name], f.default) for f in dataclasses.fields(SceneOptions)}
+del _fields["seed"]
+SceneParams = create_model("SceneParams", __base__=Params, **_fields)
+"""How the scene is read: `SceneOptions` as a block, without the seed of its start points, which is the run's."""
 
 
 class OptimizationParams(Params):

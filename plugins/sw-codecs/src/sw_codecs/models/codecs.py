@@ -1,4 +1,4 @@
-"""The files of 3DGS as codecs that any method of explicit Gaussians may ask for by name (coding/gaussian_codec.py)."""
+"""The files of 3DGS as codecs that any method of explicit Gaussians may ask for by name (`GaussianMethod`)."""
 
 from __future__ import annotations
 
