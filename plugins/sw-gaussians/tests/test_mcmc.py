@@ -97,8 +97,10 @@ def test_the_dead_move_onto_a_live_one_and_share_with_it():
     assert model.scales[:, 0].tolist() == pytest.approx([smaller] * 3, rel=1e-5)
     for name, _ in model.named_parameters():
         exp_avg, exp_avg_sq, step = optimizer.moments(name)
-        assert not exp_avg.any()
-        assert not exp_avg_sq.any()
+        assert not exp_avg[1].any()  # the source
+        assert not exp_avg_sq[1].any()
+        assert exp_avg[[0, 2]].all()  # those that moved
+        assert exp_avg_sq[[0, 2]].all()
         assert step == 1
 
 
@@ -115,7 +117,9 @@ def test_who_is_neither_dead_nor_chosen_keeps_everything():
         exp_avg, exp_avg_sq, _ = optimizer.moments(name)
         assert exp_avg[kept].all()
         assert exp_avg_sq[kept].all()
-        assert not exp_avg[changed].any()
+        source = next(i for i in changed if i != 1)
+        assert not exp_avg[source].any()
+        assert exp_avg[1].all()
 
 
 @pytest.mark.parametrize("opacities", [[0.3, 0.4], [0.001, 0.002]], ids=["none dead", "none alive"])
@@ -136,6 +140,7 @@ def test_growth_is_five_per_cent_up_to_the_cap(count, cap, expected):
     assert model.num_rows == expected
     exp_avg, _, _ = optimizer.moments("means")
     assert exp_avg.shape == (expected, 3)
+    assert exp_avg[:count].all()  # sources go on as they were
     assert not exp_avg[count:].any()
     assert not model.grad_accum.any()
     # What all of them let through together is what it was: copies share, they do not add.

@@ -73,7 +73,9 @@ def relocate(
     """Move every Gaussian with an opacity of at most `min_opacity` onto a live one; how many moved.
 
     The live ones are drawn in proportion to their opacity, and each shares its opacity and scales with those that come
-    (`shared_among`). Adam moments of both become zero. If none is dead, or none is alive, nothing happens.
+    (`shared_among`). Adam moments of the sources become zero, the moved ones keep theirs: with a second moment of zero
+    the tiny gradients of the regularisers make steps of several learning rates for as long as no view shows a
+    Gaussian, so that it dies again. If none is dead, or none is alive, nothing happens.
     """
     opacities = model.opacities
     is_dead = opacities <= min_opacity
@@ -86,6 +88,7 @@ def relocate(
         model,
         torch.cat([dead, index]),
         {name: torch.cat([arrivals[name], values[name]]) for name in arrivals},
+        forget=index,
     )
     return dead.numel()
 
@@ -102,14 +105,15 @@ def grow(
 ) -> int:
     """Add copies of Gaussians drawn in proportion to opacity, up to min(cap, floor((1 + growth) N)); how many.
 
-    Each copied one shares its opacity and scales with its copies, and its Adam moments become zero. A model that is
-    larger than the cap stays as it is.
+    Each copied one shares its opacity and scales with its copies and keeps its Adam moments, those of the copies are
+    zero. A model that is larger than the cap stays as it is.
     """
+    # Paper's code: the moments of the sources become zero; 0.4 dB less on a room with cameras all round, see README.
     count = min(cap, math.floor((1 + growth) * model.num_rows)) - model.num_rows
     if count <= 0:
         return 0
     (index, values), arrivals = _shared(model, draw(model.opacities, count, generator), min_opacity)
-    rows.set_rows(model, index, values)
+    rows.set_rows(model, index, values, forget=index[:0])
     rows.append_rows(model, arrivals)
     return count
 

@@ -184,15 +184,19 @@ class SplatOptimizer:
                 attrgetter(name)(model).grad = kept(old.grad)
 
     @torch.no_grad()
-    def set_rows(self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor]) -> None:
+    def set_rows(
+        self, model: SplatModel, index: Tensor, rows: Mapping[str, Tensor], *, forget: Tensor | None = None
+    ) -> None:
         """Give some primitives new values.
 
         index   [n] int64, each row once
         rows    parameter or buffer of `model.ROWS` -> new rows [n, ...]; what is not named keeps its values
+        forget  [m] int64, rows whose moments become zero in every parameter, named or not; None: those of `index`
 
-        Moments of these rows become zero in every parameter, named or not; step counters stay. Every parameter of the
-        model is a new tensor afterwards: none is updated in this step. Raises ShapeError if rows do not fit.
+        Step counters stay. Every parameter of the model is a new tensor afterwards: none is updated in this step.
+        Raises ShapeError if rows do not fit.
         """
+        forget = index if forget is None else forget
         for name, new in rows.items():
             expected = (len(index), *attrgetter(name)(model).shape[1:]) if name in model.ROWS else None
             if expected is None or new.shape != expected:
@@ -206,7 +210,7 @@ class SplatOptimizer:
             new = attrgetter(name)(model).detach()
             if name in rows:
                 new = new.index_copy(0, index, rows[name].detach().to(new))
-            self._put(model, name, new, lambda t: t.index_fill(0, index, 0))
+            self._put(model, name, new, lambda t: t.index_fill(0, forget, 0))
 
     @torch.no_grad()
     def replace(self, model: SplatModel, name: str, tensor: Tensor) -> None:
