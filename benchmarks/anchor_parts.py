@@ -1,4 +1,4 @@
-"""What the parts of a training step of HAC and CAT-3DGS cost on anchors of any number, without a scene or pictures.
+"""Cost of the parts of a training step of HAC and CAT-3DGS on anchors of any number, without a scene or pictures.
 
     python benchmarks/anchor_parts.py --anchors 53000 118000 --device cuda --kernels 12
 

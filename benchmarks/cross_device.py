@@ -50,18 +50,18 @@ class Written:
 
 @dataclass(frozen=True)
 class Failed:
-    """Why there is no such file, or no model from it."""
+    """Reason why there is no such file, or no model from it."""
 
     device: str
     why: str
 
 
 class CommandError(Exception):
-    """What `sw` said, in one short line."""
+    """Message of `sw`, in one short line."""
 
 
 def sw(*arguments: object) -> dict[str, Any]:
-    """What a command prints with --json, from a fresh process. Raises CommandError."""
+    """JSON that a command prints, from a fresh process. Raises CommandError."""
     command = [sys.executable, "-m", "splatwizard_core", *map(str, arguments), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode != 0:

@@ -46,7 +46,7 @@ console = Console(width=150)
 
 @dataclass(frozen=True)
 class Run:
-    """What a record says, in the units of the table."""
+    """Facts of a record, in the units of the table."""
 
     directory: Path
     method: str
@@ -164,7 +164,7 @@ def print_table(scene: str, runs: list[Run]) -> None:
 
 
 def print_claims(runs: list[Run]) -> None:
-    """What the papers say of their methods, and what is measured here."""
+    """Print the claims of the papers beside what is measured here."""
     of = {(run.method, run.rate): run for run in runs}
     default = {name: _default(name, of) for name in (*EXPLICIT, *ANCHORS)}
     base = default["3dgs"]

@@ -1,4 +1,4 @@
-"""How fast the compiled CPU rasterizer is, and against what: one run prints one table.
+"""Speed of the compiled CPU rasterizer, and against what: one run prints one table.
 
     python benchmarks/rasterize_cpu.py [--n 250000] [--size 270x480] [--repeats 10]
 

@@ -1,4 +1,4 @@
-"""How fast the compiled CUDA rasterizer is, beside gsplat in the same process: one run prints one table.
+"""Speed of the compiled CUDA rasterizer beside gsplat in the same process: one run prints one table.
 
     python benchmarks/rasterize_cuda.py [--scenes 200000,1000000,3000000] [--sizes 1237x822,1920x1080] [--repeats 40]
     python benchmarks/rasterize_cuda.py --inference    the approximate rasterizers beside the exact one, forward only

@@ -1,4 +1,4 @@
-"""What surfels cost beside ellipsoids: `2dgs` and `standard` on the same splats, for the same outputs.
+"""Cost of surfels beside ellipsoids: `2dgs` and `standard` on the same splats, for the same outputs.
 
     python benchmarks/rasterize_surfels.py [--n 250000] [--size 270x480] [--threads 1] [--repeats 10]
     python benchmarks/rasterize_surfels.py --device cuda --n 1000000 --size 1920x1080

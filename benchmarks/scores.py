@@ -1,4 +1,4 @@
-"""What scores of Gaussians cost beside drawing the same view: one run prints one table.
+"""Cost of scores of Gaussians beside drawing the same view: one run prints one table.
 
     python benchmarks/scores.py [--device cpu] [--n 250000] [--size 270x480] [--repeats 10] [--threads 1] [--views 4]
     python benchmarks/scores.py --device cuda --n 1000000 --size 1080x1920

@@ -1,4 +1,4 @@
-"""How fast HAC and CAT-3DGS train, phase by phase, where a step's time goes, and 3DGS drawing as many Gaussians beside.
+"""Training speed of HAC and CAT-3DGS by phase, where a step's time goes, and 3DGS drawing as many Gaussians beside.
 
     python benchmarks/train_anchors.py demo --preset quick --device cuda
     python benchmarks/train_anchors.py ../shared/data/fox:images_2 --iterations 7000 --device cuda --syncs
@@ -164,7 +164,7 @@ def _activities(device: torch.device) -> list[ProfilerActivity]:
 
 @dataclass
 class Part:
-    """What one part of a step took, summed over the window; times in microseconds."""
+    """Time of one part of a step, summed over the window; times in microseconds."""
 
     host: float = 0.0
     device: float = 0.0
@@ -210,7 +210,7 @@ def _share(value: float, total: float) -> str:
 
 
 def _sections(events: list[Any]) -> tuple[Callable[[Any, dict[int, str]], str], dict[int, str]]:
-    """How to find an event's part, and the part of each autograd node by its sequence number."""
+    """Find an event's part, and the part of each autograd node by its sequence number."""
 
     def part_of(event: Any, forward: dict[int, str]) -> str:
         while event is not None:

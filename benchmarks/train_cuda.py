@@ -1,4 +1,4 @@
-"""How fast 3DGS trains on a GPU, beside gsplat's trainer on the same pictures, and where a step's time goes.
+"""Training speed of 3DGS on a GPU, beside gsplat's trainer on the same pictures, and where a step's time goes.
 
     python benchmarks/train_cuda.py ../shared/data/mug ../shared/data/fox:images_2 ../shared/data/lego
     python benchmarks/train_cuda.py ../shared/data/mug=out/prepared/mug --gsplat ../shared/bench/train_gsplat.py
@@ -56,7 +56,7 @@ def fused_ssim(img1, img2, padding="same", train=True):
 
 @dataclass
 class Figures:
-    """What one trainer reaches on one scene."""
+    """Figures of one trainer on one scene."""
 
     iterations_per_second: float
     psnr: float

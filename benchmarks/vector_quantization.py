@@ -53,7 +53,7 @@ def rows_of(options):
 
 
 def contest(options):
-    """What a child does: train, save the codebook, print seconds and peak memory."""
+    """Run in a child: train, save the codebook, print seconds and peak memory."""
     x = rows_of(options).to(options.device)
     if options.contestant == "sklearn":
         from sklearn.cluster import MiniBatchKMeans

@@ -1,4 +1,4 @@
-"""What a method, rasterizer, codec, metric or data set imports of the core: at most 80 names, stable since 0.2.
+"""The face of the core for methods, rasterizers, codecs, metrics and data sets: at most 80 names, stable since 0.2.
 
 docs/plugins.md describes each. Everything else in `splatwizard_core` may change with any release.
 """

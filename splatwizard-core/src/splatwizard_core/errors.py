@@ -15,7 +15,7 @@ class SplatwizardError(Exception):
 
 
 class UserInputError(SplatwizardError):
-    """What was handed in is wrong: a path, key, value, scene or file. Exit status 2."""
+    """Wrong input: a path, key, value, scene or file. Exit status 2."""
 
     exit_status = 2
 

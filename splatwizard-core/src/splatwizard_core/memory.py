@@ -77,7 +77,7 @@ class MemoryMeter:
         return max(self._peak, int(now))
 
     def current_bytes(self) -> int:
-        """What is held now, above what was there at `start` (CUDA: all that is allocated)."""
+        """Bytes held now, above those at `start` (CUDA: all that is allocated)."""
         now = torch.cuda.memory_allocated(self.device) if self.kind == "cuda" else rss_bytes() - self._before
         return max(int(now), 0)
 
@@ -89,7 +89,7 @@ class MemoryMeter:
 
     @contextmanager
     def excluded(self) -> Iterator[None]:
-        """What happens inside does not count: the peak is kept as it is, and starts again from what is left then.
+        """Leave out of the peak what happens inside: it is kept as it is, and starts again from what is left then.
 
         Where the system cannot reset a resident set's peak (it can on Linux), everything counts.
         """

@@ -1,4 +1,4 @@
-"""What packages about runs (reports, sweeps, diagnoses, viewers) import of the core besides `api`.
+"""The face of the core for packages about runs (reports, sweeps, diagnoses, viewers), besides `api`.
 
 Documented in docs/plugins.md; unlike `api` it is not promised to stay as it is.
 """

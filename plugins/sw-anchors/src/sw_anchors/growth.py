@@ -19,7 +19,7 @@ MAX_LOG_BASE_SCALE = 0.05
 
 @dataclass(frozen=True)
 class GrowthReport:
-    """What one adjustment did: counts of anchors."""
+    """Counts of anchors that one adjustment grew and pruned."""
 
     grown: int
     pruned: int

@@ -1,4 +1,4 @@
-"""What this package provides: the method cat-3dgs."""
+"""Registration of the method cat-3dgs."""
 
 from splatwizard_core.api import Registry, hookimpl
 

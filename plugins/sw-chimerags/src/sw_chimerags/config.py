@@ -48,7 +48,7 @@ class Distill(Params):
 
 
 class Score(Params):
-    """Whose scores say how much each Gaussian matters for the file."""
+    """The pruner whose scores say how much each Gaussian matters for the file."""
 
     pruner: str = Field("lightgaussian", description="whose scores: any registered pruner, with its own settings")
     v_pow: float = Field(0.1, ge=0, description="power of the volume in the score of lightgaussian")

@@ -22,7 +22,7 @@ from splatwizard_core.api import BitstreamError, ConfigError, GaussianModel, Spl
 from sw_chimerags.model import DEGREE, LOWER, TENSORS, MaskedGaussians
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager, VectorCoder
     from sw_chimerags.config import Steps
 
 GROUPS = {"sh2": LOWER, "sh3": (DEGREE + 1) ** 2 - 1}
@@ -37,17 +37,11 @@ ROW_BYTES = 4 * (3 + 8 + 3 * (DEGREE + 1) ** 2)  # of a decoded Gaussian
 Arrays = dict[str, NDArray[Any]]
 
 
-def vector_coders(plugins: PluginManager) -> list[str]:
-    """Names of the installed coders of vectors by importance: those that are declared `codes="vectors"`."""
-    return [entry.name for entry in plugins.coders if entry.declared.get("codes") == "vectors"]
-
-
 def check_coder(plugins: PluginManager, name: str) -> None:
     """Raise ConfigError if no coder of vectors is called so."""
-    if name not in vector_coders(plugins):
-        raise ConfigError(
-            f"no coder of vectors is called '{name}'; installed: {', '.join(vector_coders(plugins))}", key="vq.codec"
-        )
+    if name not in plugins.vector_coders:
+        installed = ", ".join(plugins.vector_coders.names)
+        raise ConfigError(f"no coder of vectors is called '{name}'; installed: {installed}", key="vq.codec")
 
 
 def encode(
@@ -83,9 +77,8 @@ def encode(
         if rows.any():
             own = {name: array[rows] for name, array in arrays.items()}
             ordered = _in_order(own, plugins, BITS if xyz == "uniform16" else CELLS)
-            vectors = plugins.coders.load(coder)(plugins, **settings.get(group, {}))
-            if hasattr(vectors, "device"):  # where a codebook is trained: many times faster on the model's GPU
-                vectors.device = model.device
+            vectors = plugins.vector_coders.load(coder)(plugins, **settings.get(group, {}))
+            vectors.device = model.device  # a codebook is trained many times faster on the model's GPU
             _write_group(group, ordered, writer, plugins, vectors, xyz)
     writer.allow(ROW_BYTES * len(on), f"a model of {len(on):,} Gaussians")
 
@@ -125,22 +118,22 @@ def _in_order(arrays: Arrays, plugins: PluginManager, bits: int) -> Arrays:
     low = points.min(0)
     width = np.maximum(points.max(0) - low, 1e-300)
     cells = np.rint((points - low) / width * ((1 << bits) - 1)).astype(np.int64)
-    order = plugins.coders.load("octree").sort(cells)
+    order = plugins.position_codecs.load("octree")().sort(cells)
     return {name: array[order] for name, array in {**arrays, "cells": cells}.items()}
 
 
 def _write_group(
-    group: str, arrays: Arrays, writer: ContainerWriter, plugins: PluginManager, coder: Any, xyz: str
+    group: str, arrays: Arrays, writer: ContainerWriter, plugins: PluginManager, coder: VectorCoder, xyz: str
 ) -> None:
-    planes = plugins.coders.load("byte-planes")()
+    planes = plugins.array_coders.load("byte-planes")()
     means, rest = arrays["means"], arrays["sh_rest"][:, : GROUPS[group]]
     if xyz == "float32":
-        writer.add(f"{group}/xyz", plugins.coders.load("float-delta")().encode(means))
+        writer.add(f"{group}/xyz", plugins.array_coders.load("float-delta")().encode(means))
     elif xyz == "float16":
         writer.add(f"{group}/xyz", planes.encode(means.clip(-HALF_MAX, HALF_MAX).astype(np.float16)))
     else:
         writer.add_array(f"{group}/box", np.stack([means.min(0), means.max(0)]).astype(np.float64))
-        writer.add(f"{group}/xyz", plugins.coders.load("octree")().encode(arrays["cells"], BITS))
+        writer.add(f"{group}/xyz", plugins.position_codecs.load("octree")().encode(arrays["cells"], BITS))
     columns = [arrays["opacity_logits"][:, None], arrays["log_scales"], arrays["quats"]]
     writer.add(f"{group}/attributes", planes.encode(np.concatenate(columns, 1).astype(np.float16)))
     n = len(means)
@@ -156,14 +149,14 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     reader.integer("max_sh_degree", low=DEGREE, high=DEGREE)
     reader.allow(ROW_BYTES * total, f"a model of {total:,} Gaussians")
     xyz = reader.text("xyz", choices=POSITIONS)
-    coder = plugins.coders.load(reader.text("vq", choices=vector_coders(plugins)))(plugins)
+    coder = plugins.vector_coders.load(reader.text("vq", choices=plugins.vector_coders.names))(plugins)
     groups = [_read_group(group, n, reader, plugins, coder, xyz) for group, n in (("sh2", total - on), ("sh3", on))]
     tensors = [torch.cat([group[i] for group in groups]) for i in range(len(TENSORS))]
     return GaussianModel(*tensors, active_sh_degree=DEGREE)
 
 
 def _read_group(
-    group: str, n: int, reader: ContainerReader, plugins: PluginManager, coder: Any, xyz: str
+    group: str, n: int, reader: ContainerReader, plugins: PluginManager, coder: VectorCoder, xyz: str
 ) -> list[Tensor]:
     """The tensors of a group in the order of TENSORS; bands that it lacks are zero."""
     rest = np.zeros((n, GROUPS["sh3"], 3), np.float32)
@@ -172,7 +165,7 @@ def _read_group(
     else:
         means = _positions(group, n, reader, plugins, xyz)
         with reader.decoding(f"{group}/attributes") as data:
-            attributes = _finite(plugins.coders.load("byte-planes")().decode(data, np.float16, (n, 8)))
+            attributes = _finite(plugins.array_coders.load("byte-planes")().decode(data, np.float16, (n, 8)))
         vectors = _vectors(group, n, 3 + 3 * GROUPS[group], reader, coder)
     rest[:, : GROUPS[group]] = vectors[:, 3:].reshape(n, 3, GROUPS[group]).transpose(0, 2, 1)
     found = (means, vectors[:, None, :3], rest, attributes[:, 0], attributes[:, 1:4], attributes[:, 4:])
@@ -182,20 +175,20 @@ def _read_group(
 def _positions(group: str, n: int, reader: ContainerReader, plugins: PluginManager, xyz: str) -> NDArray[Any]:
     if xyz == "float32":
         with reader.decoding(f"{group}/xyz") as data:
-            return _finite(plugins.coders.load("float-delta")().decode(data, np.float32, (n, 3)))
+            return _finite(plugins.array_coders.load("float-delta")().decode(data, np.float32, (n, 3)))
     if xyz == "float16":
         with reader.decoding(f"{group}/xyz") as data:
-            return _finite(plugins.coders.load("byte-planes")().decode(data, np.float16, (n, 3)))
+            return _finite(plugins.array_coders.load("byte-planes")().decode(data, np.float16, (n, 3)))
     low, high = reader.array(f"{group}/box", dtype="float64", shape=(2, 3), finite=True)
     with reader.decoding(f"{group}/xyz") as data:
-        cells = plugins.coders.load("octree")(max_points=n).decode(data)
+        cells = plugins.position_codecs.load("octree")(max_points=n).decode(data)
         if len(cells) != n or cells.max() >= 1 << BITS:
             raise BitstreamError(f"{len(cells):,} points of up to {int(cells.max(initial=0)):,}, expected {n:,}")
         with np.errstate(over="ignore", invalid="ignore"):
             return _finite((low + cells / ((1 << BITS) - 1) * (high - low)).astype(np.float32))
 
 
-def _vectors(group: str, n: int, d: int, reader: ContainerReader, coder: Any) -> NDArray[Any]:
+def _vectors(group: str, n: int, d: int, reader: ContainerReader, coder: VectorCoder) -> NDArray[Any]:
     prefix = f"{group}/vq/"
     parts = {name.removeprefix(prefix): reader.section(name) for name in reader.sections if name.startswith(prefix)}
     if not parts:

@@ -55,7 +55,7 @@ class PseudoViewSampler(CameraSampler):
 def distillation_loss(
     image: Tensor, target: Tensor, kind: DistillLoss = "l1_ssim", lambda_dssim: float = 0.2
 ) -> LossPack:
-    """How far a student's render is from its teacher's.
+    """Distance of a student's render from its teacher's.
 
     image, target   [3,H,W]; `target` without gradient
     kind            "l1_ssim": the 3DGS loss between the two; "l2": their mean squared difference

@@ -1,4 +1,4 @@
-"""How many primitives go and which: by the scores of a pruner that any plugin may provide."""
+"""Pruning by score: how many primitives go, and which, by the scores of a pruner that any plugin may provide."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CountRule = Literal["exact", "official"]
 
 
 def removal_count(n: int, fraction: float) -> int:
-    """How many of n primitives a removal of `fraction` (0..1) takes: floor(fraction n), unharmed by binary fractions.
+    """Number of n primitives that a removal of `fraction` (0..1) takes: floor(fraction n), safe from binary fractions.
 
     0.3 of 10 is 3, though 0.3 * 10 may come out below 3 in floating point.
     """

@@ -1,4 +1,4 @@
-"""How 3DGS trains: the one stage that other methods start from, extend, or take over whole."""
+"""The training stage of 3DGS: the one that other methods start from, extend, or take over whole."""
 
 from __future__ import annotations
 

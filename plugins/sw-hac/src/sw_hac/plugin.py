@@ -1,4 +1,4 @@
-"""What this package provides: the method hac."""
+"""Registration of the method hac."""
 
 from splatwizard_core.api import Registry, hookimpl
 

@@ -120,7 +120,7 @@ class ImportanceVQ:
         return self.unpack(parts, n, d).vectors()
 
     def quantize(self, vectors: NDArray[Any], importance: NDArray[Any], seed: int = 0) -> CodedVectors:
-        """Which vectors keep their own, and which entry of a newly trained codebook stands for each other one."""
+        """Choose the vectors that keep their own, and train a codebook whose entries stand for the others."""
         x = np.clip(np.asarray(vectors, np.float32), -HALF_MAX, HALF_MAX)
         importance = np.asarray(importance, np.float64)
         if x.ndim != 2 or importance.shape != x.shape[:1]:

@@ -83,7 +83,7 @@ class Weights:
 
 
 def hub_folder() -> Path:
-    """Where torch.hub keeps what it has downloaded ($TORCH_HOME moves it)."""
+    """Folder where torch.hub keeps what it has downloaded ($TORCH_HOME moves it)."""
     return Path(torch.hub.get_dir()) / "checkpoints"
 
 

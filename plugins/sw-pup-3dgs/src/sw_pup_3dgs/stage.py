@@ -1,4 +1,4 @@
-"""How it trains: rounds of 3DGS without densification; each removes at its first step and begins with fresh Adam."""
+"""The training stage: rounds of 3DGS without densification, each with a removal at its first step and fresh Adam."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ from splatwizard_core.api import ShapeError
 
 
 class Segments:
-    """Which rows of a table each of N indices asks for, sorted once so that sums over equal indices have an order.
+    """Rows of a table that N indices ask for, sorted once so that sums over equal indices have an order.
 
     indices     [N] int64, each in 0 .. rows - 1
     rows        M, length of the table

@@ -28,7 +28,7 @@ KEEP_ELEMENTS = 1 << 23
 
 @dataclass
 class TileLists:
-    """Which splats each tile draws, front to back.
+    """Splats of each tile, front to back.
 
     tile     pixels a side
     grid     (columns, rows)

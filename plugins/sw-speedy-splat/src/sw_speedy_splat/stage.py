@@ -1,4 +1,4 @@
-"""How Speedy-Splat trains: the stage of 3DGS, taken over as it is, with removals between and behind its own tasks."""
+"""The training stage of Speedy-Splat: that of 3DGS, with removals between and behind its own tasks."""
 
 from __future__ import annotations
 

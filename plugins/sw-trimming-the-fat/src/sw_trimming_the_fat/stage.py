@@ -1,4 +1,4 @@
-"""How it trains: 3DGS without densification from a trained scene, with removals in the first third."""
+"""The training stage: 3DGS without densification from a trained scene, with removals in the first third."""
 
 from __future__ import annotations
 

@@ -101,7 +101,7 @@ def _registered(kind: str) -> Iterable[Entry]:
 
 
 def _declared(context: click.Context, field: str) -> list[str]:
-    """What the entries of the methods on the command line declare, without importing them."""
+    """Declared values of the methods on the command line, without importing them."""
     given = context.params.get("methods") or context.params.get("method") or ()
     named = {name.strip() for text in ([given] if isinstance(given, str) else given) for name in text.split(",")}
     chosen = [e for e in _registered("method") if (e.name in named if named else e.declared.get("default"))]

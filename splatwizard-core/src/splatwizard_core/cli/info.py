@@ -138,7 +138,7 @@ def _print_record(facts: dict[str, Any]) -> None:
 
 
 def _started_from(pretraining: dict[str, dict[str, Any]]) -> str:
-    """What a training started from, in words; empty: nothing that was trained."""
+    """The start of a training, in words; empty: nothing that was trained."""
     forms = {"preset": "{} preset", "steps": "{:,} steps", "train_s": "{:.0f} s"}
     found = []
     for name, scene in pretraining.items():

@@ -1,4 +1,4 @@
-"""What a shell may do to a command besides giving it arguments: close its streams, stop reading, ask it to end."""
+"""Streams of a command, which a shell may close or stop reading, and its requests to end."""
 
 from __future__ import annotations
 

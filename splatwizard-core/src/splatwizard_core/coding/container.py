@@ -385,7 +385,7 @@ class ContainerReader:
         return value
 
     def summary(self) -> dict[str, Any]:
-        """What `sw info` prints: identity, requirements, and bytes by section that sum to `size`."""
+        """Facts for `sw info`: identity, requirements, and bytes by section that sum to `size`."""
         return {
             "container_version": VERSION,
             "method": self.method,

@@ -1,4 +1,4 @@
-"""What a file needs to be decoded: the distributions that wrote it, their versions, and what each provided.
+"""Requirements of decoding a file: the distributions that wrote it, their versions, and what each provided.
 
 It stands in the header under `requires`, so that whoever lacks a plugin or has too old a one can be told what to
 install. It is advice and no part of the decoded scene: the names come from a stranger, so they are restricted to what
@@ -35,7 +35,7 @@ class Requirement:
 
     @property
     def command(self) -> str:
-        """What a user may type to get it."""
+        """Command that installs it."""
         return f"pip install '{self.distribution}>={self.version}'"
 
     @property

@@ -69,7 +69,7 @@ class MetricInfo:
 
 @dataclass
 class MetricSetup:
-    """What metrics may use to get ready.
+    """Device and settings that metrics get ready with.
 
     device      where the images will be
     settings    of all metrics, by group; a metric reads its own with `read`
@@ -96,7 +96,7 @@ class MetricSetup:
             raise ConfigError(f"bad value {first['input']!r} for '{key}': {reason}", key=key) from None
 
     def share(self, key: str, make: Callable[[], T]) -> T:
-        """What `make` returns, made once for all metrics of this evaluation that ask under the same key."""
+        """The object that `make` returns, made once for all metrics of this evaluation that ask under the same key."""
         if key not in self._shared:
             self._shared[key] = make()
         found: T = self._shared[key]
@@ -130,7 +130,7 @@ class MetricFactory(Protocol):
         ...
 
     def identity(self, setup: MetricSetup) -> str | None:
-        """What `prepare` would find, as one cheap string: a step is done again when it changes. None: it would fail."""
+        """Cheap description of what `prepare` would find: a step is done again when it changes. None: it would fail."""
         ...
 
 
@@ -225,5 +225,5 @@ def metric_identities(registry: TypedRegistry[AnyMetric], setup: MetricSetup) ->
 
 
 def short_reason(reason: str) -> str:
-    """Why a metric has no value, for a table below a warning that has told how to mend it."""
+    """Short reason why a metric has no value, for a table below a warning that has told how to mend it."""
     return next((word for word in MISSING if reason.startswith(word)), reason)

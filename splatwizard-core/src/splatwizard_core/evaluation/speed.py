@@ -32,7 +32,7 @@ View = TypeVar("View")
 
 @dataclass(frozen=True)
 class Spread:
-    """How much n >= 2 measurements of one thing differ; std is the sample's (n - 1)."""
+    """Spread of n >= 2 measurements of one thing; std is the sample's (n - 1)."""
 
     n: int
     mean: float

@@ -44,7 +44,7 @@ class SplatModel(nn.Module):
 
     @property
     def device(self) -> torch.device:
-        """Where the parameters are."""
+        """Device of the parameters."""
         return next(self.parameters()).device
 
     def counts(self) -> dict[str, int]:

@@ -39,7 +39,7 @@ Say = Callable[[str], None]
 
 
 def cache_root() -> Path:
-    """Where this user's caches are: $SPLATWIZARD_CACHE, else the platform's cache folder."""
+    """Folder of this user's caches: $SPLATWIZARD_CACHE, else the platform's cache folder."""
     chosen = os.environ.get("SPLATWIZARD_CACHE")
     if chosen:
         return Path(chosen).expanduser()
@@ -218,12 +218,12 @@ class NativeModule:
 
     @property
     def prebuilt_folder(self) -> Path:
-        """Where a wheel, or `sw build-kernels --portable`, puts the library."""
+        """Folder where a wheel, or `sw build-kernels --portable`, puts the library."""
         return self._root() / "prebuilt"
 
     @property
     def cache_folder(self) -> Path:
-        """Where builds for this user go."""
+        """Folder of builds for this user."""
         return cache_root() / "native"
 
     def key(self, march: str, cuda: bool | None = None, *, any_gpu: bool = False) -> str:
@@ -274,7 +274,7 @@ class NativeModule:
                     yield library
 
     def _places(self) -> Iterator[Path]:
-        """Where a library for this machine and these sources may be, best first."""
+        """Places of a library for this machine and these sources, best first."""
         import torch
 
         # One without CUDA only where none with it can be built: else an old build would hide the GPU for ever.

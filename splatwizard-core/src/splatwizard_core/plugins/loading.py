@@ -26,14 +26,14 @@ class PluginInfo:
 
 
 def plugin_info(entry_point: importlib.metadata.EntryPoint) -> PluginInfo:
-    """What is known of a plugin before it is imported."""
+    """Facts of a plugin before it is imported."""
     dist = entry_point.dist
     name, version = (dist.metadata["Name"], dist.version) if dist else (entry_point.name, "")
     return PluginInfo(entry_point.name, name, version, entry_point.value)
 
 
 def names_of(entry_point: importlib.metadata.EntryPoint) -> set[str]:
-    """What a user may call a plugin: its entry point, its distribution; normalised."""
+    """Names that a user may call a plugin: its entry point, its distribution; normalised."""
     dist = entry_point.dist
     return {normal_name(name) for name in (entry_point.name, dist.metadata["Name"] if dist else None) if name}
 

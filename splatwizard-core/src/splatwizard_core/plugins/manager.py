@@ -152,7 +152,7 @@ class PluginManager:
         return self._pluggy.hook
 
     def provided_by(self, info: PluginInfo) -> list[Entry]:
-        """What one plugin added, clashing names included."""
+        """Entries that one plugin added, clashing names included."""
         found: list[Entry] = []
         for registry in self.registries.values():
             clashing = [e for entries in registry.clashes.values() for e in entries]

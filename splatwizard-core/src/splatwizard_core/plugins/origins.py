@@ -1,4 +1,4 @@
-"""Which installed distribution a class, a function or an object comes from, by the module that defines it."""
+"""The installed distribution of a class, a function or an object, by the module that defines it."""
 
 from __future__ import annotations
 

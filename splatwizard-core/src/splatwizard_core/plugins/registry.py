@@ -180,7 +180,7 @@ class Coders(Generic[T]):
 
 
 def nearest(kind: str, name: str, installed: list[str]) -> str:
-    """Where `name` could come from: its package, the installed name spelt most alike, or all installed names."""
+    """Hint where `name` could come from: its package, the installed name spelt most alike, or all installed names."""
     package = package_of(kind, name)
     if package is not None:
         return f"it comes with {package}: pip install {package}"

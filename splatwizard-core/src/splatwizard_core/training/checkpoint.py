@@ -177,7 +177,7 @@ class CheckpointStore:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """What a JSON file says, unverified; nothing if it is missing or cannot be read."""
+    """Content of a JSON file, unverified; nothing if it is missing or cannot be read."""
     with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
         found = json.loads(path.read_text())["content"]
         return found if isinstance(found, dict) else {}

@@ -256,7 +256,7 @@ class SplatOptimizer:
         self.states = loaded
 
     def _prefix(self, model: SplatModel) -> str:
-        """Where `model` sits in the optimizer's model: "" for itself, "inner." for a submodule."""
+        """Place of `model` in the optimizer's model: "" for itself, "inner." for a submodule."""
         for path, module in self.model.named_modules():
             if module is model:
                 return f"{path}." if path else ""

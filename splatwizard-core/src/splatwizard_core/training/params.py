@@ -24,7 +24,7 @@ class Params(BaseModel):
 
 
 class RasterParams(Params):
-    """Which rasterizers may serve."""
+    """Choice among the installed rasterizers."""
 
     prefer: list[str] = Field([], description="rasterizers to take first if they can, by name")
     forbid: list[str] = Field([], description="rasterizers never to take, by name")

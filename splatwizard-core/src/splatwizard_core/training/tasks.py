@@ -66,7 +66,7 @@ POST_ONLY = ("result", "loss")
 
 @dataclass(frozen=True)
 class Argument:
-    """Where one parameter's value comes from.
+    """Source of one parameter's value.
 
     field       of TaskContext
     classes     the value must be an instance of one of them

@@ -38,7 +38,7 @@ SECONDS, SECONDS_PER_POINT = 5, 2e-5
 
 
 def unavailable() -> str | None:
-    """Why Draco cannot be used here, or None; imports nothing."""
+    """Reason why Draco cannot be used here, or None; imports nothing."""
     if importlib.util.find_spec("DracoPy") is None:
         return "not installed: pip install 'sw-codecs[draco]'"
     return None

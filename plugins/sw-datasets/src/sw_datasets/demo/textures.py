@@ -16,7 +16,7 @@ Texture = Callable[[Vec], Vec]
 
 @dataclass(frozen=True)
 class Material:
-    """How a surface looks.
+    """Look of a surface.
 
     texture     local points -> linear RGB in 0..1
     specular    strength of the highlight, 0 is matte

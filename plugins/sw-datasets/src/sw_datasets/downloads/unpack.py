@@ -262,7 +262,7 @@ def _is_junk(parts: tuple[str, ...]) -> bool:
 
 @contextlib.contextmanager
 def _damage_named(archive: Path) -> Iterator[None]:
-    """What the decoders raise on damage becomes an ArchiveError; a full disk stays what it is."""
+    """Turn what decoders raise on damage into an ArchiveError; a full disk stays what it is."""
     try:
         yield
     except (zipfile.BadZipFile, tarfile.TarError, zlib.error, lzma.LZMAError, EOFError, struct.error) as error:

@@ -100,7 +100,7 @@ class _Bytes:
         raise SceneError(f"{self.path}: {what}", path=str(self.path))
 
     def need(self, size: int, what: str) -> int:
-        """Where the next `size` bytes begin; moves past them."""
+        """Offset of the next `size` bytes; moves past them."""
         start = self.at
         if size > len(self.data) - start:
             self.fail(f"truncated at byte {start} of {len(self.data)}: {what} needs {size} bytes")

@@ -17,7 +17,7 @@ MIN_SCALE = 0.05
 
 
 def context_inputs(codes: Tensor) -> Tensor:
-    """What the context network sees of 16-bit positions [n,3]: int64 [n, CONTEXT_INPUTS], 12 fractional bits, 0..1.
+    """Inputs of the context network from 16-bit positions [n,3]: int64 [n, CONTEXT_INPUTS], 12 fractional bits, 0..1.
 
     Per axis the coordinate, and triangle waves of it whose period halves; integers alone, so that the decoder has
     the encoder's.

@@ -1,4 +1,4 @@
-"""What this package provides."""
+"""Registration of the method test-anchors."""
 
 from splatwizard_core.api import Registry, hookimpl
 
