@@ -102,7 +102,7 @@ def test_a_library_that_is_gone_is_named(everything):
 @pytest.mark.parametrize(
     ("command", "package"),
     [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
-     (["run", "--method", "hac"], "sw-hac"), (["render", "x.ply", "--scene", "demo", "--out", "o"], "sw-datasets")],
+     (["run", "--method", "hac"], "sw-hac"), (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip
 def test_the_core_alone_names_the_package_of_what_is_asked_for(fresh_environment, wheels, command, package, tmp_path):
     fresh_environment.install(wheels["splatwizard-core"])

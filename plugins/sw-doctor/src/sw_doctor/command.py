@@ -9,7 +9,7 @@ import click
 from splatwizard_core.tooling import debug_option, json_option, options, print_json
 
 if TYPE_CHECKING:
-    from sw_doctor import Diagnosis
+    from sw_doctor.diagnosis import Diagnosis
 
 COLOURS = {"ok": "green", "missing": "yellow", "broken": "red"}
 
@@ -22,7 +22,7 @@ def doctor(as_json: bool) -> None:
     Kernels that are built are loaded, compilers compile a few lines, rasterizers draw a small picture, packages are
     imported; nothing is installed or built. Exit status 1 if `sw run` on the demo scene cannot run here.
     """
-    from sw_doctor import examine
+    from sw_doctor.diagnosis import examine
 
     found = examine()
     if as_json:

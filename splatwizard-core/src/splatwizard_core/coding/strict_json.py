@@ -50,7 +50,8 @@ def check_json(value: Any, place: str = "", depth: int = 0) -> None:
             check_json(each, f"{place}.{key[:80]}" if place else key[:80], depth + 1)
     elif isinstance(value, (list, tuple)):
         for i, each in enumerate(value):
-            check_json(each, f"{place}[{i}]", depth + 1)
+            if type(each) is not int or abs(each) > MAX_INTEGER:  # most of a long list needs no name
+                check_json(each, f"{place}[{i}]", depth + 1)
     elif isinstance(value, str):
         if len(value) > MAX_STRING:
             problem = f"a string of {len(value):,} characters is longer than {MAX_STRING:,}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 from dataclasses import dataclass
 
@@ -27,9 +28,9 @@ class PluginInfo:
 
 def plugin_info(entry_point: importlib.metadata.EntryPoint) -> PluginInfo:
     """Facts of a plugin before it is imported."""
-    dist = entry_point.dist
-    name, version = (dist.metadata["Name"], dist.version) if dist else (entry_point.name, "")
-    return PluginInfo(entry_point.name, name, version, entry_point.value)
+    # Each access of `metadata` parses the file anew.
+    metadata = entry_point.dist.metadata if entry_point.dist else {"Name": entry_point.name, "Version": ""}
+    return PluginInfo(entry_point.name, metadata["Name"], metadata["Version"], entry_point.value)
 
 
 def names_of(entry_point: importlib.metadata.EntryPoint) -> set[str]:
@@ -48,10 +49,16 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
         if requirement.marker is not None and not requirement.marker.evaluate({"extra": ""}):
             continue
         try:
-            version = importlib.metadata.version(requirement.name)
+            version = _installed_version(requirement.name)
         except importlib.metadata.PackageNotFoundError:
             return f"needs {requirement.name}, which is not installed: pip install {requirement.name}"
         if not requirement.specifier.contains(version, prereleases=True):
             wanted = f"{requirement.name}{requirement.specifier}"
             return f"needs {wanted}, but {version} is installed: pip install '{wanted}'"
     return None
+
+
+@functools.cache
+def _installed_version(distribution: str) -> str:
+    """Version of a distribution, looked up once: plugins need the same few. Raises PackageNotFoundError."""
+    return importlib.metadata.version(distribution)
