@@ -5,8 +5,7 @@ Documented in docs/plugins.md; unlike `api` it is not promised to stay as it is.
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+from splatwizard_core.lending import lend
 
 MODULES = {
     "plugins.manager": "load_plugins",
@@ -40,18 +39,4 @@ MODULES = {
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 
-_HOMES = {name: f"splatwizard_core.{module}" for module, names in MODULES.items() for name in names.split()}
-__all__ = list(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    """Import what is asked for, once: a plugin that only registers itself imports no torch."""
-    if name not in _HOMES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    found = getattr(importlib.import_module(_HOMES[name]), name)
-    globals()[name] = found
-    return found
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__all__, __getattr__ = lend(__name__, MODULES)

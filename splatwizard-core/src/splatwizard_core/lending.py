@@ -1,0 +1,26 @@
+"""Lending of names: the faces of the core import each from its module when it is asked for."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any
+
+
+def lend(face: str, modules: Mapping[str, str]) -> tuple[list[str], Callable[[str], Any]]:
+    """Make `__all__` and `__getattr__` of the module `face`.
+
+    modules     module of the core -> the names that it lends, separated by spaces
+    """
+    homes = {name: f"splatwizard_core.{module}" for module, names in modules.items() for name in names.split()}
+
+    def find(name: str) -> Any:
+        """Import what is asked for, once: a plugin that only registers itself imports no torch."""
+        if name not in homes:
+            raise AttributeError(f"module '{face}' has no attribute '{name}'")
+        found = getattr(importlib.import_module(homes[name]), name)
+        setattr(sys.modules[face], name, found)
+        return found
+
+    return list(homes), find
