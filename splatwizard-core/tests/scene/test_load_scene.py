@@ -43,7 +43,7 @@ def families(monkeypatch, tmp_path):
 
 @pytest.fixture
 def catalogue(monkeypatch):
-    """What of ours is not installed: nothing, until a test adds kind -> name -> package."""
+    """Packages of ours that are not installed: none, until a test adds kind -> name -> package."""
     found: dict[str, dict[str, str]] = {"dataset": {}}
     monkeypatch.setattr("splatwizard_core.plugins.catalogue.catalogue", lambda: found)
     monkeypatch.setattr("splatwizard_core.scene.loading.catalogue", lambda: found)

@@ -66,8 +66,6 @@ class Choices:
         if said is None:
             package = package_of("default", "method") or "'splatwizard-core[all]'"
             raise click.UsageError(f"no method is named, and the default one is not there: pip install {package}")
-        if not isinstance(said, str) or not said.strip():
-            raise ConfigError(f"bad value {said!r} for 'method' in {self.config_file}: expected a name", key="method")
         return [said]
 
     def resolve(self, plugins: PluginManager) -> list[ResolvedConfig]:
@@ -105,8 +103,6 @@ class Choices:
 
         file, values = self.config_file, self.values()
         tables = read_config_file(file) if file else {}
-        for name in (n for n in RESERVED if not isinstance(tables.get(n, ""), str)):
-            raise ConfigError(f"bad value {tables[name]!r} for '{name}' in {file}: expected a name", key=name)
         for key in (k for k in values if k in OptimizationParams.model_fields):
             known = ", ".join(sorted({*SCENE_KEYS, *block_keys(PipelineParams)}))
             raise ConfigError(f"key '{key}' in --set is of no use here: one of {known}", key=key)
