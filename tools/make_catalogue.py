@@ -28,6 +28,8 @@ def generate() -> str:
         kind: {e.name: e.distribution for e in registry if is_ours(e.distribution) and e.distribution != CORE}
         for kind, registry in plugins.registries.items()
     }
+    defaults = {kind: registry.default for kind, registry in plugins.registries.items()}
+    found["default"] = {kind: found[kind][name] for kind, name in defaults.items() if name is not None}
     return json.dumps({kind: names for kind, names in found.items() if names}, indent=1, sort_keys=True) + "\n"
 
 
