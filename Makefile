@@ -8,7 +8,7 @@
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
-PACKAGES := splatwizard-core $(sort $(wildcard plugins/*))
+PACKAGES := splatwizard-native splatwizard-core $(sort $(wildcard plugins/*))
 PROJECTS := $(addsuffix /pyproject.toml,$(PACKAGES))
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out

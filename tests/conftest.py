@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from fresh_environments import WORKSPACE, FreshEnvironment, build_wheel, is_ours, make_environment
+from import_graph import needed
 
 
 @pytest.fixture(scope="session")
@@ -16,6 +17,12 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One wheel of each workspace package, by distribution name."""
     out = tmp_path_factory.mktemp("wheels")
     return {project.name: build_wheel(project, out) for project in WORKSPACE}
+
+
+@pytest.fixture(scope="session")
+def core_wheels(wheels: dict[str, Path]) -> list[Path]:
+    """The wheels of the core and of what it requires of ours."""
+    return [wheels[name] for name in needed("splatwizard-core")]
 
 
 @pytest.fixture

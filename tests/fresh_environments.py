@@ -19,7 +19,10 @@ from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
-WORKSPACE = [ROOT / "splatwizard-core", *sorted(p.parent for p in (ROOT / "plugins").glob("*/pyproject.toml"))]
+WORKSPACE = [
+    ROOT / "splatwizard-native", ROOT / "splatwizard-core",
+    *sorted(p.parent for p in (ROOT / "plugins").glob("*/pyproject.toml")),
+]  # fmt: skip
 OURS = ("splatwizard", "sw_", "sw-")
 
 

@@ -15,9 +15,11 @@ else:
     import tomli as tomllib
 
 ROOT = Path(__file__).parents[1]
+NATIVE = ROOT / "splatwizard-native" / "src" / "splatwizard_native"
+"""The base below the core."""
 CORE = ROOT / "splatwizard-core" / "src" / "splatwizard_core"
 PACKAGES = sorted(p for p in ROOT.glob("plugins/*/src/sw_*") if p.is_dir())
-"""Import packages of the workspace besides the core."""
+"""Import packages of the workspace above the core."""
 STRANGERS = sorted(p for folder in ("examples", "tests/plugins") for p in ROOT.glob(f"{folder}/*/src/sw_*"))
 """Packages as third parties would write them."""
 
@@ -50,7 +52,7 @@ def module_name(path: Path, package: Path) -> str:
 @cache
 def module_graph() -> Mapping[str, frozenset[str]]:
     """Module -> the modules of the workspace that it imports when it runs, function-level imports included."""
-    files = {module_name(p, package): p for package in (CORE, *PACKAGES) for p in files_of(package)}
+    files = {module_name(p, package): p for package in (NATIVE, CORE, *PACKAGES) for p in files_of(package)}
 
     def home(name: str) -> str | None:
         """The module that a dotted name is or lies in."""
@@ -107,6 +109,19 @@ def project(package: Path) -> dict[str, object]:
     """The [project] table of an import package."""
     table: dict[str, object] = tomllib.loads((package.parents[1] / "pyproject.toml").read_text("utf-8"))["project"]
     return table
+
+
+def needed(distribution: str) -> list[str]:
+    """A distribution of ours and those of ours that it requires, directly or through others."""
+    ours = {str(project(package)["name"]): package for package in (NATIVE, CORE, *PACKAGES)}
+    found: list[str] = []
+    waiting = [distribution]
+    while waiting:
+        name = waiting.pop()
+        if name in ours and name not in found:
+            found.append(name)
+            waiting += sorted(declared_dependencies(ours[name]))
+    return found
 
 
 def declared_dependencies(package: Path) -> set[str]:

@@ -6,13 +6,13 @@ import subprocess
 
 import pytest
 
-from splatwizard_core.native import toolchain
-from splatwizard_core.native.build import declared_modules, resolve_module
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.kernels import declared_modules
+from splatwizard_native import find_nvcc, resolve_module, toolchain
 
 MODULES = [resolve_module(target) for target in declared_modules(load_plugins())]
 SOURCES = [(module, source) for module in MODULES for source in module.cuda_sources if source.endswith(".cu")]
-NVCC = toolchain.find_nvcc()
+NVCC = find_nvcc()
 
 
 def test_there_are_cuda_sources_to_compile():

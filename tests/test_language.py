@@ -5,10 +5,10 @@ from __future__ import annotations
 import ast
 
 import pytest
-from import_graph import CORE, PACKAGES, ROOT, STRANGERS, files_of
+from import_graph import CORE, NATIVE, PACKAGES, ROOT, STRANGERS, files_of
 
 QUESTIONS = {"What", "Who", "Whose", "How", "Where", "Which", "Why"}
-FOLDERS = [CORE, *PACKAGES, *STRANGERS, ROOT / "benchmarks", ROOT / "tools"]
+FOLDERS = [NATIVE, CORE, *PACKAGES, *STRANGERS, ROOT / "benchmarks", ROOT / "tools"]
 
 
 @pytest.mark.parametrize("folder", FOLDERS, ids=lambda p: p.name)

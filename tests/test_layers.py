@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from import_graph import (
     CORE,
+    NATIVE,
     PACKAGES,
     STRANGERS,
     circles,
@@ -19,16 +20,17 @@ from import_graph import (
     module_graph,
 )
 
+import splatwizard_native
+
 BELOW_ALL = {"errors", "files", "progress", "streams", "memory", "cores"}
 """Single modules that know no room."""
-BELOW_RUNS = {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins", "native"}
+BELOW_RUNS = {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins"}
 ROOMS = {
     "plugins": set(),
-    "native": {"plugins"},
     "scene": {"plugins"},
     "gaussians": {"scene"},
     "rendering": {"gaussians", "scene", "plugins"},
-    "training": {"rendering", "gaussians", "scene", "native", "plugins"},
+    "training": {"rendering", "gaussians", "scene", "plugins"},
     "coding": {"gaussians", "scene", "plugins"},
     "evaluation": {"rendering", "gaussians", "scene", "plugins"},
     "method": {"training", "coding", "gaussians", "scene", "plugins"},
@@ -80,8 +82,23 @@ def test_no_modules_import_each_other():
 
 
 def test_the_longest_chain_of_imports_stays_short():
-    chain = longest_chain(module_graph())
+    # The base counts as one: whoever imports its public names need not know its inside.
+    inside = {module for module in module_graph() if module.startswith("splatwizard_native.")}
+    chain = longest_chain({module: uses - inside for module, uses in module_graph().items()})
     assert len(chain) <= 16, " -> ".join(chain)
+
+
+def test_the_base_imports_nothing_of_ours():
+    ours = {m for p in files_of(NATIVE) for m in imported(p) if m.startswith(("splatwizard_", "sw_"))}
+    assert {name.partition(".")[0] for name in ours} == {"splatwizard_native"}
+    assert declared_dependencies(NATIVE) == {"torch", "filelock"}
+
+
+@pytest.mark.parametrize("package", [CORE, *PACKAGES, *STRANGERS], ids=lambda p: p.name)
+def test_the_base_is_imported_by_its_public_names_where_it_is_declared(package):
+    used = {m for p in files_of(package) for m in imported(p) if m.startswith("splatwizard_native")}
+    assert used <= {f"splatwizard_native.{name}" for name in splatwizard_native.__all__}
+    assert ("splatwizard-native" in declared_dependencies(package)) == bool(used)
 
 
 def test_the_core_imports_no_plugin():

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from fresh_environments import FreshEnvironment, make_environment
-from import_graph import PACKAGES, declared_dependencies, project
+from import_graph import PACKAGES, needed, project
 
 from splatwizard_core.coding.container import ContainerReader
 
@@ -24,22 +24,10 @@ for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
 """
 
 
-def needed(distribution: str) -> list[str]:
-    """A package of ours and those of ours that it requires, directly or through others."""
-    found: list[str] = []
-    waiting = [distribution]
-    while waiting:
-        name = waiting.pop()
-        if name in BY_NAME and name not in found:
-            found.append(name)
-            waiting += sorted(declared_dependencies(BY_NAME[name]))
-    return found
-
-
 @pytest.mark.pipeline
 @pytest.mark.parametrize("distribution", sorted(BY_NAME))
 def test_a_package_works_alone_beside_the_core(fresh_environment, wheels, distribution):
-    fresh_environment.install(wheels["splatwizard-core"], *(wheels[name] for name in needed(distribution)))
+    fresh_environment.install(*(wheels[name] for name in needed(distribution)))
     listed = fresh_environment.plugins()
     assert {name: row["error"] for name, row in listed.items() if row["error"]} == {}
     if "entry-points" in project(BY_NAME[distribution]):
@@ -104,8 +92,8 @@ def test_a_library_that_is_gone_is_named(everything):
     [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
      (["run", "--method", "hac"], "sw-hac"), (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip
-def test_the_core_alone_names_the_package_of_what_is_asked_for(fresh_environment, wheels, command, package, tmp_path):
-    fresh_environment.install(wheels["splatwizard-core"])
+def test_the_core_alone_names_the_package_of_what_is_asked_for(fresh_environment, core_wheels, command, package):
+    fresh_environment.install(*core_wheels)
     done = fresh_environment.run(*command, check=False)
     assert done.returncode == 2
     assert f"pip install {package}" in done.stderr

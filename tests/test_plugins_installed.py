@@ -21,9 +21,9 @@ GOOD = """
 
 
 @pytest.fixture
-def core(fresh_environment, wheels):
+def core(fresh_environment, core_wheels):
     """An environment with nothing of ours but the core."""
-    fresh_environment.install(wheels["splatwizard-core"])
+    fresh_environment.install(*core_wheels)
     return fresh_environment
 
 

@@ -194,10 +194,10 @@ def test_info_of_a_file_that_can_be_decoded_misses_nothing(capsys):
 
 
 @pytest.mark.pipeline
-def test_really_missing_packages(fresh_environment, wheels, tmp_path):
+def test_really_missing_packages(fresh_environment, wheels, core_wheels, tmp_path):
     """Without any plugin, then with one whose own requirement is missing, then with everything."""
     path = write(tmp_path)
-    fresh_environment.install(wheels["splatwizard-core"])
+    fresh_environment.install(*core_wheels)
     assert "positions" in fresh_environment.run("info", str(path)).stdout
     done = fresh_environment.run("decode", str(path), check=False)
     assert done.returncode == 2

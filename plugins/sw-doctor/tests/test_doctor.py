@@ -16,10 +16,9 @@ import pytest
 from sw_doctor import child, compilers, diagnosis, packages, probe, registered, system
 from sw_doctor.text import gigabytes, one_line
 
-from splatwizard_core.api import NativeModule
-from splatwizard_core.native import toolchain
 from splatwizard_core.plugins import Entry, PluginManager, load_plugins
 from splatwizard_core.plugins.check import Check
+from splatwizard_native import NativeModule, toolchain
 
 needs_compiler = pytest.mark.skipif(
     not any(shutil.which(name) for name in toolchain.COMPILERS), reason="no C++ compiler on this machine"
@@ -243,12 +242,19 @@ def test_requirements_and_extras_come_from_the_metadata(site):
                   "lib-b; extra == 'fast'", "lib-c>=2; extra == 'fast'", "not//valid"),
         extras=("fast",),
     )  # fmt: skip
+    distribution(site, "splatwizard-core")
     needs = packages.collect_needs(["sw-thing", "not-installed"])
     assert list(needs.required) == ["lib-a"]
     assert {name: [r.name for r in found] for name, found in needs.extras.items()} == {
         "sw-thing[fast]": ["lib-b", "lib-c"]
     }
     assert needs.names() == ["lib-a", "lib-b", "lib-c"]
+
+
+def test_what_lies_below_the_core_is_asked_too(site):
+    distribution(site, "splatwizard-below", requires=("lib-z>=3",))
+    distribution(site, "sw-thing", requires=("lib-a", "splatwizard-below>=0.1", "splatwizard-absent"))
+    assert list(packages.collect_needs(["sw-thing"]).required) == ["lib-a", "lib-z"]
 
 
 def test_packages_are_imported_and_one_that_crashes_takes_no_other_along(site):
@@ -475,7 +481,7 @@ def kernels(tmp_path, monkeypatch) -> NativeModule:
     package = tmp_path / "src" / "doctored_kernels"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(
-        "from splatwizard_core.api import NativeModule\n"
+        "from splatwizard_native import NativeModule\n"
         "MODULE = NativeModule(name='doctored', package='doctored_kernels', sources=('a.cpp',), seconds=7,"
         " without='it is slow')\n"
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import sw_rasterizers
-from splatwizard_core.native.toolchain import CompilerMissingError, find_compiler
+from splatwizard_native import CompilerMissingError, find_compiler
 
 
 def test_tiles_of_ten_thousand_ellipses_equal_brute_force(tmp_path):

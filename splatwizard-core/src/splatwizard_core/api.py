@@ -44,7 +44,6 @@ MODULES = {
     ),
     "evaluation.image": "ssim_map",
     "evaluation.metrics": "MetricSetup PreparedMetric",
-    "native.loader": "NativeModule",
     "progress": "track",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""

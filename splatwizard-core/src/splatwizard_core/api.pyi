@@ -30,7 +30,6 @@ from splatwizard_core.gaussians.ply import to_ply as to_ply
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method
-from splatwizard_core.native.loader import NativeModule as NativeModule
 from splatwizard_core.plugins.hookspecs import hookimpl as hookimpl
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.registry import Registry as Registry

@@ -7,11 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+from splatwizard_native import NativeBuildError
+
 
 class SplatwizardError(Exception):
     """Base of all errors raised on purpose; the command line prints them without a traceback."""
 
     exit_status = 1
+
+
+FORESEEN = (SplatwizardError, NativeBuildError)
+"""Errors that say to a user what is wrong and what to do: ours, and those of native modules."""
 
 
 class UserInputError(SplatwizardError):
@@ -115,10 +121,6 @@ class DeviceMemoryError(SplatwizardError):
         figures = _figures(("bytes wanted at once", wanted), ("bytes free", free), ("bytes in all", total))
         super().__init__(f"the GPU has too little memory for {doing} ({figures or 'no figures'}); {advice}")
         self.wanted, self.free, self.total = wanted, free, total
-
-
-class NativeBuildError(SplatwizardError):
-    """A kernel module could not be compiled or loaded."""
 
 
 class TaskSignatureError(SplatwizardError):

@@ -15,7 +15,6 @@ from splatwizard_core.cli.paths import output_file as output_file
 from splatwizard_core.cli.paths import output_folder as output_folder
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cores import available_cores as available_cores
-from splatwizard_core.errors import NativeBuildError as NativeBuildError
 from splatwizard_core.errors import PluginError as PluginError
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
@@ -26,13 +25,9 @@ from splatwizard_core.files import new_folder as new_folder
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
 from splatwizard_core.files import write_json as write_json
-from splatwizard_core.native.build import declared_modules as declared_modules
-from splatwizard_core.native.loader import cache_root as cache_root
-from splatwizard_core.native.toolchain import find_compiler as find_compiler
-from splatwizard_core.native.toolchain import find_nvcc as find_nvcc
-from splatwizard_core.native.toolchain import nvcc_version as nvcc_version
 from splatwizard_core.plugins.check import Check as Check
 from splatwizard_core.plugins.check import State as State
+from splatwizard_core.plugins.kernels import declared_modules as declared_modules
 from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
 from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry

@@ -10,7 +10,7 @@ from sw_reference import plugin as reference_plugin
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import RasterCase, draw_scene, with_tensors
 
-from splatwizard_core.errors import CapabilityError, ConfigError, NativeBuildError, PluginError
+from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.plugins import catalogue
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.rendering import negotiation
@@ -18,6 +18,7 @@ from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
+from splatwizard_native import NativeBuildError
 
 _UNIQUE = count()
 NOT_HERE = "needs a GPU that is not here"

@@ -12,7 +12,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.tooling import Check, NativeBuildError, find_compiler, find_nvcc, nvcc_version
+from splatwizard_core.tooling import Check
+from splatwizard_native import NativeBuildError, find_compiler, find_nvcc, nvcc_version
 from sw_doctor.text import one_line
 
 GROUP = "compilers"

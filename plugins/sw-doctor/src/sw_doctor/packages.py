@@ -39,7 +39,10 @@ class Needs:
 
 
 def collect_needs(distributions: Iterable[str]) -> Needs:
-    """Read the metadata of these distributions; what they need of each other is not listed."""
+    """Read the metadata of these distributions, and of those below the core, which are no plugins.
+
+    What they need of each other is not listed.
+    """
     needs = Needs()
     names = list(dict.fromkeys(distributions))
     ours = {canonicalize_name(name) for name in names}
@@ -55,7 +58,10 @@ def collect_needs(distributions: Iterable[str]) -> Needs:
             except InvalidRequirement:
                 continue
             key = canonicalize_name(requirement.name)
-            if key in ours or key.startswith(("sw-", "splatwizard-")):
+            if key.startswith("splatwizard-") and key not in ours:
+                ours.add(key)
+                names.append(key)
+            if key in ours or key.startswith("sw-"):
                 continue  # the plugins' own check
             if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
                 needs.required.setdefault(key, requirement)

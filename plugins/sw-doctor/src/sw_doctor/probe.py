@@ -20,12 +20,12 @@ from splatwizard_core.api import PluginManager, SplatwizardError
 from splatwizard_core.tooling import (
     Check,
     Entry,
-    NativeBuildError,
     PluginError,
     State,
     declared_modules,
     load_plugins,
 )
+from splatwizard_native import NativeBuildError, NativeModule
 from sw_doctor.child import Step, serve
 from sw_doctor.text import SLOWLY, one_line
 
@@ -135,8 +135,6 @@ def nvidia_driver() -> str | None:
 
 def check_kernels(target: str) -> Check:
     """Load a native module if it is built; it compiles nothing."""
-    from splatwizard_core.api import NativeModule
-
     try:
         module = pkgutil.resolve_name(target)
     except Exception as error:
@@ -306,7 +304,8 @@ def check_main_job(plugins: PluginManager) -> Check:
         rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=lacking)
         _draw(rasterizer, str(device), backward=True)
     except Exception as error:
-        why = str(error) if isinstance(error, SplatwizardError) else f"{type(error).__name__}: {error}"
+        told = isinstance(error, (SplatwizardError, NativeBuildError))
+        why = str(error) if told else f"{type(error).__name__}: {error}"
         return Check("main job", name, "broken", one_line(why), None, needed=True)
     drawn_by = next(iter(rasterizer.choices.values()))
     fast = plugins.rasterizers.entry(drawn_by).declared.get("speed", 0) > 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatwizard_core.api import NativeModule
+from splatwizard_native import NativeModule
 
 GAUSSIANS = NativeModule(
     name="splatwizard_gaussians",

@@ -8,6 +8,8 @@ import click
 
 from splatwizard_core.cli import options as shared
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.kernels import declared_modules
+from splatwizard_native import build_all
 
 
 @click.command("build-kernels", short_help="compile all native modules ahead of time")
@@ -36,11 +38,9 @@ def build_kernels(
 
     Without this they are compiled when first used.
     """
-    from splatwizard_core.native.build import build_all
-
     rows = build_all(
-        load_plugins(), march="portable" if portable else "native", into_packages=into_packages, force=force, cuda=cuda,
-        jobs=jobs, say=shared.say,
+        declared_modules(load_plugins()), march="portable" if portable else "native", into_packages=into_packages,
+        force=force, cuda=cuda, jobs=jobs, say=shared.say,
     )  # fmt: skip
     if as_json:
         shared.print_json({"modules": [{**asdict(row), "path": row.path and str(row.path)} for row in rows]})

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
-from splatwizard_core.errors import DiskFullError, SplatwizardError
+from splatwizard_core.errors import FORESEEN, DiskFullError, SplatwizardError
 from splatwizard_core.files import FULL
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
@@ -137,9 +137,9 @@ def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     if isinstance(error, OSError) and error.errno in FULL:
         # What did not go through our own writing may not say where.
         error = DiskFullError(str(error.filename or "a file"), FULL[error.errno])
-    if isinstance(error, SplatwizardError):
+    if isinstance(error, FORESEEN):
         _say(f"error: {error}")
-        return error.exit_status
+        return error.exit_status if isinstance(error, SplatwizardError) else 1
     add_debug = "" if debug else " (a traceback: add --debug)"
     if isinstance(error, OSError) and error.strerror is not None:
         at = "" if error.filename is None else f"{error.filename}: "

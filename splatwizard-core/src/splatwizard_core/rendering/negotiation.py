@@ -12,7 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, NativeBuildError, PluginError, SplatwizardError
+from splatwizard_core.errors import FORESEEN, CapabilityError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
 from splatwizard_core.plugins.manager import PluginManager
@@ -22,6 +22,7 @@ from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
+from splatwizard_native import NativeBuildError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -108,7 +109,7 @@ class NegotiatedRasterizer:
             try:
                 rasterizer = self._make(best.name)
                 break
-            except SplatwizardError as error:
+            except FORESEEN as error:
                 self._fail(best.name, error)
         asked, composing = "+".join(sorted(wanted)) or "plain", ""
         if missing := wanted - best.features:
@@ -137,14 +138,14 @@ class NegotiatedRasterizer:
         entry = self._registry.entry(name)
         try:
             made: Rasterizer = entry.load()()
-        except SplatwizardError:
+        except FORESEEN:
             raise
         except (Exception, SystemExit) as error:
             reason = f"{type(error).__name__}: {error}"
             raise PluginError(f"rasterizer '{name}' of {entry.distribution} cannot be made: {reason}") from error
         return made
 
-    def _fail(self, name: str, error: SplatwizardError) -> None:
+    def _fail(self, name: str, error: Exception) -> None:
         if self._forced is not None:
             raise error
         module = self._registry.entry(name).declared.get("native", name)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatwizard_core.native.loader import NativeModule
+from splatwizard_native import NativeModule
 
 TRAINING = NativeModule(
     name="splatwizard_training",

@@ -11,9 +11,7 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import itertools
-import json
 import logging
-import os
 import platform
 import sys
 import tempfile
@@ -23,31 +21,18 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.files import file_sha256, write_json
-from splatwizard_core.native import toolchain
-from splatwizard_core.native.build_lock import build_lock
-from splatwizard_core.native.toolchain import Job, Toolchain
+from splatwizard_native import cuda_toolkit, toolchain
+from splatwizard_native.errors import NativeBuildError
+from splatwizard_native.library import architectures_of, install, is_intact, load_ops
+from splatwizard_native.lock import build_lock
+from splatwizard_native.settings import SWITCHED_OFF, build_timeout, cache_root, switched_off
+from splatwizard_native.toolchain import Job, Toolchain
 
 log = logging.getLogger(__name__)
 
-BUILD_TIMEOUT = 600.0
 MARCHES = ("native", "portable")
-SWITCHED_OFF = "native code is switched off by SPLATWIZARD_NATIVE=0"
 
 Say = Callable[[str], None]
-
-
-def cache_root() -> Path:
-    """Folder of this user's caches: $SPLATWIZARD_CACHE, else the platform's cache folder."""
-    chosen = os.environ.get("SPLATWIZARD_CACHE")
-    if chosen:
-        return Path(chosen).expanduser()
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "splatwizard"
-    if sys.platform == "win32":
-        return Path(os.environ.get("LOCALAPPDATA", str(Path.home()))) / "splatwizard"
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "splatwizard"
 
 
 @dataclass
@@ -111,7 +96,7 @@ class NativeModule:
         try:
             self.load()
         except NativeBuildError as error:
-            if not self._session.warned and not _disabled():
+            if not self._session.warned and not switched_off():
                 log.warning("%s", error)
             self._session.warned = True
             return False
@@ -121,7 +106,7 @@ class NativeModule:
         """Load, and say whether there are CUDA kernels; if not, warn once. For code that has a torch fallback."""
         session = self._session
         if session.cuda is None:
-            session.cuda = self.try_load() and bool(_architectures(session.loaded))
+            session.cuda = self.try_load() and bool(architectures_of(session.loaded))
             if not session.cuda and session.loaded is not None:
                 log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, self._without_cuda(), self.without)
         return session.cuda
@@ -132,11 +117,11 @@ class NativeModule:
         Raises NativeBuildError if native code is switched off, or if what is there does not load.
         """
         if self._session.loaded is None:
-            if _disabled():
+            if switched_off():
                 raise NativeBuildError(SWITCHED_OFF)
             problems = []
             for library in self._existing():
-                problem = _load_library(library)
+                problem = load_ops(library)
                 if problem is None:
                     self._session.loaded = library
                     return True
@@ -155,13 +140,13 @@ class NativeModule:
             return str(session.error)
         try:
             found = session.loaded or next(self._existing(), None)
-            if cuda and not _architectures(found):
+            if cuda and not architectures_of(found):
                 if session.loaded is not None:
                     return f"the kernels '{self.name}' that are loaded were built without CUDA: start again"
                 missing = self._without_cuda()
                 if missing is not None:
                     return missing
-            if session.loaded is None and _disabled():
+            if session.loaded is None and switched_off():
                 return SWITCHED_OFF
             if found is None:
                 toolchain.find_compiler()
@@ -179,12 +164,12 @@ class NativeModule:
             state = "prebuilt" if path.parent == self.prebuilt_folder else "cached"
         else:
             state = "damaged" if any(library.exists() for library in self._places()) else "not built"
-        cuda = self._with_cuda() if path is None else bool(_architectures(path))
+        cuda = self._with_cuda() if path is None else bool(architectures_of(path))
         return {"state": state, "path": None if path is None else str(path), "target": "cuda" if cuda else "cpu"}
 
     def is_built(self, march: str, folder: Path | None = None) -> bool:
         """Whether `build` with these arguments would find the library there and undamaged."""
-        return _intact(self._library(folder or self.cache_folder, march))
+        return is_intact(self._library(folder or self.cache_folder, march))
 
     def build(
         self,
@@ -206,8 +191,8 @@ class NativeModule:
         library = self._library(folder, march)
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            with build_lock(library.with_suffix(".lock"), timeout=_timeout(), say=say or _say):
-                if force or not _intact(library):
+            with build_lock(library.with_suffix(".lock"), timeout=build_timeout(), say=say or _say):
+                if force or not is_intact(library):
                     self._compile(library, march, tools or Toolchain(), say or _say)
         except NativeBuildError as error:
             raise self._failure(error) from error
@@ -241,7 +226,7 @@ class NativeModule:
             toolchain.arch_variants(march), toolchain.cpu_identity() if march == "native" else "", self.cflags, (),
         ]  # fmt: skip
         if cuda:
-            facts += [torch.version.cuda, () if any_gpu else toolchain.cuda_architectures(), ()]
+            facts += [torch.version.cuda, () if any_gpu else cuda_toolkit.architectures(), ()]
         digest = hashlib.sha256(repr(facts).encode())
         for path in self._files(cuda):
             try:
@@ -252,7 +237,7 @@ class NativeModule:
         return digest.hexdigest()[:16]
 
     def _load(self, say: Say | None) -> None:
-        if _disabled():
+        if switched_off():
             raise self._failure(SWITCHED_OFF)
         try:
             if self.load_built():
@@ -260,7 +245,7 @@ class NativeModule:
         except NativeBuildError as error:
             log.debug("%s", error)
         library = self.build(force=self.is_built("native"), say=say)
-        problem = _load_library(library)
+        problem = load_ops(library)
         if problem is not None:
             raise self._failure(f"{library} was compiled but does not load: {problem}")
         self._session.loaded = library
@@ -268,9 +253,9 @@ class NativeModule:
     def _existing(self) -> Iterator[Path]:
         """Undamaged libraries for this machine and these sources, best first."""
         for library in self._places():
-            if _intact(library):
-                held = _architectures(library)
-                if not held or all(any(toolchain.runs_on(a, gpu) for a in held) for gpu in toolchain.gpus()):
+            if is_intact(library):
+                held = architectures_of(library)
+                if not held or all(any(cuda_toolkit.runs_on(a, gpu) for a in held) for gpu in cuda_toolkit.gpus()):
                     yield library
 
     def _places(self) -> Iterator[Path]:
@@ -307,7 +292,7 @@ class NativeModule:
         """The reason why a build here holds no CUDA kernels, or None."""
         if not self.cuda_sources:
             return f"module '{self.name}' has no CUDA kernels"
-        return toolchain.cuda_mismatch()
+        return cuda_toolkit.mismatch()
 
     def _jobs(self, march: str, objects: Path) -> list[Job]:
         root, cuda = self._root(), self._with_cuda()
@@ -328,7 +313,7 @@ class NativeModule:
             kernel = (*shared, *include, *self.cflags, *flags, f"-DSW_ARCH={arch}")
             jobs += [Job(root / s, objects / f"{arch}-{i}.o", kernel) for i, s in enumerate(self.kernels)]
         if cuda:
-            plain = [a.replace(".", "") for a in toolchain.cuda_architectures()]
+            plain = [a.replace(".", "") for a in cuda_toolkit.architectures()]
             gencode = [f"-gencode=arch=compute_{a},code=sm_{a}" for a in plain]
             flags = ("-std=c++20", "-O3", "-Xcompiler", "-fPIC", "-DSW_WITH_CUDA", *gencode, *include)
             jobs += [Job(root / s, objects / f"cuda-{i}.o", flags, cuda=True) for i, s in enumerate(self.cuda_sources)]
@@ -350,14 +335,12 @@ class NativeModule:
             self._check_headers(jobs)
             seconds = round(time.monotonic() - started, 1)
             facts = {
-                "sha256": file_sha256(built),
                 "seconds": seconds,
                 "compiler": tools.version(),
                 "march": march,
-                "architectures": toolchain.cuda_architectures() if cuda else [],
+                "architectures": cuda_toolkit.architectures() if cuda else [],
             }
-            os.replace(built, library)
-            write_json(library.with_suffix(".json"), facts)
+            install(built, library, facts)
         say(f"compiled kernels '{self.name}' in {seconds:.0f} s")
 
     def _check_headers(self, jobs: list[Job]) -> None:
@@ -381,47 +364,3 @@ class NativeModule:
 def _say(message: str) -> None:
     """Progress to whoever sits at the terminal; logging would hide it unless configured."""
     print(message, file=sys.stderr, flush=True)
-
-
-def _load_library(library: Path) -> str | None:
-    """Load the ops into torch; the reason if that fails."""
-    import torch
-
-    try:
-        torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
-    except (OSError, RuntimeError) as error:
-        return str(error.__cause__ or error)
-    return None
-
-
-def _disabled() -> bool:
-    return os.environ.get("SPLATWIZARD_NATIVE", "1").strip().lower() in ("0", "off", "no", "false")
-
-
-def _timeout() -> float:
-    try:
-        return float(os.environ.get("SPLATWIZARD_BUILD_TIMEOUT", BUILD_TIMEOUT))
-    except ValueError:
-        return BUILD_TIMEOUT
-
-
-def _facts(library: Path) -> dict[str, Any]:
-    """Facts that the build wrote beside a library; empty if they cannot be read."""
-    try:
-        facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
-
-
-def _architectures(library: Path | None) -> list[str]:
-    """Compute capabilities that the library's CUDA kernels are compiled for; empty if it has none."""
-    return [] if library is None else _facts(library).get("architectures") or []
-
-
-def _intact(library: Path) -> bool:
-    """Whether the file is what the build wrote. A truncated library may load and crash the process later."""
-    try:
-        return _facts(library).get("sha256") == file_sha256(library)
-    except OSError:
-        return False

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from splatwizard_core.errors import NativeBuildError
+from splatwizard_native.errors import NativeBuildError
 
 
 @contextmanager

@@ -16,13 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.files import file_sha256
-from splatwizard_core.native import build, toolchain
-from splatwizard_core.native.build import build_all, declared_modules, resolve_module
-from splatwizard_core.native.build_lock import build_lock
-from splatwizard_core.native.loader import NativeModule, cache_root
-from splatwizard_core.plugins.manager import PluginManager
+from splatwizard_native import NativeBuildError, NativeModule, build_all, cache_root, cuda_toolkit, toolchain
+from splatwizard_native.lock import build_lock
 
 needs_compiler = pytest.mark.skipif(
     not any(shutil.which(name) for name in toolchain.COMPILERS), reason="no C++ compiler on this machine"
@@ -50,6 +45,10 @@ class Package:
     @property
     def compilations(self) -> int:
         return self.calls.read_text().count(" -c ") if self.calls.exists() else 0
+
+
+def digest_of(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
 
 
 def call(library: Path | str | None, function: str = "answer") -> int:
@@ -205,7 +204,7 @@ def test_a_damaged_library_is_rebuilt(package, damage):
         facts.unlink()
     else:  # the digest fits, and still it is no library
         library.write_bytes(b"not a library")
-        facts.write_text(json.dumps({"sha256": file_sha256(library)}))
+        facts.write_text(json.dumps({"sha256": digest_of(library)}))
     module = package.module()
     module.load()
     assert package.compilations == 2
@@ -245,7 +244,7 @@ def test_a_missing_source_is_named(package):
 HOLD = """
 import sys, time
 from pathlib import Path
-from splatwizard_core.native.build_lock import build_lock
+from splatwizard_native.lock import build_lock
 with build_lock(Path(sys.argv[1]), timeout=5, say=print):
     print("held", flush=True)
     sys.stdin.read()
@@ -381,7 +380,7 @@ def test_cuda_sources_are_left_out_without_cuda_in_torch(package):
 
 
 @needs_compiler
-@pytest.mark.skipif(toolchain.find_nvcc() is None, reason="no CUDA compiler on this machine")
+@pytest.mark.skipif(cuda_toolkit.find_nvcc() is None, reason="no CUDA compiler on this machine")
 def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, tmp_path):
     import torch
 
@@ -413,8 +412,8 @@ def test_a_cuda_toolkit_that_does_not_fit_torch_is_named(package, monkeypatch, t
 
     module = package.module(cuda_sources=("fill.cu",))
     monkeypatch.setattr(torch.version, "cuda", torchs)
-    monkeypatch.setattr(toolchain, "find_nvcc", lambda: None if nvcc is None else "/opt/cuda/bin/nvcc")
-    monkeypatch.setattr(toolchain, "nvcc_version", lambda _: nvcc)
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None if nvcc is None else "/opt/cuda/bin/nvcc")
+    monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda _: nvcc)
     package.write("fill.cu", CUDA_KERNEL)
     reason = module.available(cuda=True)
     if message is None:
@@ -432,11 +431,11 @@ def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_
     package.write("fill.cu", CUDA_KERNEL)
     module = package.module(cuda_sources=("fill.cu",))
     monkeypatch.setattr(torch.version, "cuda", "13.0")
-    monkeypatch.setattr(toolchain, "find_nvcc", lambda: None)
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
     library = module._library(module.prebuilt_folder, "portable", True)
     library.parent.mkdir()
     library.write_bytes(b"not looked into")
-    facts = {"sha256": file_sha256(library), "architectures": ["8.0", "9.0", "12.0a"]}
+    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a"]}
     library.with_suffix(".json").write_text(json.dumps(facts))
     for gpu, suits in (
         ((9, 0), True),
@@ -446,7 +445,7 @@ def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_
         ((12, 0), True),
         ((12, 1), False),
     ):
-        monkeypatch.setattr(toolchain, "gpus", lambda gpu=gpu: [gpu])
+        monkeypatch.setattr(cuda_toolkit, "gpus", lambda gpu=gpu: [gpu])
         assert (library in module._existing()) == suits
         assert (module.available(cuda=True) is None) == suits
 
@@ -457,39 +456,46 @@ def test_an_unknown_march_is_refused(package):
 
 
 @needs_compiler
-def test_build_all_builds_what_entries_declare_and_reports_what_fails(package, monkeypatch):
-    monkeypatch.setattr(build, "CORE_MODULES", ())
+def test_build_all_builds_every_target_and_reports_what_fails(package):
     package.write(
         "native.py",
-        "from splatwizard_core.api import NativeModule\n"
+        "from splatwizard_native import NativeModule\n"
         f"GOOD = NativeModule('good', '{package.folder.name}', ('answer.cpp',), ('*.h',))\n"
         f"BAD = NativeModule('bad', '{package.folder.name}', ('bad.cpp',))\n"
         "NOT_ONE = 3\n",
     )
     package.write("bad.cpp", "nonsense\n")
-    plugins = PluginManager([])
-    for kind, name, native in (
-        ("rasterizer", "a", "GOOD"), ("rasterizer", "b", "GOOD"), ("coder", "c", "BAD"), ("coder", "d", "NOT_ONE"),
-    ):  # fmt: skip
-        plugins.registries[kind].add(name, "nowhere:Thing", summary="", native=f"{package.folder.name}.native:{native}")
-    plugins.registries["method"].add("e", "nowhere:Thing", summary="", native=["no.such.module:X"])
-    rows = {row.name.partition(":")[2] or row.name: row for row in build_all(plugins, jobs=1)}
-    assert {name: row.state for name, row in rows.items()} == {
-        "good": "built", "BAD": "failed", "NOT_ONE": "failed", "X": "failed"
-    }  # fmt: skip
-    assert "bad.cpp:1:1: error" in str(rows["BAD"].error)
-    assert "not a NativeModule but int" in str(rows["NOT_ONE"].error)
-    assert "no.such.module" in str(rows["X"].error)
-    assert call(rows["good"].path) == 42
-    again = {row.name: row.state for row in build_all(plugins)}
-    assert again["good"] == "up to date"
-    into = {row.name: row for row in build_all(plugins, into_packages=True)}["good"]
+    targets = [f"{package.folder.name}.native:{name}" for name in ("GOOD", "BAD", "NOT_ONE")] + ["no.such.module:X"]
+    good, bad, not_one, absent = build_all(targets, jobs=1)
+    assert [row.state for row in (good, bad, not_one, absent)] == ["built", "failed", "failed", "failed"]
+    assert (good.name, bad.name) == ("good", targets[1])
+    assert "bad.cpp:1:1: error" in str(bad.error)
+    assert "not a NativeModule but int" in str(not_one.error)
+    assert "no.such.module" in str(absent.error)
+    assert call(good.path) == 42
+    assert build_all(targets)[0].state == "up to date"
+    into = build_all(targets[:1], into_packages=True)[0]
     assert into.path is not None
     assert into.path.parent == package.folder / "prebuilt"
+    assert build_all([]) == []
 
 
-def test_every_native_module_of_the_core_exists():
-    assert all(isinstance(resolve_module(target), NativeModule) for target in declared_modules(PluginManager([])))
+def test_build_all_for_cuda_fails_where_it_would_leave_kernels_out(package, monkeypatch):
+    monkeypatch.setattr(cuda_toolkit, "mismatch", lambda: "there is none")
+    monkeypatch.setenv("CXX", sys.executable)  # there, and not called
+    package.write(
+        "native.py",
+        "from splatwizard_native import NativeModule\n"
+        f"GPU = NativeModule('gpu', '{package.folder.name}', ('answer.cpp',), cuda_sources=('fill.cu',))\n",
+    )
+    (row,) = build_all([f"{package.folder.name}.native:GPU"], cuda=True)
+    assert (row.state, row.error) == ("failed", "the CUDA kernels of 'gpu' cannot be built: there is none")
+    assert package.compilations == 0
+
+
+def test_importing_imports_no_torch():
+    program = "import sys, splatwizard_native; sys.exit('torch' in sys.modules)"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=60)
 
 
 def test_the_cache_follows_the_platforms_convention(monkeypatch, tmp_path):
@@ -527,7 +533,7 @@ def test_load_built_says_why_a_build_does_not_load(package):
     library = package.module().build()
     library.write_bytes(b"no library")
     facts = json.loads(library.with_suffix(".json").read_text())
-    library.with_suffix(".json").write_text(json.dumps({**facts, "sha256": file_sha256(library)}))
+    library.with_suffix(".json").write_text(json.dumps({**facts, "sha256": digest_of(library)}))
     with pytest.raises(NativeBuildError, match=f"{library.name} does not load: "):
         package.module().load_built()
 
@@ -552,8 +558,8 @@ def fake_cuda(package, monkeypatch) -> NativeModule:
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(platform, "machine", lambda: "x86_64")
     monkeypatch.setattr(toolchain, "cpu_identity", lambda: "a CPU")
-    monkeypatch.setattr(toolchain, "find_nvcc", lambda: "/opt/cuda/bin/nvcc")
-    monkeypatch.setattr(toolchain, "nvcc_version", lambda _: (13, 2))
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: "/opt/cuda/bin/nvcc")
+    monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda _: (13, 2))
     return package.module(
         sources=("answer.cpp", "binding.cpp"), kernels=("level.cpp",), cuda_sources=("fill.cu",), cflags=("-fx", "-fy")
     )
@@ -580,7 +586,7 @@ def test_the_command_lines_of_a_build(package, monkeypatch, tmp_path, march):
     link = run.pop()
     scratch = Path(link[link.index("-o") + 1]).parent
     lib, include = Path(torch.__file__).parent / "lib", Path(torch.__file__).parent / "include"
-    home = toolchain._cuda_home("/opt/cuda/bin/nvcc")
+    home = cuda_toolkit.root_of("/opt/cuda/bin/nvcc")
     common = "-std=c++20 -O3 -fPIC -D_GLIBCXX_USE_CXX11_ABI=1 -fopenmp -DSW_WITH_CUDA"
     if march == "native":
         levels = {"arch_native": "-march=native -mprefer-vector-width=512"}

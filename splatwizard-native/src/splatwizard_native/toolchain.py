@@ -6,7 +6,6 @@ and waits for ever on the lock of a dead process. What is left to know is the tw
 
 from __future__ import annotations
 
-import functools
 import os
 import platform
 import re
@@ -19,8 +18,8 @@ from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatwizard_core.cores import available_cores
-from splatwizard_core.errors import NativeBuildError
+from splatwizard_native import cuda_toolkit
+from splatwizard_native.errors import CompilerMissingError, NativeBuildError
 
 SHARED_INCLUDE = Path(__file__).parent / "include"
 SHARED_INCLUDE_FLAGS = ("-isystem", str(SHARED_INCLUDE))
@@ -34,13 +33,6 @@ X86_LEVELS = {
     # 512: GCC otherwise keeps to 256-bit vectors on AVX-512 machines, half the speed on current server cores.
     "arch_v4": ("-march=x86-64-v4", "-mprefer-vector-width=512"),
 }
-
-
-ARCHITECTURE = re.compile(r"(\d+)\.(\d)([af]?)")
-
-
-class CompilerMissingError(NativeBuildError):
-    """There is no compiler on this machine."""
 
 
 @dataclass(frozen=True)
@@ -73,81 +65,6 @@ def find_compiler() -> list[str]:
     )
 
 
-def find_nvcc() -> str | None:
-    """The CUDA compiler, from $CUDA_HOME, $CUDA_PATH, the PATH or /usr/local/cuda; None if there is none."""
-    for home in (os.environ.get("CUDA_HOME"), os.environ.get("CUDA_PATH")):
-        if home and (Path(home) / "bin" / "nvcc").is_file():
-            return str(Path(home) / "bin" / "nvcc")
-    default = Path("/usr/local/cuda/bin/nvcc")
-    return shutil.which("nvcc") or (str(default) if default.is_file() else None)
-
-
-@functools.cache
-def nvcc_version(nvcc: str) -> tuple[int, int] | None:
-    """(major, minor) of a CUDA compiler, None if it does not say."""
-    try:
-        result = subprocess.run([nvcc, "--version"], capture_output=True, text=True, check=False)
-    except OSError:
-        return None
-    found = re.search(r"release (\d+)\.(\d+)", result.stdout)
-    return None if found is None else (int(found[1]), int(found[2]))
-
-
-def cuda_mismatch() -> str | None:
-    """The reason why CUDA kernels for this torch cannot be compiled here, or None."""
-    import torch
-
-    wanted = torch.version.cuda
-    if wanted is None:
-        return "this torch is built without CUDA: install a CUDA build of torch"
-    major = wanted.partition(".")[0]
-    nvcc = find_nvcc()
-    if nvcc is None:
-        return (
-            f"no CUDA compiler was found (looked for nvcc in $CUDA_HOME, $CUDA_PATH, the PATH and /usr/local/cuda): "
-            f"install the CUDA {major} toolkit"
-        )
-    version = nvcc_version(nvcc)
-    if version is None:
-        return f"{nvcc} does not run: correct $CUDA_HOME"
-    if version[0] != int(major):
-        return (
-            f"torch is built for CUDA {wanted}, {nvcc} is of CUDA {version[0]}.{version[1]}: install a toolkit of CUDA "
-            f"{major} and point CUDA_HOME at it, or install torch for CUDA {version[0]}"
-        )
-    return None
-
-
-def cuda_architectures() -> list[str]:
-    """Compute capabilities to compile for: $TORCH_CUDA_ARCH_LIST, else those of the GPUs here, else 8.0 and 9.0."""
-    listed = os.environ.get("TORCH_CUDA_ARCH_LIST", "")
-    if listed:
-        asked = sorted(a.removesuffix("+PTX") for a in re.split(r"[ ;,]+", listed) if a)
-        for a in asked:
-            if not ARCHITECTURE.fullmatch(a):
-                raise NativeBuildError(f"$TORCH_CUDA_ARCH_LIST names '{a}': give compute capabilities, as 8.0;9.0")
-        return asked
-    return [f"{major}.{minor}" for major, minor in gpus()] or ["8.0", "9.0"]
-
-
-def runs_on(architecture: str, gpu: tuple[int, int]) -> bool:
-    """Whether machine code runs there: of "8.0" on 8.0 and any later 8.x, of "9.0a" on 9.0 alone."""
-    found = ARCHITECTURE.fullmatch(architecture)
-    if found is None:
-        return False
-    major, minor = int(found[1]), int(found[2])
-    return gpu == (major, minor) if found[3] else gpu[0] == major and gpu[1] >= minor
-
-
-def gpus() -> list[tuple[int, int]]:
-    """Compute capabilities of the GPUs that torch sees, each once, in order."""
-    import torch
-
-    if not torch.cuda.is_available():
-        return []
-    return sorted({torch.cuda.get_device_capability(i) for i in range(torch.cuda.device_count())})
-
-
 def cpu_identity() -> str:
     """The CPU's feature list and model, on which -march=native depends."""
     try:
@@ -176,9 +93,9 @@ def torch_include_flags(*, cuda: bool) -> tuple[str, ...]:
 
     base = Path(torch.__file__).parent / "include"
     paths = [base, base / "torch" / "csrc" / "api" / "include"]
-    nvcc = find_nvcc() if cuda else None
+    nvcc = cuda_toolkit.find_nvcc() if cuda else None
     if nvcc is not None:
-        paths.append(_cuda_home(nvcc) / "include")
+        paths.append(cuda_toolkit.root_of(nvcc) / "include")
     return tuple(flag for path in paths for flag in ("-isystem", str(path)))
 
 
@@ -200,7 +117,7 @@ class Toolchain:
 
     def __init__(self, jobs: int | None = None) -> None:
         limit = os.environ.get("MAX_JOBS", "")
-        self._pool = ThreadPoolExecutor(jobs or (int(limit) if limit.isdigit() else 0) or available_cores())
+        self._pool = ThreadPoolExecutor(jobs or (int(limit) if limit.isdigit() else 0) or _cores())
         self.compiler = find_compiler()
 
     def version(self) -> str:
@@ -212,7 +129,7 @@ class Toolchain:
         """Compile all files. Raises NativeBuildError with the first compiler error; everything goes to `log`."""
         runs = []
         for job in jobs:
-            compiler = [str(find_nvcc())] if job.cuda else self.compiler
+            compiler = [str(cuda_toolkit.find_nvcc())] if job.cuda else self.compiler
             written = ["-MD", "-MF", f"{job.output}.d", "-c", str(job.source), "-o", str(job.output)]
             runs.append(self._pool.submit(_run, [*compiler, *job.flags, *written], log))
         wait(runs)
@@ -224,12 +141,16 @@ class Toolchain:
         import torch
 
         libraries = ["-L", str(Path(torch.__file__).parent / "lib"), "-ltorch", "-ltorch_cpu", "-lc10"]
-        nvcc = find_nvcc() if cuda else None
+        nvcc = cuda_toolkit.find_nvcc() if cuda else None
         if nvcc is not None:
-            libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(_cuda_home(nvcc) / "lib64"), "-lcudart"]
+            libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(cuda_toolkit.root_of(nvcc) / "lib64"), "-lcudart"]
         extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
         command = [*self.compiler, "-shared", *map(str, objects), "-o", str(output), *extra, *libraries]
         self._pool.submit(_run, command, log).result()
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _run(command: list[str], log: Path) -> None:
@@ -257,10 +178,3 @@ def read_dependencies(path: Path) -> list[Path]:
     """The files that one compilation read, from the compiler's make rule."""
     rule = path.read_text(encoding="utf-8").replace("\\\n", " ")
     return [Path(p.replace("\\ ", " ")) for p in re.split(r"(?<!\\)\s+", rule.partition(": ")[2].strip()) if p]
-
-
-def _cuda_home(nvcc: str) -> Path:
-    """The toolkit's folder; an nvcc on the PATH may be a script that stands elsewhere."""
-    beside = Path(nvcc).resolve().parent.parent
-    homes = [beside, Path("/usr/local/cuda")]
-    return next((home for home in homes if (home / "include" / "cuda_runtime.h").is_file()), beside)

@@ -1,24 +1,18 @@
-"""Compilation of the native modules of all installed packages, ahead of time: `sw build-kernels`."""
+"""Compilation of several native modules at once, ahead of time."""
 
 from __future__ import annotations
 
 import pkgutil
 import time
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.native import toolchain
-from splatwizard_core.native.loader import NativeModule, Say
-from splatwizard_core.native.toolchain import Toolchain
-
-if TYPE_CHECKING:
-    from splatwizard_core.plugins.manager import PluginManager
-
-# By name: this room imports no other one.
-CORE_MODULES = ("splatwizard_core.training.native:TRAINING",)
+from splatwizard_native import cuda_toolkit
+from splatwizard_native.errors import NativeBuildError
+from splatwizard_native.module import NativeModule, Say
+from splatwizard_native.toolchain import Toolchain
 
 
 @dataclass(frozen=True)
@@ -30,16 +24,6 @@ class BuildRow:
     seconds: float
     path: Path | None
     error: str | None = None
-
-
-def declared_modules(plugins: PluginManager) -> list[str]:
-    """Targets "module:attribute", each once: the core's own, then those that registry entries declare as `native`."""
-    targets = [*CORE_MODULES]
-    for registry in plugins.registries.values():
-        for entry in registry:
-            declared = entry.declared.get("native") or ()
-            targets += [declared] if isinstance(declared, str) else declared
-    return list(dict.fromkeys(targets))
 
 
 def resolve_module(target: str) -> NativeModule:
@@ -54,7 +38,7 @@ def resolve_module(target: str) -> NativeModule:
 
 
 def build_all(
-    plugins: PluginManager,
+    targets: Sequence[str],
     *,
     march: str = "native",
     into_packages: bool = False,
@@ -63,7 +47,7 @@ def build_all(
     jobs: int | None = None,
     say: Say | None = None,
 ) -> list[BuildRow]:
-    """Build the core's and all plugins' native modules; one row each, in the order of `declared_modules`.
+    """Build the native modules that `targets` ("module:attribute") name; one row each, in their order.
 
     march, force    as for `NativeModule.build`
     cuda            fail where a module's CUDA kernels cannot be built, instead of building what is left
@@ -78,7 +62,7 @@ def build_all(
         started = time.monotonic()
         try:
             module = resolve_module(target)
-            missing = toolchain.cuda_mismatch() if cuda and module.cuda_sources else None
+            missing = cuda_toolkit.mismatch() if cuda and module.cuda_sources else None
             if missing is not None:
                 raise NativeBuildError(f"the CUDA kernels of '{module.name}' cannot be built: {missing}")
             folder = module.prebuilt_folder if into_packages else module.cache_folder
@@ -88,6 +72,5 @@ def build_all(
             return BuildRow(target, "failed", time.monotonic() - started, None, str(error))
         return BuildRow(module.name, "up to date" if fresh else "built", time.monotonic() - started, path)
 
-    targets = declared_modules(plugins)
-    with ThreadPoolExecutor(max_workers=len(targets)) as pool:
+    with ThreadPoolExecutor(max_workers=max(1, len(targets))) as pool:
         return list(pool.map(build, targets))

@@ -1,1 +1,0 @@
-"""Native modules: compiled kernels, found prebuilt, in the cache, or compiled on first use."""

@@ -1,0 +1,54 @@
+"""A compiled library on disk, and the facts that its build writes beside it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+
+def install(built: Path, library: Path, facts: dict[str, Any]) -> None:
+    """Move a new library into its place, then its digest and `facts`; `built` is on the same file system."""
+    written = built.with_suffix(".json")
+    written.write_text(json.dumps({"sha256": _sha256(built), **facts}, indent=2) + "\n", encoding="utf-8")
+    os.replace(built, library)
+    os.replace(written, library.with_suffix(".json"))
+
+
+def is_intact(library: Path) -> bool:
+    """Whether the file is the one that the build wrote. A truncated library may load and crash the process later."""
+    try:
+        return _facts(library).get("sha256") == _sha256(library)
+    except OSError:
+        return False
+
+
+def architectures_of(library: Path | None) -> list[str]:
+    """Compute capabilities that the library's CUDA kernels are compiled for; empty if it has none."""
+    return [] if library is None else _facts(library).get("architectures") or []
+
+
+def load_ops(library: Path) -> str | None:
+    """Load the ops into torch; the reason if that fails."""
+    import torch
+
+    try:
+        torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
+    except (OSError, RuntimeError) as error:
+        return str(error.__cause__ or error)
+    return None
+
+
+def _facts(library: Path) -> dict[str, Any]:
+    """Facts that the build wrote beside a library; empty if they cannot be read."""
+    try:
+        facts = json.loads(library.with_suffix(".json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def _sha256(file: Path) -> str:
+    return hashlib.sha256(file.read_bytes()).hexdigest()
