@@ -23,6 +23,7 @@ from splatwizard_core.plugins.registry import Registry
 from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import View
+from splatwizard_native import NativeBuildError
 
 
 def views(*greys: int) -> list[View]:
@@ -136,6 +137,16 @@ def test_a_metric_that_breaks_is_null_and_harms_no_other(monkeypatch: pytest.Mon
     assert "metric 'broken'" in (result.metrics["broken"].reason or "")
     assert "the sky fell" in (result.metrics["broken"].reason or "")
     assert result.metrics["l1"].mean is not None
+
+
+@pytest.mark.parametrize("error", [SceneError("no"), NativeBuildError("no")], ids=["ours", "native"])
+def test_an_error_for_the_user_ends_the_evaluation(monkeypatch: pytest.MonkeyPatch, error: Exception):
+    def stops(render: torch.Tensor, truth: torch.Tensor) -> float:
+        raise error
+
+    monkeypatch.setattr(f"{IMAGE}.ssim", stops)
+    with pytest.raises(type(error)):
+        run(views(0, 1), stops=f"{IMAGE}:ssim")
 
 
 def test_what_an_entry_declares_of_a_metric_is_typed_and_has_defaults():
