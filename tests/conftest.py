@@ -8,20 +8,28 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from fresh_environments import WORKSPACE, FreshEnvironment, build_wheel, is_ours, make_environment
+from fresh_environments import WORKSPACE, FreshEnvironment, build_wheels, is_ours, make_environment
 
 
 @pytest.fixture(scope="session")
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One wheel of each workspace package, by distribution name."""
     out = tmp_path_factory.mktemp("wheels")
-    return {project.name: build_wheel(project, out) for project in WORKSPACE}
+    return dict(zip((project.name for project in WORKSPACE), build_wheels(WORKSPACE, out), strict=True))
+
+
+@pytest.fixture(scope="session")
+def core_environment(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> FreshEnvironment:
+    """An environment with third-party packages and the core; to be cloned, not changed."""
+    environment = make_environment(tmp_path_factory.mktemp("core") / "env")
+    environment.install(wheels["splatwizard-core"])
+    return environment
 
 
 @pytest.fixture
-def fresh_environment(tmp_path: Path) -> FreshEnvironment:
-    """An empty environment: third-party packages only, nothing of ours."""
-    return make_environment(tmp_path / "env")
+def core(core_environment: FreshEnvironment, tmp_path: Path) -> FreshEnvironment:
+    """An environment of the test's own with nothing of ours but the core."""
+    return core_environment.clone(tmp_path / "env")
 
 
 @pytest.fixture
@@ -50,7 +58,7 @@ def make_plugin(tmp_path: Path):
         )
         out = tmp_path / "plugin-wheels"
         out.mkdir(exist_ok=True)
-        return build_wheel(project, out)
+        return build_wheels([project], out)[0]
 
     return make
 

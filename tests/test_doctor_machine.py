@@ -168,9 +168,9 @@ def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
     assert found.mend == "pip install 'sw-gsplat[gsplat]'"
 
 
-def test_beside_the_core_alone_it_names_the_packages_that_a_run_needs(fresh_environment, wheels):
-    fresh_environment.install(wheels["splatwizard-core"], wheels["sw-doctor"])
-    done = fresh_environment.run("doctor", "--json", check=False)
+def test_beside_the_core_alone_it_names_the_packages_that_a_run_needs(core, wheels):
+    core.install(wheels["sw-doctor"])
+    done = core.run("doctor", "--json", check=False)
     assert done.returncode == 1
     checks = checks_of(done)
     job = checks["sw run"]

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fresh_environments import FreshEnvironment, make_environment
+from fresh_environments import FreshEnvironment
 from import_graph import PACKAGES, declared_dependencies, project
 
 from splatwizard_core.coding.container import ContainerReader
@@ -38,20 +37,31 @@ def needed(distribution: str) -> list[str]:
 
 @pytest.mark.pipeline
 @pytest.mark.parametrize("distribution", sorted(BY_NAME))
-def test_a_package_works_alone_beside_the_core(fresh_environment, wheels, distribution):
-    fresh_environment.install(wheels["splatwizard-core"], *(wheels[name] for name in needed(distribution)))
-    listed = fresh_environment.plugins()
+def test_a_package_works_alone_beside_the_core(core, wheels, distribution):
+    core.install(*(wheels[name] for name in needed(distribution) if name != "splatwizard-core"))
+    listed = core.plugins()
     assert {name: row["error"] for name, row in listed.items() if row["error"]} == {}
     if "entry-points" in project(BY_NAME[distribution]):
         assert listed[distribution]["provides"]
-    fresh_environment.python_c(IMPORT_ALL, BY_NAME[distribution].name)
+    core.python_c(IMPORT_ALL, BY_NAME[distribution].name)
 
 
 @pytest.fixture(scope="module")
-def everything(tmp_path_factory, wheels) -> FreshEnvironment:
-    environment = make_environment(tmp_path_factory.mktemp("everything") / "env")
-    environment.install(*wheels.values())
+def everything(tmp_path_factory, core_environment, wheels) -> FreshEnvironment:
+    environment = core_environment.clone(tmp_path_factory.mktemp("everything") / "env")
+    environment.install(*(wheel for name, wheel in wheels.items() if name != "splatwizard-core"))
     return environment
+
+
+@pytest.fixture(scope="module")
+def providers(everything) -> dict[str, str]:
+    """Method -> the distribution that provides it."""
+    return {
+        each["name"]: distribution
+        for distribution, row in everything.plugins().items()
+        for each in row["provides"]
+        if each["kind"] == "method"
+    }
 
 
 @contextlib.contextmanager
@@ -73,16 +83,9 @@ def uninstalled(environment: FreshEnvironment, distribution: str) -> Iterator[No
 
 @pytest.mark.pipeline
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.swz")), ids=lambda p: p.stem)
-def test_a_file_whose_provider_is_gone_names_it(everything, path):
+def test_a_file_whose_provider_is_gone_names_it(everything, providers, path):
     """The header knows its packages; of older files that do not, the catalogue does."""
-    reader = ContainerReader.open(path)
-    listed = json.loads(everything.run("list-plugins", "--json").stdout)["plugins"]
-    (provider,) = [
-        row["distribution"]
-        for row in listed
-        for each in row["provides"]
-        if (each["kind"], each["name"]) == ("method", reader.method)
-    ]
+    provider = providers[ContainerReader.open(path).method]
     with uninstalled(everything, provider):
         done = everything.run("decode", str(path), check=False)
     assert done.returncode == 2
@@ -104,8 +107,7 @@ def test_a_library_that_is_gone_is_named(everything):
     [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
      (["run", "--method", "hac"], "sw-hac"), (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip
-def test_the_core_alone_names_the_package_of_what_is_asked_for(fresh_environment, wheels, command, package, tmp_path):
-    fresh_environment.install(wheels["splatwizard-core"])
-    done = fresh_environment.run(*command, check=False)
+def test_the_core_alone_names_the_package_of_what_is_asked_for(core_environment, command, package):
+    done = core_environment.run(*command, check=False)
     assert done.returncode == 2
     assert f"pip install {package}" in done.stderr
