@@ -14,6 +14,8 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 DEMO_OUT ?= out
 PYTEST_ARGS ?=
 TEST_JOBS ?= 2
+# Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
+TEST_DIST := --dist loadfile --no-loadscope-reorder
 
 .PHONY: demo test coverage lint format bench kernels docs clean
 
@@ -22,10 +24,10 @@ demo: $(VENV)/.ready
 	$(BIN)/sw run --method 3dgs --method chimerags --scene demo --out $(DEMO_OUT)
 
 test: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) $(PYTEST_ARGS)
 
 coverage: $(VENV)/.ready-dev
-	$(BIN)/python -m pytest -n $(TEST_JOBS) --dist worksteal --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
+	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
 
 lint: $(VENV)/.ready-dev
 	$(BIN)/ruff check .

@@ -1,7 +1,9 @@
-"""How all tests of the workspace run: hypothesis without deadlines, and no more threads than cores for all workers."""
+"""How all tests of the workspace run: hypothesis without deadlines, no more threads than cores, long files first."""
 
 import os
+from pathlib import Path
 
+import pytest
 from hypothesis import HealthCheck, settings
 
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -12,3 +14,24 @@ settings.load_profile("patient")
 _workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if _workers > 1:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, (os.cpu_count() or 1) // _workers)))
+
+LONG_FIRST = (
+    "tests/test_documented_commands.py",
+    "tests/test_strangers.py",
+    "tests/test_packages_alone.py",
+    "tests/test_plugins_installed.py",
+    "tests/test_gaussian_methods.py",
+    "splatwizard-core/tests/runs/test_survival.py",
+    "tests/test_written_configs.py",
+    "tests/test_fuzz_swz.py",
+    "splatwizard-core/tests/runs/test_measuring.py",
+    "splatwizard-core/tests/cli/test_streams.py",
+)
+"""The files that take tens of seconds. Begun last, one of them would leave every other worker idle at the end."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Put the long files first, each as a whole; the others keep their order."""
+    first = {config.rootpath / name: place for place, name in enumerate(LONG_FIRST)}
+    assert all(map(Path.is_file, first)), "LONG_FIRST names a file that is gone"
+    items.sort(key=lambda item: first.get(item.path, len(first)))

@@ -8,7 +8,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from fresh_environments import WORKSPACE, FreshEnvironment, build_wheel, is_ours, make_environment
+from fresh_environments import WORKSPACE, FreshEnvironment, build_wheels, is_ours, make_environment
 from import_graph import needed
 
 
@@ -16,19 +16,21 @@ from import_graph import needed
 def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One wheel of each workspace package, by distribution name."""
     out = tmp_path_factory.mktemp("wheels")
-    return {project.name: build_wheel(project, out) for project in WORKSPACE}
+    return dict(zip((project.name for project in WORKSPACE), build_wheels(WORKSPACE, out), strict=True))
 
 
 @pytest.fixture(scope="session")
-def core_wheels(wheels: dict[str, Path]) -> list[Path]:
-    """The wheels of the core and of what it requires of ours."""
-    return [wheels[name] for name in needed("splatwizard-core")]
+def core_environment(tmp_path_factory: pytest.TempPathFactory, wheels: dict[str, Path]) -> FreshEnvironment:
+    """An environment with third-party packages, the core and what it requires of ours; to be cloned, not changed."""
+    environment = make_environment(tmp_path_factory.mktemp("core") / "env")
+    environment.install(*(wheels[name] for name in needed("splatwizard-core")))
+    return environment
 
 
 @pytest.fixture
-def fresh_environment(tmp_path: Path) -> FreshEnvironment:
-    """An empty environment: third-party packages only, nothing of ours."""
-    return make_environment(tmp_path / "env")
+def core(core_environment: FreshEnvironment, tmp_path: Path) -> FreshEnvironment:
+    """An environment of the test's own with nothing of ours but the core."""
+    return core_environment.clone(tmp_path / "env")
 
 
 @pytest.fixture
@@ -57,7 +59,7 @@ def make_plugin(tmp_path: Path):
         )
         out = tmp_path / "plugin-wheels"
         out.mkdir(exist_ok=True)
-        return build_wheel(project, out)
+        return build_wheels([project], out)[0]
 
     return make
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -32,16 +33,23 @@ def is_ours(name: str) -> bool:
     return stem.startswith(OURS)
 
 
-def build_wheel(project: Path, out: Path) -> Path:
-    """Build one wheel with the build backend of the running environment."""
-    before = set(out.glob("*.whl"))
-    subprocess.run(
-        [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "--no-index",
-         "--disable-pip-version-check", "-w", str(out), str(project)],
-        check=True, capture_output=True, text=True,
-    )  # fmt: skip
-    (wheel,) = set(out.glob("*.whl")) - before
-    return wheel
+BUILD = """
+import os, sys
+from hatchling.build import build_wheel
+out, *projects = sys.argv[1:]
+for project in projects:
+    os.chdir(project)
+    print(build_wheel(out))
+"""
+"""What pip does with a project whose build backend is hatchling, for many of them in one process."""
+
+
+def build_wheels(projects: Sequence[Path], out: Path) -> list[Path]:
+    """Build a wheel of each project with the build backend of the running environment."""
+    done = subprocess.run(
+        [sys.executable, "-c", BUILD, str(out), *map(str, projects)], check=True, capture_output=True, text=True
+    )
+    return [out / name for name in done.stdout.split()]
 
 
 @dataclass
@@ -55,11 +63,21 @@ class FreshEnvironment:
         return self.prefix / "bin" / "python"
 
     def install(self, *wheels: Path) -> None:
-        subprocess.run(
-            [sys.executable, "-m", "pip", "--python", str(self.python), "install", "-q", "--no-deps", "--no-index",
-             "--disable-pip-version-check", *map(str, wheels)],
-            check=True, capture_output=True, text=True,
-        )  # fmt: skip
+        """Have the environment's own pip install the wheels; without any, do nothing."""
+        if wheels:
+            subprocess.run(
+                [str(self.python), "-m", "pip", "install", "-q", "--no-deps", "--no-index",
+                 "--disable-pip-version-check", *map(str, wheels)],
+                check=True, capture_output=True, **self._surroundings({}),
+            )  # fmt: skip
+
+    def clone(self, prefix: Path) -> FreshEnvironment:
+        """Make an environment with the same distributions at another place, in a tenth of the time."""
+        shutil.copytree(self.prefix, prefix, symlinks=True)
+        for script in (prefix / "bin").iterdir():
+            if not script.is_symlink():  # its first line names the interpreter
+                script.write_text(script.read_text().replace(str(self.prefix), str(prefix)))
+        return FreshEnvironment(prefix)
 
     def run(self, *args: str, check: bool = True, **env: str) -> subprocess.CompletedProcess[str]:
         """Run `sw ARGS` there, away from the source tree."""

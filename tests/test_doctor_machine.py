@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +39,11 @@ def plugin(site: Path, name: str, source: str, *more: str) -> None:
 
 @pytest.fixture(scope="module")
 def sound() -> tuple[subprocess.CompletedProcess[str], float]:
-    started = time.monotonic()
-    return doctor("--json"), time.monotonic() - started
+    """What `sw doctor` says of this machine, and the CPU seconds that it and its children took."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    done = doctor("--json")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return done, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def test_this_machine_can_do_the_main_job(sound):
@@ -59,7 +62,7 @@ def test_this_machine_can_do_the_main_job(sound):
 
 
 def test_it_is_done_while_one_waits(sound):
-    assert sound[1] < 20  # 3 s on two quiet cores; this test shares them with others
+    assert sound[1] < 100  # 13 on a server's core
 
 
 def test_everything_that_is_wrong_has_its_own_line(tmp_path):
@@ -168,9 +171,9 @@ def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):
     assert found.mend == "pip install 'sw-gsplat[gsplat]'"
 
 
-def test_beside_the_core_alone_it_names_the_packages_that_a_run_needs(fresh_environment, wheels, core_wheels):
-    fresh_environment.install(*core_wheels, wheels["sw-doctor"])
-    done = fresh_environment.run("doctor", "--json", check=False)
+def test_beside_the_core_alone_it_names_the_packages_that_a_run_needs(core, wheels):
+    core.install(wheels["sw-doctor"])
+    done = core.run("doctor", "--json", check=False)
     assert done.returncode == 1
     checks = checks_of(done)
     job = checks["sw run"]

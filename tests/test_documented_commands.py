@@ -1,8 +1,8 @@
 """Every command that README.md and docs/guide.md show runs as written.
 
 A training command gets settings for some 20 steps added, so that the pages can be run in a test; `path/to/garden` and
-`path/to/data` become a small photographed scene and a folder of data sets. A run of several methods becomes one of
-each, since those settings are not those of all. Nothing else is changed.
+`path/to/data` become a small photographed scene and a folder of data sets, and `demo` is drawn as small as `demo:tiny`.
+A run of several methods becomes one of each, since those settings are not those of all. Nothing else is changed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from sw_datasets.demo.synthetic import SIZES
 
 from splatwizard_core.cli.main import main
 
@@ -26,6 +27,12 @@ SHORT: dict[str | None, list[str]] = {
 }
 """What makes a training short: of every method, and of one beside that."""
 TRAINING = ("run", "train")
+SMALL_DEMO = """
+from sw_datasets.demo.synthetic import SIZES
+
+SIZES["demo"] = SIZES["tiny"]
+"""
+"""A plugin for the processes that a run starts: drawing `demo` would be most of their work."""
 
 
 def commands(page: Path) -> list[str]:
@@ -66,6 +73,19 @@ def working_directory(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture
+def small_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`demo` has the pictures and points of `demo:tiny`, here and in every process started from here."""
+    monkeypatch.setitem(SIZES, "demo", SIZES["tiny"])
+    information = tmp_path / "sw_small_demo-1.0.dist-info"
+    information.mkdir()
+    (tmp_path / "sw_small_demo.py").write_text(SMALL_DEMO)
+    (information / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-small-demo\nVersion: 1.0\n")
+    (information / "entry_points.txt").write_text("[splatwizard]\nsmall-demo = sw_small_demo\n")
+    paths = [str(tmp_path), *filter(None, [os.environ.get("PYTHONPATH")])]
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(paths))
+
+
 def documented(page: str) -> list[str]:
     shown = [command for command in commands(ROOT / page) if sw_arguments(command) is not None]
     assert len(shown) >= 4, f"{page} shows hardly any command: has its layout changed?"
@@ -74,7 +94,7 @@ def documented(page: str) -> list[str]:
 
 @pytest.mark.parametrize("page", ["README.md", "docs/guide.md"])
 def test_every_sw_command_of_the_page_succeeds_in_the_order_of_the_page(
-    page: str, working_directory: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    page: str, working_directory: Path, small_demo, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(working_directory)
     monkeypatch.setenv("SPLATWIZARD_DATA", str(working_directory / "path" / "to" / "data"))

@@ -137,7 +137,7 @@ def test_the_harness_sees_what_it_looks_for():
 
     def hang():
         began = time.process_time()
-        while time.process_time() < began + 1.05:
+        while time.process_time() < began + 0.25:
             pass
         return "decoded"
 
@@ -147,7 +147,7 @@ def test_the_harness_sees_what_it_looks_for():
     tally = Tally()
     faults = [crash, *([flood] if reset_peak_rss() else []), hang, miss]  # not every system tells a peak of memory
     for number, fault in enumerate(faults, 1):
-        attempt(fault, fault.__name__, 4 << 20, tally)
+        attempt(fault, fault.__name__, 4 << 20, tally, seconds=0.2)
         assert [problem.partition(":")[0] for problem in tally.problems[number - 1 :]] == [fault.__name__]
     attempt(miss, "miss", 4 << 20, tally, plugins_may_miss=True)
     assert len(tally.problems) == len(faults)
@@ -265,16 +265,23 @@ def test_the_largest_model_that_few_bytes_may_claim_stays_within_time_and_memory
     ids=["lists", "objects", "zeros", "floats", "strings", "nulls", "nests"],
 )
 def test_a_header_of_the_largest_size_is_read_within_time_and_memory(tmp_path, filler):
-    count = ((1 << 19) - 2000) // (len(filler) + 1)
-    parts = Parts.of(SEEDS["3dgs_empty_v1"])
-    parts.header["static"] = {"filler": "@"}
-    data = parts.join(raw=lambda raw: raw.replace(b'"@"', b"[" + b",".join([filler] * count) + b"]"))
-    path, tally = tmp_path / "header.swz", Tally()
-    path.write_bytes(data)
+    def attempts(size: int) -> float:
+        """Read a header of `size` bytes; the least CPU seconds of three times."""
+        parts = Parts.of(SEEDS["3dgs_empty_v1"])
+        parts.header["static"] = {"filler": "@"}
+        fillers = b",".join([filler] * ((size - 2000) // (len(filler) + 1)))
+        data = parts.join(raw=lambda raw: raw.replace(b'"@"', b"[" + fillers + b"]"))
+        path = tmp_path / "header.swz"
+        path.write_bytes(data)
+        taken = []
+        for _ in range(3):
+            tally = Tally()
+            attempt(lambda: ContainerReader.open(path).method, f"a header of {len(data):,} bytes",
+                    4 * 64 * len(data) + NOISE, tally)  # fmt: skip
+            assert tally.problems == []
+            assert tally.outcomes["3dgs"] == 1
+            taken.append(tally.slowest_s)
+        return min(taken)
 
-    def read():
-        return ContainerReader.open(path).method
-
-    attempt(read, f"a header of {len(data):,} bytes", 4 * 64 * len(data) + NOISE, tally)
-    assert tally.problems == []
-    assert tally.outcomes["3dgs"] == 1
+    # 8 times the bytes take 8 times as long; if anything took quadratic time, 64 times.
+    assert attempts(1 << 19) < 3 * 8 * attempts(1 << 16)

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import contextlib
-import json
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from fresh_environments import FreshEnvironment, make_environment
+from fresh_environments import FreshEnvironment
 from import_graph import PACKAGES, needed, project
 
 from splatwizard_core.coding.container import ContainerReader
 
 GOLDEN = Path(__file__).parent / "golden"
+IN_EVERY_ENVIRONMENT = needed("splatwizard-core")
 BY_NAME = {str(project(package)["name"]): package for package in PACKAGES}
 IMPORT_ALL = """
 import importlib, pkgutil, sys
@@ -26,20 +26,31 @@ for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
 
 @pytest.mark.pipeline
 @pytest.mark.parametrize("distribution", sorted(BY_NAME))
-def test_a_package_works_alone_beside_the_core(fresh_environment, wheels, distribution):
-    fresh_environment.install(*(wheels[name] for name in needed(distribution)))
-    listed = fresh_environment.plugins()
+def test_a_package_works_alone_beside_the_core(core, wheels, distribution):
+    core.install(*(wheels[name] for name in needed(distribution) if name not in IN_EVERY_ENVIRONMENT))
+    listed = core.plugins()
     assert {name: row["error"] for name, row in listed.items() if row["error"]} == {}
     if "entry-points" in project(BY_NAME[distribution]):
         assert listed[distribution]["provides"]
-    fresh_environment.python_c(IMPORT_ALL, BY_NAME[distribution].name)
+    core.python_c(IMPORT_ALL, BY_NAME[distribution].name)
 
 
 @pytest.fixture(scope="module")
-def everything(tmp_path_factory, wheels) -> FreshEnvironment:
-    environment = make_environment(tmp_path_factory.mktemp("everything") / "env")
-    environment.install(*wheels.values())
+def everything(tmp_path_factory, core_environment, wheels) -> FreshEnvironment:
+    environment = core_environment.clone(tmp_path_factory.mktemp("everything") / "env")
+    environment.install(*(wheel for name, wheel in wheels.items() if name not in IN_EVERY_ENVIRONMENT))
     return environment
+
+
+@pytest.fixture(scope="module")
+def providers(everything) -> dict[str, str]:
+    """Method -> the distribution that provides it."""
+    return {
+        each["name"]: distribution
+        for distribution, row in everything.plugins().items()
+        for each in row["provides"]
+        if each["kind"] == "method"
+    }
 
 
 @contextlib.contextmanager
@@ -61,16 +72,9 @@ def uninstalled(environment: FreshEnvironment, distribution: str) -> Iterator[No
 
 @pytest.mark.pipeline
 @pytest.mark.parametrize("path", sorted(GOLDEN.glob("*.swz")), ids=lambda p: p.stem)
-def test_a_file_whose_provider_is_gone_names_it(everything, path):
+def test_a_file_whose_provider_is_gone_names_it(everything, providers, path):
     """The header knows its packages; of older files that do not, the catalogue does."""
-    reader = ContainerReader.open(path)
-    listed = json.loads(everything.run("list-plugins", "--json").stdout)["plugins"]
-    (provider,) = [
-        row["distribution"]
-        for row in listed
-        for each in row["provides"]
-        if (each["kind"], each["name"]) == ("method", reader.method)
-    ]
+    provider = providers[ContainerReader.open(path).method]
     with uninstalled(everything, provider):
         done = everything.run("decode", str(path), check=False)
     assert done.returncode == 2
@@ -92,8 +96,7 @@ def test_a_library_that_is_gone_is_named(everything):
     [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
      (["run", "--method", "hac"], "sw-hac"), (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip
-def test_the_core_alone_names_the_package_of_what_is_asked_for(fresh_environment, core_wheels, command, package):
-    fresh_environment.install(*core_wheels)
-    done = fresh_environment.run(*command, check=False)
+def test_the_core_alone_names_the_package_of_what_is_asked_for(core_environment, command, package):
+    done = core_environment.run(*command, check=False)
     assert done.returncode == 2
     assert f"pip install {package}" in done.stderr

@@ -20,13 +20,6 @@ GOOD = """
 """
 
 
-@pytest.fixture
-def core(fresh_environment, core_wheels):
-    """An environment with nothing of ours but the core."""
-    fresh_environment.install(*core_wheels)
-    return fresh_environment
-
-
 def good(make_plugin, name: str, **kwargs) -> Path:
     return make_plugin(name, GOOD.format(module=name.replace("-", "_")), **kwargs)
 

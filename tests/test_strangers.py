@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from fresh_environments import ROOT, FreshEnvironment, build_wheel, make_environment
+from fresh_environments import ROOT, FreshEnvironment, build_wheels
 
 pytestmark = pytest.mark.pipeline
 
@@ -38,18 +38,18 @@ INTERRUPTED = {
 
 
 @pytest.fixture(scope="module")
-def strangers(tmp_path_factory: pytest.TempPathFactory, wheels) -> FreshEnvironment:
+def strangers(tmp_path_factory: pytest.TempPathFactory, core_environment, wheels) -> FreshEnvironment:
     """An environment with our wheels and the three foreign ones."""
     root = tmp_path_factory.mktemp("strangers")
-    environment = make_environment(root / "env")
-    built = [build_wheel(project, root) for project in PACKAGES.values()]
-    environment.install(*wheels.values(), *built)
+    environment = core_environment.clone(root / "env")
+    ours = (wheel for name, wheel in wheels.items() if name != "splatwizard-core")
+    environment.install(*ours, *build_wheels(list(PACKAGES.values()), root))
     return environment
 
 
-def arguments(method: str, out: Path, sets: tuple[str, ...], scene: str = "demo") -> list[str]:
+def arguments(method: str, out: Path, sets: tuple[str, ...]) -> list[str]:
     pairs = [argument for pair in sets for argument in ("--set", pair)]
-    return ["--method", method, "--scene", scene, "--out", str(out), *pairs]
+    return ["--method", method, "--scene", "demo:tiny", "--out", str(out), *pairs]
 
 
 def record_of(out: Path) -> dict[str, Any]:
@@ -94,8 +94,8 @@ def test_it_runs_by_name_and_its_file_decodes_in_a_fresh_process(strangers, tmp_
 def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strangers, tmp_path, method):
     stage, sets = INTERRUPTED[method]
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    strangers.run("train", *arguments(method, whole, sets, "demo:tiny"))
-    with strangers.start("train", *arguments(method, broken, sets, "demo:tiny")) as process:
+    strangers.run("train", *arguments(method, whole, sets))
+    with strangers.start("train", *arguments(method, broken, sets)) as process:
         while process.poll() is None and not any(x["stage"] == stage and x["step"] > 20 for x in log_of(broken)):
             time.sleep(0.01)
         process.send_signal(signal.SIGINT)
@@ -104,7 +104,7 @@ def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strang
     last = log_of(broken)[-1]
     assert (last["stage"], last["step"] < 150) == (stage, True)
     assert list(broken.glob(f"**/checkpoints/{stage:02}-{last['step']:07}.safetensors"))
-    strangers.run("train", *arguments(method, broken, sets, "demo:tiny"))
+    strangers.run("train", *arguments(method, broken, sets))
     assert log_of(broken)[-1]["step"] == 150
     files = []
     for out in (whole, broken):

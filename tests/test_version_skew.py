@@ -194,18 +194,17 @@ def test_info_of_a_file_that_can_be_decoded_misses_nothing(capsys):
 
 
 @pytest.mark.pipeline
-def test_really_missing_packages(fresh_environment, wheels, core_wheels, tmp_path):
+def test_really_missing_packages(core, wheels, tmp_path):
     """Without any plugin, then with one whose own requirement is missing, then with everything."""
     path = write(tmp_path)
-    fresh_environment.install(*core_wheels)
-    assert "positions" in fresh_environment.run("info", str(path)).stdout
-    done = fresh_environment.run("decode", str(path), check=False)
+    assert "positions" in core.run("info", str(path)).stdout
+    done = core.run("decode", str(path), check=False)
     assert done.returncode == 2
     assert "pip install 'sw-3dgs>=0.1.0' (the package that the file names)" in done.stderr
-    fresh_environment.install(wheels["sw-3dgs"])
-    done = fresh_environment.run("decode", str(path), check=False)
+    core.install(wheels["sw-3dgs"])
+    done = core.run("decode", str(path), check=False)
     assert done.returncode == 2
     assert f"sw-3dgs {HERE} does not load: needs " in done.stderr
-    fresh_environment.install(*(wheels[f"sw-{name}"] for name in ("codecs", "gaussians", "rasterizers", "reference")))
-    decoded = json.loads(fresh_environment.run("decode", str(path), "--repeats", "0", "--json").stdout)
+    core.install(*(wheels[f"sw-{name}"] for name in ("codecs", "gaussians", "rasterizers", "reference")))
+    decoded = json.loads(core.run("decode", str(path), "--repeats", "0", "--json").stdout)
     assert decoded["counts"] == {"num_gaussians": 48}

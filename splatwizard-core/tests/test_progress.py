@@ -59,10 +59,10 @@ def test_values_are_read_only_when_they_are_shown():
 
 def test_advancing_is_cheap():
     with track("t", stream=io.StringIO()) as bar:
-        began = time.perf_counter()
+        began = time.process_time()
         for _ in range(10_000):
             bar.advance(1, loss=0.5, gaussians=10)
-        per_call = (time.perf_counter() - began) / 10_000
+        per_call = (time.process_time() - began) / 10_000
     assert per_call < 100e-6  # about 1 us; a training step takes 100 ms
 
 

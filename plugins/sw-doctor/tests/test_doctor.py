@@ -348,7 +348,7 @@ def test_noise_and_exceptions_do_not_stop_the_steps(site):
     ],
 )
 def test_a_process_that_dies_or_hangs_is_a_finding(site, step, how):
-    answer = child.ask(serving(site, step), timeout=5 if "sleep" in step else 60)
+    answer = child.ask(serving(site, step), timeout=10 if "sleep" in step else 60)
     assert answer.died_in is not None
     assert answer.died_in[0] == "two"
     assert how in answer.died_in[1]

@@ -50,15 +50,19 @@ def test_help_and_list_plugins_import_no_torch(arguments: list[str]):
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["list-plugins"]])
-def test_help_and_list_plugins_take_under_half_a_second(arguments: list[str]):
-    taken = []
-    for _ in range(3):
-        before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        assert sw(*arguments).returncode == 0
-        after = resource.getrusage(resource.RUSAGE_CHILDREN)
-        # Processor time: that of the clock on the wall says more about the other tests that run.
-        taken.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
-    assert min(taken) < 0.5
+def test_help_and_list_plugins_take_little_more_than_the_libraries_they_stand_on(arguments: list[str]):
+    def seconds(*command: str) -> float:
+        """Least CPU time of three processes."""
+        taken = []
+        for _ in range(3):
+            before = resource.getrusage(resource.RUSAGE_CHILDREN)
+            subprocess.run([sys.executable, *command], capture_output=True, timeout=120, check=True)
+            after = resource.getrusage(resource.RUSAGE_CHILDREN)
+            taken.append(after.ru_utime - before.ru_utime + after.ru_stime - before.ru_stime)
+        return min(taken)
+
+    libraries = seconds("-c", "import click, pluggy, importlib.metadata as m; list(m.distributions())")
+    assert seconds("-m", "splatwizard_core", *arguments) < 5 * libraries
 
 
 @pytest.mark.parametrize("command", [[], *([name] for name in COMMANDS)])

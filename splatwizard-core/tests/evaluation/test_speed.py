@@ -1,7 +1,5 @@
 """The FPS protocol on fake renderers whose time is known."""
 
-import time
-
 import pytest
 import torch
 from fresh_memory import fresh_memory
@@ -10,37 +8,39 @@ from splatwizard_core.evaluation import speed
 from splatwizard_core.evaluation.speed import WARMUP_FRAMES, measure_speed, spread
 
 
-class SleepyRenderer:
-    """Sleeps, and keeps how long each call really took (a busy machine oversleeps)."""
+class ClockedRenderer:
+    """Takes times of its own making, on a clock that nothing else moves: no test waits, every value is exact.
 
-    def __init__(self, seconds: float, first: float = 0.0) -> None:
-        self.seconds, self.first = seconds, first
+    seconds     of a frame after the warm-up, and up to 40 % more; `first`: of each frame of the warm-up
+    """
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, seconds: float, first: float = 0.0) -> None:
+        self.seconds, self.first, self.now = seconds, first, 0.0
         self.took: list[float] = []
         self.seen: list[int] = []
+        monkeypatch.setattr(speed.time, "perf_counter", lambda: self.now)
 
     def __call__(self, view: int) -> torch.Tensor:
-        began = time.perf_counter()
-        time.sleep(self.first if len(self.took) < WARMUP_FRAMES else self.seconds)
-        image = torch.full((3, 2, 2), float(view))
+        drawn = len(self.took)
+        self.took.append(self.first if drawn < WARMUP_FRAMES else self.seconds * (1 + 0.1 * (drawn % 5)))
+        self.now += self.took[-1]
         self.seen.append(view)
-        self.took.append(time.perf_counter() - began)
-        return image
+        return torch.full((3, 2, 2), float(view))
 
 
-def test_frames_per_second_are_within_5_percent_and_warm_up_is_not_counted():
-    renderer = SleepyRenderer(seconds=0.010, first=0.060)  # a slow first round must not show
-    report = measure_speed(renderer, list(range(12)), "cpu")
+def test_frames_per_second_are_those_of_the_measured_frames_and_warm_up_is_not_counted(monkeypatch):
+    renderer = ClockedRenderer(monkeypatch, seconds=0.010, first=0.060)  # a slow first round must not show
+    report = measure_speed(renderer, list(range(13)), "cpu")
     measured = renderer.took[report.warmup_frames :]
-    assert report.warmup_frames == 12
-    assert report.frames == len(measured) == 12
-    assert report.fps == pytest.approx(len(measured) / sum(measured), rel=0.05)
-    assert report.fps > 1 / 0.030
-    assert report.latency_ms_median == pytest.approx(1e3 * sorted(measured)[6], rel=0.05)
-    assert report.latency_ms_p95 >= report.latency_ms_median
+    assert report.warmup_frames == 13
+    assert report.frames == len(measured) == 13
+    assert report.fps == pytest.approx(len(measured) / sum(measured))
+    assert report.latency_ms_median == pytest.approx(1e3 * sorted(measured)[6])
+    assert report.latency_ms_p95 == pytest.approx(14.0)
 
 
-def test_few_views_are_repeated_for_the_warm_up_only():
-    renderer = SleepyRenderer(0.0)
+def test_few_views_are_repeated_for_the_warm_up_only(monkeypatch):
+    renderer = ClockedRenderer(monkeypatch, seconds=0.001)
     report = measure_speed(renderer, [1, 2, 3], "cpu")
     assert report.warmup_frames == WARMUP_FRAMES
     assert (report.rounds, report.frames, report.views) == (1, 3, 3)
@@ -75,17 +75,18 @@ def test_no_view_is_refused():
         measure_speed(lambda v: torch.zeros(3, 1, 1), [0], "cpu", repeats=0)
 
 
-def test_repeats_are_measured_after_one_warm_up_and_give_the_spread():
-    renderer = SleepyRenderer(seconds=0.004)
-    report = measure_speed(renderer, list(range(10)), "cpu", repeats=3)
-    measured = [renderer.took[10 * k : 10 * k + 10] for k in (1, 2, 3)]
-    assert len(renderer.took) == 40
-    assert (report.repeats, report.rounds, report.frames, report.warmup_frames) == (3, 1, 30, 10)
-    assert report.fps == pytest.approx(30 / sum(map(sum, measured)), rel=0.05)
-    each = [10 / sum(run) for run in measured]
+def test_repeats_are_measured_after_one_warm_up_and_give_the_spread(monkeypatch):
+    renderer = ClockedRenderer(monkeypatch, seconds=0.004)
+    report = measure_speed(renderer, list(range(11)), "cpu", repeats=3)
+    measured = [renderer.took[11 * k : 11 * k + 11] for k in (1, 2, 3)]
+    assert len(renderer.took) == 44
+    assert (report.repeats, report.rounds, report.frames, report.warmup_frames) == (3, 1, 33, 11)
+    assert report.fps == pytest.approx(33 / sum(map(sum, measured)))
+    each = [11 / sum(run) for run in measured]
+    assert len(set(each)) == 3
     fps = report.spread["fps"]
-    assert (fps.n, fps.mean) == (3, pytest.approx(sum(each) / 3, rel=0.05))
-    assert (fps.min, fps.max) == (pytest.approx(min(each), rel=0.05), pytest.approx(max(each), rel=0.05))
+    assert (fps.n, fps.mean) == (3, pytest.approx(sum(each) / 3))
+    assert (fps.min, fps.max) == (pytest.approx(min(each)), pytest.approx(max(each)))
     assert fps.min <= report.fps <= fps.max
     assert set(report.spread) == {"fps", "latency_ms_median", "latency_ms_p95"}
 
@@ -100,10 +101,9 @@ def test_the_spread_is_that_of_a_sample():
     assert found.std == pytest.approx((((4 / 3) ** 2 + (1 / 3) ** 2 + (5 / 3) ** 2) / 2) ** 0.5)
 
 
-def test_the_first_frame_is_timed_apart():
-    renderer = SleepyRenderer(seconds=0.0, first=0.020)
-    report = measure_speed(renderer, [0], "cpu")
-    assert report.first_frame_s == pytest.approx(renderer.took[0], rel=0.05)
+def test_the_first_frame_is_timed_apart(monkeypatch):
+    renderer = ClockedRenderer(monkeypatch, seconds=0.005, first=0.020)
+    assert measure_speed(renderer, [0], "cpu").first_frame_s == pytest.approx(0.020)
 
 
 class FakeGpu:
