@@ -55,7 +55,7 @@ class Toy(Method):
 
     def create_model(self, scene, generator):
         points = PointCloud(scene.points.xyz[:60], scene.points.rgb[:60])
-        return GaussianModel.from_points(points, max_sh_degree=1)
+        return gaussians_from_points(points, max_sh_degree=1)
 
     def stages(self) -> Sequence[Stage]:
         return [ToyStage(self.config)]

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians import density
+from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.gaussians.model import GaussianModel
@@ -98,8 +99,9 @@ class PhasedModel(GaussianModel):
         self.phase = extra["phase"]
 
 
-def make_model(scene):
-    return PhasedModel.from_points(scene.points, max_sh_degree=1)
+def make_model(scene, cls=PhasedModel):
+    tensors = dict(gaussians_from_points(scene.points, max_sh_degree=1).named_parameters())
+    return cls.from_tensors(**tensors, active_sh_degree=0)
 
 
 class UpdateRate:
