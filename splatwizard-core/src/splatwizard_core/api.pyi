@@ -50,7 +50,6 @@ from splatwizard_core.scene.scene import Protocol as Protocol
 from splatwizard_core.scene.scene import Scene as Scene
 from splatwizard_core.scene.scene import View as View
 from splatwizard_core.streams import stream as stream
-from splatwizard_core.training.learning_rate import exponential_lr as exponential_lr
 from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
@@ -61,7 +60,6 @@ from splatwizard_core.training.params import Params as Params
 from splatwizard_core.training.params import PipelineParams as PipelineParams
 from splatwizard_core.training.plan import When as When
 from splatwizard_core.training.pruner import Pruner as Pruner
-from splatwizard_core.training.scheduler import PhaseSwitch as PhaseSwitch
 from splatwizard_core.training.scheduler import Scheduler as Scheduler
 from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
