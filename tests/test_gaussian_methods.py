@@ -2,10 +2,10 @@
 
 import pytest
 import torch
+from sw_gaussians.method import GaussianMethod
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError
-from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides

@@ -34,7 +34,6 @@ ROOMS = {
     "coding": {"gaussians", "scene", "plugins"},
     "evaluation": {"rendering", "gaussians", "scene", "plugins"},
     "method": {"training", "coding", "gaussians", "scene", "plugins"},
-    "gaussian_method": {"method", "training", "coding", "gaussians", "scene", "plugins"},
     "runs": {"method", *BELOW_RUNS},
     "cli": {"runs", "method", *BELOW_RUNS},
     "builtin": {"plugins"},

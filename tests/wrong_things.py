@@ -8,6 +8,8 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
+from sw_gaussians.start import gaussians_from_points
+
 from splatwizard_core.cli.main import main
 
 STEPS = 2
@@ -132,15 +134,14 @@ def cut(path: Path) -> None:
 def make_models(root: Path) -> None:
     """grey.ply, grey.swz and what can be wrong with such."""
     import torch
+    from sw_gaussians.ply import export_ply
 
     from splatwizard_core.coding.container import ContainerWriter
-    from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.gaussians.ply import export_ply
     from splatwizard_core.scene.scene import PointCloud
 
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     ply = root / "grey.ply"
-    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), ply)
+    export_ply(gaussians_from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), ply)
     content = ply.read_bytes()
     head, _, body = content.partition(b"end_header\n")
     (root / "cut.ply").write_bytes(content[:-50])
@@ -150,7 +151,7 @@ def make_models(root: Path) -> None:
     )
     (root / "huge.ply").write_bytes(head.replace(b"vertex 40", b"vertex 4000000000") + b"end_header\n" + body)
     (root / "text.ply").write_text("hello")
-    damaged = GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1)
+    damaged = gaussians_from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1)
     with torch.no_grad():
         damaged.means[3, 1] = float("nan")
     export_ply(damaged, root / "nan.ply")

@@ -7,9 +7,9 @@ import torch
 from sw_gaussians.config import MCMC
 from sw_gaussians.mcmc import draw
 from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_in_torch, accumulate_statistics
 
-from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.camera import Camera
@@ -49,7 +49,7 @@ def make_trainer(scene: Scene, config: ThreeDGSConfig | None = None, **settings)
     rasterizer = NegotiatedRasterizer(load_plugins(), device="cuda")
     assert scene.points is not None
     model = stage.begin(
-        StageContext(GaussianModel.from_points(scene.points).cuda(), scene, ppl, rasterizer, streams, lambda name: None)
+        StageContext(gaussians_from_points(scene.points).cuda(), scene, ppl, rasterizer, streams, lambda name: None)
     )
     return Trainer(stage, model, scene, ppl, rasterizer, streams)
 
@@ -104,7 +104,7 @@ def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():
 def test_statistics_of_one_launch_are_those_of_many():
     generator = torch.Generator().manual_seed(5)
     assert small_scene(3).points is not None
-    ours, theirs = (GaussianModel.from_points(small_scene(3).points).cuda() for _ in range(2))
+    ours, theirs = (gaussians_from_points(small_scene(3).points).cuda() for _ in range(2))
     for _ in range(3):
         gradients = torch.randn(500, 2, generator=generator).cuda()
         radii = torch.randint(-1, 20, (500,), generator=generator, dtype=torch.int32).cuda()

@@ -120,7 +120,7 @@ def test_quantised_files_trade_bytes_for_quality(scene, rasterizer, trained):
 
 
 def test_training_starts_again_from_a_decoded_file(scene, rasterizer, trained, tmp_path):
-    from splatwizard_core.gaussians.ply import export_ply
+    from sw_gaussians.ply import export_ply
 
     export_ply(trained.model, tmp_path / "model.ply")
     resumed = train(

@@ -4,12 +4,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians.ply import export_ply
 from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
 from splatwizard_core.errors import SceneError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import Camera
@@ -54,7 +55,7 @@ def tiny_scene(background: str = "black", points: PointCloud | None = None) -> S
 
 
 def begin(stage: ThreeDGSStage, scene: Scene, model: GaussianModel | None = None) -> GaussianModel:
-    model = model or GaussianModel.from_points(PointCloud(torch.rand(8, 3), torch.rand(8, 3)))
+    model = model or gaussians_from_points(PointCloud(torch.rand(8, 3), torch.rand(8, 3)))
     context = SimpleNamespace(model=model, scene=scene, ppl=PipelineParams(), generator=lambda name: stream(3, name))
     return stage.begin(context)
 
@@ -229,7 +230,7 @@ def test_a_scene_without_points_is_refused():
 
 
 def test_a_ply_is_a_start_with_all_bands_active(tmp_path):
-    trained = GaussianModel.from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)))
+    trained = gaussians_from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)))
     export_ply(trained, tmp_path / "m.ply")
     model = create(tiny_scene(), init=str(tmp_path / "m.ply"))
     assert model.active_sh_degree == 3

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 import torch
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import ConfigError
-from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve
@@ -143,7 +143,7 @@ def test_student_teacher_score_and_coder_of_others_need_names_alone(everybody, s
 
     def trained(name):
         asked.append(name)
-        return GaussianModel.from_points(scene.points).requires_grad_(False)
+        return gaussians_from_points(scene.points).requires_grad_(False)
 
     rasterizer = NegotiatedRasterizer(everybody, device="cpu")
     model = TrainingRun(
@@ -170,7 +170,7 @@ SHORT = {
 
 def run(plugins, scene, directory=None, stop_after=None):
     method = ChimeraGS(plugins, resolve(ChimeraGS, "quick", sets=SHORT).config)
-    teacher = GaussianModel.from_points(scene.points).requires_grad_(False)
+    teacher = gaussians_from_points(scene.points).requires_grad_(False)
     model = TrainingRun(
         method.stages(), lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(),
         NegotiatedRasterizer(plugins, device="cpu"), directory=directory, identity={}, trained=lambda name: teacher,
@@ -195,7 +195,7 @@ def test_a_run_that_is_stopped_in_the_distillation_ends_in_the_same_file(everybo
 
 def test_a_model_without_importance_gets_it_at_the_end(everybody, scene):
     stage = method_of(everybody, score__pruner="their-order", distill__iterations=1).stages()[-1]
-    teacher = GaussianModel.from_points(scene.points).requires_grad_(False)
+    teacher = gaussians_from_points(scene.points).requires_grad_(False)
     stage._rasterizer = NegotiatedRasterizer(everybody, device="cpu")
     from sw_chimerags.model import MaskedGaussians
 

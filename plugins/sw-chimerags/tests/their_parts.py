@@ -4,8 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
+from sw_gaussians.start import gaussians_from_points
 
-from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Registry, hookimpl
 from splatwizard_core.training.params import OptimizationParams
@@ -46,7 +46,7 @@ class Theirs(Method):
     Config = TheirConfig
 
     def create_model(self, scene, generator):
-        return GaussianModel.from_points(scene.points)
+        return gaussians_from_points(scene.points)
 
     def stages(self) -> Sequence[TheirStage]:
         return [TheirStage(self.config, FineTuningRates())]

@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from sw_gaussians.start import gaussians_from_points
 
-from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.camera import Camera
@@ -33,7 +33,7 @@ def make_scene(views=6, points=40, radius=3.0):
 
 
 def make_model(scene):
-    return GaussianModel.from_points(scene.points, max_sh_degree=1)
+    return gaussians_from_points(scene.points, max_sh_degree=1)
 
 
 @pytest.fixture(autouse=True)

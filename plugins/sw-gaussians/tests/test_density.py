@@ -10,10 +10,11 @@ from sw_gaussians.density import (
     reset_opacity,
     rotate,
 )
+from sw_gaussians.start import logit
 from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.errors import EmptyModel
-from splatwizard_core.gaussians.model import GaussianModel, logit
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.streams import stream
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 

@@ -6,6 +6,7 @@ from math import comb
 import pytest
 import torch
 from sw_gaussians.mcmc import add_noise, draw, grow, relocate, shared_among
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -71,7 +72,7 @@ def test_rows_are_drawn_in_proportion_to_their_weights():
 def model_of(opacities: list[float]) -> tuple[GaussianModel, SplatOptimizer]:
     n = len(opacities)
     generator = torch.Generator().manual_seed(5)
-    model = GaussianModel.from_points(
+    model = gaussians_from_points(
         PointCloud(torch.rand(n, 3, generator=generator), torch.rand(n, 3, generator=generator)), max_sh_degree=1
     )
     with torch.no_grad():

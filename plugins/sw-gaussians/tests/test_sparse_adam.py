@@ -8,6 +8,7 @@ import torch
 from sw_gaussians import sparse_adam as module
 from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.sparse_adam import SparseSplatOptimizer, sparse_adam
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -136,7 +137,7 @@ def test_wrong_arguments_are_refused():
 def made(mode, n: int = 12) -> tuple[GaussianModel, SplatOptimizer]:
     generator = torch.Generator().manual_seed(4)
     points = PointCloud(torch.rand(n, 3, generator=generator), torch.rand(n, 3, generator=generator))
-    model = GaussianModel.from_points(points, max_sh_degree=1)
+    model = gaussians_from_points(points, max_sh_degree=1)
     groups = [ParamGroup(name, lr=0.01) for name, _ in model.named_parameters()]
     if mode is None:
         return model, SplatOptimizer(model, groups)

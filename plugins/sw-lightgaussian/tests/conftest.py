@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians.start import logit
 
-from splatwizard_core.gaussians.model import GaussianModel, logit
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.scene.camera import Camera

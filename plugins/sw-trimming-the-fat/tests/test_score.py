@@ -7,8 +7,9 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sw_gaussians.start import logit
 
-from splatwizard_core.gaussians.model import GaussianModel, logit
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from sw_trimming_the_fat.score import OpacityAndGradient, doomed, mean_gradients, ranks, worth
 

@@ -12,31 +12,27 @@ MODULES = {
     "plugins.registry": "Registry",
     "plugins.manager": "PluginManager",
     "errors": (
-        "SplatwizardError BitstreamError CapabilityError ConfigError EmptyModel SceneError ShapeError UserInputError"
+        "SplatwizardError BitstreamError CapabilityError ConfigError EmptyModel PluginError SceneError ShapeError "
+        "UserInputError"
     ),
     "method": "Method create_method",
-    "gaussian_method": "GaussianMethod",
     "scene.camera": "Camera",
     "scene.scene": "View Scene PointCloud Protocol",
     "scene.dataset": "SceneOptions Dataset",
-    "scene.assemble": "assemble_scene",
     "gaussians.splat_model": "SplatModel",
     "gaussians.model": "GaussianModel",
     "gaussians.inputs": "GaussianInputs SH",
-    "gaussians.ply": "load_ply to_ply from_ply",
-    "gaussians.knn": "mean_squared_neighbor_distance",
+    "gaussians.spherical_harmonics": "rgb_to_dc",
     "rendering.rasterizer": "Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec",
     "rendering.features": "Feature",
     "rendering.info": "RasterizerInfo",
     "training.stage": "Stage StageContext CameraSampler CameraIterator",
-    "training.wrapped_stage": "WrappedStage",
-    "training.scheduler": "Scheduler PhaseSwitch",
+    "training.scheduler": "Scheduler",
     "training.plan": "When",
     "training.params": "OptimizationParams PipelineParams Params InputFile",
     "training.optimizer": "SplatOptimizer ParamGroup",
     "training.losses": "LossPack photometric_loss",
-    "training.learning_rate": "exponential_lr",
-    "training.pruner": "Pruner load_pruner",
+    "training.pruner": "Pruner",
     "streams": "stream",
     "coding.container": "ContainerReader ContainerWriter",
     "coding.contracts": (
@@ -44,6 +40,7 @@ MODULES = {
     ),
     "evaluation.image": "ssim_map",
     "evaluation.metrics": "MetricSetup PreparedMetric",
+    "files": "replacing",
     "progress": "track",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""

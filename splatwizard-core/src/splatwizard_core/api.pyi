@@ -12,6 +12,7 @@ from splatwizard_core.errors import BitstreamError as BitstreamError
 from splatwizard_core.errors import CapabilityError as CapabilityError
 from splatwizard_core.errors import ConfigError as ConfigError
 from splatwizard_core.errors import EmptyModel as EmptyModel
+from splatwizard_core.errors import PluginError as PluginError
 from splatwizard_core.errors import SceneError as SceneError
 from splatwizard_core.errors import ShapeError as ShapeError
 from splatwizard_core.errors import SplatwizardError as SplatwizardError
@@ -19,14 +20,11 @@ from splatwizard_core.errors import UserInputError as UserInputError
 from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
-from splatwizard_core.gaussian_method import GaussianMethod as GaussianMethod
+from splatwizard_core.files import replacing as replacing
 from splatwizard_core.gaussians.inputs import SH as SH
 from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
-from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance as mean_squared_neighbor_distance
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel
-from splatwizard_core.gaussians.ply import from_ply as from_ply
-from splatwizard_core.gaussians.ply import load_ply as load_ply
-from splatwizard_core.gaussians.ply import to_ply as to_ply
+from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc as rgb_to_dc
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method
@@ -43,7 +41,6 @@ from splatwizard_core.rendering.rasterizer import RasterOptions as RasterOptions
 from splatwizard_core.rendering.rasterizer import RasterStats as RasterStats
 from splatwizard_core.rendering.rasterizer import RenderResult as RenderResult
 from splatwizard_core.rendering.rasterizer import ScoreSpec as ScoreSpec
-from splatwizard_core.scene.assemble import assemble_scene as assemble_scene
 from splatwizard_core.scene.camera import Camera as Camera
 from splatwizard_core.scene.dataset import Dataset as Dataset
 from splatwizard_core.scene.dataset import SceneOptions as SceneOptions
@@ -52,7 +49,6 @@ from splatwizard_core.scene.scene import Protocol as Protocol
 from splatwizard_core.scene.scene import Scene as Scene
 from splatwizard_core.scene.scene import View as View
 from splatwizard_core.streams import stream as stream
-from splatwizard_core.training.learning_rate import exponential_lr as exponential_lr
 from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
@@ -63,11 +59,8 @@ from splatwizard_core.training.params import Params as Params
 from splatwizard_core.training.params import PipelineParams as PipelineParams
 from splatwizard_core.training.plan import When as When
 from splatwizard_core.training.pruner import Pruner as Pruner
-from splatwizard_core.training.pruner import load_pruner as load_pruner
-from splatwizard_core.training.scheduler import PhaseSwitch as PhaseSwitch
 from splatwizard_core.training.scheduler import Scheduler as Scheduler
 from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
-from splatwizard_core.training.wrapped_stage import WrappedStage as WrappedStage

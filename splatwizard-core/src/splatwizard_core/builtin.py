@@ -1,4 +1,4 @@
-"""The core as a plugin of itself: its image metrics, its interchange format and its commands."""
+"""The core as a plugin of itself: its image metrics and its commands."""
 
 from splatwizard_core.plugins.hookspecs import hookimpl
 from splatwizard_core.plugins.registry import Registry
@@ -13,18 +13,6 @@ def register_metrics(registry: Registry) -> None:
                  summary="structural similarity, 11x11 Gaussian window, zero padding")  # fmt: skip
     registry.add("l1", f"{image}:l1", label="L1", digits=4, position=6, direction="lower",
                  summary="mean absolute error")  # fmt: skip
-
-
-@hookimpl
-def register_exporters(registry: Registry) -> None:
-    registry.add("ply", "splatwizard_core.gaussians.ply:export_ply",
-                 summary="3DGS .ply, float32, as the original viewers read it", suffix=".ply")  # fmt: skip
-
-
-@hookimpl
-def register_importers(registry: Registry) -> None:
-    registry.add("ply", "splatwizard_core.gaussians.ply:load_ply",
-                 summary="3DGS .ply, float32, as the original code writes it", suffix=".ply")  # fmt: skip
 
 
 @hookimpl

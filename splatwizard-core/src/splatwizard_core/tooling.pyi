@@ -15,14 +15,12 @@ from splatwizard_core.cli.paths import output_file as output_file
 from splatwizard_core.cli.paths import output_folder as output_folder
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cores import available_cores as available_cores
-from splatwizard_core.errors import PluginError as PluginError
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
 from splatwizard_core.files import file_sha256 as file_sha256
 from splatwizard_core.files import new_folder as new_folder
-from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
 from splatwizard_core.files import write_json as write_json
 from splatwizard_core.plugins.check import Check as Check

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import click
 import pytest
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.cli.main import cli, main
 from splatwizard_core.plugins import catalogue, load_plugins
@@ -345,14 +346,13 @@ def test_info_counts_the_gaussians_of_a_ply_that_are_not_finite(
 def ply(tmp_path: Path) -> Path:
     """Forty grey Gaussians."""
     import torch
+    from sw_gaussians.ply import export_ply
 
-    from splatwizard_core.gaussians.model import GaussianModel
-    from splatwizard_core.gaussians.ply import export_ply
     from splatwizard_core.scene.scene import PointCloud
 
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     path = tmp_path / "grey.ply"
-    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), path)
+    export_ply(gaussians_from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), path)
     return path
 
 

@@ -19,6 +19,8 @@ from typing import Literal
 import numpy as np
 import torch
 from pydantic import Field
+from sw_gaussians.start import gaussians_from_points
+
 from splatwizard_core.method import Method
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.scene.scene import PointCloud
@@ -55,7 +57,7 @@ class Toy(Method):
 
     def create_model(self, scene, generator):
         points = PointCloud(scene.points.xyz[:60], scene.points.rgb[:60])
-        return GaussianModel.from_points(points, max_sh_degree=1)
+        return gaussians_from_points(points, max_sh_degree=1)
 
     def stages(self) -> Sequence[Stage]:
         return [ToyStage(self.config)]
@@ -303,7 +305,7 @@ def absent(render, truth):
 """
 
 
-OURS = "datasets,metrics,reference"
+OURS = "gaussians,datasets,metrics,reference"
 """Packages that a run on the procedural scene needs beside the toy: no kernels, so that nothing is compiled."""
 
 

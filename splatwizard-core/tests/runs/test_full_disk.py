@@ -12,12 +12,12 @@ from typing import Any
 
 import pytest
 import torch
+from sw_gaussians.ply import export_ply
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import DiskFullError
 from splatwizard_core.files import TEMPORARY
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, resolve
@@ -170,7 +170,7 @@ def test_encode_eval_and_export_without_space_are_status_1_and_leave_nothing(
 ):
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)) - 0.5
     ply = tmp_path / "grey.ply"
-    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), ply)
+    export_ply(gaussians_from_points(PointCloud(points, torch.full((40, 3), 0.5)), max_sh_degree=1), ply)
     commands = {
         "scene.swz": ["encode", str(ply), "--method", "toy", "--out", str(tmp_path / "scene.swz")],
         "view_000.png": [

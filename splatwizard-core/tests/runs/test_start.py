@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from sw_gaussians.ply import export_ply
+from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, ConfigError, SplatwizardError, UserInputError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
@@ -50,7 +50,7 @@ class Run:
 def write_ply(path: Path, count: int = 90, seed: int = 0) -> Path:
     generator = torch.Generator().manual_seed(seed)
     points = torch.rand(count, 3, generator=generator) - 0.5
-    export_ply(GaussianModel.from_points(PointCloud(points, torch.full((count, 3), 0.5)), max_sh_degree=1), path)
+    export_ply(gaussians_from_points(PointCloud(points, torch.full((count, 3), 0.5)), max_sh_degree=1), path)
     return path
 
 
@@ -156,7 +156,7 @@ def test_wrong_keys_about_what_a_method_starts_from(toy_plugins, tmp_path, ply, 
 
 
 def test_wrong_files(tmp_path, ply):
-    damaged = GaussianModel.from_points(PointCloud(torch.rand(4, 3), torch.rand(4, 3)), max_sh_degree=0)
+    damaged = gaussians_from_points(PointCloud(torch.rand(4, 3), torch.rand(4, 3)), max_sh_degree=0)
     with torch.no_grad():
         damaged.means[1, 2] = float("nan")
     export_ply(damaged, tmp_path / "nan.ply")

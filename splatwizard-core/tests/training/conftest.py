@@ -6,7 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from sw_anchors.phase_switch import PhaseSwitch
 from sw_gaussians import density
+from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import accumulate_statistics
 
 from splatwizard_core.gaussians.model import GaussianModel
@@ -14,11 +17,9 @@ from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import GradBuffer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
-from splatwizard_core.training.learning_rate import exponential_lr
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
-from splatwizard_core.training.scheduler import PhaseSwitch
 from splatwizard_core.training.stage import Stage
 
 WIDTH, HEIGHT = 12, 10
@@ -98,8 +99,9 @@ class PhasedModel(GaussianModel):
         self.phase = extra["phase"]
 
 
-def make_model(scene):
-    return PhasedModel.from_points(scene.points, max_sh_degree=1)
+def make_model(scene, cls=PhasedModel):
+    tensors = dict(gaussians_from_points(scene.points, max_sh_degree=1).named_parameters())
+    return cls.from_tensors(**tensors, active_sh_degree=0)
 
 
 class UpdateRate:

@@ -303,7 +303,7 @@ def test_state_that_does_not_fit_the_model_is_a_checkpoint_error(toy, tmp_path):
             pass
 
     with pytest.raises(CheckpointError, match="step 20, does not fit this run"):
-        toy.train(iterations=60, directory=tmp_path, model=lambda: Renamed.from_points(toy.scene.points))
+        toy.train(iterations=60, directory=tmp_path, model=lambda: toy.make_model(toy.scene, Renamed))
 
 
 def test_a_damaged_checkpoint_costs_only_the_steps_since_the_one_before(toy, whole, tmp_path, caplog):

@@ -4,10 +4,11 @@ import logging
 from types import SimpleNamespace
 
 import pytest
+from sw_anchors.phase_switch import PhaseSwitch
 
 from splatwizard_core.errors import EmptyModel, TaskError
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.training.scheduler import STOP, PhaseSwitch, Scheduler, task_name
+from splatwizard_core.training.scheduler import STOP, Scheduler, task_name
 
 
 @pytest.fixture

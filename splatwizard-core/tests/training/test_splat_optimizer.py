@@ -4,11 +4,11 @@ import copy
 
 import pytest
 import torch
+from sw_gaussians.learning_rate import exponential_lr
 from torch import nn
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.training.learning_rate import exponential_lr
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 
 

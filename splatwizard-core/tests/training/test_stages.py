@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from sw_gaussians.wrapped_stage import WrappedStage
 from torch import nn
 
 from splatwizard_core.gaussians.splat_model import SplatModel
@@ -13,7 +14,6 @@ from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import CameraSampler, Stage
-from splatwizard_core.training.wrapped_stage import WrappedStage
 
 
 class Masked(SplatModel):

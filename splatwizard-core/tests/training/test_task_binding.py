@@ -48,7 +48,7 @@ UnboundT = TypeVar("UnboundT")
 
 @pytest.fixture
 def context(toy):
-    model = SubModel.from_points(toy.scene.points)
+    model = toy.make_model(toy.scene, SubModel)
     return TaskContext(
         PipelineParams(),
         SubOptions(strength=3.0),

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.ply import load_ply
 from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.start import gaussians_from_points
 
-from splatwizard_core.api import GaussianModel, Method, SceneError, load_ply
+from splatwizard_core.api import GaussianModel, Method, SceneError
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
 from sw_codecs.models import exact, quantized
@@ -42,8 +44,8 @@ class ThreeDGS(Method):
                 path=scene.path,
             )
         if not config.mcmc.enabled:
-            return GaussianModel.from_points(scene.points, max_sh_degree=config.sh_degree)
-        return GaussianModel.from_points(
+            return gaussians_from_points(scene.points, max_sh_degree=config.sh_degree)
+        return gaussians_from_points(
             scene.points,
             max_sh_degree=config.sh_degree,
             opacity=config.mcmc.init_opacity,

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import torch
+from sw_gaussians.knn import mean_squared_neighbor_distance
 from torch import Tensor, nn
 
 from splatwizard_core.api import (
@@ -19,7 +20,6 @@ from splatwizard_core.api import (
     SceneError,
     ShapeError,
     SplatModel,
-    mean_squared_neighbor_distance,
 )
 from sw_anchors.neural_gaussians import GEOMETRY, spawn
 from sw_anchors.shape import AnchorShape

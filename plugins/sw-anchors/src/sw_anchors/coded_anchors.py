@@ -83,7 +83,7 @@ class CodedAnchors(AnchorModel):
 
     mask_logits     [N,k] a Gaussian is kept if sigmoid(logit) times `mask_weights` exceeds 0.01
     bounds          [2,3] buffer: ends of the position lattice; `update_bounds` sets them
-    phase           FULL, QUANTIZED or ENTROPY (scheduler.PhaseSwitch sets it)
+    phase           FULL, QUANTIZED or ENTROPY (`PhaseSwitch` sets it)
     noise           generator of noise and samples; None: the default one of the device. Whoever trains sets it
     base_steps      quantiser step of each group before it is predicted
     """

@@ -9,6 +9,8 @@ import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from sw_gaussians.learning_rate import exponential_lr
+
 from splatwizard_core.api import (
     LossPack,
     ParamGroup,
@@ -17,7 +19,6 @@ from splatwizard_core.api import (
     SplatOptimizer,
     Stage,
     StageContext,
-    exponential_lr,
     photometric_loss,
 )
 from sw_anchors.anchors import AnchorModel

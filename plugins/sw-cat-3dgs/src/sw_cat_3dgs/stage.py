@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
+from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
 
-from splatwizard_core.api import CameraIterator, LossPack, PhaseSwitch, Rasterizer, SplatOptimizer
+from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.model import CatAnchors, Trained
 

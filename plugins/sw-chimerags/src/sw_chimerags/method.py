@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import ConfigError, Method, create_method, load_pruner
+from sw_finetuning.pruners import load_pruner
+
+from splatwizard_core.api import ConfigError, Method, create_method
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
 from sw_chimerags.model import MaskedGaussians

@@ -5,12 +5,12 @@ import tracemalloc
 
 import pytest
 import torch
+from sw_gaussians.method import GaussianMethod
+from sw_gaussians.ply import export_ply
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError
-from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.training.params import OptimizationParams
 

@@ -9,7 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
-from splatwizard_core.tooling import Check, Entry, PluginError, load_plugins
+from splatwizard_core.api import PluginError
+from splatwizard_core.tooling import Check, Entry, load_plugins
 from sw_doctor import child, compilers, packages, system
 from sw_doctor.registered import MAIN_JOB, SECONDS, needs_of, run_registered
 from sw_doctor.text import SLOWLY, one_line

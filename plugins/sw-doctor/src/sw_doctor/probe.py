@@ -16,11 +16,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from splatwizard_core.api import PluginManager, SplatwizardError
+from splatwizard_core.api import PluginError, PluginManager, SplatwizardError
 from splatwizard_core.tooling import (
     Check,
     Entry,
-    PluginError,
     State,
     declared_modules,
     load_plugins,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 from pydantic import Field
+from sw_gaussians.learning_rate import exponential_lr
 from sw_gaussians.statistics import clear_statistics, collect_statistics
 from torch import Tensor
 
@@ -25,7 +26,6 @@ from splatwizard_core.api import (
     StageContext,
     View,
     When,
-    exponential_lr,
     photometric_loss,
 )
 

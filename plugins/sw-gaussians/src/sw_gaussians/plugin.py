@@ -1,4 +1,4 @@
-"""Registers the tasks of 3DGS and of 3DGS-MCMC, and a pruner, for any method that wants them."""
+"""Registers the tasks of 3DGS and of 3DGS-MCMC, a pruner, and the .ply of 3DGS."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -29,3 +29,15 @@ def register_tasks(registry: Registry) -> None:
 @hookimpl
 def register_pruners(registry: Registry) -> None:
     registry.add("opacity", "sw_gaussians.pruners:Opacity", summary="keeps what is opaque; looks at no view")
+
+
+@hookimpl
+def register_exporters(registry: Registry) -> None:
+    registry.add("ply", "sw_gaussians.ply:export_ply",
+                 summary="3DGS .ply, float32, as the original viewers read it", suffix=".ply")  # fmt: skip
+
+
+@hookimpl
+def register_importers(registry: Registry) -> None:
+    registry.add("ply", "sw_gaussians.ply:load_ply",
+                 summary="3DGS .ply, float32, as the original code writes it", suffix=".ply")  # fmt: skip

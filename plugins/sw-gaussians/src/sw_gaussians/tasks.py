@@ -11,8 +11,9 @@ short runs are taken before the densification of their last step, too.
 
 import logging
 
-from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, exponential_lr
+from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer
 from sw_gaussians import density
+from sw_gaussians.learning_rate import exponential_lr
 
 log = logging.getLogger(__name__)
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED, AnchorRate
+from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
 
-from splatwizard_core.api import PhaseSwitch
 from sw_hac.config import HACConfig
 from sw_hac.model import HACAnchors
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import ConfigError, GaussianModel, Method, create_method, load_pruner
+from sw_finetuning.pruners import load_pruner
+
+from splatwizard_core.api import ConfigError, GaussianModel, Method, create_method
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.presets import PRESETS, RATES
 from sw_lightgaussian.significance import Significance

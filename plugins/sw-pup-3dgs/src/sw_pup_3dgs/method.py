@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import GaussianMethod
+from sw_gaussians.method import GaussianMethod
+
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.presets import PRESETS, RATES
 from sw_pup_3dgs.stage import PupStage

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
+from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore
 
-from splatwizard_core.api import ConfigError, SplatOptimizer, load_pruner
+from splatwizard_core.api import ConfigError, SplatOptimizer
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -152,7 +152,7 @@ def is_what_was_scored(render: Pixels, truth: Pixels, recorded: float | None) ->
 
 
 def _save(pixels: Pixels, path: Path) -> None:
-    from splatwizard_core.tooling import replacing
+    from splatwizard_core.api import replacing
 
     with replacing(path) as temporary:
         Image.fromarray(pixels).save(temporary, format="PNG")

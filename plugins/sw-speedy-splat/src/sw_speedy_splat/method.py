@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import GaussianMethod, Method, create_method
+from sw_gaussians.method import GaussianMethod
+
+from splatwizard_core.api import Method, create_method
 from sw_speedy_splat.config import SpeedySplatConfig
 from sw_speedy_splat.presets import PRESETS, RATES
 from sw_speedy_splat.stage import SpeedySplatStage

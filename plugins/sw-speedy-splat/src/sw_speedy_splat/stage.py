@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
-
-from splatwizard_core.api import WrappedStage, load_pruner
+from sw_gaussians.wrapped_stage import WrappedStage
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Method, OptimizationParams, PipelineParams, PluginManager, Scheduler

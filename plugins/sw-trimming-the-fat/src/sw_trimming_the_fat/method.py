@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import GaussianMethod
+from sw_gaussians.method import GaussianMethod
+
 from sw_trimming_the_fat.config import TrimmingTheFatConfig
 from sw_trimming_the_fat.presets import PRESETS, RATES
 from sw_trimming_the_fat.stage import TrimmingStage

@@ -7,6 +7,7 @@ import math
 from typing import TYPE_CHECKING
 
 from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
+from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore, scores_of
 from sw_gaussians.statistics import GRADIENT_STATISTICS, collect_statistics
 
@@ -18,7 +19,6 @@ from splatwizard_core.api import (
     Rasterizer,
     Scene,
     SplatOptimizer,
-    load_pruner,
 )
 from sw_trimming_the_fat.score import doomed, mean_gradients
 

@@ -82,7 +82,7 @@ def _part(facts: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:
-    from splatwizard_core.gaussians.ply import load_ply
+    from splatwizard_core.plugins.interchange import load_ply
 
     model = load_ply(existing(str(path)))
     means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()

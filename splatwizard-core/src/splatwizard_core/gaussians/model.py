@@ -2,34 +2,20 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.errors import SceneError, ShapeError
+from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.inputs import SH, GaussianInputs, check_shape
-from splatwizard_core.gaussians.knn import mean_squared_neighbor_distance
-from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.streams import stream
 
 if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import Rasterizer
-
-log = logging.getLogger(__name__)
-
-MIN_SQUARED_DISTANCE = 1e-7
-"""Floor of the squared neighbour distance at initialisation, world units squared (smallest sigma 3.162e-4)."""
-
-
-def logit(p: float) -> float:
-    """ln(p / (1 - p)), the inverse of the logistic function."""
-    return math.log(p / (1 - p))
 
 
 class GaussianModel(SplatModel):
@@ -115,45 +101,6 @@ class GaussianModel(SplatModel):
         """A model of copies of these raw tensors (shapes: the class). active_sh_degree None: the full degree."""
         tensors = (means, sh_dc, sh_rest, opacity_logits, log_scales, quats)
         return cls(*(t.detach().clone().contiguous() for t in tensors), active_sh_degree=active_sh_degree)
-
-    @classmethod
-    def from_points(
-        cls, points: PointCloud, *, max_sh_degree: int = 3, opacity: float = 0.1, scale_factor: float = 1.0
-    ) -> GaussianModel:
-        """One isotropic Gaussian a point, as large as the distance to its three nearest neighbours.
-
-        points          xyz [P,3]; points that are not finite are dropped with a warning; missing colours are grey
-        opacity         initial opacity, 0..1
-        scale_factor    multiplies the initial standard deviations (MCMC starts at 0.1)
-
-        The active SH degree starts at 0. Raises SceneError if no point is left.
-        Source: 3DGS (arXiv 2308.04079), code of the authors.
-        """
-        finite = PointCloud(points.xyz.float(), points.rgb).finite()
-        n = len(finite)
-        if n < len(points):
-            log.warning("dropped %d of %d start points that are not finite", len(points) - n, len(points))
-        xyz, rgb = finite.xyz, finite.rgb
-        if n == 0:
-            raise SceneError("the scene has no usable start point: 3DGS needs SfM points or random ones")
-        if rgb is None:
-            log.warning("the %d start points have no colours; they start grey", n)
-            sh_dc = xyz.new_zeros(n, 1, 3)
-        else:
-            sh_dc = rgb_to_dc(rgb.to(xyz))[:, None, :]
-        squared = mean_squared_neighbor_distance(xyz).clamp_min(MIN_SQUARED_DISTANCE)
-        log_scales = (squared.sqrt() * scale_factor).log()[:, None].repeat(1, 3)
-        quats = xyz.new_zeros(n, 4)
-        quats[:, 0] = 1
-        return cls(
-            xyz.clone(),
-            sh_dc,
-            xyz.new_zeros(n, (max_sh_degree + 1) ** 2 - 1, 3),
-            xyz.new_full((n,), logit(opacity)),
-            log_scales,
-            quats,
-            active_sh_degree=0,
-        )
 
     @property
     def max_sh_degree(self) -> int:

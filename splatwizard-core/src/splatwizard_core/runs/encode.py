@@ -107,7 +107,7 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
     """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
-    from splatwizard_core.gaussians.ply import load_ply
+    from splatwizard_core.plugins.interchange import load_ply
 
     session.load_kernels()
     if path.suffix != ".ply":

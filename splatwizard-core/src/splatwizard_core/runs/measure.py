@@ -12,9 +12,9 @@ import torch
 
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
-from splatwizard_core.gaussians.ply import load_ply
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter, synchronize
+from splatwizard_core.plugins.interchange import load_ply
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig

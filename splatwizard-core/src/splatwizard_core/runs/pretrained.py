@@ -16,9 +16,9 @@ from typing import Any
 
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import load_ply
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins.interchange import load_ply
 from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
 from splatwizard_core.runs.session import Session
 from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at

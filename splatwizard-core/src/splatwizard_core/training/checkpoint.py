@@ -28,6 +28,7 @@ from torch import Tensor
 
 from splatwizard_core.errors import CheckpointError
 from splatwizard_core.files import TEMPORARY, replacing
+from splatwizard_core.training.keys import dotted
 from splatwizard_core.training.plan import plan_digest
 
 log = logging.getLogger(__name__)
@@ -271,7 +272,7 @@ def normalised(identity: Mapping[str, Any]) -> dict[str, Any]:
 
 def differences(checkpoint: Checkpoint, identity: Mapping[str, Any], plan: Sequence[str], extent: float) -> list[str]:
     """Return a line for each difference between a checkpoint's identity, plan or extent and this run's."""
-    old, new = _flat(checkpoint.identity), _flat(normalised(identity))
+    old, new = dotted(checkpoint.identity, ""), dotted(normalised(identity), "")
     lines = []
     for key in sorted(old.keys() | new.keys()):
         before, now = old.get(key, "absent"), new.get(key, "absent")
@@ -287,13 +288,3 @@ def _short(value: Any) -> str:
     """A value for a message: digests and long lists are cut."""
     text = str(value)
     return text if len(text) <= SHOWN_CHARACTERS else f"{text[: SHOWN_CHARACTERS - 3]}..."
-
-
-def _flat(value: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for key, item in value.items():
-        if isinstance(item, dict) and item:
-            found |= _flat(item, f"{prefix}{key}.")
-        else:
-            found[prefix + key] = item
-    return found

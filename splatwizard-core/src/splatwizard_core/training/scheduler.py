@@ -13,13 +13,12 @@ from typing import Any, Final
 import torch
 
 from splatwizard_core.errors import EmptyModel, TaskError, TaskSignatureError, TrainingDiverged
-from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import Registration, When, check_when, format_plan, plan_lines
 from splatwizard_core.training.stage import Stage
 from splatwizard_core.training.tasks import POST_ONLY, SOURCES, TaskContext, bind
 
-__all__ = ["STOP", "PhaseSwitch", "Scheduler", "build_schedulers", "format_plan"]
+__all__ = ["STOP", "Scheduler", "build_schedulers", "format_plan"]
 
 log = logging.getLogger(__name__)
 
@@ -131,26 +130,6 @@ class Scheduler:
 SOURCES[Scheduler] = "scheduler"
 
 _order = attrgetter("priority", "order")
-
-
-class PhaseSwitch:
-    """Change of the model's phase at a step: `PhaseSwitch(10_000, "entropy").register(scheduler)`.
-
-    At `step` it sets `model.phase = name`, or runs `task` instead if there is one. The plan shows it as
-    "switch to <name>". The model keeps its phase in `state_dict_extra()["phase"]`, so that a resumed run has it.
-    """
-
-    def __init__(self, step: int, name: str, task: Callable[..., Any] | None = None) -> None:
-        self.step, self.name, self.task = step, name, task
-
-    def register(self, scheduler: Scheduler, *, priority: int = 0) -> None:
-        """Register it; the same errors as `register_task`."""
-        scheduler.register_task(self.step, self.task or self._switch, priority=priority, name=f"switch to {self.name}")
-
-    def _switch(self, model: SplatModel) -> None:
-        model.phase = self.name  # type: ignore[assignment]
-        if model.state_dict_extra().get("phase") != self.name:
-            raise TypeError(f"{type(model).__name__}.state_dict_extra() must hold 'phase', or a resumed run loses it")
 
 
 def build_schedulers(stage: Stage, ppl: PipelineParams) -> tuple[Scheduler, Scheduler]:

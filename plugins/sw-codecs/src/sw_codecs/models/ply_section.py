@@ -8,8 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
+from sw_gaussians.ply import from_ply, to_ply
 
-from splatwizard_core.api import BitstreamError, GaussianModel, from_ply, to_ply
+from splatwizard_core.api import BitstreamError, GaussianModel
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter

@@ -11,7 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, assemble_scene, stream
+from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, stream
+from sw_datasets.assemble import assemble_scene
 from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, stream
+from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import BLENDER
 from sw_datasets.pictures import (
     find_pictures,

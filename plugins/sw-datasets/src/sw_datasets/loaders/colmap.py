@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View
+from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import COLMAP
 from sw_datasets.loaders.colmap_model import ColmapCamera, ColmapImage, ColmapPoints, read_model
 from sw_datasets.pictures import (

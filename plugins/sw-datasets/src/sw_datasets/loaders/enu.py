@@ -17,7 +17,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, assemble_scene, stream
+from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, stream
+from sw_datasets.assemble import assemble_scene
 from sw_datasets.pictures import fitted_size, list_pictures, load_picture, picture_header
 from sw_datasets.rules import Rules, unused_option_warnings
 

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.errors import ConfigError, SceneError
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.method import Method
+from splatwizard_core.api import ConfigError, GaussianModel, Method, SceneError
 
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-    from splatwizard_core.gaussians.splat_model import SplatModel
-    from splatwizard_core.plugins import PluginManager
-    from splatwizard_core.scene.scene import Scene
-    from splatwizard_core.training.params import OptimizationParams
+    from splatwizard_core.api import (
+        ContainerReader,
+        ContainerWriter,
+        OptimizationParams,
+        PluginManager,
+        Scene,
+        SplatModel,
+    )
 
 HEADER_KEY = "codec"
 """Header value that names the codec."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 import functools
 from typing import Any
 
-from splatwizard_core.training.params import OptimizationParams
-from splatwizard_core.training.stage import Stage
+from splatwizard_core.api import OptimizationParams, Stage
 
 
 class WrappedStage(Stage):

@@ -10,10 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
+from sw_gaussians.ply import export_ply, from_ply, load_ply, property_names, to_ply
 
 from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.ply import export_ply, from_ply, load_ply, property_names, to_ply
 from splatwizard_core.gaussians.splat_model import SplatModel
 
 DATA = Path(os.environ.get("SPLATWIZARD_TEST_DATA", Path(__file__).parents[4] / "shared" / "data")) / "model"

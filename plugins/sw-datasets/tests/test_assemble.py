@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 import torch
+from sw_datasets.assemble import assemble_scene
 
 from splatwizard_core.errors import SceneError, ShapeError
-from splatwizard_core.scene.assemble import assemble_scene
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, View
 

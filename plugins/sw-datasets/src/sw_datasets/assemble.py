@@ -9,9 +9,8 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
-from splatwizard_core.scene.splits import split_views
+from splatwizard_core.api import PointCloud, Protocol, Scene, SceneError, View
+from sw_datasets.splits import split_views
 
 
 def assemble_scene(

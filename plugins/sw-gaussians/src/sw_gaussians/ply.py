@@ -13,10 +13,7 @@ import torch
 from plyfile import PlyData
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, SceneError
-from splatwizard_core.files import replacing
-from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.splat_model import SplatModel
+from splatwizard_core.api import BitstreamError, GaussianModel, SceneError, SplatModel, replacing
 
 MAX_HEADER = 1 << 16
 _SIZES = {

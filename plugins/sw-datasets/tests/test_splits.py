@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sw_datasets.splits import split_views
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.scene.splits import split_views
 
 
 def test_every8_over_25_names_tests_0_8_16_24():

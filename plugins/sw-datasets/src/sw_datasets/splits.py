@@ -6,7 +6,7 @@ import re
 from collections.abc import Sequence
 from typing import TypeVar
 
-from splatwizard_core.errors import SceneError
+from splatwizard_core.api import SceneError
 
 T = TypeVar("T")
 

@@ -3,10 +3,10 @@
 from types import SimpleNamespace
 
 import pytest
+from sw_finetuning.pruners import load_pruner
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.plugins.registry import Registry
-from splatwizard_core.training.pruner import load_pruner
 
 
 class Ours:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 import torch
 from pydantic import Field
+from sw_gaussians.method import GaussianMethod
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
-from splatwizard_core.gaussian_method import GaussianMethod
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.registry import Coders, Registry
 from splatwizard_core.training.params import OptimizationParams
