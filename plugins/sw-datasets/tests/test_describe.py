@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from sw_datasets.describe import describe
 
-from splatwizard_core.cli.describe_scene import describe
 from splatwizard_core.scene.assemble import assemble_scene
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
