@@ -262,7 +262,7 @@ def test_a_child_ends_with_the_process_that_started_it(toy_plugins: PluginManage
     )  # fmt: skip
     assert child.stdin is not None
     assert child.stderr is not None
-    assert b"training toy" in child.stderr.readline() + child.stderr.readline()
+    assert any(b"training toy" in line for line in child.stderr)  # a slow machine tells of other things first
     assert child.poll() is None
     child.stdin.close()
     assert child.wait(timeout=30) == 1
