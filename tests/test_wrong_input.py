@@ -251,7 +251,7 @@ ROWS = [
     Row("export {grey.swz} {folder}", "{folder} is a folder"),
     Row("export {grey.swz} /proc/x.ply", "cannot write /proc/x.ply"),
     Row("data synth {folder}", "is not an empty folder"),
-    Row("data synth {notes.txt}", "is not an empty folder"),
+    Row("data synth {notes.txt}", "cannot write into {notes.txt}: it is a file"),
     Row("data synth {notes.txt}/x", "{notes.txt}"),
     # Reports.
     Row("report", "Missing argument"),

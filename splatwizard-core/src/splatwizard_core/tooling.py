@@ -31,8 +31,8 @@ MODULES = {
     "errors": "RunLockedError",
     "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": "console debug_option json_option options print_json say set_option",
-    "cli.complete": "complete_files complete_folders complete_image_folders complete_names complete_nothing",
-    "cli.paths": "existing_file output_file output_folder",
+    "cli.complete": "name_of",
+    "cli.paths": "OUTPUT_FILE OUTPUT_FOLDER existing_file",
     "cli.setup": "Choices",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""

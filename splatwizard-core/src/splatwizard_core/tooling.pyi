@@ -1,8 +1,4 @@
-from splatwizard_core.cli.complete import complete_files as complete_files
-from splatwizard_core.cli.complete import complete_folders as complete_folders
-from splatwizard_core.cli.complete import complete_image_folders as complete_image_folders
-from splatwizard_core.cli.complete import complete_names as complete_names
-from splatwizard_core.cli.complete import complete_nothing as complete_nothing
+from splatwizard_core.cli.complete import name_of as name_of
 from splatwizard_core.cli.options import console as console
 from splatwizard_core.cli.options import debug_option as debug_option
 from splatwizard_core.cli.options import json_option as json_option
@@ -10,9 +6,9 @@ from splatwizard_core.cli.options import options as options
 from splatwizard_core.cli.options import print_json as print_json
 from splatwizard_core.cli.options import say as say
 from splatwizard_core.cli.options import set_option as set_option
+from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
+from splatwizard_core.cli.paths import OUTPUT_FOLDER as OUTPUT_FOLDER
 from splatwizard_core.cli.paths import existing_file as existing_file
-from splatwizard_core.cli.paths import output_file as output_file
-from splatwizard_core.cli.paths import output_folder as output_folder
 from splatwizard_core.cli.setup import Choices as Choices
 from splatwizard_core.cores import available_cores as available_cores
 from splatwizard_core.errors import RunLockedError as RunLockedError

@@ -11,7 +11,7 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.runs.config import parse_set, resolve
-from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
+from splatwizard_core.runs.directory import RunRequest, run_directory
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.run import run, train_in
 from splatwizard_core.runs.session import Session
@@ -125,17 +125,3 @@ def test_a_plan_says_whose_its_stages_and_tasks_are(helped_plugins, capsys):
     assert main(["schedule", "borrower", "--json"]) == 0
     first = json.loads(capsys.readouterr().out)["stages"][0]
     assert [part["distribution"] for part in first["provided_by"]] == ["sw-toy", "sw-helper"]
-
-
-def test_steps_of_an_older_release_leave_the_phases_unknown_and_say_so(helped_plugins, finished):
-    """It changes what the others look at, so it is the last one."""
-    request = request_of(helped_plugins, finished[1])
-    directory = run_directory(request)
-    steps = StepLog(directory)
-    for step, name in (("train", "phases"), ("encode", "parts")):
-        before = json.loads(steps.path.read_text())[step]
-        steps.finish(step, before["key"], {k: v for k, v in before["facts"].items() if k != name})
-    steps.finish("record", "another", {})
-    record, _ = run(session(helped_plugins), request)
-    assert record.phases is None
-    assert "a release that did not note them" in record.unknown["phases"]

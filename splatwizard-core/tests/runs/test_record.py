@@ -80,7 +80,6 @@ def test_every_null_has_its_reason():
     "change",
     [
         {"unheard_of": 1},
-        {"schema_version": 4},
         {"visible_gaussians": float("nan")},
         {"file": {"bytes": 0, "sha256": "", "sections": {}, "digest": ""}},
         {"metrics": {"psnr": {"mean": 1.0, "per_view": [], "direction": "up"}}},
@@ -103,56 +102,12 @@ def test_a_damaged_record_is_named_with_its_field(tmp_path: Path):
         read_record(path)
 
 
-def as_schema_2(content: dict[str, Any]) -> dict[str, Any]:
-    """What a release wrote of the same run that did not say who served what."""
-    found: dict[str, Any] = json.loads(json.dumps({**content, "schema_version": 2}))
-    del found["phases"], found["train"]["pretraining"]
-    return found
-
-
-def as_schema_1(content: dict[str, Any]) -> dict[str, Any]:
-    """What the first release wrote of the same run."""
-    found = {**as_schema_2(content), "schema_version": 1}
-    for block, names in {
-        "speed": ("jit_s", "load_s", "repeats", "spread"), "memory": ("peak_load_bytes",),
-        "codec": ("decode_spread", "jit_s"), "train": ("pictures_in",),
-    }.items():  # fmt: skip
-        for name in names:
-            del found[block][name]
-    del found["unknown"]["speed.spread"]
-    return found
-
-
-def test_a_record_of_schema_1_is_read_and_says_what_it_does_not_hold(tmp_path: Path):
+@pytest.mark.parametrize("version", [2, 4, True, None])
+def test_a_record_of_another_schema_is_refused(tmp_path: Path, version: Any):
     path = tmp_path / "metrics.json"
-    path.write_text(json.dumps(as_schema_1(content())))
-    record = read_record(path)
-    assert record.schema_version == 3
-    assert (record.speed.fps, record.speed.repeats, record.speed.load_s) == (10.0, 1, None)
-    assert "schema 1" in record.unknown["speed.load_s"]
-    assert missing_reasons(record) == []
-    assert read_record(path).model_dump() == record.model_dump()
-    assert json.loads(path.read_text())["schema_version"] == 1  # reading changes no file
-
-
-@pytest.mark.parametrize(
-    "damage", [{"unknown": None}, {"speed": None}, {"schema_version": True}, {"schema_version": 0}]
-)
-def test_a_damaged_record_of_schema_1_is_refused(tmp_path: Path, damage: dict[str, Any]):
-    path = tmp_path / "metrics.json"
-    path.write_text(json.dumps({**as_schema_1(content()), **damage}))
-    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
+    path.write_text(json.dumps(content(schema_version=version)))
+    with pytest.raises(UserInputError, match="not a result record of schema 3: schema_version: "):
         read_record(path)
-
-
-def test_a_record_of_schema_2_is_read_and_says_what_it_does_not_hold(tmp_path: Path):
-    path = tmp_path / "metrics.json"
-    path.write_text(json.dumps(as_schema_2(content())))
-    record = read_record(path)
-    assert (record.schema_version, record.phases, record.train.pretraining) == (3, None, None)
-    assert "schema 2" in record.unknown["phases"]
-    assert (record.speed.load_s, record.train.train_s) == (0.3, 1.0)
-    assert missing_reasons(record) == []
 
 
 def test_what_a_scene_was_trained_with_may_hold_null_and_what_is_unknown_of_it_needs_a_reason():
@@ -160,14 +115,6 @@ def test_what_a_scene_was_trained_with_may_hold_null_and_what_is_unknown_of_it_n
     found = content()
     found["train"] = {**found["train"], "pretraining": {"3dgs": scene}}
     assert missing_reasons(Record.model_validate(found)) == ["train.pretraining.3dgs.preset"]
-
-
-@pytest.mark.parametrize("damage", [{"unknown": None}, {"train": None}])
-def test_a_damaged_record_of_schema_2_is_refused(tmp_path: Path, damage: dict[str, Any]):
-    path = tmp_path / "metrics.json"
-    path.write_text(json.dumps({**as_schema_2(content()), **damage}))
-    with pytest.raises(UserInputError, match=r"metrics\.json: not a result record"):
-        read_record(path)
 
 
 def test_a_block_takes_its_fields_from_whoever_measured_them():
@@ -179,11 +126,10 @@ def test_a_block_takes_its_fields_from_whoever_measured_them():
 def test_nulls_get_the_reasons_of_their_fields_and_keep_better_ones():
     values = content(unknown={"geometry": "no mesh"})
     values["speed"]["spread"] = values["train"]["breakdown_s"] = None
-    record = complete_record({**values, "phases": None})
+    record = complete_record(values)
     assert record.unknown["geometry"] == "no mesh"
     assert record.unknown["speed.spread"] == "measured once (--repeats N)"
     assert record.unknown["train.breakdown_s"].startswith("not profiled")
-    assert "older" in record.unknown["phases"] or "release" in record.unknown["phases"]
     values["codec"]["encode_s"] = None
     with pytest.raises(SplatwizardError, match=r"null without a reason: codec\.encode_s"):
-        complete_record({**values, "phases": None})
+        complete_record(values)

@@ -5,7 +5,6 @@ import os
 import shutil
 import subprocess
 import sys
-import zlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -20,13 +19,11 @@ from splatwizard_core.cli.main import main
 from splatwizard_core.errors import CheckpointError, SceneError
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.runs import file_digests
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, read_config_file, resolve
 from splatwizard_core.runs.directory import RunRequest, StepLog, run_directory
-from splatwizard_core.runs.file_digests import digests_of
 from splatwizard_core.runs.run import run, train_only
-from splatwizard_core.runs.scene_digest import picture_files, scene_digest
+from splatwizard_core.runs.scene_digest import digests_of, picture_files, scene_digest
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.versions import changes, installed
 from splatwizard_core.scene.dataset import SceneOptions
@@ -111,45 +108,6 @@ def test_pictures_of_a_loader_that_tells_no_files_count_by_their_pixels(photogra
     assert len({digest(i) for i in (None, *range(count))}) == 1 + count
 
 
-def test_digests_are_remembered_until_a_file_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(file_digests, "SETTLED_SECONDS", -1.0)
-    read: list[Path] = []
-    real = file_digests.file_sha256
-    monkeypatch.setattr(file_digests, "file_sha256", lambda path: (read.append(path), real(path))[1])
-    a, b, store = tmp_path / "a", tmp_path / "b", tmp_path / "deep" / "store.json"
-    a.write_bytes(b"abc")
-    b.write_bytes(b"xyz")
-    first = digests_of([a, b, a], store)
-    assert sorted(read) == [a, b]
-    assert digests_of([a, b], store) == first
-    assert len(read) == 2
-    stamp = b.stat()
-    b.write_bytes(b"XYZ")
-    os.utime(b, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))  # size and time of content are as before
-    second = digests_of([a, b], store)
-    assert read[2:] == [b]
-    assert second[a] == first[a]
-    assert second[b] != first[b]
-
-
-def test_a_file_that_has_just_changed_is_read_again(tmp_path: Path):
-    file = tmp_path / "a"
-    file.write_bytes(b"abc")
-    digests_of([file], tmp_path / "store")
-    assert json.loads((tmp_path / "store").read_text()) == {}
-
-
-@pytest.mark.parametrize("content", ["", "[]", "{", '{"a": 3}'])
-def test_a_damaged_store_costs_time_alone(tmp_path: Path, content: str):
-    file, store = tmp_path / "a", tmp_path / "store"
-    file.write_bytes(b"abc")
-    store.write_text(content.replace('"a"', json.dumps(str(file))))
-    # FIPS 180-2, example B.1
-    assert digests_of([file], store)[file].startswith("ba7816bf")
-    unwritable = tmp_path / "a" / "store"
-    assert digests_of([file], unwritable)[file].startswith("ba7816bf")
-
-
 def test_a_picture_that_is_gone_is_a_scene_error(tmp_path: Path):
     with pytest.raises(SceneError, match=r"absent.png: cannot be read"):
         digests_of([tmp_path / "absent.png"])
@@ -227,28 +185,6 @@ def test_changes_name_what_is_another_version_or_gone(toy_plugins: PluginManager
     now = installed(toy_plugins, ["sw-toy"])
     assert changes(toy_plugins, now) == []
     assert changes(toy_plugins, {**now, "sw-gone": "1.0"}) == ["sw-gone 1.0, now not installed"]
-    assert changes(toy_plugins, None) == ["versions that were not noted"]
-
-
-def test_a_directory_of_an_older_release_is_trained_again_and_says_why(toy_plugins: PluginManager, tmp_path: Path):
-    first = Invocation(toy_plugins, tmp_path)
-    expected, directory = train_only(first.session, first.request())
-    for path in (directory / "checkpoints").glob("*.json"):
-        content = json.loads(path.read_text())["content"]
-        del content["identity"]["identity"]
-        content["identity"]["scene_digest"] = content["identity"].pop("scene content")
-        path.write_text(json.dumps({"crc": zlib.crc32(json.dumps(content).encode()), "content": content}))
-    (directory / "steps.json").write_text(
-        '{"train": {"key": "old", "facts": {}}, "record": {"key": "old", "facts": {}}}'
-    )
-    again = Invocation(toy_plugins, tmp_path)
-    found, _ = train_only(again.session, again.request())
-    assert "trained by a release that did not note what all pictures and input files hold" in again.said[0]
-    assert "so it is trained again" in again.said[0]
-    assert found.model.digest() == expected.model.digest()
-    once_more = Invocation(toy_plugins, tmp_path)
-    train_only(once_more.session, once_more.request())
-    assert once_more.said == []
 
 
 def test_a_shared_training_that_was_removed_is_made_again(toy_plugins: PluginManager, tmp_path: Path):
@@ -326,7 +262,7 @@ def test_a_child_ends_with_the_process_that_started_it(toy_plugins: PluginManage
     )  # fmt: skip
     assert child.stdin is not None
     assert child.stderr is not None
-    assert b"training toy" in child.stderr.readline() + child.stderr.readline()
+    assert any(b"training toy" in line for line in child.stderr)  # a slow machine tells of other things first
     assert child.poll() is None
     child.stdin.close()
     assert child.wait(timeout=30) == 1

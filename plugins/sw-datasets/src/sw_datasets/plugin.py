@@ -1,7 +1,14 @@
 """Registers the readers of scenes, the six published data sets, the demo scene, and the command `sw data`."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
 from splatwizard_core.api import Registry, hookimpl
 from sw_datasets.families import BENCHMARKS, BLENDER, COLMAP, DEMO
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Scene
 
 LOADERS = "sw_datasets.loaders"
 
@@ -35,3 +42,11 @@ def register_downloads(registry: Registry) -> None:
 def register_commands(registry: Registry) -> None:
     registry.add("data", "sw_datasets.commands.data:data", position=10,
                  summary="scenes on disk: list, verify, fetch, undistort, synth")  # fmt: skip
+
+
+@hookimpl
+def describe_scene(scene: Scene) -> dict[str, Any]:
+    # Imported here: every `sw` command loads this module.
+    from sw_datasets.describe import describe
+
+    return describe(scene)

@@ -8,14 +8,12 @@ from typing import TYPE_CHECKING
 import click
 
 from splatwizard_core.tooling import (
-    complete_files,
-    complete_folders,
-    complete_names,
+    OUTPUT_FILE,
+    OUTPUT_FOLDER,
     console,
     debug_option,
+    name_of,
     options,
-    output_file,
-    output_folder,
     print_json,
     say,
 )
@@ -27,11 +25,11 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="tables, curves, BD-rates, one HTML page")
-@click.argument("folders", metavar="DIR...", nargs=-1, required=True, shell_complete=complete_folders)
+@click.argument("folders", metavar="DIR...", nargs=-1, required=True, type=click.Path())
 @options(
-    click.option("--html", metavar="FILE", shell_complete=complete_files,
+    click.option("--html", metavar="FILE", type=OUTPUT_FILE,
                  help="Write one self-contained page there.  [default: none]"),
-    click.option("--survey", metavar="FOLDER", shell_complete=complete_folders,
+    click.option("--survey", metavar="FOLDER", type=OUTPUT_FOLDER,
                  help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
                  "[default: none]"),
     click.option("--csv", "form", flag_value="csv",
@@ -40,7 +38,7 @@ if TYPE_CHECKING:
     click.option("--markdown", "form", flag_value="markdown", help="Print Markdown tables."),
     click.option("--json", "form", flag_value="json", help="Print one JSON object: runs, means, BD values, notes."),
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
-    click.option("--anchor", metavar="METHOD", shell_complete=complete_names("method"),
+    click.option("--anchor", metavar="METHOD", type=name_of("method"),
                  help="What BD-rates compare against.  [default: the most usual "
                  "of the methods, or the first]"),
     click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),
@@ -52,8 +50,8 @@ if TYPE_CHECKING:
 )  # fmt: skip
 def report(
     folders: tuple[str, ...],
-    html: str | None,
-    survey: str | None,
+    html: Path | None,
+    survey: Path | None,
     form: str | None,
     anchor: str | None,
     pareto: bool,
@@ -69,16 +67,15 @@ def report(
     from sw_report.distortion import choose_anchor
     from sw_report.runs import collect
 
-    target = output_file(html) if html is not None else None
     collection = collect([Path(folder) for folder in folders])
     against = choose_anchor(collection.runs, anchor)
-    if target is not None:
+    if html is not None:
         from sw_report.page import PageOptions, write_page
 
-        write_page(collection, target, PageOptions(against, partial, pareto, open_scene, pictures))
-        say(f"wrote {target}")
+        write_page(collection, html, PageOptions(against, partial, pareto, open_scene, pictures))
+        say(f"wrote {html}")
     if survey is not None:
-        for path in exports.write_survey(collection.runs, output_folder(survey)):
+        for path in exports.write_survey(collection.runs, survey):
             say(f"wrote {path}")
     if form == "csv":
         click.echo(exports.to_csv(collection.runs), nl=False)
@@ -86,7 +83,7 @@ def report(
         click.echo(exports.to_json_lines(collection.runs), nl=False)
     elif form == "json":
         print_json(exports.to_dict(collection, anchor=against, partial=partial, pareto=pareto))
-    elif form is not None or (target is None and survey is None):
+    elif form is not None or (html is None and survey is None):
         tables = exports.tables_of(collection, anchor=against, partial=partial, pareto=pareto)
         if form == "latex":
             click.echo(exports.to_latex(tables, collection.notes), nl=False)

@@ -10,8 +10,8 @@ from typing import Any
 import click
 
 from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.complete import complete_files, complete_folders, complete_names
-from splatwizard_core.cli.paths import existing, output_folder
+from splatwizard_core.cli.complete import name_of
+from splatwizard_core.cli.paths import EXISTING, OUTPUT_FOLDER
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices, warn_of_metrics
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.files import scratch_folder
@@ -19,15 +19,15 @@ from splatwizard_core.plugins import load_plugins
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")
-@click.argument("file", metavar="FILE", shell_complete=complete_files)
+@click.argument("file", metavar="FILE", type=EXISTING)
 @shared.options(
     shared.scene_option, shared.images_option, shared.config_option, shared.set_option,
     click.option(
-        "--metrics", metavar="NAME[,NAME]", shell_complete=complete_names("metric"),
+        "--metrics", metavar="NAME[,NAME]", type=name_of("metric"),
         help="Which metrics.  [default: every one that is installed]",
     ),
     click.option(
-        "--renders", metavar="DIR", shell_complete=complete_folders,
+        "--renders", metavar="DIR", type=OUTPUT_FOLDER,
         help="Keep the rendered test views there as PNG.  [default: they are not kept]",
     ),
     click.option(
@@ -41,9 +41,9 @@ from splatwizard_core.plugins import load_plugins
 )  # fmt: skip
 @takes_choices
 def evaluate(
-    file: str,
+    file: Path,
     metrics: str | None,
-    renders: str | None,
+    renders: Path | None,
     roundtrip: bool,
     no_speed: bool,
     repeats: int,
@@ -57,18 +57,16 @@ def evaluate(
     model is opened before the scene is read. --set takes scene keys (resolution, test_every, background, ...), keys of
     the run (raster.prefer, threads, ...) and settings of metrics (metrics.GROUP.KEY).
     """
-    from splatwizard_core.runs.encode import encode_directory, load_finished
+    from splatwizard_core.runs.encode import encode_directory, finished_training
     from splatwizard_core.runs.fresh import decode_fresh
     from splatwizard_core.runs.measure import Opened, measure, opener
 
-    path, plugins = existing(file), load_plugins()
+    plugins = load_plugins()
     names = None if metrics is None else [m.strip() for m in metrics.split(",") if m.strip()]
     if names == []:
         raise click.UsageError("--metrics is empty: give names, or leave it out")
-    if renders is not None:
-        output_folder(renders)
-    if path.is_dir():
-        config = path / "config.toml"
+    if file.is_dir():
+        config = file / "config.toml"
         if not config.exists():
             raise click.UsageError(f"{file} is no run directory, it has no config.toml: give <scene>/<method>/<rate>")
         resolved = replace(chosen, config_file=chosen.config_file or str(config)).resolve_one(plugins)
@@ -80,14 +78,14 @@ def evaluate(
     warn_of_metrics(session, names, resolved.metrics, quiet=quiet)
 
     def open_trained() -> Opened:
-        trained = load_finished(session, resolved, path)
-        return Opened(trained.model.eval().requires_grad_(False), trained.facts["raster"])
+        with finished_training(session, resolved, file) as trained:
+            return Opened(trained.model.eval().requires_grad_(False), trained.facts["raster"])
 
     with contextlib.ExitStack() as stack:
-        measured, digest = path, None
+        measured, digest = file, None
         if roundtrip:
             measured = stack.enter_context(scratch_folder("roundtrip")) / "scene.swz"
-            encode_directory(session, resolved, path, measured)
+            encode_directory(session, resolved, file, measured)
             digest = decode_fresh(measured, str(session.device))["digest"]
         facts: dict[str, Any] = measure(
             session,
@@ -96,12 +94,12 @@ def evaluate(
             metrics=names,
             speed=not no_speed,
             repeats=repeats,
-            renders=Path(renders) if renders else None,
+            renders=renders,
         )
         size = None if measured.is_dir() else measured.stat().st_size
     if digest not in (None, facts["digest"]):
         raise SplatwizardError(f"{file}: two processes decode different models from the same file")
-    shared.print_facts({"file": {"path": file, "bytes": size}, **facts}, as_json, _print)
+    shared.print_facts({"file": {"path": str(file), "bytes": size}, **facts}, as_json, _print)
 
 
 def _print(facts: dict[str, Any]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import click
 
 from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.complete import complete_scene_or_file
+from splatwizard_core.cli.complete import SCENE_OR_FILE
 from splatwizard_core.cli.paths import existing
 from splatwizard_core.cli.setup import Choices, takes_choices
 from splatwizard_core.cli.streams import without_orders
@@ -18,7 +18,7 @@ from splatwizard_core.plugins import load_plugins
 
 
 @click.command(short_help="what is in a file or scene")
-@click.argument("path", metavar="PATH", shell_complete=complete_scene_or_file)
+@click.argument("path", metavar="PATH", type=SCENE_OR_FILE)
 @shared.options(shared.images_option, shared.set_option, shared.json_option, shared.debug_option)
 @takes_choices
 def info(path: str, as_json: bool, chosen: Choices) -> None:
@@ -101,10 +101,12 @@ def _ply_facts(path: Path) -> dict[str, Any]:
 
 
 def _scene_facts(spec: str, chosen: Choices) -> dict[str, Any]:
-    from splatwizard_core.cli.describe_scene import describe
     from splatwizard_core.scene.loading import load_scene
 
-    return describe(load_scene(spec, chosen.resolve_without_method().scene, load_plugins()))
+    plugins = load_plugins()
+    scene = load_scene(spec, chosen.resolve_without_method().scene, plugins)
+    found: list[dict[str, Any]] = plugins.hook.describe_scene(scene=scene)
+    return {"name": scene.name} | {name: value for facts in found for name, value in facts.items()}
 
 
 def _print_file(facts: dict[str, Any]) -> None:

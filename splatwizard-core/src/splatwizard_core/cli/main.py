@@ -6,6 +6,7 @@ import contextlib
 import difflib
 import logging
 import math
+import os
 import sys
 import traceback
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from splatwizard_core.cli.complete import VARIABLE
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
 from splatwizard_core.errors import FORESEEN, DiskFullError, SplatwizardError
 from splatwizard_core.files import FULL
@@ -31,16 +33,12 @@ class LazyGroup(click.Group):
     """A group whose commands come from the registry and are imported when they are called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
-        with _silent_for_completion(ctx):
-            return [entry.name for entry in command_entries()]
-        return []
+        return [entry.name for entry in command_entries()]
 
     def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
-        with _silent_for_completion(ctx):
-            commands = load_plugins().commands
-            if cmd_name in commands or cmd_name in commands.clashes:
-                return commands.load(cmd_name)
-        return None
+        commands = load_plugins().commands
+        known = cmd_name in commands or cmd_name in commands.clashes
+        return commands.load(cmd_name) if known else None
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
         """One line a command, from the registry: `sw --help` imports none of them."""
@@ -75,11 +73,6 @@ class LazyGroup(click.Group):
 def command_entries() -> list[Entry]:
     """The commands in the order of the help: those with a declared `position` by it, then by name."""
     return sorted(load_plugins().commands, key=lambda e: (e.declared.get("position", math.inf), e.name))
-
-
-def _silent_for_completion(ctx: click.Context) -> contextlib.AbstractContextManager[None]:
-    """Swallow what is wrong with the plugins while the shell asks for completions: TAB is not the place to say so."""
-    return contextlib.suppress(SplatwizardError) if ctx.resilient_parsing else contextlib.nullcontext()
 
 
 @contextlib.contextmanager
@@ -119,6 +112,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
+    if VARIABLE in os.environ and isinstance(error, SplatwizardError):
+        return error.exit_status  # the shell asks for completions: TAB is not the place to say what is wrong
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     if debug and not isinstance(error, (click.ClickException, click.Abort)):

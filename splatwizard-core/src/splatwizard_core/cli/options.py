@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from splatwizard_core.cli import complete
+from splatwizard_core.cli.complete import PRESET, RATE, SCENE, name_of
+from splatwizard_core.cli.paths import OUTPUT_FOLDER
 from splatwizard_core.cli.streams import without_orders
 
 if TYPE_CHECKING:
@@ -25,33 +26,33 @@ def _not_empty(_context: click.Context, parameter: click.Parameter, value: str |
 
 
 scene_option = click.option(
-    "--scene", metavar="SCENE", shell_complete=complete.complete_scenes,
+    "--scene", metavar="SCENE", type=SCENE,
     help="A folder (the format is detected), `dataset/scene` under $SPLATWIZARD_DATA, or a scene that is made on the "
     "spot, by its name.  [default: such a one]",
 )  # fmt: skip
 images_option = click.option(
-    "--images", metavar="FOLDER", shell_complete=complete.complete_image_folders,
+    "--images", metavar="FOLDER",
     help="Picture folder of a scene that has several, such as images_2.  [default: the data set's own]",
 )  # fmt: skip
 method_option = click.option(
-    "--method", "-m", "methods", multiple=True, metavar="NAME", shell_complete=complete.complete_names("method"),
+    "--method", "-m", "methods", multiple=True, metavar="NAME", type=name_of("method"),
     help="Method, see `sw list-plugins`.  [default: the one marked there, or what --config says]",
 )  # fmt: skip
 methods_option = click.option(
-    "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]", shell_complete=complete.complete_names("method"),
+    "--method", "-m", "methods", multiple=True, metavar="NAME[,NAME]", type=name_of("method"),
     help="One or more methods, see `sw list-plugins`; repeatable.  [default: the one marked there, or what --config "
     "says]",
 )  # fmt: skip
 preset_option = click.option(
-    "--preset", metavar="NAME", shell_complete=complete.complete_presets,
+    "--preset", metavar="NAME", type=PRESET,
     help="Named values of the method.  [default: paper; quick on a scene that is made on the spot]",
 )  # fmt: skip
 rate_option = click.option(
-    "--rate", metavar="NAME", shell_complete=complete.complete_rates,
+    "--rate", metavar="NAME", type=RATE,
     help="Rate point: r1 (smallest file) .. rN, or low, default, high.  [default: default]",
 )  # fmt: skip
 rates_option = click.option(
-    "--rate", metavar="NAME[,NAME]", shell_complete=complete.complete_rates,
+    "--rate", metavar="NAME[,NAME]", type=RATE,
     help="Rate points: r1 (smallest file) .. rN, or low, default, high, all.  [default: default]",
 )  # fmt: skip
 config_option = click.option(
@@ -59,16 +60,16 @@ config_option = click.option(
     help="TOML file of values; config.toml of a run directory repeats that run.  [default: none]",
 )  # fmt: skip
 set_option = click.option(
-    "--set", "sets", multiple=True, metavar="KEY=VALUE", shell_complete=complete.complete_nothing,
+    "--set", "sets", multiple=True, metavar="KEY=VALUE",
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
 )  # fmt: skip
 init_option = click.option(
-    "--init", metavar="FILE.ply", shell_complete=complete.complete_files, callback=_not_empty,
+    "--init", metavar="FILE.ply", type=click.Path(), callback=_not_empty,
     help="Start from this trained scene, for methods that start from one or have a key `init`.  "
     "[default: it is trained first, or taken from an earlier run]",
 )  # fmt: skip
 out_option = click.option(
-    "--out", default="out", show_default=True, metavar="DIR", shell_complete=complete.complete_folders,
+    "--out", default="out", show_default=True, metavar="DIR", type=OUTPUT_FOLDER,
     help="Root of the run directories, DIR/<scene>/<method>/<rate>; a later `sw run` with the same options goes on "
     "there.",
 )  # fmt: skip

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+
+import click
+from click.shell_completion import CompletionItem
 
 from splatwizard_core.errors import UserInputError
 
 
-def existing(path: str) -> Path:
+def existing(path: str | Path) -> Path:
     """A path that must be there."""
     found = Path(path)
     if not found.exists():
@@ -16,7 +20,7 @@ def existing(path: str) -> Path:
     return found
 
 
-def existing_file(path: str) -> Path:
+def existing_file(path: str | Path) -> Path:
     """A file that must be there; of a run directory the error names the file inside."""
     found = existing(path)
     if found.is_dir():
@@ -53,3 +57,22 @@ def _check_writable(folder: Path, told: str) -> None:
         tempfile.TemporaryFile(dir=folder).close()
     except OSError as error:
         raise UserInputError(f"{told}: {folder}: {error.strerror}") from None
+
+
+class CheckedPath(click.ParamType):  # type: ignore[type-arg]  # generic only in new releases of click
+    """A parameter that is a path: checked while the command line is read, completed by the shell."""
+
+    name = "path"
+
+    def __init__(self, check: Callable[[str | Path], Path], completed: str = "file") -> None:
+        self.check, self.completed = check, completed
+
+    def convert(self, value: str | Path, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        return self.check(value)
+
+    def shell_complete(self, ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        return [CompletionItem(incomplete, type=self.completed)]
+
+
+EXISTING, INPUT_FILE, OUTPUT_FILE = CheckedPath(existing), CheckedPath(existing_file), CheckedPath(output_file)
+OUTPUT_FOLDER = CheckedPath(output_folder, "dir")

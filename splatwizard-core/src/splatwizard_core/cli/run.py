@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import click
 
 from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.paths import output_folder
 from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices, warn_of_metrics
 from splatwizard_core.plugins import load_plugins
 
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
     shared.debug_option,
 )  # fmt: skip
 @takes_choices
-def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
+def run(out: Path, repeats: int, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
     """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
 
     Finished steps are not done again; an interrupted run goes on from its last checkpoint. Installed packages make
@@ -38,7 +37,6 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
 
     plugins = load_plugins()
     resolved = chosen.resolve(plugins)
-    output_folder(out)
     session = open_training_session(resolved, plugins)
     warn_of_metrics(session, None, resolved[0].metrics)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
@@ -47,7 +45,7 @@ def run(out: str, repeats: int, resume: bool, allow_changed_plan: bool, as_json:
     written: list[Path] = []
     console = None if as_json else shared.console()
     for each in resolved:
-        request = RunRequest(each, Path(out), resume, allow_changed_plan, repeats)
+        request = RunRequest(each, out, resume, allow_changed_plan, repeats)
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))
         plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, console, shared.say, written))

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.complete import complete_names, complete_presets
+from splatwizard_core.cli.complete import PRESET, name_of
 from splatwizard_core.cli.setup import Choices, takes_choices
 from splatwizard_core.plugins import load_plugins
 
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 @click.command(short_help="a method's plan as a table")
-@click.argument("method", shell_complete=complete_names("method"))
+@click.argument("method", type=name_of("method"))
 @shared.options(
     click.option(
-        "--preset", metavar="NAME", shell_complete=complete_presets,
+        "--preset", metavar="NAME", type=PRESET,
         help="Named values of the method.  [default: paper, or what --config says]",
     ),
     shared.rate_option, shared.config_option, shared.set_option,

@@ -140,17 +140,17 @@ def takes_choices(function: Callable[..., None]) -> Callable[..., None]:
 
 def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) -> list[ResolvedConfig]:
     """Of several methods, take --init and `pretrained.KEY` from those that start from nothing trained."""
-    from splatwizard_core.runs.pretrained import unused_start
+    from splatwizard_core.runs.pretrained import useful_starts
 
     nothing: dict[str, Any] = {"init": "", "pretrained": {}}
-    for what, other in (("init", "pretrained"), ("pretrained", "init")):
-        alone = {each.method: unused_start(plugins, replace(each, **{other: nothing[other]})) for each in found}
-        useless = {method: error for method, error in alone.items() if error is not None}
-        if len(useless) < len(alone):  # else it is wrong, and told so
-            for name, error in useless.items():
-                say(f"{name} does not start from a trained scene: '{error.key}' is for the others")
-            without = {what: nothing[what]}
-            found = [replace(each, **without) if each.method in useless else each for each in found]
+    given = [what for what in nothing if any(getattr(each, what) for each in found)]
+    useful = {each.method: useful_starts(plugins, each) for each in found} if given else {}
+    for what in given:
+        useless = [method for method, starts in useful.items() if what not in starts]
+        if len(useless) < len(useful):  # else it is wrong, and told so
+            for method in useless:
+                say(f"{method} does not start from a trained scene: '{what}' is for the others")
+            found = [replace(each, **{what: nothing[what]}) if each.method in useless else each for each in found]
     return found
 
 

@@ -7,9 +7,10 @@ from pathlib import Path
 import click
 
 from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.paths import output_folder
 from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices
 from splatwizard_core.plugins import load_plugins
+
+REPORTED = ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdown_s", "pretraining")
 
 
 @click.command(short_help="train one method on one scene")
@@ -19,21 +20,18 @@ from splatwizard_core.plugins import load_plugins
     shared.seed_option, shared.resume_option, shared.changed_plan_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
-def train(out: str, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
+def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
     """Train one method on one scene; checkpoints and log go into its run directory."""
     from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.run import train_only
-    from splatwizard_core.runs.training import pretraining
 
     resolved = chosen.resolve_one(load_plugins())
-    output_folder(out)
     session = open_training_session([resolved], load_plugins())
-    trained, directory = train_only(session, RunRequest(resolved, Path(out), resume, allow_changed_plan))
+    trained, directory = train_only(session, RunRequest(resolved, out, resume, allow_changed_plan))
     facts = {
         "directory": str(directory),
         "counts": trained.model.counts(),
-        **{k: trained.facts[k] for k in ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdown_s")},
-        "pretraining": pretraining(trained.facts),
+        **{name: trained.facts[name] for name in REPORTED},
     }
     told = f"{facts['steps']:,} steps in {facts['train_s']:.1f} s, {shared.counted(facts['counts'])}: {directory}"
     shared.print_facts(facts, as_json, told)

@@ -7,13 +7,15 @@ so `specname`, `tryfirst`, `trylast` and wrappers work as its documentation says
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins.registry import Registry
     from splatwizard_core.runs.observers import FinishedRuns, StartedTraining, TrainingObserver
+    from splatwizard_core.scene.scene import Scene
 
 PROJECT = "splatwizard"
 ENTRY_POINT_GROUP = "splatwizard"
@@ -100,6 +102,11 @@ def register_downloads(registry: Registry) -> None:
 @hookspec
 def register_commands(registry: Registry) -> None:
     """Add subcommands of `sw`: click commands, imported when they are called; the summary is their line in the help."""
+
+
+@hookspec
+def describe_scene(scene: Scene) -> Mapping[str, Any] | None:
+    """Return facts of a scene as plain values, or None; `sw info SCENE` shows those of all plugins together."""
 
 
 @hookspec

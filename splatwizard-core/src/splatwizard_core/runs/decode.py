@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import statistics
 import time
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
-from splatwizard_core.evaluation.speed import Spread, spread
+from splatwizard_core.evaluation.speed import spread
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter, synchronize
@@ -24,35 +25,6 @@ from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installe
 from splatwizard_core.runs.session import Session
 
 REPEATS = 3
-
-
-@dataclass(frozen=True)
-class DecodeReport:
-    """Facts and times of decoding a file.
-
-    digest              of the model; equal models have equal digests
-    decode_s            median of `decode_runs_s`: from opening the file to a model on the device
-    decode_spread       how much the timed decodes differ; None for fewer than two
-    first_decode_s      of the decode before the timed ones, which imports what is imported late
-    jit_s               loading (or compiling) the native modules, before all decodes
-    peak_bytes          memory growth over the first decode; `memory_kind` says of what
-    """
-
-    method: str
-    method_version: int
-    digest: str
-    counts: dict[str, int]
-    bytes: int
-    sections: dict[str, int]
-    raster: dict[str, Any]
-    decode_s: float
-    decode_runs_s: list[float]
-    decode_spread: Spread | None
-    first_decode_s: float
-    jit_s: float
-    peak_bytes: int
-    memory_kind: str
-    device: str
 
 
 def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -> tuple[SplatModel, ContainerReader]:
@@ -107,8 +79,17 @@ def _method_of(reader: ContainerReader, plugins: PluginManager) -> type[Method]:
     raise missing_plugin(reader, plugins, "method", name)
 
 
-def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tuple[SplatModel, DecodeReport]:
+def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tuple[SplatModel, dict[str, Any]]:
     """Decode once untimed and `repeats` times timed, after every native module was loaded or compiled, timed apart.
+
+    Returns the model and facts about the file and its decoding, plain values. Among them
+
+    digest              of the model; equal models have equal digests
+    decode_s            median of `decode_runs_s`: from opening the file to a model on the device
+    decode_spread       how much the timed decodes differ; None for fewer than two
+    first_decode_s      of the decode before the timed ones, which imports what is imported late
+    jit_s               loading (or compiling) the native modules, before all decodes
+    peak_bytes          memory growth over the first decode; `memory_kind` says of what
 
     Raises SplatwizardError if two decodes give different models.
     """
@@ -142,26 +123,26 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         raise SplatwizardError(
             f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
         )
-    return model, DecodeReport(
-        method=reader.method,
-        method_version=reader.version,
-        digest=digest,
-        counts=model.counts(),
-        bytes=reader.size,
-        sections={"header": reader.header_bytes, **reader.sections},
-        raster=reader.raster,
-        decode_s=statistics.median(runs) if runs else first,
-        decode_runs_s=runs,
-        decode_spread=spread(runs) if len(runs) > 1 else None,
-        first_decode_s=first,
-        jit_s=jit_s,
-        peak_bytes=peak,
-        memory_kind=meter.kind,
-        device=str(device),
-    )
+    return model, {
+        "method": reader.method,
+        "method_version": reader.version,
+        "digest": digest,
+        "counts": model.counts(),
+        "bytes": reader.size,
+        "sections": {"header": reader.header_bytes, **reader.sections},
+        "raster": reader.raster,
+        "decode_s": statistics.median(runs) if runs else first,
+        "decode_runs_s": runs,
+        "decode_spread": asdict(spread(runs)) if len(runs) > 1 else None,
+        "first_decode_s": first,
+        "jit_s": jit_s,
+        "peak_bytes": peak,
+        "memory_kind": meter.kind,
+        "device": str(device),
+    }
 
 
-def save_decoded(model: SplatModel, report: DecodeReport, path: Path, plugins: PluginManager) -> None:
+def save_decoded(model: SplatModel, facts: Mapping[str, Any], path: Path, plugins: PluginManager) -> None:
     """Keep a decoded model: `.safetensors` holds its tensors and says what they are, any other suffix is an exporter's.
 
     Raises UserInputError if no exporter writes such files.
@@ -172,7 +153,7 @@ def save_decoded(model: SplatModel, report: DecodeReport, path: Path, plugins: P
     from safetensors.torch import save_file
 
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in model.state_dict().items()}
-    told = {"method": report.method, "digest": report.digest, "extra": json.dumps(model.state_dict_extra())}
+    told = {"method": facts["method"], "digest": facts["digest"], "extra": json.dumps(model.state_dict_extra())}
     with replacing(path) as temporary:
         save_file(tensors, temporary, metadata=told)
 

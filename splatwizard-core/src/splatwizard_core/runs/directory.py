@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,10 @@ from typing import Any
 from splatwizard_core.errors import SceneError
 from splatwizard_core.files import remove_folder, sweep, write_atomic, write_json
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.record import FILE_NAME
+from splatwizard_core.runs.session import Session
+from splatwizard_core.scene.images import check_pictures, decode_all
 
 STEPS = "steps.json"
 CHECKPOINTS = "checkpoints"
@@ -102,18 +106,29 @@ def run_directory(request: RunRequest) -> Path:
     return request.out / Path(scene).name.replace(":", "-") / resolved.method / resolved.rate
 
 
-def begin(directory: Path, request: RunRequest) -> None:
-    """Clear what is to be cleared, and what a killed process left half written; other files in the directory stay."""
-    own = [directory / name for name in OWN_FILES]
-    for folder in (directory, *(path for path in own if path.is_dir())):
-        sweep(folder)
-    for path in () if request.resume else own:
-        if path.is_dir() and not path.is_symlink():
-            remove_folder(path)
-        else:
-            path.unlink(missing_ok=True)
-    if not (directory / CONFIG).exists():
-        write_config(directory, request.resolved)
+@contextlib.contextmanager
+def held_directory(session: Session, request: RunRequest) -> Iterator[Path]:
+    """Hold the directory of a run, cleared where the run starts again; before that load the scene, and check pictures.
+
+    What a killed process left half written is cleared too; other files in the directory stay.
+    """
+    directory = run_directory(request)
+    scene = session.scene(request.resolved)
+    if not directory.exists() or not request.resume:
+        decode_all(scene.train)  # training reads them anyway, and they stay
+        check_pictures(scene.test)
+    with directory_lock(directory, say=session.say):
+        own = [directory / name for name in OWN_FILES]
+        for folder in (directory, *(path for path in own if path.is_dir())):
+            sweep(folder)
+        for path in () if request.resume else own:
+            if path.is_dir() and not path.is_symlink():
+                remove_folder(path)
+            else:
+                path.unlink(missing_ok=True)
+        if not (directory / CONFIG).exists():
+            write_config(directory, request.resolved)
+        yield directory
 
 
 def write_config(directory: Path, resolved: ResolvedConfig) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.metadata
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -78,31 +78,24 @@ def requirements(entries: Iterable[Entry]) -> list[Requirement]:
     return [each for each in found if each.is_well_formed]  # it is advice: an odd name must not spoil the file
 
 
-def load_finished(session: Session, resolved: ResolvedConfig, directory: Path) -> TrainedModel:
-    """Return the finished training of a run directory. Raises UserInputError if it is not finished."""
+@contextlib.contextmanager
+def finished_training(session: Session, resolved: ResolvedConfig, directory: Path) -> Iterator[TrainedModel]:
+    """Load the finished training of a run directory, and hold it. Raises UserInputError if it is not finished."""
     parents = directory.resolve().parents
     request = RunRequest(resolved, parents[min(2, len(parents) - 1)])  # OUT/<scene>/<method>/<rate>
-
-    def check() -> None:
-        if finished_directory(session, request, directory) is None:
-            raise UserInputError(
-                f"{directory} holds no finished training of this configuration: `sw train --config "
-                f"{directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
-            )
-
-    check()  # before the lock too, which is a file in the directory
+    if finished_directory(session, request, directory) is None:
+        raise UserInputError(
+            f"{directory} holds no finished training of this configuration: `sw train --config "
+            f"{directory}/config.toml` makes it (only keys of the file, such as `codec`, may differ)"
+        )
     with directory_lock(directory, say=session.say):
-        check()
-        return train(session, request, directory)
+        yield train(session, request, directory)
 
 
 def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path, target: Path) -> dict[str, Any]:
     """Encode the finished training of a run directory. Raises UserInputError if it is not finished."""
-    trained = load_finished(session, resolved, directory)
-    inside = target.resolve().parent == directory.resolve()
-    with directory_lock(directory) if inside else contextlib.nullcontext():
-        method = make_method(session.plugins, resolved)
-        return encode(method, trained.model, trained.facts["raster"], target)
+    with finished_training(session, resolved, directory) as trained:
+        return encode(make_method(session.plugins, resolved), trained.model, trained.facts["raster"], target)
 
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:

@@ -16,7 +16,6 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.plugins.interchange import load_ply
 from splatwizard_core.progress import track
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.decode import import_method, open_model
 from splatwizard_core.runs.environment import describe_environment
@@ -73,7 +72,7 @@ def measure(
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
     scene = load_scene(resolved.scene_spec, resolved.scene, plugins)
     options = quality.render_options(raster, scene.background.to(device))
-    rasterizer = _rasterizer_for(raster, session, resolved)
+    rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     views = scene.test
 
     meter.start()
@@ -162,24 +161,12 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
     return open_file
 
 
-def _rasterizer_for(raster: dict[str, Any], session: Session, resolved: ResolvedConfig) -> NegotiatedRasterizer:
-    """Choose what draws a decoded scene: the user's choice first, then the file's."""
-    chosen = resolved.ppl.raster
-    return NegotiatedRasterizer(
-        session.plugins,
-        device=session.device,
-        prefer=chosen.prefer,
-        forbid=chosen.forbid,
-        suggested=quality.suggested_rasterizers(raster),
-    )
-
-
 def render_views(
     session: Session, resolved: ResolvedConfig, opened: Opened, views: Sequence[View], folder: Path
 ) -> list[str]:
     """Draw views as PNG into `folder`; returns the file names."""
     options = quality.render_options(opened.raster, session.scene(resolved).background.to(session.device))
-    rasterizer = _rasterizer_for(opened.raster, session, resolved)
+    rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(opened.raster))
     folder.mkdir(parents=True, exist_ok=True)
     names = quality.png_names([view.name for view in views])
     opened.model.prepare()

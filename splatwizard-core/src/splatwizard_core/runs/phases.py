@@ -104,10 +104,8 @@ def phases_of_run(
     training: Mapping[str, Any],
     encoding: Mapping[str, Any],
     rasterizers: Mapping[str, str],
-) -> list[dict[str, Any]] | None:
-    """Return all phases of a run from the facts of its steps; None if an older release did one, which noted none."""
-    if "phases" not in training or "parts" not in encoding:
-        return None
+) -> list[dict[str, Any]]:
+    """Return all phases of a run from the facts of its steps."""
     return [
         *training["phases"],
         _phase(ENCODE, encoding["parts"]),

@@ -98,19 +98,12 @@ def training_key(session: Session, resolved: ResolvedConfig) -> str:
     return content_hash([*content, before] if before else content)
 
 
-def unused_start(plugins: PluginManager, resolved: ResolvedConfig) -> ConfigError | None:
-    """Return the error for `init` or `pretrained.KEY` of a method that starts from no trained scene; None: it does."""
-    if not resolved.init and not resolved.pretrained:
-        return None
+def useful_starts(plugins: PluginManager, resolved: ResolvedConfig) -> set[str]:
+    """Name which of "init" and "pretrained" the method of a configuration has a use for."""
     method = make_method(plugins, resolved)
-    if first_scene(method) is not None or (not resolved.init and named_scenes(method)):
-        return None
-    key = INIT if resolved.init else f"pretrained.{next(iter(resolved.pretrained))}"
-    about = f"'init' ({resolved.init})" if resolved.init else f"'{key}'"
-    return ConfigError(
-        f"method '{resolved.method}' does not start from a trained scene, so {about} is of no use to it: leave it out",
-        key=key,
-    )
+    if first_scene(method) is not None:
+        return {"init", "pretrained"}
+    return {"pretrained"} if named_scenes(method) else set()
 
 
 def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedConfig:
@@ -119,9 +112,18 @@ def checked_start(plugins: PluginManager, resolved: ResolvedConfig) -> ResolvedC
     Before anything runs: raises UserInputError for a file that is no model, ConfigError for a wrong key or value, or
     for either of them where the method starts from no trained scene.
     """
-    unused = unused_start(plugins, resolved)
-    if unused is not None:
-        raise unused
+    given = {
+        **({INIT: f"'init' ({resolved.init})"} if resolved.init else {}),
+        **{f"pretrained.{key}": f"'pretrained.{key}'" for key in resolved.pretrained},
+    }
+    useful = useful_starts(plugins, resolved) if given else set[str]()
+    for key, told in given.items():
+        if key.partition(".")[0] not in useful:
+            raise ConfigError(
+                f"method '{resolved.method}' does not start from a trained scene, so {told} is of no use to it: "
+                "leave it out",
+                key=key,
+            )
     if resolved.pretrained:
         method, parsed = make_method(plugins, resolved), dict(resolved.pretrained)
         names, first = named_scenes(method), first_scene(method)

@@ -16,7 +16,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.files import write_atomic
-from splatwizard_core.runs.record_versions import upgraded
 
 SCHEMA: Literal[3] = 3
 FILE_NAME = "metrics.json"
@@ -28,6 +27,9 @@ class WhyNull:
     """Marks a field with the reason of its null, where whoever measured it told none."""
 
     reason: str
+
+
+OF_A_FILE = WhyNull("it came from a file, which does not say")
 
 
 class Part(BaseModel):
@@ -125,10 +127,10 @@ class PretrainingBlock(Part):
     """The trained scene of another method that a training started from, or was taught by."""
 
     file: dict[str, str] = Field(description="name and sha256 of the .ply that it came from; empty: trained here")
-    preset: str | None
-    config: dict[str, Any] | None = Field(description="every value of the method that trained it")
-    steps: int | None
-    train_s: float | None = Field(description="with what it started from itself")
+    preset: Annotated[str | None, OF_A_FILE]
+    config: Annotated[dict[str, Any] | None, OF_A_FILE] = Field(description="every value of the method that trained it")
+    steps: Annotated[int | None, OF_A_FILE]
+    train_s: Annotated[float | None, OF_A_FILE] = Field(description="with what it started from itself")
     made_by: dict[str, str] = Field(description="distribution -> version")
 
 
@@ -137,16 +139,16 @@ class TrainBlock(Part):
 
     train_s: float | None
     stages: list[StageBlock]
-    with_pretraining_s: float | None = Field(description="with the training of the scenes it starts from")
-    pretraining: dict[str, PretrainingBlock] | None = Field(description="method -> its scene that this one used")
+    with_pretraining_s: Annotated[float | None, WhyNull("a scene that it started from came from a file")] = Field(
+        description="with the training of the scenes it starts from"
+    )
+    pretraining: dict[str, PretrainingBlock] = Field(description="method -> its scene that this one used")
     steps: int | None
     peak_bytes: Annotated[int | None, WhyNull("not measured")] = Field(
         description="over the loop; without evaluation and checkpoints since schema 2"
     )
     memory_kind: Literal["cuda", "rss"] | None
-    pictures_in: Annotated[str | None, WhyNull("trained by a release that did not note it")] = Field(
-        description="where the training pictures lay: host, cuda"
-    )
+    pictures_in: str = Field(description="where the training pictures lay: host, cuda")
     breakdown_s: Annotated[dict[str, dict[str, float]] | None, WhyNull("not profiled (--set profile=stages)")] = Field(
         description="stage -> part of a step -> seconds, if profiled"
     )
@@ -219,9 +221,7 @@ class Record(Part):
     geometry: Annotated[dict[str, float] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
-    phases: Annotated[list[PhaseBlock] | None, WhyNull("trained or encoded by a release that did not note them")] = (
-        Field(description="who served each phase, with distribution and version")
-    )
+    phases: list[PhaseBlock] = Field(description="who served each phase, with distribution and version")
     environment: dict[str, Any]
     flags: list[str] = Field(description="fit, rss, ...")
     unknown: dict[str, str] = Field(description="dotted name of each null -> why")
@@ -233,13 +233,11 @@ class Record(Part):
 
 
 def read_record(path: Path) -> Record:
-    """A record from its file, of this schema or an older one. Raises UserInputError that names what is wrong first."""
+    """Return a record from its file. Raises UserInputError that names what is wrong first."""
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserInputError(f"{path}: cannot be read: {error}") from error
-    try:
-        return Record.model_validate_json(upgraded(text))
+        return Record.model_validate_json(path.read_bytes())
+    except OSError as error:
+        raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"])) or "the file"

@@ -7,7 +7,7 @@ a finished one is not done again.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,16 @@ from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
 from splatwizard_core.files import file_sha256
 from splatwizard_core.runs import record as schema
-from splatwizard_core.runs.config import METRICS, ResolvedConfig, content_hash
+from splatwizard_core.runs.config import ResolvedConfig, content_hash
 from splatwizard_core.runs.decode import REPEATS
-from splatwizard_core.runs.directory import ENCODED, RENDERS, RunRequest, StepLog, begin, run_directory, write_config
+from splatwizard_core.runs.directory import CONFIG, ENCODED, RENDERS, RunRequest, StepLog, held_directory, write_config
 from splatwizard_core.runs.encode import encode
 from splatwizard_core.runs.fresh import decode_fresh, run_fresh
-from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.phases import phases_of_run
 from splatwizard_core.runs.pretrained import make_method, training_key
 from splatwizard_core.runs.session import Session, TrainedModel
-from splatwizard_core.runs.training import pretraining, total_seconds, train
+from splatwizard_core.runs.training import total_seconds, train
 from splatwizard_core.runs.versions import changes, installed, providers
-from splatwizard_core.scene.images import check_pictures, decode_all
-from splatwizard_core.training.keys import dotted
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 
@@ -39,7 +36,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
     Raises RunLockedError if another process writes there, and whatever a step raises.
     """
     resolved = request.resolved
-    with _held_directory(session, request) as directory:
+    with held_directory(session, request) as directory:
         steps, encoded = StepLog(directory), directory / ENCODED
         train_key, repeats = training_key(session, resolved), max(REPEATS, request.repeats)
 
@@ -57,8 +54,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             return facts
 
         def evaluate_it() -> dict[str, Any]:
-            arguments = ["eval", str(encoded), "--scene", resolved.absolute_scene]
-            arguments += _eval_options(resolved, str(session.device))
+            arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
             return {**run_fresh(arguments), "asked": asked}
 
@@ -98,7 +94,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
 
 def train_only(session: Session, request: RunRequest) -> tuple[TrainedModel, Path]:
     """Do the training step of a run; `run` with the same request goes on from there."""
-    with _held_directory(session, request) as directory:
+    with held_directory(session, request) as directory:
         return train_in(session, request, directory), directory
 
 
@@ -109,24 +105,11 @@ def train_in(session: Session, request: RunRequest, directory: Path, *, stop_aft
     return found
 
 
-@contextlib.contextmanager
-def _held_directory(session: Session, request: RunRequest) -> Iterator[Path]:
-    """Hold the directory of a run, ready to be written to; before that load the scene, and check what begins."""
-    directory = run_directory(request)
-    scene = session.scene(request.resolved)
-    if not directory.exists() or not request.resume:
-        decode_all(scene.train)  # training reads them anyway, and they stay
-        check_pictures(scene.test)
-    with directory_lock(directory, say=session.say):
-        begin(directory, request)
-        yield directory
-
-
 def _is_current(session: Session, encoded: Path, facts: dict[str, Any]) -> bool:
     """Whether an encoded file is as it was written, and would be written the same today."""
     if not encoded.is_file() or file_sha256(encoded) != facts["sha256"]:
         return False
-    changed = changes(session.plugins, facts.get("made_by"))
+    changed = changes(session.plugins, facts["made_by"])
     if changed:
         session.say(f"{encoded} was made with {', '.join(changed)}: encoding again")
     return not changed
@@ -162,16 +145,6 @@ def measures(extent: Any, asked: Mapping[str, Any]) -> bool:
         return False  # damaged
 
 
-def _eval_options(resolved: ResolvedConfig, device: str) -> list[str]:
-    """Return the options that make `sw eval` see the scene, and set up its metrics, as this run does."""
-    ppl = resolved.ppl
-    values: dict[str, Any] = {"seed": ppl.seed, "threads": ppl.threads}
-    values |= {key: "none" if value is None else value for key, value in resolved.scene_options.items()}
-    values |= {f"raster.{key}": ",".join(names) for key, names in ppl.raster if names}
-    values |= dotted(resolved.metrics, METRICS)
-    return ["--device", device, *(word for key, value in values.items() for word in ("--set", f"{key}={value}"))]
-
-
 def _record(
     session: Session,
     resolved: ResolvedConfig,
@@ -182,8 +155,6 @@ def _record(
 ) -> schema.Record:
     """Return the record from the facts of the steps: each block takes its fields from whatever step reported them."""
     entry = session.plugins.methods.entry(resolved.method)
-    before, unknown = _pretraining(training)
-    started = {"pretraining": before, "with_pretraining_s": total_seconds(training)}
     steps = {**training, **measured, **encoding, **decoded}
     values = {
         **steps,
@@ -194,22 +165,9 @@ def _record(
         "config_hash": resolved.config_hash(),
         "file": schema.picked(schema.RecordFile, steps),
         "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
-        "train": schema.picked(schema.TrainBlock, training, started),
+        "train": schema.picked(schema.TrainBlock, training, {"with_pretraining_s": total_seconds(training)}),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
         "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
-        "unknown": {**measured["unknown"], **unknown},
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
     return schema.complete_record(schema.picked(schema.Record, values))
-
-
-def _pretraining(training: dict[str, Any]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return what a run started from, and the reasons for what is null of it, by dotted name."""
-    found, unknown = {}, dict[str, str]()
-    for name, facts in pretraining(training).items():
-        found[name] = scene = schema.picked(schema.PretrainingBlock, {"file": {}, "made_by": {}}, facts)
-        why = "it came from a file, which does not say" if scene["file"] else "a release that did not note it"
-        unknown |= {f"train.pretraining.{name}.{key}": why for key, value in scene.items() if value is None}
-        if scene["train_s"] is None:
-            unknown["train.with_pretraining_s"] = f"the {name} scene that it started from came from a file"
-    return found, unknown

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar
@@ -16,15 +15,16 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import package_of
 from splatwizard_core.plugins.kernels import declared_modules
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.scene_digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import NativeBuildError, cache_root, resolve_module
+from splatwizard_native import NativeBuildError, resolve_module
 
 T = TypeVar("T")
-Role = Literal["trained", "start", "file"]
-"""Of a model that a session keeps: trained last, started from last, or read from a file last."""
+Role = Literal["trained", "start"]
+"""Of a model that a session keeps: trained last, or started from last."""
 
 
 @dataclass
@@ -50,7 +50,8 @@ class Session:
     _made: dict[Hashable, Any] = field(default_factory=dict)
     _models: dict[Role, TrainedModel] = field(default_factory=dict)
 
-    def _once(self, key: Hashable, make: Callable[[], T]) -> T:
+    def once(self, key: Hashable, make: Callable[[], T]) -> T:
+        """Return what `make` made when the key first came."""
         if key not in self._made:
             self._made[key] = make()
         found: T = self._made[key]
@@ -68,24 +69,27 @@ class Session:
                 self.say(f"scene {scene.name}: {warning}")
             return scene
 
-        return self._once(("scene", resolved.scene_spec, resolved.scene), load)
+        return self.once(("scene", resolved.scene_spec, resolved.scene), load)
 
     def scene_digest(self, resolved: ResolvedConfig) -> str:
         """Return the checksum of the scene's content, computed once."""
-
-        def digest() -> str:
-            scene = self.scene(resolved)
-            return scene_digest(scene, _digest_store(scene))
-
-        return self._once(("digest", resolved.scene_spec, resolved.scene), digest)
+        key = ("digest", resolved.scene_spec, resolved.scene)
+        return self.once(key, lambda: scene_digest(self.scene(resolved)))
 
     def file_digest(self, path: Path) -> str:
         """Return the SHA-256 of a file, read once."""
-        return self._once(path, lambda: file_sha256(path))
+        return self.once(path, lambda: file_sha256(path))
 
     def say_once(self, line: str) -> None:
         """Tell what rate points and stages would repeat."""
-        self._once(line, lambda: self.say(line))
+        self.once(line, lambda: self.say(line))
+
+    def rasterizer(self, resolved: ResolvedConfig, suggested: Iterable[str]) -> NegotiatedRasterizer:
+        """Return what draws for a run: the user's choice first, then `suggested` names."""
+        chosen = resolved.ppl.raster
+        return NegotiatedRasterizer(
+            self.plugins, device=self.device, prefer=chosen.prefer, forbid=chosen.forbid, suggested=suggested
+        )
 
     def load_kernels(self) -> None:
         """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.
@@ -106,11 +110,3 @@ class Session:
         """Return the kept model of a role if it was made from what `key` stands for."""
         found = self._models.get(role)
         return found if found is not None and found.key == key else None
-
-
-def _digest_store(scene: Scene) -> Path | None:
-    """Return where checksums of a scene's pictures are remembered; None for one that lies nowhere."""
-    if scene.path is None:
-        return None
-    name = hashlib.sha256(str(Path(scene.path).absolute()).encode()).hexdigest()
-    return cache_root() / "pictures" / f"{name[:16]}.json"

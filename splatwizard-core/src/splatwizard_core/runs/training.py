@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,12 +12,10 @@ from splatwizard_core.evaluation.evaluate import evaluate, raster_header
 from splatwizard_core.evaluation.metrics import quick_metrics
 from splatwizard_core.files import sweep, write_atomic
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog
+from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog, run_directory
 from splatwizard_core.runs.lock import directory_lock, is_held
 from splatwizard_core.runs.observers import StartedTraining, watched_by
 from splatwizard_core.runs.phases import StageParts
@@ -28,7 +25,7 @@ from splatwizard_core.runs.versions import changes, made_by
 from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
-from splatwizard_core.training.pipeline import TrainingRun, TrainOutcome
+from splatwizard_core.training.pipeline import TrainingRun
 
 STEP = "train"
 BEGUN = "begun"
@@ -66,23 +63,22 @@ def train(session: Session, request: RunRequest, directory: Path, *, stop_after:
 def _trained_in(home: Path, session: Session, request: RunRequest, key: str, stop_after: int | None) -> TrainedModel:
     """Train in the directory `home`, or load what is finished there."""
     resolved, plugins = request.resolved, session.plugins
-    steps, done = StepLog(home), finished_training(home, key)
-    resume = done is not None or (request.resume and not _is_of_an_older_release(session, home))
+    steps, done = StepLog(home), _finished(home, key)
     if done is None:
         scene = session.scene(resolved)
         session.say(f"training {resolved.method} on {scene.name} ({resolved.preset} preset, {session.device})")
         if not CheckpointStore(home / CHECKPOINTS).paths():  # those of another training are refused, and stay as is
             steps.finish(BEGUN, key, {})  # whoever wants the same scene meanwhile may wait for it
+    request = replace(request, resume=request.resume or done is not None)
     with plugins.recording() as loaded:
-        training = _StagesOfARun(session, replace(request, resume=resume), home, loaded)
-        model, facts = training.train(stop_after=stop_after, watched=done is None)
+        model, facts = _train_stages(session, request, home, loaded, stop_after, watched=done is None)
     if done is None:
         rasterizers = plugins.rasterizers
         served = [rasterizers.entry(name) for name in facts["rasterizers"].values() if name in rasterizers]
         facts |= {"made_by": made_by(plugins, [*loaded, *served]), "trained_in": resolved.rate}
         steps.finish(STEP, key, facts)
         return TrainedModel(model, key, facts)
-    changed = changes(plugins, done.get("made_by"))
+    changed = changes(plugins, done["made_by"])
     if changed:
         session.say(f"{home} was trained with {', '.join(changed)}; it is used as it is (--fresh trains again)")
     return TrainedModel(model, key, done)  # with what was measured when it was trained, not when it was loaded
@@ -96,14 +92,16 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
     """
     if outer.init and name == pretrained.first_scene(pretrained.make_method(session.plugins, outer)):
         session.say_once(f"{outer.method} starts from {outer.init} in place of a trained {name} scene")
-        return _scene_of_file(session, Path(outer.init))
+        return session.once(("model", outer.init), lambda: _scene_of_file(session, Path(outer.init)))
     resolved = pretrained.base_config(session.plugins, name, outer)
     key = pretrained.training_key(session, resolved)
     kept = session.kept("start", key)
     if kept is not None:
         return kept
-    ordinary = _ordinary_run(out / session.scene(resolved).name / name, key)
-    directory = ordinary or cached_directory(session, resolved, out)
+    request, cached = RunRequest(resolved, out), cached_directory(session, resolved, out)
+    homes = [*_folders(run_directory(request).parent), cached]
+    begun = (each for each in homes if StepLog(each).done(BEGUN, key) is not None and is_held(each))
+    directory = _first_finished(homes, key) or next(begun, cached)
     with directory_lock(directory, wait=True, say=session.say):
         sweep(directory)
         if StepLog(directory).done(STEP, key) is not None:
@@ -112,7 +110,7 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
             session.say(f"the trained {name} scene for this configuration is not finished yet: going on with it first")
         else:
             session.say(f"no trained {name} scene for this configuration yet: training it first")
-        found = train(session, RunRequest(resolved, out), directory)
+        found = train(session, request, directory)
     found.model.eval().requires_grad_(False)
     session.keep("start", found)
     return found
@@ -121,12 +119,8 @@ def trained_scene(session: Session, name: str, outer: ResolvedConfig, out: Path)
 def _scene_of_file(session: Session, path: Path) -> TrainedModel:
     """Return the explicit Gaussians of a .ply as a trained scene, frozen. Nobody knows how it was trained."""
     digest = session.file_digest(path)
-    found = session.kept("file", digest)
-    if found is None:
-        model = pretrained.check_model(str(path)).to(session.device).eval().requires_grad_(False)
-        found = TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
-        session.keep("file", found)
-    return found
+    model = pretrained.check_model(str(path)).to(session.device).eval().requires_grad_(False)
+    return TrainedModel(model, digest, {"train_s": None, "file": {"name": path.name, "sha256": digest}})
 
 
 def cached_directory(session: Session, resolved: ResolvedConfig, out: Path) -> Path:
@@ -135,24 +129,19 @@ def cached_directory(session: Session, resolved: ResolvedConfig, out: Path) -> P
     return out / CACHE / f"{session.scene(resolved).name}-{resolved.method}-{key[:16]}"
 
 
-def _ordinary_run(parent: Path, key: str) -> Path | None:
-    """Find a run directory that holds this training, finished; else one in which another process is making it now."""
-    directories = _folders(parent)
-    finished = (each for each in directories if finished_training(each, key) is not None)
-    begun = (each for each in directories if StepLog(each).done(BEGUN, key) is not None and is_held(each))
-    return next(itertools.chain(finished, begun), None)
-
-
 def finished_directory(session: Session, request: RunRequest, directory: Path) -> Path | None:
     """Find the directory with the finished training of a request: `directory`, that of a rate point beside, or the
     cache's."""
-    key = pretrained.training_key(session, request.resolved)
     cached = cached_directory(session, request.resolved, request.out)
-    candidates = dict.fromkeys([directory, *_folders(directory.parent), cached])
-    return next((each for each in candidates if finished_training(each, key) is not None), None)
+    homes = [directory, *_folders(directory.parent), cached]
+    return _first_finished(homes, pretrained.training_key(session, request.resolved))
 
 
-def finished_training(directory: Path, key: str) -> dict[str, Any] | None:
+def _first_finished(homes: Iterable[Path], key: str) -> Path | None:
+    return next((each for each in homes if _finished(each, key) is not None), None)
+
+
+def _finished(directory: Path, key: str) -> dict[str, Any] | None:
     """Return the facts of this training if a run directory holds it, finished, with its own checkpoints."""
     facts = StepLog(directory).done(STEP, key)
     if facts is None or "checkpoints" in facts or not CheckpointStore(directory / CHECKPOINTS).paths():
@@ -164,122 +153,87 @@ def _folders(parent: Path) -> list[Path]:
     return sorted(each for each in parent.iterdir() if each.is_dir()) if parent.is_dir() else []
 
 
-def _is_of_an_older_release(session: Session, directory: Path) -> bool:
-    """Whether the checkpoints of a directory do not say all that they were made from; told, since they go then."""
-    identity = CheckpointStore(directory / CHECKPOINTS).identity()
-    if identity is None or identity.get("identity") == pretrained.IDENTITY:
-        return False
-    session.say(
-        f"{directory} was trained by a release that did not note what all pictures and input files hold: "
-        "its checkpoints cannot be trusted to be of this scene, so it is trained again"
-    )
-    return True
-
-
-class _StagesOfARun:
-    """The stages of a method, trained in a directory, or loaded where its checkpoints say that they are finished.
+def _train_stages(
+    session: Session,
+    request: RunRequest,
+    directory: Path,
+    loaded: list[Entry],
+    stop_after: int | None,
+    *,
+    watched: bool,
+) -> tuple[SplatModel, dict[str, Any]]:
+    """Train the stages of a method in a directory, or load what its checkpoints say is finished.
 
     loaded      entries that the registries are asked for meanwhile, as it grows
+    watched     plugins may watch it; False: it is only loaded
+
+    Returns the model and the facts that are reported of its training.
     """
+    session.load_kernels()
+    resolved, plugins = request.resolved, session.plugins
+    scene, ppl = session.scene(resolved), resolved.ppl
+    method = pretrained.make_method(plugins, resolved)
+    stages = list(method.stages())
+    options = stages[-1].raster_options(stages[-1].iterations, scene.background)
+    rasterizer = session.rasterizer(resolved, [name for stage in stages for name in stage.prefer])
+    parts = StageParts(plugins, stages, ppl, loaded, rasterizer)
+    before: dict[str, dict[str, Any]] = {}
 
-    def __init__(self, session: Session, request: RunRequest, directory: Path, loaded: list[Entry]) -> None:
-        session.load_kernels()
-        self.session, self.request, self.directory = session, request, directory
-        self.resolved, self.scene = request.resolved, session.scene(request.resolved)
-        self.method: Method = pretrained.make_method(session.plugins, self.resolved)
-        self.stages = list(self.method.stages())
-        last = self.stages[-1]
-        self.options = last.raster_options(last.iterations, self.scene.background)
-        ppl = self.resolved.ppl
-        self.rasterizer = NegotiatedRasterizer(
-            session.plugins,
-            device=session.device,
-            prefer=ppl.raster.prefer,
-            forbid=ppl.raster.forbid,
-            suggested=list(dict.fromkeys(name for stage in self.stages for name in stage.prefer)),
-        )
-        self.parts = StageParts(session.plugins, self.stages, ppl, loaded, self.rasterizer)
-        self.before: dict[str, dict[str, Any]] = {}
-
-    def train(self, *, stop_after: int | None, watched: bool) -> tuple[SplatModel, dict[str, Any]]:
-        """Return the model and the facts that are reported of its training.
-
-        watched     plugins may watch it; False: it is only loaded
-        """
-        session, resolved, directory = self.session, self.resolved, self.directory
-        scenes_before = pretrained.starts(session, resolved)
-        if resolved.ppl.eval_every:
-            decode_all(self.scene.test)  # here, so that they do not count as memory of the training
-        started = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
-        watching = session.plugins.hook.run_started(training=started) if watched else []
-        with watched_by(watching, session.plugins, session.say) as after_step:
-            outcome = TrainingRun(
-                self.stages,
-                lambda: self.method.create_model(self.scene, stream(resolved.ppl.seed, "init")).to(session.device),
-                self.scene,
-                resolved.ppl,
-                self.rasterizer,
-                directory=directory / CHECKPOINTS,
-                # The content besides its key, so that a refused resume can say what differs.
-                identity={
-                    **resolved.training_content(),
-                    "identity": pretrained.IDENTITY,
-                    "method_version": self.method.version,
-                    "scene content": session.scene_digest(resolved),
-                    **({"starts from": scenes_before} if scenes_before else {}),
-                },
-                trained=self._frozen,
-                stop_after=stop_after,
-                resume=self.request.resume,
-                allow_changed_plan=self.request.allow_changed_plan,
-                on_step=after_step,
-                evaluate=self._evaluate,
-                log_path=directory / LOG,
-                provided=self.parts.since_asked,
-            ).train()
-        return outcome.model, self._facts(outcome)
-
-    def _facts(self, outcome: TrainOutcome) -> dict[str, Any]:
-        return {
-            **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},
-            "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
-            "pretraining": self.before,
-            "peak_bytes": outcome.peak_memory,
-            "memory_kind": "cuda" if self.session.device.type == "cuda" else "rss",
-            "breakdown_s": outcome.breakdown or None,
-            "plan": outcome.plan,
-            "rasterizers": outcome.rasterizers,
-            "phases": self.parts.phases(outcome.provided),
-            "raster": raster_header(self.options),
-        }
-
-    def _frozen(self, name: str) -> SplatModel:
+    def frozen(name: str) -> SplatModel:
         """Return the trained scene that a stage starts from or is taught by."""
-        if name not in pretrained.named_scenes(self.method):
+        if name not in pretrained.named_scenes(method):
             raise SplatwizardError(
-                f"a stage of '{self.resolved.method}' asks for a trained '{name}' scene, which no stage names in "
+                f"a stage of '{resolved.method}' asks for a trained '{name}' scene, which no stage names in "
                 "`starts_from` or `taught_by`: its training could not be told from one with another such scene"
             )
-        with self.parts.elsewhere():
-            source = trained_scene(self.session, name, self.resolved, self.request.out)
-        base = pretrained.base_config(self.session.plugins, name, self.resolved)
-        self.before[name] = _pretraining_facts(source, base)
+        with parts.elsewhere():
+            source = trained_scene(session, name, resolved, request.out)
+        before[name] = _pretraining_facts(source, pretrained.base_config(plugins, name, resolved))
         return source.model
 
-    def _evaluate(self, model: SplatModel, step: int) -> dict[str, float]:
+    def test_metrics(model: SplatModel, step: int) -> dict[str, float]:
         """Return the metrics of the test views that the log keeps on the way."""
-        plugins = self.session.plugins
         result = evaluate(
-            model,
-            self.scene.test,
-            self.rasterizer,
-            plugins,
-            device=self.session.device,
-            options=replace(self.options, background=self.scene.background),
-            metrics=quick_metrics(plugins.metrics),
-            label=f"evaluate at step {step:,}",
-        )
+            model, scene.test, rasterizer, plugins,
+            device=session.device, options=replace(options, background=scene.background),
+            metrics=quick_metrics(plugins.metrics), label=f"evaluate at step {step:,}",
+        )  # fmt: skip
         return {name: metric.mean for name, metric in result.metrics.items() if metric.mean is not None}
+
+    scenes_before = pretrained.starts(session, resolved)
+    # The content besides its key, so that a refused resume can say what differs.
+    identity = {
+        **resolved.training_content(),
+        "identity": pretrained.IDENTITY,
+        "method_version": method.version,
+        "scene content": session.scene_digest(resolved),
+        **({"starts from": scenes_before} if scenes_before else {}),
+    }
+    if ppl.eval_every:
+        decode_all(scene.test)  # here, so that they do not count as memory of the training
+    started = StartedTraining(resolved.method, directory, scene, rasterizer)
+    watching = plugins.hook.run_started(training=started) if watched else []
+    with watched_by(watching, plugins, session.say) as after_step:
+        outcome = TrainingRun(
+            stages,
+            lambda: method.create_model(scene, stream(ppl.seed, "init")).to(session.device),
+            scene, ppl, rasterizer,
+            directory=directory / CHECKPOINTS, identity=identity, trained=frozen, stop_after=stop_after,
+            resume=request.resume, allow_changed_plan=request.allow_changed_plan, on_step=after_step,
+            evaluate=test_metrics, log_path=directory / LOG, provided=parts.since_asked,
+        ).train()  # fmt: skip
+    return outcome.model, {
+        **{name: getattr(outcome, name) for name in TrainBlock.model_fields if hasattr(outcome, name)},
+        "stages": [{"name": name, "seconds": seconds} for name, seconds in outcome.stage_seconds.items()],
+        "pretraining": before,
+        "peak_bytes": outcome.peak_memory,
+        "memory_kind": "cuda" if session.device.type == "cuda" else "rss",
+        "breakdown_s": outcome.breakdown or None,
+        "plan": outcome.plan,
+        "rasterizers": outcome.rasterizers,
+        "phases": parts.phases(outcome.provided),
+        "raster": raster_header(options),
+    }
 
 
 def _pretraining_facts(source: TrainedModel, base: ResolvedConfig) -> dict[str, Any]:
@@ -291,13 +245,7 @@ def _pretraining_facts(source: TrainedModel, base: ResolvedConfig) -> dict[str, 
     return picked(PretrainingBlock, facts, told, {"train_s": total_seconds(facts)})
 
 
-def pretraining(facts: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a training started from, by method; of one of an older release its seconds alone."""
-    older = {name: {"train_s": seconds} for name, seconds in facts.get("pretraining_s", {}).items()}
-    return dict(facts.get("pretraining", older))
-
-
 def total_seconds(facts: Mapping[str, Any]) -> float | None:
     """Return the seconds of a training with those of what it started from; None if that came from a file."""
-    seconds = [facts["train_s"], *(each["train_s"] for each in pretraining(facts).values())]
+    seconds = [facts["train_s"], *(each["train_s"] for each in facts["pretraining"].values())]
     return None if None in seconds else sum(seconds)

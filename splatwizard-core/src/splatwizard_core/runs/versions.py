@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import importlib.metadata
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from packaging.requirements import Requirement
 
@@ -30,19 +29,14 @@ def providers(plugins: PluginManager, *kinds: str) -> list[str]:
     return sorted({entry.distribution for kind in kinds for entry in plugins.registries[kind]})
 
 
-def changes(plugins: PluginManager, before: Any) -> list[str]:
+def changes(plugins: PluginManager, before: Mapping[str, str]) -> list[str]:
     """List what was made by another version than is installed, such as `sw-x 0.1, now 0.2`; `before` as of `made_by`.
 
-    Versions that cannot be read count as a change too; a distribution that was not noted does not.
+    A distribution that was not noted is no change.
     """
-    if not isinstance(before, Mapping):
-        return ["versions that were not noted"]
-    now = installed(plugins, map(str, before))
-    return [
-        f"{name} {version}, now {now[str(name)] or 'not installed'}"
-        for name, version in before.items()
-        if now[str(name)] != version
-    ]
+    now = installed(plugins, before)
+    pairs = ((name, version, now[name]) for name, version in before.items())
+    return [f"{name} {was}, now {version or 'not installed'}" for name, was, version in pairs if version != was]
 
 
 @functools.cache

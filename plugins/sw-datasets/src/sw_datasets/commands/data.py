@@ -9,14 +9,12 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.tooling import (
+    OUTPUT_FOLDER,
     Choices,
-    complete_folders,
-    complete_image_folders,
     console,
     debug_option,
     json_option,
     options,
-    output_folder,
     print_json,
     say,
     set_option,
@@ -266,17 +264,16 @@ data.add_command(fetch)
 
 
 @data.command(short_help="a pinhole copy of a COLMAP scene with lens distortion")
-@click.argument("scene", metavar="SCENE", shell_complete=complete_folders)
-@click.argument("out", metavar="OUT", shell_complete=complete_folders)
+@click.argument("scene", metavar="SCENE", type=click.Path(file_okay=False))
+@click.argument("out", metavar="OUT", type=OUTPUT_FOLDER)
 @options(
     click.option("--images", metavar="FOLDER", default="images", show_default=True,
-                 shell_complete=complete_image_folders,
                  help="Which picture folder of SCENE to undistort; OUT/images holds the result."),
     click.option("--quality", type=click.IntRange(1, 100), default=100, show_default=True, metavar="1..100",
                  help="Of JPEG pictures that are written."),
     json_option, debug_option,
 )  # fmt: skip
-def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) -> None:
+def undistort(scene: str, out: Path, images: str, quality: int, as_json: bool) -> None:
     """Write a copy of the COLMAP scene SCENE without lens distortion into the new folder OUT: pinhole cameras, the
     same poses, points and image names, pictures (and masks) resampled and cut so that no black border is left.
 
@@ -284,8 +281,8 @@ def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) ->
     """
     from sw_datasets.undistort import undistort_scene
 
-    done = undistort_scene(Path(scene), Path(out), images=images, quality=quality)
-    facts = {"scene": scene, "folder": out, **vars(done)}
+    done = undistort_scene(Path(scene), out, images=images, quality=quality)
+    facts = {"scene": scene, "folder": str(out), **vars(done)}
     if as_json:
         print_json(facts)
     else:
@@ -296,7 +293,7 @@ def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) ->
 
 
 @data.command(short_help="write the procedural demo scene")
-@click.argument("out", metavar="OUT", shell_complete=complete_folders)
+@click.argument("out", metavar="OUT", type=OUTPUT_FOLDER)
 @options(
     click.option(
         "--size", type=click.Choice(["demo", "tiny"]), default="demo", show_default=True,
@@ -309,7 +306,7 @@ def undistort(scene: str, out: str, images: str, quality: int, as_json: bool) ->
     click.option("--text", is_flag=True, help="COLMAP model as text.  [default: binary]"),
     set_option, json_option, debug_option,
 )  # fmt: skip
-def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], as_json: bool) -> None:
+def synth(out: Path, size: str, layout: str, text: bool, sets: tuple[str, ...], as_json: bool) -> None:
     """Write the procedural demo scene into the folder OUT, as a data set that any trainer reads.
 
     --set takes scene keys: resolution, test_every, background, split.
@@ -318,16 +315,14 @@ def synth(out: str, size: str, layout: str, text: bool, sets: tuple[str, ...], a
     from splatwizard_core.tooling import load_plugins, load_scene
     from sw_datasets.write_scene import write_scene
 
-    target = Path(out)
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+    if out.exists() and any(out.iterdir()):
         raise UserInputError(f"{out} is not an empty folder: choose another one")
-    output_folder(target)
     scene_options = Choices(sets=sets).resolve_without_method().scene
     scene = load_scene("demo" if size == "demo" else f"demo:{size}", scene_options, load_plugins())
     say(f"drawing {len(scene.train) + len(scene.test)} views")
-    write_scene(scene, target, layout, text=text)
+    write_scene(scene, out, layout, text=text)
     facts = {
-        "folder": out,
+        "folder": str(out),
         "layout": layout,
         "train_views": len(scene.train),
         "test_views": len(scene.test),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from splatwizard_core.tooling import complete_nothing, debug_option, json_option, options, print_json, say
+from splatwizard_core.tooling import debug_option, json_option, options, print_json, say
 from sw_datasets.commands import completions
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ registry_option = click.option(
 @click.argument("targets", nargs=-1, required=True, metavar="DATASET[/SCENE]...", shell_complete=completions.datasets)
 @options(
     click.option("--yes", "-y", is_flag=True, help="Do not ask."),
-    click.option("--sha256", "pins", multiple=True, metavar="[FILE=]HEX", shell_complete=complete_nothing,
+    click.option("--sha256", "pins", multiple=True, metavar="[FILE=]HEX",
                  help="What the archive's SHA-256 must be; repeatable where several archives are fetched."),
     click.option("--from", "archives", multiple=True, metavar="FILE", type=click.Path(dir_okay=False),
                  help="Unpack this archive, which is here already, instead of downloading one."),

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 from sw_datasets.assemble import assemble_scene
+from sw_datasets.describe import describe
 
-from splatwizard_core.cli.describe_scene import describe
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 

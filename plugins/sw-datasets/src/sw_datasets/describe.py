@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from typing import Any
 
-from splatwizard_core.scene.scene import Scene
+from splatwizard_core.api import Scene
 
 
 def describe(scene: Scene) -> dict[str, Any]:
