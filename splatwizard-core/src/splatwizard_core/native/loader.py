@@ -25,7 +25,7 @@ from typing import Any
 
 from splatwizard_core.errors import NativeBuildError
 from splatwizard_core.files import file_sha256, write_json
-from splatwizard_core.native import toolchain
+from splatwizard_core.native import toolchain, waiting
 from splatwizard_core.native.build_lock import build_lock
 from splatwizard_core.native.toolchain import Job, Toolchain
 
@@ -391,6 +391,7 @@ def _load_library(library: Path) -> str | None:
         torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
     except (OSError, RuntimeError) as error:
         return str(error.__cause__ or error)
+    waiting.watch_cores()
     return None
 
 

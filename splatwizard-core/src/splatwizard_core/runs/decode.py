@@ -18,8 +18,10 @@ from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.method import Method
+from splatwizard_core.native.core_time import CoreTime
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
 from splatwizard_core.runs.session import Session
 
@@ -35,6 +37,7 @@ class DecodeReport:
     decode_spread       how much the timed decodes differ; None for fewer than two
     first_decode_s      of the decode before the timed ones, which imports what is imported late
     jit_s               loading (or compiling) the native modules, before all decodes
+    contended           "decode" -> share of the cores that the decodes had, where they had to share; else empty
     peak_bytes          memory growth over the first decode; `memory_kind` says of what
     """
 
@@ -50,6 +53,7 @@ class DecodeReport:
     decode_spread: Spread | None
     first_decode_s: float
     jit_s: float
+    contended: dict[str, float]
     peak_bytes: int
     memory_kind: str
     device: str
@@ -133,11 +137,13 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         digest = model.digest()
         bar.advance()
         runs: list[float] = []
+        cores = CoreTime()
         for _ in range(repeats):
             del model
             model, reader, seconds = once()
             runs.append(seconds)
             bar.advance()
+        contended = contention("decode", cores)
     if model.digest() != digest:
         raise SplatwizardError(
             f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
@@ -155,6 +161,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         decode_spread=spread(runs) if len(runs) > 1 else None,
         first_decode_s=first,
         jit_s=jit_s,
+        contended=contended,
         peak_bytes=peak,
         memory_kind=meter.kind,
         device=str(device),

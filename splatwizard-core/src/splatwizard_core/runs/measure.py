@@ -15,9 +15,11 @@ from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.ply import load_ply
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.memory import MemoryMeter, synchronize
+from splatwizard_core.native.core_time import CoreTime
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.contention import CONTENDED, contention
 from splatwizard_core.runs.decode import import_method, open_model
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
@@ -86,15 +88,17 @@ def measure(
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
 
     report: SpeedReport | None = None
+    contended: dict[str, float] = {}
     speed_views = views
     if len(views) < FEWEST_SPEED_VIEWS:
         tested = {view.name for view in views}
         speed_views = [*views, *(view for view in scene.train if view.name not in tested)]
     if speed and speed_views:
-        cameras = [view.camera.to(device) for view in speed_views]
+        cameras, cores = [view.camera.to(device) for view in speed_views], CoreTime()
         report = measure_speed(
             lambda c: quality.render_view(model, c, rasterizer, options).image, cameras, device, repeats=repeats
         )
+        contended = contention("render", cores)
     result = quality.evaluate(
         model, views, rasterizer, plugins,
         device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
@@ -117,7 +121,8 @@ def measure(
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
-        "flags": _flags(scene, result, meter, device_bound),
+        "contended": contended,
+        "flags": [*_flags(scene, result, meter, device_bound), *([CONTENDED] if contended else [])],
     }
     if report is not None:
         first = speed_views[0].camera

@@ -17,6 +17,7 @@ from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
 from splatwizard_core.files import file_sha256
 from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import METRICS, ResolvedConfig, content_hash
+from splatwizard_core.runs.contention import CONTENDED, contended_phases
 from splatwizard_core.runs.decode import REPEATS
 from splatwizard_core.runs.directory import ENCODED, RENDERS, RunRequest, StepLog, begin, run_directory, write_config
 from splatwizard_core.runs.encode import encode
@@ -51,7 +52,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             return facts
 
         def decode_it() -> dict[str, Any]:
-            facts = decode_fresh(encoded, str(session.device), repeats=repeats)
+            facts = decode_fresh(encoded, str(session.device), repeats=repeats, threads=resolved.ppl.threads)
             counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts["counts"].items())
             session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {counted}")
             return facts
@@ -185,6 +186,7 @@ def _record(
     before, unknown = _pretraining(training)
     started = {"pretraining": before, "with_pretraining_s": total_seconds(training)}
     steps = {**training, **measured, **encoding, **decoded}
+    contended = contended_phases(training, encoding, decoded, measured)
     values = {
         **steps,
         "distribution": f"{entry.distribution} {entry.version}",
@@ -196,6 +198,8 @@ def _record(
         "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
         "train": schema.picked(schema.TrainBlock, training, started),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
+        "contended": contended,
+        "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
         "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
         "unknown": {**measured["unknown"], **unknown},
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),

@@ -14,10 +14,12 @@ from splatwizard_core.evaluation.metrics import quick_metrics
 from splatwizard_core.files import sweep, write_atomic
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
+from splatwizard_core.native.core_time import CoreTime
 from splatwizard_core.plugins import Entry
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog
 from splatwizard_core.runs.lock import directory_lock, is_held
 from splatwizard_core.runs.observers import StartedTraining, watched_by
@@ -212,6 +214,7 @@ class _StagesOfARun:
             decode_all(self.scene.test)  # here, so that they do not count as memory of the training
         started = StartedTraining(resolved.method, directory, self.scene, self.rasterizer)
         watching = session.plugins.hook.run_started(training=started) if watched else []
+        cores = CoreTime()
         with watched_by(watching, session.plugins, session.say) as after_step:
             outcome = TrainingRun(
                 self.stages,
@@ -237,7 +240,7 @@ class _StagesOfARun:
                 log_path=directory / LOG,
                 provided=self.parts.since_asked,
             ).train()
-        return outcome.model, self._facts(outcome)
+        return outcome.model, {**self._facts(outcome), "contended": contention("train", cores)}
 
     def _facts(self, outcome: TrainOutcome) -> dict[str, Any]:
         return {
