@@ -1,4 +1,4 @@
-"""Which timed phases of a run had to share the cores with other processes."""
+"""Name the timed phases of a run that had to share the cores with other processes."""
 
 from __future__ import annotations
 

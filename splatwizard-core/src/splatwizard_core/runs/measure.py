@@ -19,7 +19,7 @@ from splatwizard_core.native.core_time import CoreTime
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
-from splatwizard_core.runs.contention import CONTENDED, contention
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.decode import import_method, open_model
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
@@ -122,7 +122,7 @@ def measure(
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
         "contended": contended,
-        "flags": [*_flags(scene, result, meter, device_bound), *([CONTENDED] if contended else [])],
+        "flags": _flags(scene, result, meter, device_bound=device_bound, contended=bool(contended)),
     }
     if report is not None:
         first = speed_views[0].camera
@@ -140,7 +140,9 @@ def measure(
     return found
 
 
-def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, device_bound: bool) -> list[str]:
+def _flags(
+    scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, *, device_bound: bool, contended: bool
+) -> list[str]:
     """Name the circumstances that a reader of the numbers must know."""
     told = {
         "fit": scene.protocol.split == "all",
@@ -149,6 +151,7 @@ def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, d
         "not-a-number": any(metric.reason == quality.NOT_A_NUMBER for metric in result.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in result.metrics.values()),
         "device-bound": device_bound,
+        "contended": contended,
     }
     return [name for name, holds in told.items() if holds]
 
