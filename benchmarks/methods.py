@@ -32,9 +32,9 @@ from rich.console import Console
 from rich.table import Table
 from sw_report.after_run import plot_above, report_above
 
-from splatwizard_core.cores import available_cores
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.runs.pretrained import named_scenes
+from splatwizard_native import available_cores
 
 EXPLICIT = ("3dgs", "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "chimerags")
 ANCHORS = ("hac", "cat-3dgs")

@@ -20,9 +20,9 @@ import torch
 from torch.nn import functional as F  # noqa: N812
 
 from splatwizard_core.training import losses
-from splatwizard_core.training.adam import AdamUpdate, adam_steps
 from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.native import TRAINING
+from splatwizard_native import AdamUpdate, adam_steps
+from splatwizard_native.fused.native import TRAINING
 
 # Floats a Gaussian: means, first and other spherical harmonics, opacity, scales, quaternion.
 GROUPS = (3, 3, 45, 1, 3, 4)

@@ -16,11 +16,11 @@ from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.images import keep_pictures
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
-from splatwizard_core.training.native import TRAINING
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
+from splatwizard_native.fused.native import TRAINING
 from sw_3dgs.config import ThreeDGSConfig
 
 pytestmark = [

@@ -6,6 +6,7 @@ from sw_report.aggregate import dataset_tables, mean
 from sw_report.distortion import bd_tables, choose_anchor
 from sw_report.results_tables import (
     bd_table,
+    cost_table,
     environment_table,
     means_table,
     missing_metrics,
@@ -331,3 +332,21 @@ def test_what_a_training_started_from_is_said(make_run, tmp_path):
     told = {run.facts.rate: run.facts.train.started_from() for run in collect([tmp_path]).runs}
     assert told["r1"] == "a trained 3dgs scene (quick preset, 2,000 steps, 45.0 s)"
     assert told["r2"] == "a trained 3dgs scene from the file a.ply"
+
+
+def test_times_beside_other_processes_are_marked_and_said(make_run, tmp_path):
+    make_run(change=lambda c: c.update(contended={"decode": 0.25, "render": 0.5}))
+    (run,) = collect([tmp_path]).runs
+    table = runs_table([run])
+    cells = dict(zip((column.name for column in table.columns), texts(table)[0], strict=True))
+    marked = {name for name, text in cells.items() if text.endswith(numbers.SHARED)}
+    assert marked == {"decode s", "FPS"}
+    assert numbers.SHARED_NOTE in table.notes
+    assert any("decode 25%, render 50%" in note for note in cost_table(run.facts).notes)
+
+
+def test_times_of_an_idle_machine_carry_no_mark(make_run, tmp_path):
+    make_run()
+    table = runs_table(collect([tmp_path]).runs)
+    assert not any(numbers.SHARED in text for row in texts(table) for text in row)
+    assert numbers.SHARED_NOTE not in table.notes

@@ -116,3 +116,10 @@ def test_further_forms_of_lpips_stand_behind_the_fields_own_and_l1(make_run):
     heads = " ".join(text.partition("┡")[0].split())
     order = [heads.index(name) for name in ("PSNR", "SSIM", "3DGS", "L1", "a_strangers", "(Alex)", "MB")]
     assert order == sorted(order)
+
+
+def test_times_beside_other_processes_are_marked(make_run):
+    path = make_run(change=lambda c: c.update(contended={"train": 0.5}))
+    told = printed([(read_record(path / "metrics.json"), path)], 200)
+    assert "†" in "".join(rows(told)[0])
+    assert "Other processes wanted the cores" in told

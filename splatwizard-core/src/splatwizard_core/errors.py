@@ -5,6 +5,7 @@ A message says what is wrong (with the value), where, and what to do, in one or 
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 from splatwizard_native import NativeBuildError
@@ -121,6 +122,17 @@ class DeviceMemoryError(SplatwizardError):
         figures = _figures(("bytes wanted at once", wanted), ("bytes free", free), ("bytes in all", total))
         super().__init__(f"the GPU has too little memory for {doing} ({figures or 'no figures'}); {advice}")
         self.wanted, self.free, self.total = wanted, free, total
+
+
+def out_of_memory(error: Exception, doing: str, advice: str) -> DeviceMemoryError:
+    """Return the error that says what torch's out-of-memory error does, and what was being done: counts, resolution."""
+    import torch
+
+    found = re.search(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)", str(error))
+    units = {"bytes": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
+    wanted = None if found is None else round(float(found[1]) * units[found[2]])
+    free, total = torch.cuda.mem_get_info() if torch.cuda.is_available() else (None, None)
+    return DeviceMemoryError(doing, advice, wanted, free, total)
 
 
 class TaskSignatureError(SplatwizardError):

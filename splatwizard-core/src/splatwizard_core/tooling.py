@@ -25,7 +25,6 @@ MODULES = {
     "scene.locate": "DATA_VARIABLE",
     "files": "file_sha256 new_folder write_atomic write_json",
     "progress": "Bar",
-    "cores": "available_cores",
     "evaluation.evaluate": "png_names",
     "evaluation.metrics": "MetricInfo short_reason",
     "errors": "RunLockedError",

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from splatwizard_core.errors import ShapeError
-from splatwizard_core.training import losses
 from splatwizard_core.training.losses import photometric_loss
-from splatwizard_core.training.native import TRAINING
+from splatwizard_native.fused import photometric
+from splatwizard_native.fused.native import TRAINING
 
 SIZES = [(1, 1), (1, 40), (40, 1), (5, 300), (17, 33), (64, 129), (11, 256)]
 
@@ -26,7 +26,7 @@ def kernels() -> None:
 
 @pytest.fixture
 def torch_path(monkeypatch) -> None:
-    monkeypatch.setattr(losses, "TRAINING", SimpleNamespace(try_load=lambda: False))
+    monkeypatch.setattr(photometric, "TRAINING", SimpleNamespace(try_load=lambda: False))
 
 
 def images(height: int, width: int, dtype=torch.float32, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -264,5 +264,5 @@ def test_the_compiled_loss_is_vectorised(kernels, monkeypatch):
         return min(taken)
 
     compiled = seconds()
-    monkeypatch.setattr(losses, "TRAINING", SimpleNamespace(try_load=lambda: False))
+    monkeypatch.setattr(photometric, "TRAINING", SimpleNamespace(try_load=lambda: False))
     assert compiled < seconds() / 3

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from splatwizard_core.training.adam import AdamUpdate, adam_steps
 from splatwizard_core.training.losses import _ssim_torch, photometric_loss
-from splatwizard_core.training.native import TRAINING
+from splatwizard_native import AdamUpdate, adam_steps
+from splatwizard_native.fused.native import TRAINING
 
 pytestmark = [
     pytest.mark.cuda,

@@ -9,13 +9,29 @@ from splatwizard_native.errors import CompilerMissingError, NativeBuildError
 
 if TYPE_CHECKING:
     from splatwizard_native.build import BuildRow, build_all, resolve_module
+    from splatwizard_native.core_time import CoreTime
+    from splatwizard_native.cores import available_cores
     from splatwizard_native.cuda_toolkit import find_nvcc, nvcc_version
+    from splatwizard_native.fused.adam import AdamUpdate, adam_steps
+    from splatwizard_native.fused.photometric import Padding, photometric
+    from splatwizard_native.memory import MemoryMeter, peak_rss_bytes, reset_peak_rss, rss_bytes, synchronize
     from splatwizard_native.module import NativeModule
     from splatwizard_native.settings import cache_root
     from splatwizard_native.toolchain import find_compiler
 
 # Imported on first use: who only catches the errors, as every command does, need not wait for the rest.
 _LATER = {
+    "AdamUpdate": "fused.adam",
+    "adam_steps": "fused.adam",
+    "Padding": "fused.photometric",
+    "photometric": "fused.photometric",
+    "CoreTime": "core_time",
+    "available_cores": "cores",
+    "MemoryMeter": "memory",
+    "peak_rss_bytes": "memory",
+    "reset_peak_rss": "memory",
+    "rss_bytes": "memory",
+    "synchronize": "memory",
     "BuildRow": "build",
     "build_all": "build",
     "resolve_module": "build",
@@ -27,16 +43,27 @@ _LATER = {
 }
 
 __all__ = [
+    "AdamUpdate",
     "BuildRow",
     "CompilerMissingError",
+    "CoreTime",
+    "MemoryMeter",
     "NativeBuildError",
     "NativeModule",
+    "Padding",
+    "adam_steps",
+    "available_cores",
     "build_all",
     "cache_root",
     "find_compiler",
     "find_nvcc",
     "nvcc_version",
+    "peak_rss_bytes",
+    "photometric",
+    "reset_peak_rss",
     "resolve_module",
+    "rss_bytes",
+    "synchronize",
 ]
 
 

@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import Any
 
+from splatwizard_native.waiting import watch_cores
+
 
 def install(built: Path, library: Path, facts: dict[str, Any]) -> None:
     """Move a new library into its place, then its digest and `facts`; `built` is on the same file system."""
@@ -38,6 +40,7 @@ def load_ops(library: Path) -> str | None:
         torch.ops.load_library(str(library))  # type: ignore[no-untyped-call]
     except (OSError, RuntimeError) as error:
         return str(error.__cause__ or error)
+    watch_cores()
     return None
 
 

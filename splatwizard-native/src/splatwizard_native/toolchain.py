@@ -19,6 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from splatwizard_native import cuda_toolkit
+from splatwizard_native.cores import available_cores
 from splatwizard_native.errors import CompilerMissingError, NativeBuildError
 
 SHARED_INCLUDE = Path(__file__).parent / "include"
@@ -117,7 +118,7 @@ class Toolchain:
 
     def __init__(self, jobs: int | None = None) -> None:
         limit = os.environ.get("MAX_JOBS", "")
-        self._pool = ThreadPoolExecutor(jobs or (int(limit) if limit.isdigit() else 0) or _cores())
+        self._pool = ThreadPoolExecutor(jobs or (int(limit) if limit.isdigit() else 0) or available_cores())
         self.compiler = find_compiler()
 
     def version(self) -> str:
@@ -147,10 +148,6 @@ class Toolchain:
         extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
         command = [*self.compiler, "-shared", *map(str, objects), "-o", str(output), *extra, *libraries]
         self._pool.submit(_run, command, log).result()
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _run(command: list[str], log: Path) -> None:

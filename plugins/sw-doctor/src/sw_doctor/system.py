@@ -11,8 +11,8 @@ import sys
 import tempfile
 from pathlib import Path
 
-from splatwizard_core.tooling import Check, available_cores
-from splatwizard_native import cache_root
+from splatwizard_core.tooling import Check
+from splatwizard_native import available_cores, cache_root
 from sw_doctor.text import gigabytes, one_line
 
 GROUP = "system"

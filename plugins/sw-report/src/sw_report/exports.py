@@ -106,6 +106,7 @@ def run_dict(run: Run) -> dict[str, Any]:
         "encode_s": facts.codec.encode_s,
         "decode_s": facts.codec.decode_s,
         "fps": facts.speed.fps,
+        "contended": facts.contended,
         "flags": facts.flags,
         "unknown": facts.unknown,
         "date": facts.date,
@@ -185,7 +186,7 @@ def _comment(text: str) -> str:
 _LATEX = {
     "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
     "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "–": "--", "−": "$-$", "×": r"$\times$", "·": r"$\cdot$",
+    "–": "--", "−": "$-$", "×": r"$\times$", "·": r"$\cdot$", "†": r"\dag{}",
 }  # fmt: skip
 
 

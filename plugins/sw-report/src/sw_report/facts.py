@@ -172,6 +172,7 @@ class RunFacts(Facts):
     rasterizers: dict[Text, dict[Text, Text]] = {}
     phases: list[PhaseFacts] = []
     environment: dict[Text, Any] = {}
+    contended: dict[Text, float] = {}
     flags: list[Text] = []
     unknown: dict[Text, Text] = {}
     date: Text | None = None

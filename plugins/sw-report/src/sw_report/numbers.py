@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from sw_report.declared import metric_key, metric_style
 
 MISSING = "–"
+SHARED = "†"
+SHARED_NOTE = f"{SHARED} Other processes wanted the cores meanwhile: on an idle machine it is faster."
 FIELD_LPIPS = "lpips_vgg_3dgs"  # the form that the field's tables, the survey's among them, print
 
 
@@ -81,6 +83,11 @@ def rate(value: float | None) -> str:
     if value is None:
         return MISSING
     return f"{value:,.0f}" if value >= 100 else f"{value:.1f}"
+
+
+def shared(text: str, contended: bool) -> str:
+    """A time or a rate, marked if other processes wanted the cores while it was measured."""
+    return text + SHARED if contended else text
 
 
 def percent(value: float | None) -> str:

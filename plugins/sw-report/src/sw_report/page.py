@@ -138,7 +138,8 @@ def _key_figures(run: Run) -> list[dict[str, str]]:
     found.append({"name": "file size", "value": numbers.megabytes(facts.file.bytes), "unit": "MB"})
     for name, n in facts.counts.items():
         found.append({"name": numbers.unit(name), "value": f"{n:,}", "unit": ""})
-    found.append({"name": "rendering", "value": numbers.rate(facts.speed.fps), "unit": "FPS"})
+    frames = numbers.shared(numbers.rate(facts.speed.fps), "render" in facts.contended)
+    found.append({"name": "rendering", "value": frames, "unit": "FPS"})
     return found
 
 

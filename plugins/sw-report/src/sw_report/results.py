@@ -50,7 +50,7 @@ def print_table(records: Sequence[Record], out: Console) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from sw_report.numbers import heading, order_after_run
+    from sw_report.numbers import SHARED_NOTE, heading, order_after_run
 
     first = records[0]
     # A metric that nobody could compute has its reason below, and no column.
@@ -91,6 +91,8 @@ def print_table(records: Sequence[Record], out: Console) -> None:
     out.print(table)
     if best:
         out.print("* best of its column")
+    if any(record.contended for record in records):
+        out.print(SHARED_NOTE, soft_wrap=True)
     if left_out:
         told = ", ".join(heads[name] for name in columns if name in left_out)
         out.print(f"no room for {told}: metrics.json has them, and `sw report`", soft_wrap=True)
@@ -99,14 +101,17 @@ def print_table(records: Sequence[Record], out: Console) -> None:
 def _cells(record: Record, names: Sequence[str], digits: int) -> dict[str, str]:
     """Column -> text; megabytes with so many digits."""
     means = {name: record.metrics[name].mean if name in record.metrics else None for name in names}
+    from sw_report.numbers import shared
+
+    contended = record.contended
     return {
         **{name: _number(name, value) for name, value in means.items()},
         "MB": f"{record.file.bytes / 1e6:.{digits}f}",
         "primitives": " / ".join(f"{n:,}" for n in record.counts.values()),
-        "train s": _seconds(record.train.with_pretraining_s),
-        "encode s": _seconds(record.codec.encode_s),
-        "decode s": _seconds(record.codec.decode_s),
-        "FPS": f"{record.speed.fps:.1f}",
+        "train s": shared(_seconds(record.train.with_pretraining_s), "train" in contended),
+        "encode s": shared(_seconds(record.codec.encode_s), "encode" in contended),
+        "decode s": shared(_seconds(record.codec.decode_s), "decode" in contended),
+        "FPS": shared(f"{record.speed.fps:.1f}", "render" in contended),
     }
 
 

@@ -55,10 +55,13 @@ def runs_table(runs: Sequence[Run]) -> Table:
             Cell(numbers.megabytes(facts.file.bytes), f"{facts.file.bytes:,} bytes"),
             numbers.counts(facts.counts),
             numbers.count(train.steps),
-            Cell(numbers.seconds(train.with_pretraining_s), "with the training of scenes that it starts from"),
-            numbers.seconds(facts.codec.encode_s),
-            numbers.seconds(facts.codec.decode_s),
-            numbers.rate(facts.speed.fps),
+            Cell(
+                numbers.shared(numbers.seconds(train.with_pretraining_s), "train" in facts.contended),
+                "with the training of scenes that it starts from",
+            ),
+            numbers.shared(numbers.seconds(facts.codec.encode_s), "encode" in facts.contended),
+            numbers.shared(numbers.seconds(facts.codec.decode_s), "decode" in facts.contended),
+            numbers.shared(numbers.rate(facts.speed.fps), "render" in facts.contended),
         ]
         rows.append(row(cells))
     views = {run.facts.test_views or len(run.facts.views) for run in runs}
@@ -66,6 +69,8 @@ def runs_table(runs: Sequence[Run]) -> Table:
     notes = missing_metrics(runs)
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
+    if any(run.facts.contended for run in runs):
+        notes.append(numbers.SHARED_NOTE)
     if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
         notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
     return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes)
@@ -263,6 +268,9 @@ def cost_table(facts: RunFacts) -> Table:
     notes = [f"Training is shared with rate point {shared}."] if shared and shared != facts.rate else []
     if any(value.startswith(numbers.MISSING) for _, value, _ in entries):
         notes += [f"{name}: {why}" for name, why in facts.unknown.items() if not name.startswith("metrics.")]
+    if facts.contended:
+        told = ", ".join(f"{phase} {share:.0%}" for phase, share in facts.contended.items())
+        notes.append(f"Other processes wanted the cores meanwhile; share of them that was had: {told}.")
     heads = ["what", "measured", "how"]
     return Table("Time and memory", columns(heads, text=("what", "how")), [row(e) for e in entries], notes=notes)
 

@@ -55,7 +55,7 @@ def encode(source: Path, out: Path | None, as_json: bool, chosen: Choices) -> No
         "--repeats", type=click.IntRange(min=0), default=3, show_default=True, metavar="N",
         help="Timed decodes after the first one; their median is reported.",
     ),
-    shared.device_option, shared.json_option, shared.debug_option,
+    shared.set_option, shared.device_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
 def decode(file: Path, out: Path | None, repeats: int, as_json: bool, chosen: Choices) -> None:

@@ -86,7 +86,7 @@ def evaluate(
         if roundtrip:
             measured = stack.enter_context(scratch_folder("roundtrip")) / "scene.swz"
             encode_directory(session, resolved, file, measured)
-            digest = decode_fresh(measured, str(session.device))["digest"]
+            digest = decode_fresh(measured, str(session.device), threads=resolved.ppl.threads)["digest"]
         facts: dict[str, Any] = measure(
             session,
             resolved,

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, SceneError
+from splatwizard_core.errors import BitstreamError, SceneError, out_of_memory
 from splatwizard_core.evaluation.image import prepare_render
 from splatwizard_core.evaluation.metrics import (
     MetricInfo,
@@ -27,7 +27,6 @@ from splatwizard_core.evaluation.metrics import (
 )
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import out_of_memory
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.progress import track

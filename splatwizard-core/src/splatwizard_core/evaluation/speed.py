@@ -20,8 +20,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.progress import track
+from splatwizard_native import MemoryMeter, synchronize
 
 WARMUP_FRAMES = 10
 CUDA_FRAMES = 100

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from splatwizard_core.plugins.manager import PluginManager
 
-CORE_MODULES = ("splatwizard_core.training.native:TRAINING",)
+CORE_MODULES = ("splatwizard_native.fused.native:TRAINING",)
 
 
 def declared_modules(plugins: PluginManager) -> list[str]:

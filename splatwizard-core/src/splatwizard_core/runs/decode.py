@@ -17,12 +17,13 @@ from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardErro
 from splatwizard_core.evaluation.speed import spread
 from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.progress import track
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
 from splatwizard_core.runs.session import Session
+from splatwizard_native import CoreTime, MemoryMeter, synchronize
 
 REPEATS = 3
 
@@ -114,11 +115,13 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         digest = model.digest()
         bar.advance()
         runs: list[float] = []
+        cores = CoreTime()
         for _ in range(repeats):
             del model
             model, reader, seconds = once()
             runs.append(seconds)
             bar.advance()
+        contended = contention("decode", cores)
     if model.digest() != digest:
         raise SplatwizardError(
             f"{path}: two decodes give different models; method '{reader.method}' is not deterministic"
@@ -136,6 +139,7 @@ def timed_decode(path: Path, session: Session, *, repeats: int = REPEATS) -> tup
         "decode_spread": asdict(spread(runs)) if len(runs) > 1 else None,
         "first_decode_s": first,
         "jit_s": jit_s,
+        "contended": contended,
         "peak_bytes": peak,
         "memory_kind": meter.kind,
         "device": str(device),

@@ -6,10 +6,10 @@ import os
 
 import torch
 
-from splatwizard_core.cores import available_cores
 from splatwizard_core.errors import CapabilityError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.rendering.info import RasterizerInfo
+from splatwizard_native import available_cores
 
 
 def choose_device(asked: str, plugins: PluginManager) -> torch.device:

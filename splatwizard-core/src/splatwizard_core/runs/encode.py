@@ -17,11 +17,11 @@ from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
 from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import synchronize
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
 from splatwizard_core.plugins.catalogue import CORE
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.directory import RunRequest
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.phases import part_of, unique
@@ -29,6 +29,7 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import finished_directory, train
 from splatwizard_core.runs.versions import made_by
+from splatwizard_native import CoreTime, synchronize
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""
@@ -43,7 +44,7 @@ def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path
     """
     before = model.digest()
     synchronize(model.device)
-    began = time.perf_counter()
+    cores, began = CoreTime(), time.perf_counter()
     writer = ContainerWriter(method.name, method.version, raster=raster)
     with torch.no_grad(), method.plugins.recording() as loaded:
         method.encode(model, writer)
@@ -53,11 +54,12 @@ def encode(method: Method, model: SplatModel, raster: dict[str, Any], path: Path
     writer.requires = requirements(loaded)
     size = writer.write(path)
     synchronize(model.device)
-    seconds = time.perf_counter() - began
+    seconds, contended = time.perf_counter() - began, contention("encode", cores)
     if model.digest() != before:
         raise SplatwizardError(f"method '{method.name}' changed the model while encoding it, which it may not")
     return {
         "encode_s": seconds,
+        "contended": contended,
         "bytes": size,
         "sha256": file_sha256(path),
         "made_by": made_by(method.plugins, loaded),

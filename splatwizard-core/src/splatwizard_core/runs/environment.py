@@ -11,8 +11,8 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.cores import available_cores
 from splatwizard_core.plugins import PluginManager
+from splatwizard_native import available_cores
 
 
 def describe_environment(plugins: PluginManager, device: torch.device, seed: int) -> dict[str, Any]:

@@ -59,13 +59,15 @@ def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None) -> dict
     return content
 
 
-def decode_fresh(path: Path, device: str, *, repeats: int = 3) -> dict[str, Any]:
+def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0) -> dict[str, Any]:
     """Decode a file where there is nothing else: an empty folder that holds only the file, no data set in sight.
 
     repeats     timed decodes
+    threads     CPU threads; 0: all cores
     """
     with scratch_folder("decode") as folder:
         copy = folder / path.name
         shutil.copyfile(path, copy)
         arguments = ["decode", copy.name, "--device", device, "--repeats", str(repeats), "--json"]
+        arguments += ["--set", f"threads={threads}"]
         return run_fresh(arguments, alone_in=folder)

@@ -13,16 +13,17 @@ import torch
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter, synchronize
 from splatwizard_core.plugins.interchange import load_ply
 from splatwizard_core.progress import track
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.decode import import_method, open_model
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene, View
+from splatwizard_native import CoreTime, MemoryMeter, synchronize
 
 FEWEST_SPEED_VIEWS = 8
 
@@ -85,15 +86,17 @@ def measure(
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
 
     report: SpeedReport | None = None
+    contended: dict[str, float] = {}
     speed_views = views
     if len(views) < FEWEST_SPEED_VIEWS:
         tested = {view.name for view in views}
         speed_views = [*views, *(view for view in scene.train if view.name not in tested)]
     if speed and speed_views:
-        cameras = [view.camera.to(device) for view in speed_views]
+        cameras, cores = [view.camera.to(device) for view in speed_views], CoreTime()
         report = measure_speed(
             lambda c: quality.render_view(model, c, rasterizer, options).image, cameras, device, repeats=repeats
         )
+        contended = contention("render", cores)
     result = quality.evaluate(
         model, views, rasterizer, plugins,
         device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
@@ -116,7 +119,8 @@ def measure(
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
-        "flags": _flags(scene, result, meter, device_bound),
+        "contended": contended,
+        "flags": _flags(scene, result, meter, device_bound=device_bound, contended=bool(contended)),
     }
     if report is not None:
         first = speed_views[0].camera
@@ -134,7 +138,9 @@ def measure(
     return found
 
 
-def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, device_bound: bool) -> list[str]:
+def _flags(
+    scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, *, device_bound: bool, contended: bool
+) -> list[str]:
     """Name the circumstances that a reader of the numbers must know."""
     told = {
         "fit": scene.protocol.split == "all",
@@ -143,6 +149,7 @@ def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, d
         "not-a-number": any(metric.reason == quality.NOT_A_NUMBER for metric in result.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in result.metrics.values()),
         "device-bound": device_bound,
+        "contended": contended,
     }
     return [name for name, holds in told.items() if holds]
 

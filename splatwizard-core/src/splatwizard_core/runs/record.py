@@ -223,6 +223,9 @@ class Record(Part):
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
     phases: list[PhaseBlock] = Field(description="who served each phase, with distribution and version")
     environment: dict[str, Any]
+    contended: dict[str, float] = Field(
+        {}, description="train, encode, decode, render: those that had to share the cores -> the share that they had"
+    )
     flags: list[str] = Field(description="fit, rss, ...")
     unknown: dict[str, str] = Field(description="dotted name of each null -> why")
     date: str = Field(description="ISO 8601, UTC")

@@ -17,6 +17,7 @@ from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
 from splatwizard_core.files import file_sha256
 from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
+from splatwizard_core.runs.contention import CONTENDED, contended_phases
 from splatwizard_core.runs.decode import REPEATS
 from splatwizard_core.runs.directory import CONFIG, ENCODED, RENDERS, RunRequest, StepLog, held_directory, write_config
 from splatwizard_core.runs.encode import encode
@@ -48,7 +49,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
             return facts
 
         def decode_it() -> dict[str, Any]:
-            facts = decode_fresh(encoded, str(session.device), repeats=repeats)
+            facts = decode_fresh(encoded, str(session.device), repeats=repeats, threads=resolved.ppl.threads)
             counted = ", ".join(f"{n:,} {name.removeprefix('num_')}" for name, n in facts["counts"].items())
             session.say(f"decoded in a fresh process: {facts['decode_s']:.2f} s, {counted}")
             return facts
@@ -156,6 +157,7 @@ def _record(
     """Return the record from the facts of the steps: each block takes its fields from whatever step reported them."""
     entry = session.plugins.methods.entry(resolved.method)
     steps = {**training, **measured, **encoding, **decoded}
+    contended = contended_phases(training, encoding, decoded, measured)
     values = {
         **steps,
         "distribution": f"{entry.distribution} {entry.version}",
@@ -167,6 +169,8 @@ def _record(
         "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
         "train": schema.picked(schema.TrainBlock, training, {"with_pretraining_s": total_seconds(training)}),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
+        "contended": contended,
+        "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
         "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }

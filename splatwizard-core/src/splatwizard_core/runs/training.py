@@ -15,6 +15,7 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import Entry
 from splatwizard_core.runs import pretrained
 from splatwizard_core.runs.config import ResolvedConfig
+from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.directory import CHECKPOINTS, LOG, RunRequest, StepLog, run_directory
 from splatwizard_core.runs.lock import directory_lock, is_held
 from splatwizard_core.runs.observers import StartedTraining, watched_by
@@ -26,6 +27,7 @@ from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.pipeline import TrainingRun
+from splatwizard_native import CoreTime
 
 STEP = "train"
 BEGUN = "begun"
@@ -213,6 +215,7 @@ def _train_stages(
         decode_all(scene.test)  # here, so that they do not count as memory of the training
     started = StartedTraining(resolved.method, directory, scene, rasterizer)
     watching = plugins.hook.run_started(training=started) if watched else []
+    cores = CoreTime()
     with watched_by(watching, plugins, session.say) as after_step:
         outcome = TrainingRun(
             stages,
@@ -233,6 +236,7 @@ def _train_stages(
         "rasterizers": outcome.rasterizers,
         "phases": parts.phases(outcome.provided),
         "raster": raster_header(options),
+        "contended": contention("train", cores),
     }
 
 

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import synchronize
 from splatwizard_core.progress import track
 from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
@@ -19,6 +18,7 @@ from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.scalars import read_scalars
 from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
+from splatwizard_native import synchronize
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.training.adam import AdamUpdate, adam_steps
+from splatwizard_native import AdamUpdate, adam_steps
 
 if TYPE_CHECKING:
     from splatwizard_core.rendering.rasterizer import RenderResult

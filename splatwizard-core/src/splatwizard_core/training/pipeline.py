@@ -11,7 +11,6 @@ from typing import Any
 
 from splatwizard_core.errors import CheckpointError
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import MemoryMeter
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
@@ -26,6 +25,7 @@ from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
+from splatwizard_native import MemoryMeter
 
 __all__ = ["TrainOutcome", "TrainingRun", "TrainingStopped"]
 

@@ -6,7 +6,7 @@ import time
 
 import torch
 
-from splatwizard_core.memory import synchronize
+from splatwizard_native import synchronize
 
 STAGES = ("pre", "render", "loss", "backward", "post", "optimize")
 """The five stages of a step, the third in its two halves."""

@@ -15,9 +15,15 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import DeviceMemoryError, EmptyModel, NothingToDo, TaskError, TrainingDiverged
+from splatwizard_core.errors import (
+    DeviceMemoryError,
+    EmptyModel,
+    NothingToDo,
+    TaskError,
+    TrainingDiverged,
+    out_of_memory,
+)
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.memory import out_of_memory
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View

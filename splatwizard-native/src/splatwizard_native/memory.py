@@ -12,8 +12,6 @@ from pathlib import Path
 import psutil
 import torch
 
-from splatwizard_core.errors import DeviceMemoryError
-
 _STATUS = Path("/proc/self/status")
 _CLEAR = Path("/proc/self/clear_refs")
 
@@ -43,17 +41,6 @@ def synchronize(device: torch.device) -> None:
     """Wait until a GPU has done what it was given; nothing on a CPU."""
     if device.type == "cuda":
         torch.cuda.synchronize(device)
-
-
-_UNITS = {"bytes": 1, "KiB": 1 << 10, "MiB": 1 << 20, "GiB": 1 << 30}
-
-
-def out_of_memory(error: torch.cuda.OutOfMemoryError, doing: str, advice: str) -> DeviceMemoryError:
-    """The error that says what torch's does, and what was being done: counts, resolution, bytes."""
-    found = re.search(r"allocate ([\d.]+) (bytes|KiB|MiB|GiB)", str(error))
-    wanted = None if found is None else round(float(found[1]) * _UNITS[found[2]])
-    free, total = torch.cuda.mem_get_info() if torch.cuda.is_available() else (None, None)
-    return DeviceMemoryError(doing, advice, wanted, free, total)
 
 
 class MemoryMeter:

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 from torch.optim.adam import adam
 
-from splatwizard_core.errors import ShapeError
-from splatwizard_core.training.native import TRAINING
+from splatwizard_native.fused.native import TRAINING
 
 
 @dataclass(slots=True)
@@ -36,7 +35,7 @@ class AdamUpdate:
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     """Update `param`, `exp_avg` and `exp_avg_sq` of each in place, densely; as torch.optim.Adam, to 1e-6.
 
-    On CUDA in one launch. Raises ShapeError if shapes differ.
+    On CUDA in one launch. Raises ValueError if shapes differ.
     Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
     """
     together = [u for u in updates if u.param.is_cuda]
@@ -59,11 +58,7 @@ def _step(u: AdamUpdate) -> None:
     for name in ("grad", "exp_avg", "exp_avg_sq"):
         shape = getattr(u, name).shape
         if shape != param.shape:
-            raise ShapeError(
-                f"{name} is {list(shape)}, the parameter {list(param.shape)}",
-                actual=shape,
-                expected=tuple(param.shape),
-            )
+            raise ValueError(f"{name} is {list(shape)}, the parameter {list(param.shape)}")
     if u.step < 1:
         raise ValueError(f"Adam's step counts from 1, got {u.step}")
     grad = u.grad.contiguous()

@@ -5,8 +5,7 @@ import pytest
 import torch
 from fresh_memory import fresh_memory
 
-from splatwizard_core import memory
-from splatwizard_core.memory import MemoryMeter, reset_peak_rss
+from splatwizard_native import MemoryMeter, memory, reset_peak_rss
 
 MEGABYTE = 1 << 20
 

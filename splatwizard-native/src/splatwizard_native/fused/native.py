@@ -1,4 +1,4 @@
-"""The training room's native module: fused photometric loss and Adam."""
+"""The native module of the fused operations."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from splatwizard_native import NativeModule
 
 TRAINING = NativeModule(
     name="splatwizard_training",
-    package="splatwizard_core.training",
+    package="splatwizard_native.fused",
     sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
     kernels=("kernels/ssim.cpp", "kernels/adam.cpp"),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
