@@ -215,5 +215,5 @@ def test_matrices_that_unpack_in_one_read_are_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "cameras.npz", "w", zipfile.ZIP_BZIP2) as file:
         for kind in ("world_mat_0", "scale_mat_0"):
             file.writestr(f"{kind}.npy", npy(np.eye(4)))
-    with pytest.raises(SceneError, match="'world_mat_0.npy' is compressed by bzip2: pack it again with deflate"):
+    with pytest.raises(SceneError, match=r"'world_mat_0\.npy' is compressed by bzip2: pack it again with deflate"):
         read_alignments(tmp_path / "cameras.npz", 1)

@@ -183,8 +183,8 @@ def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
             limit = pixel_limit()
             if picture.width * picture.height > limit:
                 raise SceneError(
-                    f"{path}: {picture.width}x{picture.height} px, more than the {limit:,} pixels that are decoded: set "
-                    f"{PIXELS_VARIABLE} to decode larger pictures (each takes about 16 bytes a pixel)",
+                    f"{path}: {picture.width}x{picture.height} px, more than the {limit:,} pixels that are decoded: "
+                    f"set {PIXELS_VARIABLE} to decode larger pictures (each takes about 16 bytes a pixel)",
                     path=str(path),
                 )
             yield picture

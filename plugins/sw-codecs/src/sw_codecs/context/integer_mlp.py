@@ -92,7 +92,7 @@ class IntegerMlp:
         """int64 [n, out] with 12 fractional bits, in units of 1 / output_scale.
 
         inputs  [n, in] integers with 12 fractional bits, clamped to +-2^20 (that is 256)
-        rows    how many are evaluated at once, chosen by the widest layer if not given; the result does not depend on it
+        rows    how many are evaluated at once, None: by the widest layer; the result does not depend on it
         """
         if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
             raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")

@@ -258,7 +258,7 @@ def _bounded_headers() -> type[tarfile.TarInfo]:
     class Bounded(tarfile.TarInfo):
         @classmethod
         def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Any:
-            """One header block. Raises tarfile.ReadError for too long or too many extensions, and for a negative size."""
+            """One header block. Raises tarfile.ReadError for too long or many extensions, or a negative size."""
             nonlocal in_a_row, all_global
             info = super().frombuf(buf, encoding, errors)
             in_a_row = in_a_row + 1 if info.type in EXTENSIONS else 0
