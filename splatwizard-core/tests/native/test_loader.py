@@ -634,3 +634,15 @@ def test_the_cache_key_is_that_of_every_earlier_release(package, monkeypatch):
     for folder, any_gpu in ((module.prebuilt_folder, True), (module.cache_folder, False)):
         key = module.key("native", any_gpu=any_gpu)
         assert module._library(folder, "native", True) == folder / f"answer-{key}.so"
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    """Another user of the folder laid it: what it points to must not be emptied, nor get a number written into it."""
+    (tmp_path / "precious").write_text("kept")
+    (tmp_path / "lock").symlink_to(tmp_path / "precious")
+    with (
+        pytest.raises(NativeBuildError, match="is a link or no file"),
+        build_lock(tmp_path / "lock", timeout=1, say=print),
+    ):
+        raise AssertionError
+    assert (tmp_path / "precious").read_text() == "kept"
