@@ -71,6 +71,7 @@ def measure(
     synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
+    bad_rows = model.check_finite()
     scene = load_scene(resolved.scene_spec, resolved.scene, plugins)
     options = quality.render_options(raster, scene.background.to(device))
     rasterizer = _rasterizer_for(raster, session, resolved)
@@ -117,7 +118,7 @@ def measure(
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
-        "flags": _flags(scene, result, meter, device_bound),
+        "flags": _flags(scene, result, meter, device_bound, bad_rows),
     }
     if report is not None:
         first = speed_views[0].camera
@@ -135,7 +136,9 @@ def measure(
     return found
 
 
-def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, device_bound: bool) -> list[str]:
+def _flags(
+    scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, device_bound: bool, bad_rows: int = 0
+) -> list[str]:
     """Name the circumstances that a reader of the numbers must know."""
     told = {
         "fit": scene.protocol.split == "all",
@@ -144,6 +147,7 @@ def _flags(scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, d
         "not-a-number": any(metric.reason == quality.NOT_A_NUMBER for metric in result.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in result.metrics.values()),
         "device-bound": device_bound,
+        "non-finite-rows": bad_rows > 0,
     }
     return [name for name, holds in told.items() if holds]
 
@@ -182,6 +186,7 @@ def render_views(
     rasterizer = _rasterizer_for(opened.raster, session, resolved)
     folder.mkdir(parents=True, exist_ok=True)
     names = quality.png_names([view.name for view in views])
+    opened.model.check_finite()
     opened.model.prepare()
     with track("render", total=len(views), unit="views") as bar:
         for view, name in zip(views, names, strict=True):
