@@ -13,12 +13,13 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.files import file_sha256
-from splatwizard_core.native import build, toolchain
+from splatwizard_core.files import _numbering, file_sha256
+from splatwizard_core.native import build, loader, toolchain
 from splatwizard_core.native.build import build_all, declared_modules, resolve_module
 from splatwizard_core.native.build_lock import build_lock
 from splatwizard_core.native.loader import NativeModule, cache_root
@@ -245,6 +246,7 @@ def test_a_missing_source_is_named(package):
 HOLD = """
 import sys, time
 from pathlib import Path
+from types import SimpleNamespace
 from splatwizard_core.native.build_lock import build_lock
 with build_lock(Path(sys.argv[1]), timeout=5, say=print):
     print("held", flush=True)
@@ -646,3 +648,30 @@ def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
     ):
         raise AssertionError
     assert (tmp_path / "precious").read_text() == "kept"
+
+
+def test_a_library_of_another_user_is_compiled_anew(package, monkeypatch, caplog):
+    library = package.module().build()
+    assert package.compilations == 1
+    assert package.module().build() == library
+    assert package.compilations == 1
+    real = os.stat
+
+    def stat(path, **kwargs):
+        found = real(path, **kwargs)
+        return SimpleNamespace(st_uid=12345) if path == library and package.compilations == 1 else found
+
+    monkeypatch.setattr(loader.os, "stat", stat)
+    package.module().build()
+    assert package.compilations == 2
+    assert "belongs to another user (12345): it is not loaded, but compiled anew" in caplog.text
+
+
+def test_what_a_killed_build_left_is_removed_by_the_next(package):
+    module = package.module()
+    module.cache_folder.mkdir(parents=True)
+    left = module.cache_folder / f".splatwizard-build-answer.{2**22 + 1}-{_numbering()}-12345678.tmp"
+    left.mkdir()
+    (left / "answer.o").write_bytes(b"half")
+    module.build()
+    assert not left.exists()

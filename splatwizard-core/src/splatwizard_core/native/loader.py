@@ -16,7 +16,6 @@ import logging
 import os
 import platform
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -24,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import NativeBuildError
-from splatwizard_core.files import file_sha256, write_json
+from splatwizard_core.files import file_sha256, scratch_folder, write_json
 from splatwizard_core.native import toolchain
 from splatwizard_core.native.build_lock import build_lock
 from splatwizard_core.native.toolchain import Job, Toolchain
@@ -339,9 +338,9 @@ class NativeModule:
         started, cuda = time.monotonic(), self._with_cuda()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
-        with tempfile.TemporaryDirectory(dir=library.parent, prefix=f".{self.name}-") as scratch:
-            jobs = self._jobs(march, Path(scratch))
-            built = Path(scratch) / library.name
+        with scratch_folder(f"build-{self.name}", library.parent) as scratch:
+            jobs = self._jobs(march, scratch)
+            built = scratch / library.name
             try:
                 tools.compile(jobs, build_log)
                 tools.link([j.output for j in jobs], built, build_log, cuda=cuda)
@@ -422,6 +421,11 @@ def _architectures(library: Path | None) -> list[str]:
 def _intact(library: Path) -> bool:
     """Whether the file is what the build wrote. A truncated library may load and crash the process later."""
     try:
+        # Whoever installed this code may bring libraries too.
+        trusted = {os.getuid(), 0, os.stat(__file__).st_uid} if hasattr(os, "getuid") else {os.stat(library).st_uid}
+        if (owner := os.stat(library).st_uid) not in trusted:
+            log.warning("%s belongs to another user (%s): it is not loaded, but compiled anew", library, owner)
+            return False
         return _facts(library).get("sha256") == file_sha256(library)
     except OSError:
         return False
