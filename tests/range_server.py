@@ -20,6 +20,7 @@ class Site:
     cuts        one for each answer to come: bytes of the body after which the connection breaks; none left: whole
     statuses    one for each request to come: answer this status instead; none left: 200 or 206
     redirects   path -> address
+    heeds_if_range  whether a condition on the ETag is kept
     says_length whether it sends Content-Length (without it the end of the connection ends the file)
     asked       (path, Range header) of every request so far
     """
@@ -32,6 +33,7 @@ class Site:
     statuses: list[int] = field(default_factory=list)
     redirects: dict[str, str] = field(default_factory=dict)
     says_length: bool = True
+    heeds_if_range: bool = True
     asked: list[tuple[str, str | None]] = field(default_factory=list)
 
     def url(self, path: str) -> str:
@@ -58,7 +60,7 @@ class _Handler(BaseHTTPRequestHandler):
         etag = site.etags.get(self.path)
         condition = self.headers.get("If-Range")
         start = 0
-        if site.ranges and wanted is not None and (condition is None or condition == etag):
+        if site.ranges and wanted is not None and (condition is None or condition == etag or not site.heeds_if_range):
             match = re.fullmatch(r"bytes=(\d+)-", wanted)
             assert match is not None, wanted
             start = int(match[1])

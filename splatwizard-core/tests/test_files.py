@@ -7,10 +7,12 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from splatwizard_core import files
 from splatwizard_core.errors import DiskFullError
 from splatwizard_core.files import (
     file_sha256,
@@ -183,3 +185,16 @@ def test_sha256_of_a_file(tmp_path: Path):
     # FIPS 180-2, example B.1
     expected = "ba7816bf8f01cfea414140de5dae2223b00361a396177a9cb410ff61f20015ad"
     assert file_sha256(tmp_path / "abc") == expected
+
+
+def test_temporaries_of_another_container_stay_for_a_day(tmp_path):
+    """On a shared folder a number says nothing of a process in another PID namespace, however free it is here."""
+    nobody = 2**22 + 1  # more than a number of a process may be
+    theirs = [tmp_path / f".a.{nobody}-0000000{i}-12345678.tmp" for i in (1, 2)]
+    ours = tmp_path / f".a.{nobody}-{files._numbering()}-12345678.tmp"
+    for each in (*theirs, ours):
+        each.write_text("half")
+    long_ago = time.time() - 2 * files.FOREIGN_SECONDS
+    os.utime(theirs[1], (long_ago, long_ago))
+    files.sweep(tmp_path, "a")
+    assert sorted(tmp_path.iterdir()) == [theirs[0]]

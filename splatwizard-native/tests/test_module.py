@@ -13,10 +13,12 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from splatwizard_native import NativeBuildError, NativeModule, build_all, cache_root, cuda_toolkit, toolchain
+from splatwizard_native import library as library_module
 from splatwizard_native.lock import build_lock
 
 needs_compiler = pytest.mark.skipif(
@@ -640,3 +642,43 @@ def test_the_cache_key_is_that_of_every_earlier_release(package, monkeypatch):
     for folder, any_gpu in ((module.prebuilt_folder, True), (module.cache_folder, False)):
         key = module.key("native", any_gpu=any_gpu)
         assert module._library(folder, "native", True) == folder / f"answer-{key}.so"
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    """Another user of the folder laid it: what it points to must not be emptied, nor get a number written into it."""
+    (tmp_path / "precious").write_text("kept")
+    (tmp_path / "lock").symlink_to(tmp_path / "precious")
+    with (
+        pytest.raises(NativeBuildError, match="is a link or no file"),
+        build_lock(tmp_path / "lock", timeout=1, say=print),
+    ):
+        raise AssertionError
+    assert (tmp_path / "precious").read_text() == "kept"
+
+
+def test_a_library_of_another_user_is_compiled_anew(package, monkeypatch, caplog):
+    library = package.module().build()
+    assert package.compilations == 1
+    assert package.module().build() == library
+    assert package.compilations == 1
+    real = os.stat
+
+    def stat(path, **kwargs):
+        found = real(path, **kwargs)
+        return SimpleNamespace(st_uid=12345) if path == library and package.compilations == 1 else found
+
+    monkeypatch.setattr(library_module.os, "stat", stat)
+    package.module().build()
+    assert package.compilations == 2
+    assert "belongs to another user (12345): it is not loaded, but compiled anew" in caplog.text
+
+
+def test_what_a_killed_build_left_is_removed_by_the_next(package):
+    module = package.module()
+    left = module.cache_folder / f".{module.build().stem}-0123abcd"
+    for library in module.cache_folder.glob("*.so"):
+        library.unlink()
+    left.mkdir()
+    (left / "answer.o").write_bytes(b"half")
+    module.build()
+    assert not left.exists()

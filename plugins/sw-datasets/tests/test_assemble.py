@@ -46,7 +46,7 @@ def test_a_pose_that_is_not_finite_names_its_image(bad):
         assemble(found)
 
 
-@pytest.mark.parametrize("bad", [{"fx": -1.0}, {"fy": math.nan}, {"cx": math.inf}])
+@pytest.mark.parametrize("bad", [{"fx": -1.0}, {"fy": math.nan}, {"cx": math.inf}, {"fx": 1e300}, {"fy": 1e-300}])
 def test_intrinsics_that_make_no_sense_name_their_image(bad):
     found = views("a", "b")
     found[0].camera = replace(CAMERA, **bad)

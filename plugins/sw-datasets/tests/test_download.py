@@ -303,3 +303,21 @@ def test_an_interrupted_download_keeps_what_came(site: Site, target: Path):
     download(site.url(PATH), target, sha256=SHA256)
     assert starts(site) == [0, CUT]
     assert time.monotonic() - begun < 30
+
+
+def test_an_answer_without_length_ends_at_the_size_of_the_registry(site: Site, target: Path):
+    site.says_length = False
+    with pytest.raises(FetchError, match="more bytes come than the 100,000 that the registry says"):
+        download(site.url(PATH), target, size=100_000)
+    assert target.with_name("scenes.zip.part").stat().st_size <= 100_000
+
+
+def test_a_part_of_another_version_is_not_appended(site: Site, target: Path):
+    """A server that answers If-Range with a part all the same: its ETag tells that the file is another one."""
+    site.cuts = [CUT] + [0] * module.ATTEMPTS
+    with pytest.raises(FetchError):
+        download(site.url(PATH), target, pause=Waits())
+    site.cuts, site.heeds_if_range = [], False
+    site.files[PATH], site.etags[PATH] = CONTENT[::-1], '"second"'
+    download(site.url(PATH), target, pause=Waits())
+    assert target.read_bytes() == CONTENT[::-1]

@@ -208,3 +208,12 @@ def test_a_damaged_archive_is_one_clear_line(tmp_path):
         except SceneError:
             refused += 1
     assert refused > 100
+
+
+def test_matrices_that_unpack_in_one_read_are_refused(tmp_path):
+    """1.5 kB of bzip2 took 4.1 GB: zipfile reads no less than a block."""
+    with zipfile.ZipFile(tmp_path / "cameras.npz", "w", zipfile.ZIP_BZIP2) as file:
+        for kind in ("world_mat_0", "scale_mat_0"):
+            file.writestr(f"{kind}.npy", npy(np.eye(4)))
+    with pytest.raises(SceneError, match=r"'world_mat_0\.npy' is compressed by bzip2: pack it again with deflate"):
+        read_alignments(tmp_path / "cameras.npz", 1)

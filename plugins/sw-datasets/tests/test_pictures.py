@@ -205,3 +205,17 @@ def test_names_that_lead_out_are_recognised(name):
 @pytest.mark.parametrize("name", ["x.png", "a/b.png", "a..b.png", "..a/b.png", "./a.png", "ü/ b.png"])
 def test_ordinary_names_are_inside(name):
     assert is_inside(name)
+
+
+def test_pictures_of_more_pixels_than_the_limit_are_refused_by_their_header(tmp_path, monkeypatch):
+    """6 kB of WebP may claim 164 megapixels, 2.7 GB for each thread that decodes."""
+    path = tmp_path / "wide.png"
+    Image.new("1", (9000, 8000)).save(path)
+    for read in (picture_header, load_picture):
+        with pytest.raises(SceneError, match=r"9000x8000 px, more than the 67,108,864 .* set SPLATWIZARD_MAX_PIXELS"):
+            read(path)
+    monkeypatch.setenv("SPLATWIZARD_MAX_PIXELS", "72000000")
+    assert picture_header(path) == (9000, 8000, False)
+    monkeypatch.setenv("SPLATWIZARD_MAX_PIXELS", "many")
+    with pytest.raises(ConfigError, match="SPLATWIZARD_MAX_PIXELS is 'many'"):
+        picture_header(path)

@@ -285,3 +285,58 @@ def test_damage_is_a_fetch_error_and_writes_nothing_outside(kind: str, data: st.
     else:
         assert sorted(os.listdir(work)) == sorted([archive.name, "data"])
     assert os.listdir(tmp_path) == ["work"]
+
+
+@pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+def test_zip_members_that_unpack_in_one_read_are_refused(method: int, tmp_path: Path):
+    """zipfile hands a block of bzip2 to its decoder without a limit: 1.5 kB unpacked 4.1 GB in one read."""
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", method) as archive:
+        archive.writestr("x", bytes(1000))
+    with pytest.raises(FetchError, match=r"'x' is compressed by (bzip2|lzma): pack it again with deflate"):
+        unpack_whole(tmp_path / "a.zip", tmp_path / "data")
+
+
+def pax_header(kind: bytes, size: int) -> bytes:
+    """An extended header of about `size` bytes of tiny entries."""
+    entry = [b"8 %04x=\n" % i for i in range(size // 8)]
+    info = tarfile.TarInfo("h")
+    info.type, info.size = kind, len(b"".join(entry))
+    return info.tobuf(tarfile.USTAR_FORMAT) + b"".join(entry) + bytes(-info.size % 512)
+
+
+@pytest.mark.parametrize(
+    ("headers", "reason"),
+    [
+        ([pax_header(tarfile.XHDTYPE, 1 << 17)], "a header claims"),
+        ([pax_header(tarfile.XHDTYPE, 512)] * 9, "9 extended headers in a row"),
+        ([pax_header(tarfile.XGLTYPE, 1024), tarfile.TarInfo("__MACOSX/f").tobuf()] * 5, "bytes of global ones"),
+    ],
+)
+def test_tar_headers_that_fill_the_memory_are_refused(headers: list[bytes], reason: str, tmp_path: Path):
+    content = tarfile.TarInfo("first").tobuf() + b"".join(headers) + tarfile.TarInfo("last").tobuf() + bytes(1024)
+    with tarfile.open(tmp_path / "ordinary.tar", "w", format=tarfile.PAX_FORMAT) as archive:
+        archive.addfile(tarfile.TarInfo("\u00fc" * 110))  # a long name needs such a header
+    assert len(unpack_whole(tmp_path / "ordinary.tar", tmp_path / "ordinary").files) == 1
+    (tmp_path / "a.tar").write_bytes(content)
+    with pytest.raises(FetchError, match=reason):
+        unpack_whole(tmp_path / "a.tar", tmp_path / "data")
+
+
+def test_junk_and_folders_are_counted_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(module, "MAX_MEMBERS", 10)
+    files = {"x": b"1"} | {f"__MACOSX/{i}": b"" for i in range(10)}
+    with pytest.raises(FetchError, match="11 entries of 1 bytes so far"):
+        unpack_whole(make_tar(tmp_path / "a.tar", files), tmp_path / "data")
+    monkeypatch.setattr(module, "GRACE_BYTES", 0)
+    with pytest.raises(FetchError, match="bomb"):
+        unpack_whole(make_tar(tmp_path / "b.tar.gz", {"__MACOSX/z": bytes(500_000), "x": b""}, "w:gz"), tmp_path / "b")
+
+
+def test_a_tar_of_a_folder_itself_unpacks(tmp_path: Path):
+    """As `tar -C FOLDER -czf a.tar.gz .` writes it."""
+    (tmp_path / "in" / "images").mkdir(parents=True)
+    (tmp_path / "in" / "images" / "a.png").write_bytes(b"a")
+    with tarfile.open(tmp_path / "a.tar.gz", "w:gz") as archive:
+        archive.add(tmp_path / "in", arcname=".")
+    unpack_whole(tmp_path / "a.tar.gz", tmp_path / "data")
+    assert tree(tmp_path / "data") == {"images/a.png": b"a"}

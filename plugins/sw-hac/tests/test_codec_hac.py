@@ -26,6 +26,7 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
 from sw_hac import codec
 from sw_hac.method import HAC
+from sw_hac.predictors import PREDICTORS
 
 RASTERIZER = ReferenceRasterizer()
 SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "offsets"]
@@ -347,3 +348,35 @@ def test_a_model_that_never_met_its_rate_is_encoded_with_a_warning(caplog):
     model.phase = "quantized training"
     assert decoded(encoded(model)).num_rows == 25
     assert "never trained for its rate" in caplog.text
+
+
+class Lookups:
+    """A hash grid that notes how many numbers each look-up gives."""
+
+    def __init__(self, grid):
+        self.grid, self.width, self.corners, self.numbers = grid, grid.width, grid.corners, []
+
+    def integer_features(self, codes):
+        self.numbers.append(len(codes) * max(self.width, self.corners))
+        return self.grid.integer_features(codes)
+
+    def __call__(self, x):
+        self.numbers.append(len(x) * max(self.width, self.corners))
+        return self.grid(x)
+
+
+@pytest.mark.parametrize("mode", ["exact", "float"])
+def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
+    """65,536 anchors of a file of 5 kB took 3.5 GB: 2,048 features of each were there at once."""
+    model = make(n=300)
+    whole = predictor(model, mode)(model.codes())
+    grid = Lookups(model.grid)
+    limit = 20 * grid.corners
+    for where, name in (("sw_anchors.attribute_sections", "EXACT_NUMBERS"), ("sw_hac.predictors", "FLOAT_NUMBERS")):
+        monkeypatch.setattr(f"{where}.{name}", limit)
+    found = PREDICTORS[mode](grid, model.mlp_grid, model.shape, model.base_steps)(model.codes())
+    assert 0 < max(grid.numbers) <= limit
+    for group in GROUPS:
+        for field in ("mean", "scale", "step"):
+            ours, expected = (torch.as_tensor(getattr(each[group][0], field)) for each in (found, whole))
+            assert torch.equal(ours, expected) if mode == "exact" else torch.allclose(ours, expected)

@@ -35,11 +35,16 @@ class ConfigError(UserInputError):
         self.key = key
 
 
+def _in_one_line(message: str) -> str:
+    """A message in which names and values from a stranger's file are shown escaped."""
+    return "".join(c if c.isprintable() else c.encode("unicode_escape", "replace").decode() for c in message)
+
+
 class SceneError(UserInputError):
     """A scene folder cannot be read or makes no sense."""
 
     def __init__(self, message: str, *, path: str | None = None) -> None:
-        super().__init__(message)
+        super().__init__(_in_one_line(message))
         self.path = path
 
 
@@ -47,7 +52,7 @@ class BitstreamError(UserInputError):
     """A file is damaged, truncated, hostile or of an unknown version."""
 
     def __init__(self, message: str, *, section: str | None = None) -> None:
-        super().__init__(message)
+        super().__init__(_in_one_line(message))
         self.section = section
 
 

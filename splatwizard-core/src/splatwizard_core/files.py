@@ -4,27 +4,34 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import hashlib
 import json
 import os
+import platform
 import re
 import secrets
 import shutil
 import tempfile
+import time
+import zlib
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import DiskFullError
 
-TEMPORARY = r"\.(\d+)-[0-9a-f]{8}\.tmp"
-"""The end of a temporary file's name, after `.NAME`: the process that writes it, and a random part."""
+TEMPORARY = r"\.(\d+)-(?:([0-9a-f]{8})-)?[0-9a-f]{8}\.tmp"
+"""The end of a temporary file's name, after `.NAME`: the process that writes it, where its number holds (`_numbering`;
+0.1 did not say), and a random part."""
 
 FULL = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the disk quota is used up",
     errno.EFBIG: "the file may not grow that large here (file system, or `ulimit -f`)",
 }
+FOREIGN_SECONDS = 86_400.0
+"""Silence after which the temporary of another container or machine counts as left behind."""
 YOUNGER_SECONDS = 2.0
 """By how much a process must be younger than a file to be another one of the same number: clocks count in seconds."""
 
@@ -117,12 +124,12 @@ def file_sha256(path: Path) -> str:
 
 
 @contextlib.contextmanager
-def scratch_folder(purpose: str) -> Iterator[Path]:
-    """An empty folder among the system's temporary files, removed when the block ends.
+def scratch_folder(purpose: str, within: Path | None = None) -> Iterator[Path]:
+    """An empty folder in `within` (None: among the system's temporary files), removed when the block ends.
 
     Those of the same purpose that killed processes left are removed too.
     """
-    folder = _temporary(Path(tempfile.gettempdir()) / f"splatwizard-{purpose}")
+    folder = _temporary((within or Path(tempfile.gettempdir())) / f"splatwizard-{purpose}")
     with naming_full_disk(folder):
         folder.mkdir(mode=0o700)
         try:
@@ -147,7 +154,10 @@ def sweep(folder: Path, name: str | None = None) -> None:
     with contextlib.suppress(OSError):
         for match in filter(None, map(pattern.fullmatch, os.listdir(folder))):
             left = folder / match[0]
-            if _is_writing(int(match[1]), left):
+            if match[2] in (None, _numbering()):
+                if _is_writing(int(match[1]), left):
+                    continue
+            elif time.time() - left.lstat().st_mtime < FOREIGN_SECONDS:
                 continue
             if left.is_dir() and not left.is_symlink():
                 shutil.rmtree(left, ignore_errors=True)
@@ -158,7 +168,17 @@ def sweep(folder: Path, name: str | None = None) -> None:
 def _temporary(path: Path) -> Path:
     """A new name beside `path`, as `TEMPORARY` describes it, in place of those that killed processes left."""
     sweep(path.parent, path.name)
-    return path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    return path.with_name(f".{path.name}.{os.getpid()}-{_numbering()}-{secrets.token_hex(4)}.tmp")
+
+
+@functools.cache
+def _numbering() -> str:
+    """8 hexadecimal digits of where the numbers of processes hold: a container, or a machine since it started."""
+    try:
+        where = Path("/proc/sys/kernel/random/boot_id").read_text() + os.readlink("/proc/self/ns/pid")
+    except OSError:
+        where = platform.node()
+    return f"{zlib.crc32(where.encode()):08x}"
 
 
 def _is_writing(process: int, file: Path) -> bool:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from splatwizard_core.coding import container
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, SplatwizardError
+from splatwizard_core.errors import BitstreamError, SceneError, SplatwizardError
 
 DTYPES = ["bool", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
 
@@ -416,3 +416,21 @@ def test_the_layout_is_the_documented_one():
     # f32, two axes, 2 x 3, then the values.
     assert body[8:18] == bytes([10, 2, 2, 0, 0, 0, 3, 0, 0, 0])
     assert struct.unpack("<6f", body[18:]) == (0, 1, 2, 3, 4, 5)
+
+
+def test_a_section_that_nobody_asks_for_is_named():
+    writer = ContainerWriter("m", 1)
+    writer.add("known", b"1")
+    writer.add("unknown", b"2")
+    reader = ContainerReader(writer.to_bytes(), "a.swz")
+    reader.section("known")
+    with pytest.raises(BitstreamError, match=r"a\.swz: section 'unknown': method 'm' knows no such section"):
+        reader.finish()
+    reader.section("unknown")
+    reader.finish()
+
+
+def test_messages_about_strangers_files_are_one_line():
+    """A line feed or an escape sequence in a header value, an image name, a column of a .ply."""
+    for kind in (BitstreamError, SceneError):
+        assert str(kind("name 'a\nerror: \x1b[31mb' of über.png")) == r"name 'a\nerror: \x1b[31mb' of über.png"

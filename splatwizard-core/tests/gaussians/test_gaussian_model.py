@@ -5,7 +5,7 @@ import json
 import pytest
 import torch
 
-from splatwizard_core.errors import ShapeError
+from splatwizard_core.errors import ShapeError, SplatwizardError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.camera import Camera
@@ -106,3 +106,16 @@ def test_a_model_names_its_primitives():
         ROW_LABEL = "anchors"
 
     assert (SplatModel.ROW_LABEL, GaussianModel.ROW_LABEL, Anchors.ROW_LABEL) == ("gaussians", "gaussians", "anchors")
+
+
+def test_rows_that_are_not_finite_are_counted_and_all_of_them_are_an_error():
+    model = some_model()
+    assert model.check_finite() == 0
+    with torch.no_grad():
+        model.means[1, 2] = torch.nan
+        model.log_scales[1:3] = torch.inf
+    assert model.check_finite() == 2
+    with torch.no_grad():
+        model.opacity_logits.fill_(torch.nan)
+    with pytest.raises(SplatwizardError, match="all 5 gaussians of the model hold values that are not finite"):
+        model.check_finite()

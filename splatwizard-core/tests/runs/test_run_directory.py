@@ -1,5 +1,6 @@
 """Locks and finished steps of a run directory."""
 
+import contextlib
 import errno
 import fcntl
 import json
@@ -159,3 +160,13 @@ def test_a_scene_that_no_record_can_name_is_refused_before_anything_is_written(t
     with pytest.raises(SceneError, match="is not UTF-8"):
         run(None, RunRequest(resolved, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_lock_that_is_a_link_is_not_followed(tmp_path):
+    """In a shared folder another user may have laid it: what it points to must not be emptied."""
+    (tmp_path / "precious").write_text("kept")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / ".lock").symlink_to(tmp_path / "precious")
+    with contextlib.suppress(RunLockedError, OSError), directory_lock(tmp_path / "run"):
+        pass
+    assert (tmp_path / "precious").read_text() == "kept"

@@ -296,7 +296,7 @@ def test_the_one_before_a_damaged_one_is_taken(tmp_path, caplog):
     flip(tmp_path / "00-0000200.json", 40)
     assert store.newest().step == 100
     assert "tensor" in caplog.text
-    assert "resuming from 00-0000100.json instead, step 100" in caplog.text
+    assert "resuming from 00-0000100.json instead" in caplog.text
     # Set aside, so that it neither counts as newest again nor pushes out a good one.
     assert [p.name for p in store.paths()] == ["00-0000100.json"]
     assert (tmp_path / "00-0000300.safetensors.damaged").exists()
@@ -332,3 +332,26 @@ def test_long_values_are_cut_in_the_message():
 def test_tuples_and_paths_of_an_identity_do_not_count_as_changes(tmp_path):
     old = make(identity={"sizes": [1, 2], "path": str(tmp_path)})
     assert differences(old, {"path": tmp_path, "sizes": (1, 2)}, old.plan, 1.5) == []
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stage": "0"}, {"step": None}, {"step": -1}, {"finished": 1}, {"plan": {}}, {"progress": []},
+        {"identity": None}, {"extent": "x"}, {"state": 7},
+    ],
+)  # fmt: skip
+def test_a_field_of_another_type_falls_back_to_the_checkpoint_before(change, tmp_path):
+    store = CheckpointStore(tmp_path, keep=2)
+    for step in (100, 200):
+        path = store.write(make(step=step))
+    content = json.loads(path.read_text())["content"] | change
+    path.write_text(json.dumps({"crc": zlib.crc32(json.dumps(content).encode()), "content": content}))
+
+    def use(found):
+        if not isinstance(found.state, dict):
+            raise DamagedCheckpointError("no state")
+        return found.step
+
+    assert store.restored(use) == 100
+    assert path.with_name(f"{path.name}.damaged").exists()

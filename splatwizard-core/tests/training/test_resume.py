@@ -10,9 +10,10 @@ import pytest
 import torch
 from sw_gaussians.statistics import accumulate_statistics
 
-from splatwizard_core.errors import CheckpointError, NothingToDo, TaskError
+from splatwizard_core.errors import CheckpointError, NothingToDo, SplatwizardError, TaskError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import RenderResult
+from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import STOP, Scheduler
@@ -319,6 +320,44 @@ def test_a_damaged_checkpoint_costs_only_the_steps_since_the_one_before(toy, who
     assert steps[0] == 81
     assert resumed.model.digest() == whole.model.digest()
     assert "resuming from 00-0000080.json instead" in caplog.text
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda state: state["model"].popitem(),
+        lambda state: state["model"].update(means=torch.zeros(3)),
+        lambda state: state.pop("rng"),
+        lambda state: state["optimizer"].update(moments=5),
+        lambda state: state.update(sampler=None),
+    ],
+)
+def test_a_state_that_cannot_be_restored_costs_only_the_steps_since_the_one_before(spoil, toy, tmp_path, caplog):
+    """Sums that are right say nothing of what was summed."""
+    ppl = PipelineParams(checkpoint_every=10, keep_checkpoints=2)
+    with pytest.raises(TrainingStopped):
+        toy.train(iterations=30, directory=tmp_path, ppl=ppl, stop_after=20)
+    store = CheckpointStore(tmp_path, keep=2)
+    saved = store.newest()
+    assert saved.step == 20
+    spoil(saved.state)
+    store.write(saved)
+    steps = []
+    toy.train(iterations=30, directory=tmp_path, ppl=ppl, on_step=lambda _, r: steps.append(r.step))
+    assert steps[0] == 11
+    assert "resuming from 00-0000010.json instead" in caplog.text
+
+
+def test_a_model_of_nothing_but_nan_is_an_error_at_the_end(toy, tmp_path):
+    with pytest.raises(TrainingStopped):
+        toy.train(iterations=20, directory=tmp_path, stop_after=19)
+    store = CheckpointStore(tmp_path)
+    saved = store.newest()
+    saved.state["model"]["means"].fill_(torch.nan)
+    saved.step, saved.finished = 20, True
+    store.write(saved)
+    with pytest.raises(SplatwizardError, match=r"all \d+ gaussians of the model hold values that are not finite"):
+        toy.train(iterations=20, directory=tmp_path)
 
 
 def test_stop_by_a_task_finishes_the_stage_for_good(toy, tmp_path):

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from pathlib import Path
 from typing import Any
 
 from splatwizard_native.waiting import watch_cores
+
+log = logging.getLogger(__name__)
 
 
 def install(built: Path, library: Path, facts: dict[str, Any]) -> None:
@@ -20,8 +23,16 @@ def install(built: Path, library: Path, facts: dict[str, Any]) -> None:
 
 
 def is_intact(library: Path) -> bool:
-    """Whether the file is the one that the build wrote. A truncated library may load and crash the process later."""
+    """Whether the file is the one that the build wrote, and nobody else's.
+
+    A truncated library may load and crash the process later; one of another user may do anything.
+    """
     try:
+        # Whoever installed this code may bring libraries too.
+        trusted = {os.getuid(), 0, os.stat(__file__).st_uid} if hasattr(os, "getuid") else {os.stat(library).st_uid}
+        if (owner := os.stat(library).st_uid) not in trusted:
+            log.warning("%s belongs to another user (%s): it is not loaded, but compiled anew", library, owner)
+            return False
         return _facts(library).get("sha256") == _sha256(library)
     except OSError:
         return False

@@ -20,6 +20,9 @@ def build_lock(path: Path, *, timeout: float, say: Callable[[str], None]) -> Ite
     """
     from filelock import FileLock, Timeout
 
+    if path.is_symlink() or (path.exists() and not path.is_file()):
+        # Locking empties a file, and the number is written into it: never through a link that another user left.
+        raise NativeBuildError(f"{path} is a link or no file, and so no lock: delete it")
     lock = FileLock(path)
     try:
         held = lock.acquire(timeout=0)

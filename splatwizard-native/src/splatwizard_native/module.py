@@ -13,6 +13,7 @@ import importlib.util
 import itertools
 import logging
 import platform
+import shutil
 import sys
 import tempfile
 import time
@@ -324,7 +325,10 @@ class NativeModule:
         started, cuda = time.monotonic(), self._with_cuda()
         build_log = library.with_suffix(".log")
         build_log.unlink(missing_ok=True)
-        with tempfile.TemporaryDirectory(dir=library.parent, prefix=f".{self.name}-") as scratch:
+        prefix = f".{library.stem}-"
+        for left in library.parent.glob(f"{prefix}*"):  # by a killed build: whoever lives would hold the lock
+            shutil.rmtree(left, ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=library.parent, prefix=prefix) as scratch:
             jobs = self._jobs(march, Path(scratch))
             built = Path(scratch) / library.name
             try:

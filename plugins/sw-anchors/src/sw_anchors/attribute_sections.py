@@ -7,7 +7,7 @@ walk hands them to an `AttributeEncoder`, which rounds the values of a model and
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -15,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
+from sw_anchors.row_parts import EXACT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
@@ -130,9 +131,14 @@ class ExactNetwork:
         self._network = IntegerMlp.from_module(network, output_scale=np.array([*units, 1.0, 1.0, 1.0]))
         self._shape, self._base_steps, self._step_offset = shape, tuple(base_steps), step_offset
 
-    def __call__(self, features: Tensor) -> dict[str, RowContext]:
-        """Distributions by group for anchors with features int64 [n, inputs], 12 fractional bits."""
-        parts = torch.split(self._network(features), self._shape.outputs, dim=1)
+    def __call__(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> dict[str, RowContext]:
+        """Distributions by group for anchors at `places` [n, ...].
+
+        features    places of some rows -> int64 [rows, inputs] with 12 fractional bits; each row on its own
+        width       the most numbers that a row has while they are looked up
+        """
+        outputs = by_parts(lambda part: self._network(features(part)), places, width, EXACT_NUMBERS)
+        parts = torch.split(outputs, self._shape.outputs, dim=1)
         multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
         return {
             group: RowContext(parts[2 * i], parts[2 * i + 1], multipliers[:, i : i + 1])

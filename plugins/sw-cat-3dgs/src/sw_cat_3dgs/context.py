@@ -135,7 +135,16 @@ class CatContext(nn.Module):
 
     def forward(self, places: Tensor) -> AnchorContext:
         """Predict steps and distributions of anchors at places [V,3]; differentiable."""
-        out = self.network(self.triplane(places, rounded=self.rounded)).split(self.shape.outputs, dim=1)
+        return self.read(self.outputs(places))
+
+    def outputs(self, places: Tensor) -> Tensor:
+        """Outputs [V, sum(shape.outputs)] of the network for anchors at places [V,3]."""
+        found: Tensor = self.network(self.triplane(places, rounded=self.rounded))
+        return found
+
+    def read(self, outputs: Tensor) -> AnchorContext:
+        """The distributions that outputs of the network stand for."""
+        out = outputs.split(self.shape.outputs, dim=1)
         steps = (STEP_OFFSET + torch.tanh(out[6])) * out[6].new_tensor(self.shape.base_steps)  # [V,3]
         means, scales = ([out[2 * i + second] * unit for i, unit in enumerate(self.units)] for second in (0, 1))
         return AnchorContext(triple(means), triple(scales), triple(steps.split(1, dim=1)))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode
+from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS
 from torch import Tensor
 
@@ -25,14 +26,14 @@ class ExactPredictor:
     def __init__(self, context: CatContext) -> None:
         """Raises ValueError or BitstreamError for weights that no exact evaluation takes."""
         self.context = context
-        self._planes = context.triplane.integers()
+        self._lookup = context.triplane.exact_lookup(context.triplane.integers())
         shape = context.shape
         self._network = ExactNetwork(context.network, shape, shape.base_steps, step_offset=MULTIPLIER_OFFSET)
         self._slices = context.slices.exact({"scales": 1 / shape.base_steps[1], "offsets": 1 / shape.base_steps[2]})
 
     def first(self, places: Tensor) -> dict[str, RowContext]:
         """Distributions by group that the position alone gives."""
-        return self._network(self.context.triplane.exact(self._planes, places))
+        return self._network(places, self._lookup, self.context.triplane.width)
 
     def shift(self, name: str, known: Tensor) -> tuple[Tensor, Tensor]:
         """Changes of mean and scale that the network `name` of the slices makes of the known features."""
@@ -57,12 +58,14 @@ class FloatPredictor:
 
     def first(self, places: Tensor) -> dict[str, RowContext]:
         """Distributions by group that the position alone gives."""
-        found = self.context(places)
+        width = max(self.context.triplane.width, self.context.shape.hidden)
+        found = self.context.read(by_parts(self.context.outputs, places, width, FLOAT_NUMBERS))
         return {g: RowContext(found.means[i], found.scales[i], found.steps[i]) for i, g in enumerate(GROUPS)}
 
     def shift(self, name: str, known: Tensor) -> tuple[Tensor, Tensor]:
         """Changes of mean and scale that the network `name` of the slices makes of the known features."""
-        mean, scale = self.context.slices.networks[name](known).chunk(2, dim=1)
+        network = self.context.slices.networks[name]
+        mean, scale = by_parts(network, known, self.context.shape.slice_hidden, FLOAT_NUMBERS).chunk(2, dim=1)
         return mean, scale
 
     def known(self, symbols: Tensor, context: RowContext) -> Tensor:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -11,6 +10,8 @@ import torch
 
 from splatwizard_core.api import PointCloud, Protocol, Scene, SceneError, View
 from sw_datasets.splits import split_views
+
+FARTHEST = 1e6  # pixels: focal lengths and principal points beyond it overflow float32 when they are projected with
 
 
 def assemble_scene(
@@ -78,6 +79,6 @@ def _camera_fault(view: View) -> str | None:
     if not (torch.isfinite(camera.R).all() and torch.isfinite(camera.tau).all()):
         return f"the pose of image '{view.name}' is not finite (NaN or infinite)"
     numbers = (camera.fx, camera.fy, camera.cx, camera.cy)
-    if not all(math.isfinite(x) for x in numbers) or camera.fx <= 0 or camera.fy <= 0:
+    if not all(abs(x) <= FARTHEST for x in numbers) or min(camera.fx, camera.fy) < 1 / FARTHEST:
         return f"the intrinsics of image '{view.name}' make no sense: fx, fy, cx, cy = {numbers}"
     return None

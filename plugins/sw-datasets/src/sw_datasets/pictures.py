@@ -18,6 +18,19 @@ SUFFIXES = frozenset((".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".webp")
 FORMATS = ("PNG", "JPEG", "TIFF", "BMP", "WEBP")
 """Formats that are decoded, whatever a file's suffix. Pillow knows more, and for EPS it would start Ghostscript."""
 
+PIXELS_VARIABLE = "SPLATWIZARD_MAX_PIXELS"
+MAX_PIXELS = 1 << 26
+"""Pixels of the largest picture that is decoded, unless the environment says another number: a file of 6 kB may claim
+164 million, and each of several threads then takes gigabytes. Pillow's own limit of 178 million stays."""
+
+
+def pixel_limit() -> int:
+    """Pixels of the largest picture that is decoded. Raises ConfigError if the environment says no such number."""
+    text = os.environ.get(PIXELS_VARIABLE) or str(MAX_PIXELS)
+    if not text.isdecimal():
+        raise ConfigError(f"{PIXELS_VARIABLE} is {text!r}, must be a number of pixels", key=PIXELS_VARIABLE)
+    return int(text)
+
 
 def fitted_size(width: int, height: int, resolution: int) -> tuple[int, int]:
     """The (width, height) a picture is used at, by the rule of the 3DGS code.
@@ -167,6 +180,13 @@ def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
     """Open a picture file; whatever Pillow raises in the block becomes a SceneError."""
     try:
         with Image.open(path, formats=FORMATS) as picture:
+            limit = pixel_limit()
+            if picture.width * picture.height > limit:
+                raise SceneError(
+                    f"{path}: {picture.width}x{picture.height} px, more than the {limit:,} pixels that are decoded: "
+                    f"set {PIXELS_VARIABLE} to decode larger pictures (each takes about 16 bytes a pixel)",
+                    path=str(path),
+                )
             yield picture
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise SceneError(f"{path}: {complaint} ({error})", path=str(path)) from error

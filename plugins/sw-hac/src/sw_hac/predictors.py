@@ -6,6 +6,7 @@ import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode, one_thread
 from sw_anchors.lattice import TOP
+from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
@@ -28,7 +29,7 @@ class ExactPredictor:
 
     def __call__(self, codes: Tensor) -> BlockPrediction:
         """Predict for anchors at `codes` [n,3] on the lattice."""
-        found = self._network(self._grid.integer_features(codes))
+        found = self._network(codes, self._grid.integer_features, row_width(self._grid))
         return {group: (context, self._network.steps(group, context)) for group, context in found.items()}
 
 
@@ -42,13 +43,21 @@ class FloatPredictor:
 
     def __call__(self, codes: Tensor) -> BlockPrediction:
         """Predict for anchors at `codes` [n,3] on the lattice."""
+        width = max(row_width(self._grid), self._network[0].out_features)
         with one_thread():
-            outputs = self._network(self._grid(codes.to(torch.float32) / TOP))
+            outputs = by_parts(
+                lambda part: self._network(self._grid(part.to(torch.float32) / TOP)), codes, width, FLOAT_NUMBERS
+            )
         found = context_of(outputs, self._shape, self._base_steps)
         return {
             group: (RowContext(mean.clamp(-1e6, 1e6), scale.clamp(1e-9, 1e6), step.double()), step.double())
             for group, mean, scale, step in zip(GROUPS, found.means, found.scales, found.steps, strict=True)
         }
+
+
+def row_width(grid: MixedHashGrid) -> int:
+    """The most numbers that one place has while it is looked up: features, or corners of all cells."""
+    return max(grid.width, grid.corners)
 
 
 PREDICTORS: dict[Mode, type[ExactPredictor] | type[FloatPredictor]] = {"exact": ExactPredictor, "float": FloatPredictor}

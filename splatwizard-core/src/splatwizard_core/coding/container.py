@@ -200,6 +200,7 @@ class ContainerReader:
         self.static: dict[str, Any] = header["static"]
         self._payload = self._split(header["sections"], file)
         self.sections: dict[str, int] = {key: len(part) for key, part in self._payload.items()}
+        self._unread = set(self._payload)
 
     def _prefix(self, data: bytes) -> tuple[int, int]:
         """Container version and header length; a wrong file is refused before it is read whole."""
@@ -293,7 +294,13 @@ class ContainerReader:
         """The bytes of a section. Raises BitstreamError if the file has none of that name."""
         if name not in self._payload:
             raise self._damage("is missing", name)
+        self._unread.discard(name)
         return self._payload[name]
+
+    def finish(self) -> None:
+        """Raise BitstreamError if a section was never asked for: its method knows none of that name."""
+        for name in sorted(self._unread):
+            raise self._damage(f"method '{self.method}' knows no such section", name)
 
     @contextlib.contextmanager
     def decoding(self, name: str) -> Iterator[bytes]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.scene.camera import Camera
 
@@ -75,6 +76,20 @@ class SplatModel(nn.Module):
             else:
                 owner.register_buffer(leaf, fresh)
         self.load_state_dict(state)
+
+    def non_finite_rows(self) -> int:
+        """Number of primitives with a value that is NaN or infinite: rasterizers leave them out."""
+        bad = torch.zeros(self.num_rows, dtype=torch.bool, device=self.device)
+        for value in (getattr(self, name) for name in self.ROWS):
+            if value.is_floating_point():
+                bad |= ~value.isfinite().flatten(1).all(dim=1) if value.ndim > 1 else ~value.isfinite()
+        return int(bad.sum())
+
+    def check_finite(self) -> int:
+        """`non_finite_rows`. Raises SplatwizardError if that is all of them: nothing would be drawn."""
+        if (bad := self.non_finite_rows()) and bad == self.num_rows:
+            raise SplatwizardError(f"all {bad:,} {self.ROW_LABEL} of the model hold values that are not finite")
+        return bad
 
     def digest(self) -> str:
         """SHA-256 over names, shapes and bytes of all parameters and buffers, and the extra state."""

@@ -50,6 +50,7 @@ def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
     try:
         with torch.no_grad():
             model = method_class(plugins, None).decode(reader)
+        reader.finish()
     except PluginError as error:
         # Asked for only now: what helped to write the file may have nothing to do with reading it.
         if error.kind is None or error.name is None:

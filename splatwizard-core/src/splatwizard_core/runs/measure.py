@@ -71,6 +71,7 @@ def measure(
     synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
+    bad_rows = model.check_finite()
     scene = load_scene(resolved.scene_spec, resolved.scene, plugins)
     options = quality.render_options(raster, scene.background.to(device))
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
@@ -120,7 +121,7 @@ def measure(
         "rasterizers": dict(rasterizer.choices),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
         "contended": contended,
-        "flags": _flags(scene, result, meter, device_bound=device_bound, contended=bool(contended)),
+        "flags": _flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
     }
     if report is not None:
         first = speed_views[0].camera
@@ -139,7 +140,13 @@ def measure(
 
 
 def _flags(
-    scene: Scene, result: quality.EvaluationResult, meter: MemoryMeter, *, device_bound: bool, contended: bool
+    scene: Scene,
+    result: quality.EvaluationResult,
+    meter: MemoryMeter,
+    *,
+    device_bound: bool,
+    bad_rows: int,
+    contended: bool,
 ) -> list[str]:
     """Name the circumstances that a reader of the numbers must know."""
     told = {
@@ -149,6 +156,7 @@ def _flags(
         "not-a-number": any(metric.reason == quality.NOT_A_NUMBER for metric in result.metrics.values()),
         "unverified-weights": not all(metric.verified for metric in result.metrics.values()),
         "device-bound": device_bound,
+        "non-finite-rows": bad_rows > 0,
         "contended": contended,
     }
     return [name for name, holds in told.items() if holds]
@@ -176,6 +184,7 @@ def render_views(
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(opened.raster))
     folder.mkdir(parents=True, exist_ok=True)
     names = quality.png_names([view.name for view in views])
+    opened.model.check_finite()
     opened.model.prepare()
     with track("render", total=len(views), unit="views") as bar:
         for view, name in zip(views, names, strict=True):

@@ -16,10 +16,10 @@ import os
 import re
 import secrets
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from safetensors import SafetensorError, safe_open
@@ -31,6 +31,7 @@ from splatwizard_core.files import TEMPORARY, replacing
 from splatwizard_core.training.keys import dotted
 from splatwizard_core.training.plan import plan_digest
 
+T = TypeVar("T")
 log = logging.getLogger(__name__)
 
 FORMAT = 1
@@ -38,6 +39,10 @@ TENSOR_KEY = "$tensor"
 SHOWN_CHARACTERS = 40  # of a value that differs
 _JSON = re.compile(r"\d{2}-\d{7}\.json")
 _TENSORS = re.compile(r"\d{2}-\d{7}(-[0-9a-f]{8})?\.safetensors")
+_KINDS: dict[str, Any] = {
+    "stage": int, "stage_name": str, "step": int, "finished": bool, "identity": dict, "plan": list,
+    "extent": (int, float), "progress": dict,
+}  # fmt: skip
 _OURS = re.compile(rf"\.?({_JSON.pattern}|{_TENSORS.pattern})({TEMPORARY}|\.damaged)?")
 
 
@@ -120,28 +125,32 @@ class CheckpointStore:
         """The JSON files, newest first."""
         return sorted((p for p in self.directory.glob("*.json") if _JSON.fullmatch(p.name)), reverse=True)
 
-    def newest(self) -> Checkpoint | None:
-        """Return the newest checkpoint that can be read, or None if there is none.
+    def restored(self, use: Callable[[Checkpoint], T]) -> T | None:
+        """Return what `use` makes of the newest checkpoint that can be read and used, or None if there is none.
 
-        A damaged one is set aside with a warning; raises CheckpointError if all of them are damaged.
+        Damaged ones, with which reading or `use` raises DamagedCheckpointError, are set aside with a warning; raises
+        CheckpointError if all of them are damaged, and then leaves them where they are.
         """
-        problem: CheckpointError | None = None
+        problems: dict[Path, CheckpointError] = {}
         for path in self.paths():
             try:
-                found = read_checkpoint(path)
+                found = use(read_checkpoint(path))
             except DamagedCheckpointError as error:
-                problem = problem or error
-                log.warning("%s; trying the one before", error)
-                for each in (path, *self.directory.glob(f"{path.stem}*.safetensors")):
+                problems[path] = error
+                continue
+            for damaged, problem in problems.items():
+                log.warning("%s; resuming from %s instead", problem, path.name)
+                for each in (damaged, *self.directory.glob(f"{damaged.stem}*.safetensors")):
                     with contextlib.suppress(OSError):
                         os.replace(each, each.with_name(f"{each.name}.damaged"))
-                continue
-            if problem is not None:
-                log.warning("resuming from %s instead, step %d", path.name, found.step)
             return found
-        if problem is not None:
+        for problem in problems.values():
             raise CheckpointError(f"{problem}; no earlier checkpoint is left, so start again (--fresh)")
         return None
+
+    def newest(self) -> Checkpoint | None:
+        """`restored`, of a checkpoint that nothing but its own sums is held against."""
+        return self.restored(lambda found: found)
 
     def last_of(self, stage: int) -> Checkpoint:
         """Return the checkpoint that finished a stage. Raises CheckpointError."""
@@ -213,10 +222,13 @@ def read_checkpoint(path: Path) -> Checkpoint:
             if _crc(tensor) != content["tensors"][name]:
                 raise DamagedCheckpointError(f"checkpoint {tensor_path} is damaged: tensor '{name}' has changed")
         values = {f.name: content[f.name] for f in fields(Checkpoint) if f.name != "state"}
+        for name, kind in _KINDS.items():
+            if not isinstance(values[name], kind) or (kind is int and values[name] < 0):
+                raise DamagedCheckpointError(f"checkpoint {path} is damaged: '{name}' is {values[name]!r:.40}")
         return Checkpoint(**values, state=join_tensors(content["state"], tensors))
     except FileNotFoundError as error:
         raise DamagedCheckpointError(f"checkpoint {error.filename or tensor_path} is missing") from error
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
+    except (OSError, SafetensorError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise DamagedCheckpointError(f"checkpoint {path} cannot be read: {type(error).__name__}: {error}") from error
 
 

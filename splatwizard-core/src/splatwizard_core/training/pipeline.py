@@ -9,13 +9,15 @@ from dataclasses import KW_ONLY, dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from splatwizard_core.errors import CheckpointError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training import rng
-from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, differences
+from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, DamagedCheckpointError, differences
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.plan import plan_rows, row_facts
@@ -110,25 +112,19 @@ class TrainingRun:
         Raises NothingToDo if a checkpoint lies at or past the end of a stage that it did not finish; CheckpointError,
         TrainingDiverged, EmptyModel, TaskError.
         """
-        saved = None
-        if self.store is not None:
-            if not self.resume:
-                self.store.clear()
-            saved = self.store.newest()
+        if self.store is not None and not self.resume:
+            self.store.clear()
         self.meter.start()
-        trainer: Trainer | None = None
         model: SplatModel | None = None
         first = 0
         with rng.seeded(self.ppl.seed):
-            if saved is None:
+            trainer = None if self.store is None else self.store.restored(self._resumed)
+            if trainer is None:
                 self.run_log.clear()
             else:
-                first = saved.stage
-                self.progress = Progress(**saved.progress)
-                trainer = self._restore(saved)
-                self.run_log.rewind(saved.stage, saved.step)
+                first = trainer.index
+                self.run_log.rewind(first, trainer.step)
                 self.provided()  # what began the stage is known from the process that began it
-                saved = None  # its tensors are as large as the model and its optimizer
             for index in range(first, len(self.stages)):
                 trainer = trainer or self._trainer(index, model)
                 if self.meter.kind == "rss" and trainer.device.type == "cuda":
@@ -139,6 +135,7 @@ class TrainingRun:
                 model = trainer.stage.finish(trainer.model, self.scene)
                 trainer = None
         assert model is not None
+        model.check_finite()
         self.progress.provided = {name: self.progress.provided.get(name, []) for name in self.names}
         plan = [self._describe(stage, name) for stage, name in zip(self.stages, self.names, strict=True)]
         return TrainOutcome(**vars(self.progress), model=model, plan=plan)
@@ -166,8 +163,20 @@ class TrainingRun:
         if index == 0 or self.stages[index].starts_from is not None:
             return None
         assert self.store is not None
-        trainer = self._restore(self.store.last_of(index - 1))
+        try:
+            trainer = self._restore(self.store.last_of(index - 1))
+        except DamagedCheckpointError as error:  # no fault of the checkpoint that goes on from it
+            raise CheckpointError(f"{error}; start again (--fresh)") from error
         return trainer.stage.finish(trainer.model, self.scene)
+
+    def _resumed(self, saved: Checkpoint) -> Trainer:
+        """`_restore`, and what the record has accumulated."""
+        trainer = self._restore(saved)
+        try:
+            self.progress = Progress(**saved.progress)
+        except TypeError as error:
+            raise DamagedCheckpointError(f"the checkpoint of step {saved.step} is damaged: {error}") from error
+        return trainer
 
     def _restore(self, saved: Checkpoint) -> Trainer:
         """Return the trainer of a checkpoint's stage as it was after the checkpoint's step. Raises CheckpointError."""
@@ -186,8 +195,12 @@ class TrainingRun:
             log.warning("resuming with a changed plan or configuration: %s", line)
         try:
             trainer.load_state_dict(saved.state, saved.step)
-        except (KeyError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-            raise CheckpointError(f"{where} does not fit this run: {error}") from error
+        except torch.OutOfMemoryError:
+            raise
+        except Exception as error:  # whatever a part of the state raises that is not what it wrote
+            # Of the very same plan and configuration, it is not what was written: the one before may be.
+            kind = CheckpointError if changed else DamagedCheckpointError
+            raise kind(f"{where} does not fit this run: {type(error).__name__}: {error}") from error
         # A stage that was finished under another plan may have steps left under this one.
         trainer.stopped = saved.finished and not changed
         return trainer

@@ -333,9 +333,14 @@ class MixedHashGrid(nn.Module):
         return self.at_places(self.places(x))
 
     @property
+    def corners(self) -> int:
+        """Corners of all cells around a place."""
+        return sum(len(grid.levels) << grid.dimensions for grid in self._all())
+
+    @property
     def place_bytes(self) -> int:
         """Of `places`, a row."""
-        return sum(8 * len(grid.levels) << grid.dimensions for grid in self._all())
+        return 8 * self.corners
 
     @torch.no_grad()
     def places(self, x: Tensor) -> GridPlaces:

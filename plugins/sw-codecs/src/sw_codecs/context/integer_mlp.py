@@ -18,6 +18,8 @@ from splatwizard_core.api import BitstreamError
 FRACTION = 12
 ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1
 WEIGHT_LIMIT = 4096
+NUMBERS_AT_ONCE = 1 << 21
+"""Of the widest layer, held together."""
 
 
 class IntegerMlp:
@@ -86,14 +88,15 @@ class IntegerMlp:
         except (KeyError, ValueError) as error:
             raise BitstreamError(f"the context network cannot be used: {error}") from error
 
-    def __call__(self, inputs: Tensor, *, rows: int = 1 << 16) -> Tensor:
+    def __call__(self, inputs: Tensor, *, rows: int | None = None) -> Tensor:
         """int64 [n, out] with 12 fractional bits, in units of 1 / output_scale.
 
         inputs  [n, in] integers with 12 fractional bits, clamped to +-2^20 (that is 256)
-        rows    how many are evaluated at once; the result does not depend on it
+        rows    how many are evaluated at once, None: by the widest layer; the result does not depend on it
         """
         if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
             raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
+        rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
         return torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
 
     def _evaluate(self, inputs: Tensor) -> Tensor:

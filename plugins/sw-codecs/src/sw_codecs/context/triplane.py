@@ -7,7 +7,7 @@ mode of the codec library, rules 1 and 2.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
 import torch
@@ -120,9 +120,14 @@ class Triplane(nn.Module):
 
         The result does not depend on device or batch: integers alone. Values stay below 2^24.
         """
+        lookup = Triplane.exact_lookup(integers)
+        return torch.cat([lookup(block) for block in places.split(ROWS_AT_ONCE)])
+
+    @staticmethod
+    def exact_lookup(integers: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
+        """`exact` of one set of planes, as a function of places: to be called often, with few places at once."""
         corners = [plane.flatten(2).transpose(1, 2).contiguous() for plane in integers]  # [3, R*R, C]
-        found = [_exact_rows(integers, corners, block) for block in places.split(ROWS_AT_ONCE)]
-        return torch.cat(found)
+        return lambda places: _exact_rows(integers, corners, places)
 
 
 class _Sampled(torch.autograd.Function):

@@ -14,7 +14,7 @@ import json
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -256,6 +256,7 @@ class _Transfer:
             match = re.fullmatch(r"bytes (\d+)-\d+/(\d+|\*)", response.headers.get("Content-Range", ""))
             total = None if match is None or match[2] == "*" else int(match[2])
             changed = self.part.total is not None and total is not None and total != self.part.total
+            changed |= self._is_another(response.headers)
             if match is None or int(match[1]) != start or changed:
                 self._discard()
                 raise _Broken("the server sent another part than asked for, starting over")
@@ -279,6 +280,11 @@ class _Transfer:
         self._check_space(start)
         write_json(self.note, asdict(self.part))
         return start
+
+    def _is_another(self, headers: Mapping[str, str]) -> bool:
+        """Whether the marks of an answer are those of another version than the part's."""
+        pairs = ((self.part.etag, headers.get("ETag")), (self.part.modified, headers.get("Last-Modified")))
+        return any(ours is not None and theirs is not None and ours != theirs for ours, theirs in pairs)
 
     def _check_space(self, start: int) -> None:
         if self.part.total is None:
@@ -320,9 +326,11 @@ class _Sink(contextlib.ExitStack):
         """Write the next bytes of the body."""
         if self.file is None:
             raise _Broken("the server answered nothing that can be kept")
-        total = self.transfer.part.total
+        announced = self.transfer.part.total
+        total = announced if announced is not None else self.transfer.size
         if total is not None and self.file.tell() + len(block) > total:
-            raise FetchError(f"{self.transfer.url}: more bytes come than were announced", address=self.transfer.url)
+            said = "were announced" if announced is not None else f"the {total:,} that the registry says"
+            raise FetchError(f"{self.transfer.url}: more bytes come than {said}", address=self.transfer.url)
         self.count(len(block))
         return self.file.write(block)
 

@@ -26,11 +26,14 @@ from splatwizard_core.tooling import new_folder
 from sw_datasets.downloads.download import byte_progress
 from sw_datasets.errors import ArchiveError, FetchError
 from sw_datasets.pictures import is_inside
+from sw_datasets.zip_methods import check_method
 
 MAX_MEMBERS = 200_000
 MAX_RATIO = 100  # bytes unpacked per byte of archive; pictures reach 1.1, COLMAP text models 5
 GRACE_BYTES = 1 << 26  # a small archive of text may exceed the ratio
-MAX_HEADER_BYTES = 1 << 20  # tar's extended headers (long names), which the standard library reads into memory
+MAX_HEADER_BYTES = 1 << 16  # a tar's extended header (long names), which the standard library keeps as a dictionary
+MAX_GLOBAL_BYTES = 1 << 12  # of its global headers together, which it copies for every member
+MAX_EXTENSIONS = 8  # extended headers in a row, which it reads into one another
 EXTENSIONS = (
     tarfile.XHDTYPE, tarfile.XGLTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.GNUTYPE_LONGNAME, tarfile.GNUTYPE_LONGLINK,
 )  # fmt: skip
@@ -44,10 +47,14 @@ Files = dict[str, tuple[int, str]]
 
 @dataclass(frozen=True)
 class Member:
-    """One file in an archive: its path as parts, and its size as the archive states it."""
+    """One entry of an archive: its path as parts, and its size as the archive states it.
+
+    skipped     a folder, or what systems leave in archives: not unpacked, but counted
+    """
 
     parts: tuple[str, ...]
     size: int
+    skipped: bool = False
 
 
 @dataclass
@@ -101,6 +108,8 @@ def _extract(
         temporary = {name: folders.enter_context(_new_folder(target)) for name, (_, target) in wanted.items()}
         with _damage_named(archive), _opened(archive) as contents:
             for member, stream in contents:
+                if member.skipped:
+                    continue
                 for name, (root, _) in wanted.items():
                     if member.parts[: len(root)] == root:
                         inner = member.parts[len(root) :]
@@ -170,21 +179,24 @@ def _members(archive: Path) -> list[Member]:
     limit = MAX_RATIO * archive.stat().st_size + GRACE_BYTES
     members: list[Member] = []
     seen: set[tuple[str, ...]] = set()
-    total = 0
+    total = entries = 0
     label = f"check {archive.name}"  # of a compressed tar, this reads it all
     with _damage_named(archive), _opened(archive) as contents, track(label, unit="files") as bar:
         for member, _ in contents:
             bar.advance()
+            entries += 1
+            total += member.size
+            if total > limit or entries > MAX_MEMBERS:
+                raise ArchiveError(
+                    f"{archive}: {entries:,} entries of {total:,} bytes so far, from an archive of "
+                    f"{archive.stat().st_size:,}: a decompression bomb; refused"
+                )
+            if member.skipped:
+                continue
             if member.parts in seen:
                 raise ArchiveError(f"{archive}: '{'/'.join(member.parts)}' is in it twice; refused")
             seen.add(member.parts)
             members.append(member)
-            total += member.size
-            if total > limit or len(members) > MAX_MEMBERS:
-                raise ArchiveError(
-                    f"{archive}: {len(members):,} files of {total:,} bytes so far, from an archive of "
-                    f"{archive.stat().st_size:,}: a decompression bomb; refused"
-                )
     if not members:
         raise ArchiveError(f"{archive}: holds no file")
     return members
@@ -201,7 +213,7 @@ def _opened(archive: Path) -> Iterator[Contents]:
             yield _zip_contents(archive, opened_zip)
     else:
         try:
-            opened_tar = tarfile.open(archive, tarinfo=_TarInfo)  # noqa: SIM115 (closed below)
+            opened_tar = tarfile.open(archive, tarinfo=_bounded_headers())  # noqa: SIM115 (closed below)
         except tarfile.TarError as error:
             raise ArchiveError(
                 f"{archive} is no zip or tar archive, or damaged ({error}): perhaps a web page in its place"
@@ -217,9 +229,10 @@ def _zip_contents(archive: Path, opened: zipfile.ZipFile) -> Contents:
             raise ArchiveError(f"{archive}: {info.filename!r} is a link or a device; refused")
         if info.flag_bits & 1:
             raise ArchiveError(f"{archive}: {info.filename!r} is encrypted; refused")
+        check_method(info)
         parts = _parts(archive, info.filename)
-        if not info.is_dir() and not _is_junk(parts):
-            yield Member(parts, info.file_size), lambda info=info: opened.open(info)  # type: ignore[misc]
+        member = Member(parts, info.file_size, info.is_dir() or _is_junk(parts))
+        yield member, lambda info=info: opened.open(info)  # type: ignore[misc]
 
 
 def _tar_contents(archive: Path, opened: tarfile.TarFile) -> Contents:
@@ -227,8 +240,9 @@ def _tar_contents(archive: Path, opened: tarfile.TarFile) -> Contents:
         if not (info.isreg() or info.isdir()) or info.issparse() or info.size < 0:
             raise ArchiveError(f"{archive}: {info.name!r} is a link, a device or a sparse file; refused")
         parts = _parts(archive, info.name)
-        if not info.isdir() and not _is_junk(parts):
-            yield Member(parts, info.size), lambda info=info: _tar_stream(opened, info)  # type: ignore[misc]
+        member = Member(parts, info.size, info.isdir() or _is_junk(parts))
+        yield member, lambda info=info: _tar_stream(opened, info)  # type: ignore[misc]
+        opened.members = []  # it would keep the headers of all
 
 
 def _tar_stream(opened: tarfile.TarFile, info: tarfile.TarInfo) -> IO[bytes]:
@@ -237,20 +251,34 @@ def _tar_stream(opened: tarfile.TarFile, info: tarfile.TarInfo) -> IO[bytes]:
     return stream
 
 
-class _TarInfo(tarfile.TarInfo):
-    """Headers whose extensions fit in memory, whatever size they claim."""
+def _bounded_headers() -> type[tarfile.TarInfo]:
+    """The headers of one archive, whose extensions fit in memory, whatever they claim."""
+    in_a_row = all_global = 0
 
-    @classmethod
-    def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Any:
-        """One header block. Raises tarfile.ReadError for an extension that is too long, and for a negative size."""
-        info = super().frombuf(buf, encoding, errors)
-        if info.size < 0 or (info.type in EXTENSIONS and info.size > MAX_HEADER_BYTES):
-            raise tarfile.ReadError(f"a header claims {info.size:,} bytes")
-        return info
+    class Bounded(tarfile.TarInfo):
+        @classmethod
+        def frombuf(cls, buf: bytes | bytearray, encoding: str, errors: str) -> Any:
+            """One header block. Raises tarfile.ReadError for too long or many extensions, or a negative size."""
+            nonlocal in_a_row, all_global
+            info = super().frombuf(buf, encoding, errors)
+            in_a_row = in_a_row + 1 if info.type in EXTENSIONS else 0
+            all_global += info.size if info.type == tarfile.XGLTYPE else 0
+            if info.size < 0 or (in_a_row and info.size > MAX_HEADER_BYTES):
+                raise tarfile.ReadError(f"a header claims {info.size:,} bytes")
+            if in_a_row > MAX_EXTENSIONS or all_global > MAX_GLOBAL_BYTES:
+                raise tarfile.ReadError(f"{in_a_row} extended headers in a row, {all_global:,} bytes of global ones")
+            return info
+
+    return Bounded
 
 
 def _parts(archive: Path, name: str) -> tuple[str, ...]:
-    """A member's path. Raises FetchError if it leads out of the folder it is unpacked to."""
+    """A member's path; () of the folder itself, which `tar -C FOLDER .` puts first.
+
+    Raises FetchError if it leads out of the folder it is unpacked to.
+    """
+    if name and set(name.split("/")) <= {"", "."} and not name.startswith("/"):
+        return ()
     if not is_inside(name) or ":" in name.split("/")[0] or not name.isprintable():
         raise ArchiveError(f"{archive}: {name!r} leads out of the folder or cannot be a file name; refused")
     return tuple(part for part in name.split("/") if part not in ("", "."))

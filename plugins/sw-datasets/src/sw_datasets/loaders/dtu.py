@@ -20,6 +20,7 @@ from splatwizard_core.api import Scene, SceneError, SceneOptions
 from sw_datasets.loaders.colmap import load_colmap, mask_files, model_folder
 from sw_datasets.pictures import list_pictures
 from sw_datasets.rules import Rules
+from sw_datasets.zip_methods import check_method
 
 CAMERAS = "cameras.npz"
 LARGEST_MEMBER = 4096  # bytes; a 4x4 float64 matrix with its header takes 256
@@ -97,6 +98,7 @@ def read_alignments(path: Path, count: int) -> tuple[Tensor, Tensor]:
                         raise SceneError(
                             f"{path}: '{kind}_{i}' is missing; the scene has {count} views", path=str(path)
                         )
+                    check_method(archive.getinfo(member))
                     with archive.open(member) as file:
                         rows.append(_matrix(file.read(LARGEST_MEMBER + 1), path, f"{kind}_{i}"))
                 mats.append(torch.from_numpy(np.stack(rows)))

@@ -4,7 +4,6 @@
 #include <ATen/ops/empty.h>
 #include <torch/library.h>
 
-#include <limits>
 #include <tuple>
 #include <vector>
 
@@ -86,8 +85,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   const int64_t used =
       n == 0 ? 0 : SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(out.radii), seen);
   const int64_t count = SW_SELECT(count_pairs<S>)(n, slots);
-  TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
-              " splat-tile pairs are more than 2^31 - 1; render fewer Gaussians or a smaller image");
+  check_pairs(count, settings);
   out.seconds.push_back(clock.lap());
 
   Tensor order = make_as({used}, at::kInt);

@@ -4,7 +4,9 @@
 #include <ATen/Parallel.h>
 #include <ATen/core/Tensor.h>
 
+#include <algorithm>
 #include <array>
+#include <cstdlib>
 #include <initializer_list>
 #include <limits>
 #include <optional>
@@ -42,6 +44,20 @@ S* data(const Tensor& t) {
 template <class S>
 const S* data(const OptionalTensor& t) {
   return t.has_value() ? data<S>(*t) : nullptr;
+}
+
+// Pairs of a splat and a tile that a call on the CPU may have, half of them where a backward pass follows: 12 bytes
+// each, 70 with gradients, which a file of a kilobyte can ask for. 2^27 are four times those of the largest real scenes.
+inline int64_t most_pairs() {
+  const char* text = std::getenv("SPLATWIZARD_MAX_TILE_PAIRS");
+  const int64_t asked = text == nullptr ? 0 : std::atoll(text);
+  return std::min<int64_t>(asked > 0 ? asked : int64_t(1) << 27, std::numeric_limits<int32_t>::max());
+}
+
+inline void check_pairs(int64_t count, const sw::Settings& settings) {
+  TORCH_CHECK(count <= settings.most_pairs, "sw_rasterizers: ", count, " splat-tile pairs are more than ",
+              settings.most_pairs, ": draw fewer Gaussians or a smaller image, or set SPLATWIZARD_MAX_TILE_PAIRS (12 "
+              "bytes each, 70 in training, which takes half as many)");
 }
 
 struct Inputs {
@@ -136,6 +152,7 @@ struct Inputs {
     s.accumulated_depth = flags & kAccumulatedDepth, s.median_depth = flags & kMedianDepth;
     s.detach_features = flags & kDetachFeatures, s.absgrad = flags & kAbsgrad;
     s.threads = at::get_num_threads();
+    s.most_pairs = most_pairs() / (flags & kSave ? 2 : 1);
     return s;
   }
 

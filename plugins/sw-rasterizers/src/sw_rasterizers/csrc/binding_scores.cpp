@@ -38,8 +38,7 @@ void accumulate_as(const Inputs& in, const ScoreInputs& asked, at::ArrayRef<doub
   const int64_t used =
       SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(radii), seen);
   const int64_t count = SW_SELECT(count_pairs<S>)(n, slots);
-  TORCH_CHECK(count <= std::numeric_limits<int32_t>::max(), "sw_rasterizers: ", count,
-              " splat-tile pairs are more than 2^31 - 1; score fewer Gaussians or a smaller image");
+  check_pairs(count, settings);
   if (count == 0) return;
 
   const Tensor order = make_as({used}, at::kInt);

@@ -4,7 +4,6 @@
 // first index, so that slots ascend with the Gaussian index without a second pass. Colours are evaluated for
 // slots only: their coefficients, three quarters of all input bytes, are not even read for the culled ones.
 #include <algorithm>
-#include <limits>
 
 #include "../projection.h"
 #include "gather.h"
@@ -64,7 +63,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
   const Slots<S>& slots;
   int32_t* radii;
 
-  // `keep_tiles`: false once there are more pairs than can be numbered; then they are only counted.
+  // `keep_tiles`: false once there are more pairs than may be drawn; then they are only counted.
   void operator()(int64_t chunk, bool keep_tiles, int64_t* invalid) const {
     const auto& g = this->g;
     const int64_t begin = chunk * kChunk, end = begin + kChunk < g.count ? begin + kChunk : g.count;
@@ -167,7 +166,7 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
   std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
   parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
     int64_t bad = 0;
-    project_chunk(chunk, pairs <= std::numeric_limits<int32_t>::max(), &bad);
+    project_chunk(chunk, pairs <= settings.most_pairs, &bad);
     pairs += int64_t(slots.tile_lists[chunk].size());
     const int32_t* first = radii + chunk * kChunk;
     visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),

@@ -1,7 +1,6 @@
 // Projection of surfels: as project.cpp, with a plane instead of a conic.
 #include <algorithm>
 #include <atomic>
-#include <limits>
 
 #include "gather.h"
 #include "parallel.h"
@@ -167,7 +166,7 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
   std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
   parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
     int64_t bad = 0;
-    project_chunk(chunk, pairs <= std::numeric_limits<int32_t>::max(), &bad);
+    project_chunk(chunk, pairs <= settings.most_pairs, &bad);
     pairs += int64_t(slots.tile_lists[chunk].size());
     const int32_t* first = radii + chunk * kChunk;
     visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),

@@ -1,0 +1,35 @@
+"""Contexts of a file computed for a few rows at a time: the widths that its header claims decide no memory.
+
+A block of symbols has up to 2^20 numbers, so as many rows as its columns are few; the context of a row has thousands of
+numbers where a header says so. What leaves a network is as wide as the block, what goes in is not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from torch import Tensor
+
+EXACT_NUMBERS = 1 << 20
+"""Most numbers of a context at once in mode `exact`, whose results do not depend on it."""
+FLOAT_NUMBERS = 1 << 24
+"""The same in mode `float`, whose products may: so many that contexts of up to 800 numbers a row are never cut."""
+
+
+def by_parts(evaluate: Callable[[Tensor], Tensor], rows: Tensor, width: int, numbers: int) -> Tensor:
+    """`evaluate(rows)` of a function that treats each row alone, at most numbers // width rows at a time.
+
+    rows        [n, ...]
+    width       the most numbers a row has on the way through `evaluate`
+    """
+    parts = iter(rows.split(max(1, numbers // width)))
+    first = evaluate(next(parts))
+    if len(first) == len(rows):
+        return first
+    # Written in place: kept one by one, the results would lie between the temporaries and hold their memory.
+    found, start = first.new_empty(len(rows), *first.shape[1:]), len(first)
+    found[:start] = first
+    for part in parts:
+        found[start : start + len(part)] = evaluate(part)
+        start += len(part)
+    return found
