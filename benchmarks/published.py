@@ -87,7 +87,7 @@ def read_rows(path: Path) -> list[Row]:
 
 
 def missing(row: Row, data: Path | None) -> str | None:
-    """Why the scene of a row cannot be read; None: it is there. A row without a data set is made on the spot."""
+    """Tell why the scene of a row cannot be read; None: it is there. A row without a data set is made on the spot."""
     if not row.dataset:
         return None
     if data is None:

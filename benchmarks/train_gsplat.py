@@ -10,7 +10,8 @@ SH degree every 1,000 steps, loss 0.8 L1 + 0.2 (1 - SSIM).
 
 The fastest settings that we know of: packed=False, torch's fused Adam, our fused SSIM ("valid": without padding, as
 gsplat's own trainer has it). gsplat 1.5.x tests `== 0 & step > 0` and never resets opacities; this trainer then does
-so, as later versions do themselves. The clock runs in the loop alone; pictures lie on the GPU. Prints one line RESULT {JSON}.
+so, as later versions do themselves. The clock runs in the loop alone; pictures lie on the GPU. Prints a line
+RESULT {JSON}.
 """
 
 from __future__ import annotations

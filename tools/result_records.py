@@ -83,7 +83,7 @@ class SmallRecord:
 
     @property
     def key(self) -> tuple[str, str, str, int]:
-        """What tells runs of one scene apart: method, variant, rate point, seed."""
+        """Identity among the runs of one scene: method, variant, rate point, seed."""
         return self.method, self.variant, self.rate, self.seed
 
 

@@ -60,7 +60,7 @@ def points(records: Rows) -> list[list[SmallRecord]]:
 
 
 def smaller(group: Rows, records: Rows) -> list[float | None]:
-    """How many times smaller than the float32 .ply of the same seed's 3DGS each file is."""
+    """Divide the float32 .ply of the same seed's 3DGS by each file."""
     plain = [r for r in records if r.method == BASE and not r.variant]
     exact = max((r.rate for r in plain), default="")
     base = {r.seed: PLY_BYTES * r.gaussians for r in plain if r.rate == exact and r.gaussians}
