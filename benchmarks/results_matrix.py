@@ -72,7 +72,7 @@ class Job:
         return root / f"seed-{self.seed}{'-' * bool(self.variant)}{self.variant}"
 
     def folder(self, root: Path) -> Path:
-        """Where its rate points lie."""
+        """Folder of its rate points."""
         return self.out(root) / scene_name(self.scene) / self.method
 
     def runs(self, root: Path) -> list[Path]:

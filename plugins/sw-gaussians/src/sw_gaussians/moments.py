@@ -8,7 +8,7 @@ from splatwizard_core.api import SplatModel, SplatOptimizer
 
 
 class Moments:
-    """Moments by parameter name, on the CPU, since a trained scene may stay on a GPU for long. Copied models share them."""
+    """Moments by parameter name, on the CPU: a trained scene may stay on a GPU for long. Copied models share them."""
 
     def __init__(self, optimizer: SplatOptimizer) -> None:
         self.by_name: dict[str, dict[str, Any]] = {
