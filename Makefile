@@ -1,4 +1,4 @@
-# make demo   set up .venv and run ChimeraGS beside 3DGS on the demo scene: train, encode, decode, evaluate, report
+# make demo   set up .venv and run ChimeraGS beside 3DGS, float32 and entropy-coded, on the demo scene; one table
 # make test   set up .venv and run the default tests (no network, no GPU), TEST_JOBS=2 at a time
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
@@ -21,7 +21,9 @@ TEST_DIST := --dist loadfile --no-loadscope-reorder
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
-	$(BIN)/sw run --method 3dgs --method chimerags --scene demo --out $(DEMO_OUT)
+	$(BIN)/sw run --method 3dgs --rate r2,r6 --scene demo --out $(DEMO_OUT)
+	$(BIN)/sw run --method chimerags --scene demo --out $(DEMO_OUT)
+	$(BIN)/sw report $(DEMO_OUT)/demo
 
 test: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) $(PYTEST_ARGS)

@@ -1,12 +1,9 @@
 """Training speed of 3DGS on a GPU, beside gsplat's trainer on the same pictures, and where a step's time goes.
 
     python benchmarks/train_cuda.py ../shared/data/mug ../shared/data/fox:images_2 ../shared/data/lego
-    python benchmarks/train_cuda.py ../shared/data/mug=out/prepared/mug --gsplat ../shared/bench/train_gsplat.py
 
-A scene is FOLDER[:PICTURES][=PREPARED]; PREPARED is the folder that prep_scene.py, beside the trainer of gsplat, wrote
-from the same files. Without it, or where gsplat cannot be imported, only ours is measured. gsplat's trainer takes its
-SSIM from the package fused_ssim where that is installed, else from our kernels, so that torch's convolutions do not
-slow it down: the output says which.
+A scene is FOLDER[:PICTURES]. Where gsplat cannot be imported, only ours is measured. Its trainer is train_gsplat.py
+beside this file, which says what SSIM and which opacity reset it has.
 
 One after the other, so that nothing shares the GPU. Iterations a second count the loop alone, densification included,
 as both trainers report it; PSNR is the mean over the held-out views, memory the peak of torch's allocator in the loop.
@@ -21,11 +18,9 @@ from __future__ import annotations
 import argparse
 import importlib.util
 import json
-import os
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -47,11 +42,6 @@ from splatwizard_core.training.trainer import StepRecord
 
 WINDOW = 40  # steps that are timed, and as many after them that are profiled
 MIB = 1 << 20
-SSIM_FOR_GSPLAT = """
-from splatwizard_core.training.losses import photometric_loss
-def fused_ssim(img1, img2, padding="same", train=True):
-    return 1 - photometric_loss(img1, img2, lambda_dssim=1.0, padding=padding).total
-"""
 
 
 @dataclass
@@ -114,8 +104,8 @@ def _short(name: str) -> str:
     return name.replace("(anonymous namespace)::", "").replace("void ", "", 1)[:70]
 
 
-def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: Watch | None) -> tuple[Figures, bool]:
-    """Figures of this trainer, and whether the scene's background is white."""
+def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: Watch | None) -> Figures:
+    """Figures of this trainer."""
     plugins = load_plugins()
     sets: dict[str, Any] = {"iterations": iterations, "seed": seed, "device": "cuda"}
     if pictures is not None:
@@ -146,44 +136,33 @@ def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: W
     )
     psnr = result.metrics["psnr"].mean
     assert psnr is not None
-    figures = Figures(outcome.steps / outcome.train_s, psnr, outcome.model.num_rows, outcome.peak_memory / MIB)
-    return figures, scene.protocol.background == "white"
+    return Figures(outcome.steps / outcome.train_s, psnr, outcome.model.num_rows, outcome.peak_memory / MIB)
 
 
 def _no_other(name: str) -> Any:
     raise AssertionError(f"3dgs starts from no {name}")
 
 
-def theirs(script: Path, prepared: str, iterations: int, seed: int, white: bool) -> Figures | str:
+def theirs(folder: str, pictures: str | None, iterations: int, seed: int) -> Figures | str:
     """Figures of gsplat's trainer in a process of its own, or why there are none."""
     if importlib.util.find_spec("gsplat") is None:
         return "it cannot be imported"
-    if not script.is_file():
-        return f"{script} is not there"
-    command = [sys.executable, str(script), prepared, "--iters", str(iterations), "--eval", str(iterations)]
-    command += ["--seed", str(seed)] + ["--white"] * white
-    module = "fused_ssim" if importlib.util.find_spec("fused_ssim") is not None else "ssim_of_splatwizard"
-    with tempfile.TemporaryDirectory() as scratch:
-        (Path(scratch) / "ssim_of_splatwizard.py").write_text(SSIM_FOR_GSPLAT)
-        paths = os.pathsep.join([scratch, os.environ.get("PYTHONPATH", "")])
-        done = subprocess.run(
-            [*command, "--ssim", module], capture_output=True, text=True, cwd=scratch, check=False,
-            env={**os.environ, "PYTHONPATH": paths},
-        )  # fmt: skip
+    command = [sys.executable, str(Path(__file__).with_name("train_gsplat.py")), folder, "--seed", str(seed)]
+    command += ["--iterations", str(iterations), *(["--images", pictures] if pictures else [])]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     if done.returncode != 0 or not lines:
         return f"it failed: {(done.stderr.strip().splitlines() or ['no output'])[-1][:200]}"
     found = json.loads(lines[-1].removeprefix("RESULT "))
-    note = f"gsplat {found['gsplat']}, SSIM of {found['ssim_impl']}"
+    note = f"gsplat {found['gsplat']}, SSIM of {found['ssim_impl']}, opacities reset by {found['reset']}"
     return Figures(found["iters"] / found["train_s"], found["psnr"], found["n"], found["peak_mib"], note)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES][=PREPARED]")
+    parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]")
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--gsplat", type=Path, default=Path("../shared/bench/train_gsplat.py"), help="its trainer")
     parser.add_argument("--profile", action="store_true", help="also where a step's time goes")
     args = parser.parse_args()
     if not torch.cuda.is_available():
@@ -191,15 +170,12 @@ def main() -> None:
     print(device_reason("cuda", torch.device("cuda"), load_plugins()))
     ratios = []
     for asked in args.scenes:
-        where, _, prepared = asked.partition("=")
-        folder, _, pictures = where.partition(":")
-        mine, white = ours(folder, pictures or None, args.iterations, args.seed, None)
+        folder, _, pictures = asked.partition(":")
+        mine = ours(folder, pictures or None, args.iterations, args.seed, None)
         name = f"{Path(folder).name} {pictures}".strip()
         print(f"{name:16} {'it/s':>7} {'PSNR':>7} {'Gaussians':>10} {'peak MiB':>9}")
         print(_row("ours", mine))
-        other: Figures | str = "no prepared folder was given"
-        if prepared:
-            other = theirs(args.gsplat.resolve(), str(Path(prepared).resolve()), args.iterations, args.seed, white)
+        other = theirs(folder, pictures or None, args.iterations, args.seed)
         if isinstance(other, str):
             print(f"  gsplat: not measured, {other}")
         else:

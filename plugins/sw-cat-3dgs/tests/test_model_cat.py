@@ -88,7 +88,7 @@ def test_views_are_counted_again_when_as_many_anchors_came_as_went(begun, little
 
 @pytest.mark.parametrize("units", ["values", "steps"])
 def test_setting_up_makes_planes_of_the_anchors_resolution_and_predicts_their_statistics(begun, units):
-    stage, model, optimizer = begun(context__anchors_per_cell=4.0, context__units=units)
+    stage, model, optimizer = begun(context__anchors_per_cell=4.0, context__units=units, context__start="statistics")
     with torch.no_grad():
         model.features.normal_(3.0, 2.0, generator=torch.Generator().manual_seed(0))
     assert model.context.resolution == 0

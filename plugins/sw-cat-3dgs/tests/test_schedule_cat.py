@@ -33,8 +33,55 @@ Post  | adjust anchor                | range(1500, 3000, 100)
 Post  | adjust anchor                | range(4000, 15000, 100)"""
 
 
-def test_the_plan_is_the_published_one():
+PAPER = """\
+Pre   | update lr                    | range(30000)
+Pre   | update cam mask              | range(30000)
+Pre   | update anchor bound          | 1
+Pre   | switch to quantized training | 3000
+Pre   | setup triplane               | 10000
+Pre   | switch to entropy training   | 10001
+Post  | collect gradient statistics  | range(15000)
+Post  | adjust anchor                | range(1500, 3000, 100)
+Post  | adjust anchor                | range(4000, 15000, 100)"""
+"""The rows that the Splatwizard paper prints."""
+ADDED = """\
+Pre   | update anchor bound          | 10000
+Pre   | update anchor bound          | 15000
+Pre   | train spatial models         | 15000
+Pre   | round planes                 | 15001
+Pre   | train all but planes         | 16000
+Pre   | train everything             | 19000"""
+"""Rows that the authors' code does without a task of its own (10000, and the phases from 15000 on), and `rebound`."""
+
+
+def plan_rows(config):
+    return format_plan(*build_schedulers(CatStage(config), PipelineParams())).splitlines()[2:]
+
+
+def test_the_plan_is_the_papers_rows_and_those_that_are_written_down_as_added():
+    printed = CatConfig(lr=CatConfig().lr.model_copy(update={"max_steps": 30_000}))  # 40,000 in the authors' code
+    assert sorted(plan_rows(printed)) == sorted([*PAPER.splitlines(), *ADDED.splitlines()])
+
+
+def test_the_whole_plan_in_its_order():
     assert format_plan(*build_schedulers(CatStage(CatConfig()), PipelineParams())) == PLAN
+
+
+@pytest.mark.parametrize("start", ["network", "statistics"])
+def test_the_context_starts_as_published_or_at_the_statistics(scene, method, start):
+    from splatwizard_core.streams import stream
+
+    made = method(context__start=start)
+    model = made.create_model(scene, stream(0, "init"))
+    lasts = [network[2] for network in model.context.slices.networks.values()]
+    bounds = [layer.in_features**-0.5 for layer in lasts]
+    assert all(layer.weight.abs().max() <= bound for layer, bound in zip(lasts, bounds, strict=True))
+    assert all(layer.weight.any() == (start == "network") for layer in lasts)
+    (stage,) = made.stages()
+    stage.plane_draws = stream(0, "triplane")
+    before = model.context.network[2].bias.clone()
+    stage.setup_triplane(model, stage.create_optimizer(model, scene))
+    assert torch.equal(model.context.network[2].bias, before) == (start == "network")
 
 
 def test_a_scaled_plan_is_a_fraction_of_forty_thousand():

@@ -12,17 +12,17 @@ from sw_hac.config import HACConfig
 from sw_hac.method import HAC
 from sw_hac.stage import HACStage
 
-PAPER_PLAN = """\
-Stage | Task                         | Plan
-------+------------------------------+------------------------
+PAPER = """\
 Pre   | update lr                    | range(30000)
 Pre   | update anchor bound          | 1
 Post  | collect gradient statistics  | range(15000)
 Post  | adjust anchor                | range(1500, 3000, 100)
 Post  | adjust anchor                | range(4000, 15000, 100)
 Post  | switch to quantized training | 3000
-Post  | update anchor bound          | 10000
 Post  | switch to entropy training   | 10001"""
+"""The rows that the Splatwizard paper prints."""
+ADDED = "Post  | update anchor bound          | 10000"
+"""In the authors' code a part of that step's forward pass."""
 
 
 def plan_of(stage):
@@ -35,8 +35,10 @@ def steps_of(stage, name: str) -> list[int]:
     return [s for r in (*pre.registrations, *post.registrations) if r.name == name for s in r.fires_in(0, total)]
 
 
-def test_the_plan_is_the_papers_table():
-    assert format_plan(*plan_of(HACStage(HACConfig()))) == PAPER_PLAN
+def test_the_plan_is_the_papers_rows_and_the_one_that_is_written_down_as_added():
+    rows = format_plan(*plan_of(HACStage(HACConfig()))).splitlines()[2:]
+    assert [row for row in rows if row != ADDED] == PAPER.splitlines()
+    assert rows.count(ADDED) == 1
 
 
 def test_the_steps_are_the_published_ones():

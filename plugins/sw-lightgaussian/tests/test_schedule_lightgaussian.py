@@ -1,14 +1,20 @@
 """The plan of both stages is the published one, and so are the step sizes."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
+from sw_finetuning.fine_tuning import FineTuningStage
 
+from splatwizard_core.api import GaussianModel, PointCloud
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.method import LightGaussian
+from sw_lightgaussian.significance import Significance
+from sw_lightgaussian.stages import PruneStage
 
 PRUNE_PLAN = """\
 Stage | Task      | Plan
@@ -150,3 +156,35 @@ def test_the_plugin_declares_what_the_class_has(plugins):
     declared = plugins.methods.entry("lightgaussian").declared
     assert list(declared["presets"]) == list(LightGaussian.PRESETS)
     assert list(declared["rates"]) == list(LightGaussian.RATES)
+
+
+@pytest.mark.parametrize(("asked", "restored"), [("restored", True), ("fresh", False)])
+def test_pruning_goes_on_with_the_moments_of_the_3dgs_training(asked, restored):
+    """As in the authors' code, which restores the optimizer from the checkpoint."""
+    import copy
+
+    from sw_gaussians.moments import keep_moments
+
+    config = LightGaussianConfig()
+    config = config.model_copy(update={"prune": config.prune.model_copy(update={"optimizer": asked})})
+    model = GaussianModel.from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)), max_sh_degree=3)
+    scene = SimpleNamespace(extent=1.0)
+    trained = FineTuningStage(config, config.prune.lr).create_optimizer(model, scene)
+    for parameter in model.parameters():
+        parameter.grad = torch.rand_like(parameter)
+    trained.step()
+    keep_moments(model, trained)
+    copied = copy.deepcopy(model)
+    optimizer = PruneStage(config, Significance()).create_optimizer(copied, scene)
+    assert (set(optimizer.states) == set(trained.states)) == restored
+    for name, state in optimizer.states.items():
+        assert state.step == 1
+        assert torch.equal(state.tensors["exp_avg_sq"], trained.states[name].tensors["exp_avg_sq"])
+    for group, rate in FineTuningStage(config, config.prune.lr).rates.of_step(0, 1.0).items():
+        assert optimizer.lr(group) == rate  # step sizes are those of this stage
+
+
+def test_a_scene_from_a_file_has_no_moments_to_go_on_with():
+    model = GaussianModel.from_points(PointCloud(torch.rand(5, 3), torch.rand(5, 3)), max_sh_degree=3)
+    stage = PruneStage(LightGaussianConfig(), Significance())
+    assert stage.create_optimizer(model, SimpleNamespace(extent=1.0)).states == {}

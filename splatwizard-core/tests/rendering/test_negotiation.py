@@ -112,6 +112,18 @@ def test_the_fastest_that_offers_everything_serves(plugins, scene):
     assert rasterizer.choices == {"ALPHA_MAP": "fast"}
 
 
+def test_who_drew_is_told_with_the_kernels_that_really_did(plugins, scene):
+    plugins.install("lent", "ALPHA_MAP", speed=9, kernels="slow")
+    plugins.install("slow", speed=7)
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions(alpha=True))
+    assert rasterizer.drawn_by == {"lent": "slow"}
+    rasterizer.served.clear()
+    rasterizer.render(*scene, RasterOptions())
+    assert rasterizer.drawn_by == {"lent": "slow"}  # the faster name, of the same kernels
+    assert NegotiatedRasterizer(plugins, device="cpu", prefer=["slow"]).drawn_by == {}
+
+
 def test_each_request_is_resolved_by_itself(plugins, scene):
     plugins.install("painter")
     plugins.install("counter", "SCORE_HITS", speed=1)

@@ -1,15 +1,19 @@
 """What a run measures beside quality: speed with its spread, loading, LPIPS once its weights are there."""
 
 import importlib.util
+import sys
 from types import SimpleNamespace
 
 import pytest
 import torch
 from lpips_backbones import write_backbones
+from sw_reference.rasterizer import ReferenceRasterizer
 
-from splatwizard_core.plugins import PluginManager
+from splatwizard_core.plugins import Entry, PluginManager
+from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest
+from splatwizard_core.runs.measure import Opened, measure
 from splatwizard_core.runs.record import Record, missing_reasons
 from splatwizard_core.runs.run import measures, run
 from splatwizard_core.runs.session import Session
@@ -88,6 +92,28 @@ def test_loading_and_compiling_are_told_apart(runs):
     assert record.codec.jit_s >= 0
     assert record.memory.peak_load_bytes >= 0
     assert record.train.pictures_in == "host"
+
+
+@pytest.mark.parametrize(("kernels", "others"), [("", True), ("reference", False)])
+def test_a_file_that_prefers_other_kernels_is_timed_with_the_default_ones_too(
+    toy_plugins: PluginManager, monkeypatch, kernels, others
+):
+    declared = {"devices": ["cpu"], "dtypes": ["float32"], "exactness": "approx-uint8", "kernels": kernels}
+    features = [*toy_plugins.rasterizers.entry("reference").declared["features"]]
+    entry = Entry("rasterizer", "own", "own_rasterizer:Own", "a fake", {**declared, "features": features}, "a", "1")
+    own = type("Own", (ReferenceRasterizer,), {"info": RasterizerInfo.from_entry(entry)})
+    monkeypatch.setitem(sys.modules, "own_rasterizer", SimpleNamespace(Own=own))
+    monkeypatch.setitem(toy_plugins.rasterizers._entries, "own", entry)
+    session = Session(toy_plugins, torch.device("cpu"), lambda line: None)
+    resolved = resolve(toy_plugins.methods.load("toy"), rate="r1", scene="demo:tiny")
+    model = toy_plugins.methods.load("toy")(toy_plugins, resolved.config).create_model(session.scene(resolved), None)
+
+    def open_model() -> Opened:
+        return Opened(model.eval().requires_grad_(False), {"prefer": ["own"]})
+
+    speed = measure(session, resolved, open_model, metrics=["psnr"])["speed"]
+    assert speed["drawn_by"] == {"own": kernels or "own"}
+    assert list(speed.get("default_fps", {})) == (["reference"] if others else [])
 
 
 def test_only_quick_metrics_are_computed_on_the_way(runs, tmp_path_factory):

@@ -56,6 +56,11 @@ class Context(Params):
     units: Literal["values", "steps"] = Field(
         "values", description="what the network predicts scales and offsets in; steps learns faster, same file"
     )
+    start: Literal["network", "statistics"] = Field(
+        "network",
+        description="network: all of it at random, as published; statistics: at mean and deviation of each column of "
+        "the anchors at the set-up, slices adding nothing",
+    )
     refine: bool = Field(False, description="also predict scales and offsets better from all features")
     neighbors: int = Field(50, ge=1, description="neighbours that decide whether an anchor is an outlier")
     contamination: float = Field(0.05, ge=0, lt=1, description="share of anchors that the triplane's axes ignore")

@@ -115,6 +115,15 @@ class CatContext(nn.Module):
                 start += len(column)
         bias[start:] = 0
 
+    @torch.no_grad()
+    def start_slices_at_random(self, generator: torch.Generator) -> None:
+        """Draw the last layers of the slices' networks too, as torch draws a linear layer: U(±1 / sqrt(inputs))."""
+        for network in self.slices.networks.values():
+            last = linear_layers(network)[1]
+            for parameter in (last.weight, last.bias):
+                drawn = torch.rand(parameter.shape, generator=generator)
+                parameter.copy_((2 * drawn - 1) / math.sqrt(last.in_features))
+
     @property
     def units(self) -> tuple[float, float, float]:
         """Units of the network's means and scales by group."""

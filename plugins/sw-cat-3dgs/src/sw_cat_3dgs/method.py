@@ -42,6 +42,8 @@ class Cat3DGS(Method):
                 f"scene '{scene.name}' has no start points: anchors need SfM points, or random ones", path=scene.path
             )
         context = CatContext(self.shape(), generator)
+        if config.context.start == "network":
+            context.start_slices_at_random(generator)
         context.in_steps = config.context.units == "steps"
         return CatAnchors.from_points(
             scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets, feature_dim=config.feature_dim,

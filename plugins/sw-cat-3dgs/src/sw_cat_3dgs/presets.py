@@ -44,6 +44,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "context.slices": [4, 6, 10, 12],
         "context.slice_hidden": 32,
         "context.units": "steps",
+        "context.start": "statistics",
         "rate_term.scale": 0.25,
         "rate_term.triplane_sample": 0.125,
         "codec.weights": "float16",

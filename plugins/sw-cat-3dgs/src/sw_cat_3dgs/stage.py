@@ -94,7 +94,8 @@ class CatStage(CodedAnchorStage):
         context.fit_frame(model.positions(), neighbors=settings.neighbors, contamination=settings.contamination)
         for i, plane in enumerate(context.triplane.initial(resolution, self.plane_draws)):
             optimizer.replace(model, f"context.triplane.planes.{i}", plane)
-        context.start_at(model.raw(torch.nonzero(model.kept()).squeeze(1)))
+        if settings.start == "statistics":
+            context.start_at(model.raw(torch.nonzero(model.kept()).squeeze(1)))
         log.debug("triplane of base resolution %d for %d anchors", resolution, model.num_rows)
 
     def train_spatial_models(self, model: CatAnchors) -> None:

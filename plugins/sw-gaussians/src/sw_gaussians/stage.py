@@ -17,6 +17,7 @@ from splatwizard_core.api import (
 from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians import tasks
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.moments import keep_moments
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 from sw_gaussians.statistics import collect_statistics
 
@@ -48,6 +49,7 @@ class ThreeDGSStage(Stage):
             )
         self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
+        self._optimizer: SplatOptimizer | None = None
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
     def steps(self, steps: int) -> int:
@@ -72,8 +74,17 @@ class ThreeDGSStage(Stage):
             ParamGroup("quats", lr=lr.quats),
         ]
         if self.config.sparse_adam == "off":
-            return SplatOptimizer(model, groups)
-        return SparseSplatOptimizer(model, groups, bias_correction=self.config.sparse_adam)
+            self._optimizer = SplatOptimizer(model, groups)
+        else:
+            self._optimizer = SparseSplatOptimizer(model, groups, bias_correction=self.config.sparse_adam)
+        return self._optimizer
+
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        """Return the model, with Adam's moments beside it for whoever goes on from here."""
+        if self._optimizer is not None and self._optimizer.model is model:
+            keep_moments(model, self._optimizer)
+        self._optimizer = None
+        return model
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         lr, chain = self.config.lr, self.config.mcmc

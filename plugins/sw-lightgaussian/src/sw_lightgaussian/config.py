@@ -1,6 +1,6 @@
 """Hyper-parameters of LightGaussian. Defaults: the authors' scripts, which is what the paper's figures belong to."""
 
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from sw_finetuning.distillation import DistillLoss
@@ -56,6 +56,9 @@ class Prune(Params):
     decay: float = Field(1.0, gt=0, le=1, description="the i-th of these steps removes percent x decay^i")
     count_rule: CountRule = Field(
         "exact", description="official: all up to the score at index int(share (N - 1)), as in the authors' code"
+    )
+    optimizer: Literal["restored", "fresh"] = Field(
+        "restored", description="Adam goes on as the 3DGS training left it, as in the authors' code, or starts afresh"
     )
     lr: PruneRates = Field(PruneRates(), description="step sizes")
 

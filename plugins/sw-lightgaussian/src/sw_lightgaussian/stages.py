@@ -2,19 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING
 
 from sw_finetuning.distillation import DistillationStage
 from sw_finetuning.fine_tuning import FineTuningStage
 from sw_finetuning.importance import KeepImportance, ScoredGaussians
 from sw_finetuning.pruning import PruneByScore
+from sw_gaussians.moments import restore_moments
 from sw_gaussians.statistics import collect_statistics
 
 from splatwizard_core.api import ConfigError, GaussianModel, Pruner
 from sw_lightgaussian.config import LightGaussianConfig
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import OptimizationParams, PipelineParams, Scheduler, SplatModel, StageContext
+    from splatwizard_core.api import (
+        OptimizationParams,
+        PipelineParams,
+        Scene,
+        Scheduler,
+        SplatModel,
+        SplatOptimizer,
+        StageContext,
+    )
+
+log = logging.getLogger(__name__)
 
 
 class PruneStage(FineTuningStage):
@@ -28,6 +40,12 @@ class PruneStage(FineTuningStage):
         super().__init__(config, config.prune.lr, lambda_dssim=config.lambda_dssim)
         self.config, self.pruner = config, pruner
         self.statistics = pruner.uses_statistics
+
+    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        optimizer = super().create_optimizer(model, scene)
+        if self.config.prune.optimizer == "restored" and not restore_moments(model, optimizer):
+            log.info("the scene that pruning starts from came without Adam's moments: they start afresh")
+        return optimizer
 
     @property
     def iterations(self) -> int:

@@ -94,6 +94,7 @@ def register_rasterizers(registry: Registry) -> None:
             exactness="exact",
             speed=speed,
             native="sw_rasterizers.native:MODULE",
+            **({} if name == "standard" else {"kernels": "standard"}),
         )
     registry.add(
         "2dgs",
@@ -140,4 +141,5 @@ def register_rasterizers(registry: Registry) -> None:
             exactness="exact",
             speed=speed,
             native="sw_rasterizers.native:MODULE",
+            kernels="standard",
         )

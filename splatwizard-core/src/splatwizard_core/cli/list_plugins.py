@@ -51,7 +51,8 @@ def _print(found: dict[str, Any]) -> None:
         by_kind: dict[str, list[str]] = {}
         for entry in row["provides"]:
             default = " (default)" if entry.get("default") else ""
-            by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]) + default)
+            kernels = f" (kernels of {escape(str(entry['kernels']))})" if entry.get("kernels") else ""
+            by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]) + default + kernels)
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if row["error"]:
             lines.append(f"[red]broken: {escape(row['error'])}[/red]")

@@ -40,6 +40,7 @@ class RasterizerInfo:
     min_cc          lowest CUDA compute capability
     needs           features that every request must hold: a rasterizer of surfels draws nothing else
     profiles        sets of constants and quirks that `RasterOptions.profile` may name
+    kernels         name of the rasterizer whose kernels draw; empty: its own
     per_device      device -> what is different there; see `on`
     """
 
@@ -54,6 +55,7 @@ class RasterizerInfo:
     min_cc: tuple[int, int] | None = None
     needs: frozenset[str] = frozenset()
     profiles: tuple[str, ...] = ()
+    kernels: str = ""
     per_device: Mapping[str, DeviceInfo] = field(default_factory=dict)
 
     @classmethod

@@ -79,6 +79,11 @@ class NegotiatedRasterizer:
             features=frozenset().union(*(i.features for i in self._usable)),
         )
 
+    @property
+    def drawn_by(self) -> dict[str, str]:
+        """Names in `served` -> the rasterizer whose kernels each one draws with."""
+        return {name: self._registry.entry(name).declared.get("kernels") or name for name in sorted(self.served)}
+
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view with the rasterizer that serves it best. Raises CapabilityError if none does."""
         return self._delegate(Feature.asked_by(opt, g), lambda r: r.render(g, cam, opt))

@@ -21,6 +21,7 @@ from splatwizard_core.runs.decode import import_method, open_model
 from splatwizard_core.runs.environment import describe_environment
 from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, picked
 from splatwizard_core.runs.session import Session
+from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene, View
 from splatwizard_native import CoreTime, MemoryMeter, synchronize
@@ -86,18 +87,26 @@ def measure(
     # CUDA's allocator knows all that is held; a resident set only grows by what was measured piece by piece.
     model_bytes = meter.current_bytes() if meter.kind == "cuda" else decoded_bytes + meter.current_bytes()
 
+    def draw(with_: NegotiatedRasterizer) -> Callable[[Camera], torch.Tensor]:
+        return lambda camera: quality.render_view(model, camera, with_, options).image
+
     report: SpeedReport | None = None
     contended: dict[str, float] = {}
+    drawn: dict[str, Any] = {}
     speed_views = views
     if len(views) < FEWEST_SPEED_VIEWS:
         tested = {view.name for view in views}
         speed_views = [*views, *(view for view in scene.train if view.name not in tested)]
     if speed and speed_views:
         cameras, cores = [view.camera.to(device) for view in speed_views], CoreTime()
-        report = measure_speed(
-            lambda c: quality.render_view(model, c, rasterizer, options).image, cameras, device, repeats=repeats
-        )
+        report = measure_speed(draw(rasterizer), cameras, device, repeats=repeats)
         contended = contention("render", cores)
+        drawn |= {"drawn_by": rasterizer.drawn_by}
+        default = session.rasterizer(resolved, ())
+        draw(default)(cameras[0])
+        if set(default.drawn_by.values()) != set(rasterizer.drawn_by.values()):  # methods are compared by one
+            fps = measure_speed(draw(default), cameras, device, repeats=repeats).fps
+            drawn |= {"default_fps": {"+".join(sorted(set(default.drawn_by.values()))): fps}}
     result = quality.evaluate(
         model, views, rasterizer, plugins,
         device=device, options=options, quantize8=scene.protocol.quantize8, metrics=metrics,
@@ -135,7 +144,7 @@ def measure(
             "peak_load_bytes": peak_load,
             "peak_render_bytes": report.peak_bytes + (0 if report.memory_kind == "cuda" else model_bytes),
         }
-        found |= {"speed": picked(SpeedBlock, measured), "memory": picked(MemoryBlock, measured)}
+        found |= {"speed": picked(SpeedBlock, measured, drawn), "memory": picked(MemoryBlock, measured)}
     return found
 
 

@@ -104,6 +104,10 @@ class SpeedBlock(Part):
         description="of fps and the latencies over the repeats"
     )
     image_size: tuple[int, int] = Field(description="width, height of the first view drawn")
+    drawn_by: dict[str, str] = Field({}, description="rasterizers that drew the frames -> whose kernels those are")
+    default_fps: dict[str, float] = Field(
+        {}, description="`fps` by the kernels that draw where a file names none; empty: those drew the frames"
+    )
 
 
 class MemoryBlock(Part):

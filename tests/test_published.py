@@ -1,0 +1,103 @@
+"""benchmarks/published.py: rows are run once, put beside what was published, and missing data is named."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+
+import pytest
+
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.config import parse_set, resolve
+
+SCRIPT = Path(__file__).parents[1] / "benchmarks" / "published.py"
+RECORD = {
+    "metrics": {"psnr": {"mean": 31.5}, "ssim": {"mean": 0.9}}, "file": {"bytes": 1234}, "test_views": 2,
+    "counts": {"num_gaussians": 50}, "train": {"steps": 5}, "protocol": {"id": "demo/64x48"},
+}  # fmt: skip
+
+
+@pytest.fixture
+def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    spec = importlib.util.spec_from_file_location("published", SCRIPT)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, "published", module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture
+def start(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
+    """Run the command on three fake rows; returns the commands given to `sw` and what was printed."""
+    real = script.read_rows(script.ROWS)[0]
+    rows = [
+        {**vars(real), "method": "3dgs", "rate": "r6", "scene": "demo:tiny", "dataset": "", "sets": [], "differs": []},
+        {**vars(real), "scene": "absent", "dataset": "nowhere", "verified": False},
+    ]
+    path = tmp_path / "rows.json"
+    path.write_text(json.dumps({"rows": rows}))
+
+    def started(*arguments: str) -> tuple[list[list[str]], str]:
+        given = []
+
+        def run(command, **_):
+            given.append(command[3:])
+            out = Path(command[command.index("--out") + 1])
+            folder = out / "demo-tiny" / "3dgs" / "r6"
+            folder.mkdir(parents=True)
+            (folder / "metrics.json").write_text(json.dumps(RECORD))
+            return SimpleNamespace(returncode=0)
+
+        monkeypatch.setattr(script.subprocess, "run", run)
+        monkeypatch.setattr(sys, "argv", ["published.py", str(tmp_path / "out"), "--rows", str(path), *arguments])
+        assert script.main() == 0
+        return given, capsys.readouterr().out
+
+    return started
+
+
+def test_a_row_is_run_once_and_stands_beside_what_was_published(start, monkeypatch, tmp_path):
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
+    given, told = start("--set", "iterations=5")
+    assert [words[:3] for words in given] == [["run", "--method", "3dgs"]]
+    assert given[0][-2:] == ["--set", "iterations=5"]
+    assert "31.50 / 35.04" in told
+    assert "1,234 / 1,313,656" in told
+    assert f"{tmp_path / 'nowhere' / 'absent'} is not there" in told
+    assert "not re-read" in told
+    given, told = start()
+    assert given == []
+    assert "31.50 / 35.04" in told
+
+
+def test_without_data_nothing_runs_but_what_needs_none(start, monkeypatch):
+    monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
+    _, told = start()
+    assert "nowhere/absent: SPLATWIZARD_DATA is not set" in told
+    given, told = start("--table", "--only", "absent")
+    assert given == []
+    assert "is not" not in told.replace("not re-read", "").replace("not measured yet", "")
+
+
+def test_the_rows_can_be_run_and_say_where_they_come_from(script):
+    rows, plugins = script.read_rows(script.ROWS), load_plugins()
+    assert len({(r.name, r.preset) for r in rows}) == len(rows)
+    for row in rows:
+        resolve(plugins.methods.load(row.method), row.preset, row.rate, sets=parse_set(row.sets), scene="demo:tiny")
+        assert row.source
+        assert row.protocol
+        assert 2020 < row.year < 2030
+        assert row.psnr is not None
+    assert any(not row.verified for row in rows)
+
+
+def test_a_row_with_a_wrong_field_is_named(script, tmp_path):
+    path = tmp_path / "rows.json"
+    path.write_text(json.dumps({"rows": [{"method": "3dgs", "psnrr": 3}]}))
+    with pytest.raises(SystemExit, match=r"row 1.*psnrr"):
+        script.read_rows(path)

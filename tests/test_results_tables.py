@@ -1,0 +1,107 @@
+"""tools/results.py: every table of README.md and docs/results.md is what its records say."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+@pytest.fixture
+def tools(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+    for name in ("results", "result_records"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    return importlib.import_module("results")
+
+
+@pytest.fixture
+def record(tools: ModuleType):
+    return tools.read(ROOT / "docs" / "records" / "demo.jsonl")[0]
+
+
+def test_every_table_is_what_its_records_say(tools):
+    for page in tools.PAGES:
+        text = page.read_text("utf-8")
+        assert tools.MARKED.search(text), f"{page.name} has no table made from records"
+        assert tools.filled(text) == text, "python tools/results.py tables"
+
+
+def test_a_table_that_was_changed_by_hand_is_found(tools):
+    page = tools.PAGES[1].read_text("utf-8")
+    changed = re.sub(r"(<!-- table brief demo -->.*?)\d\d\.\d\d", r"\g<1>99.99", page, count=1, flags=re.S)
+    assert changed != page
+    assert tools.filled(changed) == page
+
+
+def test_every_record_file_is_shown_and_every_record_is_read(tools):
+    shown = {found[3] for page in tools.PAGES for found in tools.MARKED.finditer(page.read_text("utf-8"))}
+    for path in tools.RECORDS.glob("*.jsonl"):
+        assert path.stem in shown
+        assert tools.read(path)
+
+
+def test_mean_deviation_and_number_of_seeds(tools, record):
+    runs = [replace(record, seed=i, psnr=30.0 + i, gaussians=100, bytes=1000) for i in range(3)]
+    exact = [replace(run, rate="r6", bytes=24_800, default_rate=True) for run in runs]
+    head, *rows = tools.quality_table([*runs, *exact])
+    cell = {row[1]: dict(zip(head, row, strict=True)) for row in rows}
+    assert cell["r1"]["PSNR dB"] == "31.00 ± 1.00"
+    assert (cell["r1"]["n"], cell["r1"]["x"], cell["r6 *"]["x"]) == ("3", "24.8 ± 0.0", "1.0 ± 0.0")
+
+
+def test_what_was_not_measured_alone_is_no_time(tools, record):
+    shared = replace(record, default_rate=True, alone=False, fps_alone=False)
+    head, row = tools.cost_table([shared])
+    assert [row[head.index(name)] for name in ("train s", "FPS, its own", "FPS, one rasterizer for all")] == ["-"] * 3
+    alone = replace(shared, alone=True, fps_alone=True, fps=200.0, default_fps=100.0, rasterizer="flash")
+    _, row = tools.cost_table([alone])
+    assert [row[head.index(name)] for name in ("FPS, its own", "FPS, one rasterizer for all")] == ["200", "100"]
+
+
+def test_runs_are_collected_and_replace_what_they_repeat(tools, tmp_path):
+    finished = ROOT / "tests" / "golden" / "runs_0_1" / "finished"
+    (path,) = tools.collect([finished], tmp_path)
+    (found,) = tools.read(path)
+    metrics = json.loads(next(finished.rglob("metrics.json")).read_text())
+    assert (found.method, found.rate, found.bytes) == ("speedy-splat", "r3", metrics["file"]["bytes"])
+    assert found.psnr == metrics["metrics"]["psnr"]["mean"]
+    tools.write([replace(found, psnr=1.0), replace(found, seed=7)], path)
+    tools.collect([finished], tmp_path)
+    assert sorted((r.seed, r.psnr) for r in tools.read(path)) == [(found.seed, found.psnr), (7, found.psnr)]
+    tools.write([replace(found, protocol="another")], path)
+    tools.write([replace(found, protocol="another", seed=9)], path)
+    with pytest.raises(SystemExit, match="several protocols"):
+        tools.collect([finished], tmp_path)
+
+
+def test_what_the_matrix_measured_alone_counts(tools, tmp_path):
+    import shutil
+
+    source = next((ROOT / "tests" / "golden" / "runs_0_1" / "finished").rglob("metrics.json"))
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(source, run)
+    speed = {"fps": 900.0, "default_fps": {"standard": 300.0}, "drawn_by": {"flash": "flash"}}
+    quiet = {"speed": speed, "memory": {"kind": "cuda", "peak_render_bytes": 5}}
+    (run / "matrix.json").write_text(json.dumps({"command": "sw run", "processes_per_gpu": 3, "quiet": quiet}))
+    (path,) = tools.collect([run], tmp_path / "records")
+    (found,) = tools.read(path)
+    assert (found.fps, found.default_fps, found.rasterizer, found.default_rasterizer) == (900, 300, "flash", "standard")
+    assert (found.fps_alone, found.alone, found.command, found.render_bytes) == (True, False, "sw run", 5)
+
+
+def test_a_line_that_is_no_record_is_named(tools, tmp_path):
+    (tmp_path / "x.jsonl").write_text('{"method": "3dgs"}\n')
+    with pytest.raises(SystemExit, match="line 1"):
+        tools.table("brief", "x", tmp_path)
+    with pytest.raises(SystemExit, match="no table is called"):
+        tools.table("other", "x", tmp_path)

@@ -1,0 +1,225 @@
+"""Make every table of measured runs in docs/results.md and README.md from the small records in docs/records.
+
+    python tools/results.py collect OUT...       # records of all runs under OUT into docs/records, then the tables
+    python tools/results.py tables               # the tables alone
+    python tools/results.py tables --check       # status 1 where a table and its records disagree; writes nothing
+
+A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
+file docs/records/SCENE.jsonl. Values are means over the seeds ± the deviation of the sample (n - 1).
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+import sys
+from collections import defaultdict
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from result_records import MIB, RECORDS, ROOT, SmallRecord, extract, merged, read, write
+
+from splatwizard_core.tooling import load_plugins
+
+PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md")
+MARKED = re.compile(r"(<!-- table (\w[\w-]*) (\w[\w.-]*) -->\n).*?(<!-- end -->)", re.S)
+PLY_BYTES = 248  # of a Gaussian in a float32 .ply of SH degree 3
+BASE = "3dgs"
+TITLES = {
+    "3dgs": "3DGS", "trimming-the-fat": "Trimming the Fat", "pup-3dgs": "PUP-3DGS", "speedy-splat": "Speedy-Splat",
+    "lightgaussian": "LightGaussian", "chimerags": "ChimeraGS", "hac": "HAC", "cat-3dgs": "CAT-3DGS",
+}  # fmt: skip
+NONE = "-"
+
+Rows = Sequence[SmallRecord]
+
+
+def spread(values: Sequence[float | None], digits: int) -> str:
+    """Write mean ± deviation of the values; "-" if one of them is missing or there is none."""
+    known = [value for value in values if value is not None]
+    if not known or len(known) < len(values):
+        return NONE
+    mean = f"{statistics.fmean(known):,.{digits}f}"
+    return mean if len(known) == 1 else f"{mean} ± {statistics.stdev(known):,.{digits}f}"
+
+
+def points(records: Rows) -> list[list[SmallRecord]]:
+    """Group the records of one scene by method, variant and rate point, largest file of a method first."""
+    groups = defaultdict(list)
+    for record in records:
+        groups[record.method, record.variant, record.rate].append(record)
+    order = list(TITLES)
+
+    def place(group: list[SmallRecord]) -> tuple[int, str, str, float]:
+        first = group[0]
+        known = order.index(first.method) if first.method in order else len(order)
+        return known, first.method, first.variant, -statistics.fmean(r.bytes for r in group)
+
+    return sorted((sorted(group, key=lambda r: r.seed) for group in groups.values()), key=place)
+
+
+def smaller(group: Rows, records: Rows) -> list[float | None]:
+    """Divide the float32 .ply of the same seed's 3DGS by each file."""
+    plain = [r for r in records if r.method == BASE and not r.variant]
+    exact = max((r.rate for r in plain), default="")
+    base = {r.seed: PLY_BYTES * r.gaussians for r in plain if r.rate == exact and r.gaussians}
+    return [base[r.seed] / r.bytes if r.seed in base else None for r in group]
+
+
+def title(group: Rows) -> str:
+    """Name a method and its variant."""
+    first = group[0]
+    return f"{TITLES.get(first.method, first.method)}{f' ({first.variant})' if first.variant else ''}"
+
+
+def rate(group: Rows) -> str:
+    """Name a rate point; the default one is marked."""
+    return f"{group[0].rate} *" if group[0].default_rate else group[0].rate
+
+
+def quality_table(records: Rows) -> list[list[str]]:
+    """Quality and size at every rate point."""
+    has_lpips = any(r.lpips is not None for r in records)
+    head = ["method", "rate", "PSNR dB", "SSIM", *(["LPIPS"] if has_lpips else []), "bytes", "x", "Gaussians",
+            "anchors", "encode s", "decode s", "n"]  # fmt: skip
+    rows = [head]
+    for group in points(records):
+        lpips = [spread([r.lpips for r in group], 4)] if has_lpips else []
+        rows.append([
+            title(group), rate(group), spread([r.psnr for r in group], 2), spread([r.ssim for r in group], 4), *lpips,
+            spread([r.bytes for r in group], 0), spread(smaller(group, records), 1),
+            spread([r.gaussians for r in group], 0), spread([r.anchors for r in group], 0),
+            spread([r.encode_s for r in group], 2), spread([r.decode_s for r in group], 2), str(len(group)),
+        ])  # fmt: skip
+    return rows
+
+
+def cost_table(records: Rows) -> list[list[str]]:
+    """Time and memory at every default rate point: rendering alone on the GPU, with the rasterizer that drew."""
+    rows = [["method", "rate", "starts from", "taught by", "steps", "train s", "start s", "train MiB", "rendering MiB",
+             "FPS, one rasterizer for all", "FPS, its own", "drawn by", "n"]]  # fmt: skip
+    for group in points([r for r in records if r.default_rate]):
+        first = group[0]
+        alone, quiet = all(r.alone for r in group), all(r.fps_alone for r in group)
+        steps = sorted({r.steps for r in group if r.steps is not None})
+        rows.append([
+            title(group), rate(group), first.starts_from, ", ".join(first.taught_by) or NONE,
+            " / ".join(f"{n:,}" for n in steps) or NONE,
+            spread([r.train_s for r in group], 0) if alone else NONE,
+            spread([r.start_s for r in group], 0) if alone else NONE,
+            spread([None if r.train_bytes is None else r.train_bytes / MIB for r in group], 0),
+            spread([r.render_bytes / MIB for r in group], 0),
+            spread([r.default_fps for r in group], 0) if quiet else NONE,
+            spread([r.fps for r in group], 0) if quiet else NONE,
+            first.rasterizer or NONE, str(len(group)),
+        ])  # fmt: skip
+    return rows
+
+
+def brief_table(records: Rows) -> list[list[str]]:
+    """Default rate points, and every file of 3DGS, for a first look."""
+    rows = [["method", "rate", "PSNR, dB", "bytes", "x", "Gaussians", "n"]]
+    rows += [
+        [title(g), rate(g), spread([r.psnr for r in g], 2), spread([r.bytes for r in g], 0),
+         spread(smaller(g, records), 1), spread([r.gaussians for r in g], 0), str(len(g))]
+        for g in points(records) if g[0].default_rate or g[0].method == BASE
+    ]  # fmt: skip
+    return rows
+
+
+TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
+    "quality": quality_table, "cost": cost_table, "brief": brief_table,
+}  # fmt: skip
+
+
+def table(name: str, scene: str, records_at: Path = RECORDS) -> str:
+    """Write one table, and below it where its records come from. Raises SystemExit for a name that is none."""
+    if name not in TABLES:
+        raise SystemExit(f"no table is called '{name}'; one of {', '.join(TABLES)}")
+    path = records_at / f"{scene}.jsonl"
+    if not path.exists():
+        return f"*No records of {scene} yet.*\n"
+    records = read(path)
+    if len({r.protocol for r in records}) > 1:
+        raise SystemExit(f"{path}: runs of several protocols cannot stand in one table")
+    head, *rows = TABLES[name](records)
+    left = [f"| {' | '.join(row)} |" for row in rows]
+    first = records[0]
+    devices, dates = sorted({r.device for r in records}), sorted({r.date for r in records})
+    views = f"{first.train_views} training and {first.test_views} test views of {first.images}"
+    presets = "/".join(sorted({r.preset for r in records}))
+    when = dates[0] if len(dates) == 1 else f"{dates[0]} to {dates[-1]}"
+    source = f"{views}, protocol `{first.protocol}`, preset {presets}; {', '.join(devices)}, {when}"
+    return "\n".join([f"| {' | '.join(head)} |", "|---" * len(head) + "|", *left, "", f"{source}.", ""])
+
+
+def filled(text: str, records_at: Path = RECORDS) -> str:
+    """Return a page with all its tables made anew."""
+    return MARKED.sub(lambda m: f"{m[1]}{table(m[2], m[3], records_at)}{m[4]}", text)
+
+
+def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "") -> list[Path]:
+    """Keep the small records of all runs under `roots`, by scene; one with the key of an older one takes its place.
+
+    name    of the file in place of the scene's, if all runs are of one scene
+
+    Raises SystemExit where there is no run, or the runs of several protocols would come together.
+    """
+    plugins = load_plugins()
+    runs = sorted(
+        {path.parent for root in roots for path in root.rglob("metrics.json") if ".trained" not in path.parts}
+    )
+    if not runs:
+        raise SystemExit(f"no metrics.json below {', '.join(map(str, roots))}")
+    by_file = defaultdict(list)
+    for run in runs:
+        record = extract(run, plugins)
+        by_file[name or record.scene].append(record)
+    written = []
+    for file, new in by_file.items():
+        path = records_at / f"{file}.jsonl"
+        found = merged(read(path) if path.exists() else [], new)
+        if len({r.protocol for r in found}) > 1:
+            told = ", ".join(sorted({r.protocol for r in found}))
+            raise SystemExit(f"{path} would hold several protocols ({told}): keep them apart by --name")
+        write(found, path)
+        written.append(path)
+    return written
+
+
+def main() -> int:
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(dest="command", required=True)
+    gather = commands.add_parser("collect", help="records of runs, then the tables")
+    gather.add_argument("out", nargs="+", type=Path, metavar="OUT", help="where runs lie, at any depth")
+    gather.add_argument("--name", default="", help="of the file in docs/records (default: the scene)")
+    gather.add_argument("--fresh", action="store_true", help="drop the records that are there first")
+    write_tables = commands.add_parser("tables", help="the tables from the records")
+    write_tables.add_argument("--check", action="store_true", help="write nothing, status 1 where they disagree")
+    args = parser.parse_args()
+    if args.command == "collect":
+        if args.fresh and args.name:
+            (RECORDS / f"{args.name}.jsonl").unlink(missing_ok=True)
+        elif args.fresh:
+            parser.error("--fresh needs --name")
+        for path in collect(args.out, name=args.name):
+            print(path)
+    stale = []
+    for page in PAGES:
+        text = page.read_text("utf-8")
+        made = filled(text)
+        if made != text:
+            stale.append(page)
+            if args.command == "collect" or not args.check:
+                page.write_text(made, encoding="utf-8")
+                print(f"{page}: tables rewritten")
+    if args.command == "tables" and args.check and stale:
+        print(f"tables and docs/records disagree in {', '.join(p.name for p in stale)}: python tools/results.py tables")
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
