@@ -14,6 +14,7 @@ from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.paths import output_file as output_file
 from splatwizard_core.cli.paths import output_folder as output_folder
 from splatwizard_core.cli.setup import Choices as Choices
+from splatwizard_core.coding.container import decoded_limit as decoded_limit
 from splatwizard_core.cores import available_cores as available_cores
 from splatwizard_core.errors import NativeBuildError as NativeBuildError
 from splatwizard_core.errors import PluginError as PluginError
@@ -26,6 +27,9 @@ from splatwizard_core.files import new_folder as new_folder
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.files import write_atomic as write_atomic
 from splatwizard_core.files import write_json as write_json
+from splatwizard_core.memory import peak_rss_bytes as peak_rss_bytes
+from splatwizard_core.memory import reset_peak_rss as reset_peak_rss
+from splatwizard_core.memory import rss_bytes as rss_bytes
 from splatwizard_core.native.build import declared_modules as declared_modules
 from splatwizard_core.native.loader import cache_root as cache_root
 from splatwizard_core.native.toolchain import find_compiler as find_compiler
@@ -39,6 +43,7 @@ from splatwizard_core.plugins.registry import Entry as Entry
 from splatwizard_core.progress import Bar as Bar
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve as resolve
+from splatwizard_core.runs.decode import open_model as open_model
 from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.lock import directory_lock as directory_lock
@@ -51,6 +56,7 @@ from splatwizard_core.runs.record import SCHEMA as SCHEMA
 from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import read_record as read_record
 from splatwizard_core.runs.run import run as run
+from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
