@@ -241,6 +241,13 @@ def test_a_shorter_run_than_its_checkpoint_has_nothing_to_do(toy, tmp_path):
         toy.train(iterations=100, directory=tmp_path, **options)
 
 
+def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
+    """As that of a method which only encodes a trained scene."""
+    outcome = toy.train(iterations=0, directory=tmp_path)
+    assert outcome.steps == 0
+    assert toy.train(iterations=0, directory=tmp_path).model.digest() == outcome.model.digest()
+
+
 def test_a_finished_run_can_be_made_longer(toy, tmp_path):
     toy.train(iterations=100, directory=tmp_path, identity={"iterations": 100})
     steps = []

@@ -29,7 +29,7 @@ log = logging.getLogger(__name__)
 
 CPU = torch.device("cpu")
 STEPS = 40
-HOSTILE = 150
+HOSTILE = 100
 """How many damaged files the decoder is shown."""
 HOSTILE_S = 120
 
@@ -53,6 +53,7 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
         hold(psnr is not None and math.isfinite(psnr), f"the PSNR is {psnr}", "the decoded scene cannot be drawn")
         model = train_in(session, whole, directory).model
         steps = sum(stage.iterations for stage in entry.load()(plugins, resolved.config).stages())
+        resumed = "resumes bit-equal" if steps > 1 else "nothing to resume"
         if steps > 1:
             _check_resume(model.digest(), halved, plugins, steps // 2)
         _check_encoding(entry.load()(plugins, resolved.config), model)
@@ -64,7 +65,7 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
             "decode() must be a function of the file: no random numbers, no state",
         )
         hostile = _check_hostile(file)
-    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; resumes bit-equal; {hostile}"
+    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}; {hostile}"
 
 
 def _lengths(config: type[Params], prefix: str = "") -> Iterator[str]:
