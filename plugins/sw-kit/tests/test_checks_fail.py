@@ -146,7 +146,7 @@ class NoBackground(NeedsAnArgument):
 @pytest.mark.parametrize(
     ("kind", "target", "declared", "said"),
     [("pruner", NeedsAnArgument, {}, "cannot be made with its defaults"),
-     ("pruner", NoBackground, {}, "cannot be called as the contract's"),
+     ("pruner", NoBackground, {}, "cannot be called so"),
      ("pruner", object, {}, r"has no score\(\)"),
      ("metric", lambda render: 0.0, {}, "cannot be called with 2 arguments"),
      ("command", print, {}, "use @click.command"),
@@ -253,7 +253,8 @@ class BadMethod(Method):
     [({"name": "other"}, {}, "called 'other'"), ({}, {"rates": ["r1", "r2"]}, "rates are declared"),
      ({"PRESETS": {"paper": {}}}, {"presets": ["paper"]}, "no preset quick"),
      ({"DEFAULT_RATE": "r9"}, {}, "DEFAULT_RATE is 'r9'"), ({"Config": Config}, {}, "no description of strength"),
-     ({"RATES": {"r1": {"no_such_key": 1}}}, {}, "no_such_key"), ({"stages": lambda self: []}, {}, "return one or more")],
+     ({"RATES": {"r1": {"no_such_key": 1}}}, {}, "no_such_key"),
+     ({"stages": lambda self: []}, {}, "return one or more")],
 )  # fmt: skip
 def test_declarations_of_a_method_that_do_not_fit_it(entry_of, changes, declared, said):
     entry = entry_of("method", type("Changed", (BadMethod,), changes), **declared)

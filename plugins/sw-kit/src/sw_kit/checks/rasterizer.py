@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import TYPE_CHECKING
 
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -29,13 +30,13 @@ def check_rasterizer(entry: Entry, plugins: PluginManager) -> str:
     )
     facts = checks_for(rasterizer.info)
     for fact in facts:
-        _held(str(fact), lambda fact=fact: fact(rasterizer, "cpu"))
+        _held(str(fact), functools.partial(fact, rasterizer, "cpu"))
     if rasterizer.info.exactness not in ("exact", "tight"):
         return f"{len(facts)} facts hold; values are approximate, so not compared"
     cases = [case for case in GRADIENT_CASES if applies(case, rasterizer.info)]
     if entry.name != oracle.info.name:
         for case in cases:
-            _held(case.name, lambda case=case: check_against(rasterizer, oracle, case))
+            _held(case.name, functools.partial(check_against, rasterizer, oracle, case))
     return f"{len(facts)} facts hold, values and gradients of {len(cases)} scenes are the reference's"
 
 
