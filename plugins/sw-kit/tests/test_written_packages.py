@@ -60,7 +60,7 @@ def test_every_kind_but_methods_keeps_its_contract(written, tmp_path):
                                   pytest.param("post-training", marks=pytest.mark.slow),
                                   pytest.param("rasterizer", marks=pytest.mark.slow)])  # fmt: skip
 def test_a_method_passes_the_whole_check(written, tmp_path, kind):
-    """Anchors without an entropy model among them: a plain AnchorModel in an AnchorStage."""
+    """By default anchors: a plain AnchorModel in an AnchorStage. Post-training is the tutorial's."""
     found = check(written, [kind], tmp_path)
     assert [row for row in found if row["state"] != "ok"] == []
     if kind != "rasterizer":
@@ -70,6 +70,7 @@ def test_a_method_passes_the_whole_check(written, tmp_path, kind):
 
 
 @pytest.mark.pipeline
+@pytest.mark.slow
 def test_a_method_that_only_encodes_passes_too(written, tmp_path):
     """A stage without steps: what post-training methods have that only code a trained scene."""
     package = packages.write_package(tmp_path, packages.kinds()["post-training"], packages.legal_names("only-encodes"))

@@ -6,7 +6,7 @@ from sw_finetuning.fine_tuning import FineTuningRates
 
 
 class OpacityPruneConfig(OptimizationParams):
-    """What is set for training on from a trained scene; that scene's own keys are `pretrained.KEY`."""
+    """Hyper-parameters of training on from a trained scene; that scene's own keys are `pretrained.KEY`."""
 
     iterations: int = Field(5_000, ge=1, description="steps after the trained scene")
     keep: float = Field(0.5, gt=0, le=1, description="fraction of the Gaussians that stay: the most opaque ones")

@@ -192,7 +192,7 @@ def varint(value: int) -> bytes:
 
 @dataclass
 class Tally:
-    """What came of a number of files."""
+    """Outcomes of decoding a number of files."""
 
     outcomes: Counter[str] = field(default_factory=Counter)
     slowest_s: float = 0.0

@@ -30,7 +30,7 @@ class Names:
 
     @property
     def distribution(self) -> str:
-        """How it is installed: "sw-opacity-prune"."""
+        """Name of the distribution: "sw-opacity-prune"."""
         return PREFIX + self.key
 
     @property
@@ -40,7 +40,7 @@ class Names:
 
     @property
     def package(self) -> str:
-        """How it is imported: "sw_opacity_prune"."""
+        """Name of the import package: "sw_opacity_prune"."""
         return f"sw_{self.snake}"
 
     @property

@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 CPU = torch.device("cpu")
 STEPS = 40
 HOSTILE = 100
-"""How many damaged files the decoder is shown."""
+"""Number of damaged files that the decoder is shown."""
 HOSTILE_S = 120
 
 
