@@ -15,7 +15,8 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from swz_fuzzer import Mutator, Parts, Tally, attempt, blind, open_handles
+from sw_kit.hostile_files import Mutator, Parts, Tally, attempt
+from swz_fuzzer import blind, open_handles
 
 from splatwizard_core.coding.container import ContainerReader, decoded_limit
 from splatwizard_core.errors import BitstreamError, PluginError

@@ -25,7 +25,7 @@ PACKAGES = {
     "test-anchors": ROOT / "tests" / "plugins" / "sw-test-anchors",
 }
 SHORT = {
-    "opacity-prune": ("base_iterations=40", "base_preset=paper", "iterations=10"),
+    "opacity-prune": ("pretrained.iterations=40", "iterations=10"),
     "test-distill": ("base_iterations=25", "iterations=25"),
     # The opacity that keeps an anchor is raised, or none of them would have gone after so few steps.
     "test-anchors": ("iterations=50", "min_opacity=0.99", "log_every=1"),
@@ -116,5 +116,5 @@ def test_an_interrupted_training_goes_on_and_ends_as_an_uninterrupted_one(strang
 
 def test_the_plan_of_a_stranger_is_printed_stage_by_stage(strangers):
     text = strangers.run("schedule", "opacity-prune").stdout
-    assert "prune and densify" in text
+    assert "starts from a trained 3dgs scene" in text
     assert "prune by opacity" in text

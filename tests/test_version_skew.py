@@ -7,7 +7,7 @@ import zlib
 from pathlib import Path
 
 import pytest
-from swz_fuzzer import Parts
+from sw_kit.hostile_files import Parts
 
 from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins

@@ -10,6 +10,7 @@ from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
 from splatwizard_core.cli.paths import OUTPUT_FOLDER as OUTPUT_FOLDER
 from splatwizard_core.cli.paths import existing_file as existing_file
 from splatwizard_core.cli.setup import Choices as Choices
+from splatwizard_core.coding.container import decoded_limit as decoded_limit
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
@@ -27,6 +28,7 @@ from splatwizard_core.plugins.registry import Entry as Entry
 from splatwizard_core.progress import Bar as Bar
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve as resolve
+from splatwizard_core.runs.decode import open_model as open_model
 from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.lock import directory_lock as directory_lock
@@ -39,6 +41,7 @@ from splatwizard_core.runs.record import SCHEMA as SCHEMA
 from splatwizard_core.runs.record import Record as Record
 from splatwizard_core.runs.record import read_record as read_record
 from splatwizard_core.runs.run import run as run
+from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE

@@ -242,6 +242,18 @@ def test_a_shorter_run_than_its_checkpoint_has_nothing_to_do(toy, tmp_path):
         toy.train(iterations=100, directory=tmp_path, **options)
 
 
+def test_a_stage_may_have_no_steps_and_is_finished_at_once(toy, tmp_path):
+    """As that of a method which only encodes a trained scene."""
+
+    class NoSteps(toy.Stage):
+        iterations = 0
+
+    outcome = toy.train([NoSteps(OptimizationParams())], directory=tmp_path)
+    assert outcome.steps == 0
+    again = toy.train([NoSteps(OptimizationParams())], directory=tmp_path)
+    assert again.model.digest() == outcome.model.digest() == toy.make_model(toy.scene).digest()
+
+
 def test_a_finished_run_can_be_made_longer(toy, tmp_path):
     toy.train(iterations=100, directory=tmp_path, identity={"iterations": 100})
     steps = []

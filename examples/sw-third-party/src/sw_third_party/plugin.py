@@ -1,4 +1,4 @@
-"""Registers the method of this package."""
+"""Registers the method opacity-prune."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -8,5 +8,7 @@ def register_methods(registry: Registry) -> None:
     registry.add(
         "opacity-prune",
         "sw_third_party.method:OpacityPrune",
-        summary="example: train 3DGS, drop the most transparent Gaussians, train on",
+        summary="example: drop the most transparent Gaussians of a trained 3DGS scene, train on",
+        presets=["paper", "quick"],
+        rates=["r1", "r2", "r3"],
     )

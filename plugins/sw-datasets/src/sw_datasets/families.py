@@ -20,7 +20,7 @@ OUTDOOR = ("bicycle", "flowers", "garden", "stump", "treehill")
 INDOOR = ("room", "counter", "kitchen", "bonsai")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)  # each method that is generated costs every `sw` command time
 class Pictures:
     """The picture folder and the size at which a scene is used.
 
@@ -38,7 +38,7 @@ class Pictures:
         return self.by_scene.get(scene, self.folder)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False, repr=False)  # each method that is generated costs every `sw` command time
 class Family:
     """One dataset family and the rules its scenes are read by unless the user says otherwise.
 

@@ -15,6 +15,7 @@ from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins.interchange import load_ply
 from splatwizard_core.progress import track
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.decode import import_method, open_model

@@ -218,7 +218,7 @@ class TrainingRun:
         stop_after = self.stop_after
         until = iterations if stop_after is None else min(iterations, stop_after - before)
         housekeeping = Housekeeping(self, trainer, name)
-        if until > trainer.step or stop_after is None:
+        if iterations and (until > trainer.step or stop_after is None):  # a method that only encodes has no steps
             decode_all(self.scene.train)  # reading pictures is not training time
             self.progress.pictures_in = "cuda" if keep_pictures(self.scene.train, trainer.device) else "host"
             try:

@@ -1,0 +1,109 @@
+"""Checks of a package as it is installed and registered, which import none of what it provides."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import subprocess
+import sys
+from typing import TYPE_CHECKING
+
+from packaging.requirements import Requirement
+
+from sw_kit.checks.fields import check_entry
+from sw_kit.checks.imports import imports_of
+from sw_kit.finding import hold
+
+if TYPE_CHECKING:
+    from splatwizard_core.tooling import Entry, PluginInfo
+
+CORE = "splatwizard-core"
+CPU_LIMIT_S = 0.005
+TRIES = 8
+"""The least counts: a busy machine makes a try longer, never shorter."""
+FACES = ("splatwizard_core.api", "splatwizard_core.tooling")
+
+
+def check_loads(info: PluginInfo) -> str:
+    """Hold a plugin to be loaded: it imports, and its hooks do not raise."""
+    hold(info.error is None, f"the plugin is broken: {info.error}", "mend that first; --debug shows a traceback")
+    return f"{info.distribution} {info.version}, entry point '{info.key}'"
+
+
+def check_requirements(info: PluginInfo) -> str:
+    """Hold the metadata to state the core and everything else that is imported, each with the versions that fit."""
+    listed = [Requirement(text) for text in importlib.metadata.requires(info.distribution) or []]
+    by_name = {_normal(each.name): each for each in listed}
+    line = f'dependencies = ["{CORE}>=X.Y,<X.Z"]'
+    hold(CORE in by_name, f"it does not require {CORE}", f"pyproject.toml: {line}")
+    operators = {spec.operator for spec in by_name[CORE].specifier}
+    hold(
+        operators & {">=", ">", "~=", "=="} and operators & {"<", "<=", "~=", "=="},
+        f"it requires '{by_name[CORE]}', which has no lower or no upper bound",
+        f"pyproject.toml: {line}: the core may change with X.Z",
+    )
+    loose = [str(each) for each in listed if not each.specifier and not each.url]
+    hold(not loose, f"no version of {', '.join(loose)} is stated", "pyproject.toml: say since which version it works")
+    return f"{len(listed)} dependencies, versions stated"
+
+
+def check_imports(info: PluginInfo) -> str:
+    """Hold every import of the core to one of its faces, and of a package `sw_...` to one that it requires."""
+    found = imports_of(info.module.partition(".")[0])
+    inner = sorted(
+        f"{name} ({where})"
+        for name, where in found.items()
+        if name.startswith("splatwizard_core.") and not f"{name}.".startswith(tuple(f"{face}." for face in FACES))
+    )
+    hold(not inner, f"it imports {', '.join(inner[:3])}", f"only {' and '.join(FACES)} are promised: import from there")
+    declared = {_normal(Requirement(text).name) for text in importlib.metadata.requires(info.distribution) or []}
+    own = info.module.partition(".")[0]
+    others = {name.partition(".")[0] for name in found if name.startswith("sw_")} - {own}
+    undeclared = sorted(each for each in map(_normal, others) if each not in declared)
+    hold(
+        not undeclared,
+        f"it imports {', '.join(undeclared)} without requiring it",
+        "pyproject.toml: list it under `dependencies`",
+    )
+    return "through the core's faces and declared packages"
+
+
+def check_light(info: PluginInfo) -> str:
+    """Hold registration to be silent, without torch, and below 5 ms of CPU: every `sw` command waits for it."""
+    best = float("inf")
+    for _ in range(TRIES):
+        seconds, torch, noise = _registered_alone(info.module)
+        hold(not noise, f"registering prints {noise[:80]!r}", f"{info.module}: print nothing when it is imported")
+        hold(not torch, "registering imports torch", f"{info.module}: import it inside what is registered")
+        best = min(best, seconds)
+        if best < CPU_LIMIT_S:
+            break
+    hold(
+        best < CPU_LIMIT_S,
+        f"registering takes {1000 * best:.1f} ms of CPU, at most {1000 * CPU_LIMIT_S:g} ms are allowed",
+        f"{info.module}: import nothing but splatwizard_core.api",
+    )
+    return f"silent, without torch, {1000 * best:.1f} ms of CPU"
+
+
+def check_fields(entries: list[Entry]) -> str:
+    """Hold names, summaries and declared fields to what their kinds take."""
+    for entry in entries:
+        check_entry(entry)
+    kinds = [entry.kind for entry in entries]
+    counted = ", ".join(f"{kinds.count(kind)} {kind}" for kind in dict.fromkeys(kinds))
+    return counted or "registers nothing by name"
+
+
+def _registered_alone(module: str) -> tuple[float, bool, str]:
+    """CPU seconds, whether torch was imported, and what was printed, of registering in a fresh process."""
+    command = [sys.executable, "-m", "sw_kit.checks.registration_child", module]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=120)
+    hold(done.returncode == 0, f"registering fails: {done.stderr.strip()[-300:]}", f"{module}: see the message")
+    *noise, last = done.stdout.splitlines()
+    told = json.loads(last)
+    return told["cpu_s"], told["torch"], "\n".join([*noise, done.stderr.strip()]).strip()
+
+
+def _normal(name: str) -> str:
+    return name.lower().replace("_", "-").replace(".", "-")

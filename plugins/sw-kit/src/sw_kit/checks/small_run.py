@@ -1,0 +1,126 @@
+"""The small run of a method: train, resume, encode, decode elsewhere, decode again, decode what is damaged."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import math
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from splatwizard_core.api import ContainerWriter, Method, Params
+from splatwizard_core.tooling import Choices, RunRequest, Session, directory_lock, open_model, run, train_in
+from sw_kit.checks.targets import make
+from sw_kit.finding import BrokenContractError, hold
+from sw_kit.samples import TINY
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import PluginManager
+    from splatwizard_core.tooling import Entry
+
+log = logging.getLogger(__name__)
+
+CPU = torch.device("cpu")
+STEPS = 40
+HOSTILE = 100
+"""Number of damaged files that the decoder is shown."""
+HOSTILE_S = 120
+
+
+def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str] = ()) -> str:
+    """Hold a method to a whole run on `demo:tiny`: some 40 steps of its full plan, scaled down.
+
+    settings    "KEY=VALUE" besides those that make it short
+    """
+    stages = make(entry, plugins).stages()
+    sets = dict.fromkeys(_lengths(entry.load().Config), STEPS) | {"scale_schedule": "true"}
+    if any(stage.starts_from or stage.taught_by for stage in stages):
+        sets["pretrained.iterations"] = STEPS
+    words = [*(f"{key}={value}" for key, value in sets.items()), *settings]
+    resolved = Choices((entry.name,), TINY, preset="paper", sets=tuple(words), device="cpu").resolve_one(plugins)
+    with tempfile.TemporaryDirectory() as folder:
+        whole, halved = (RunRequest(resolved, Path(folder) / name) for name in ("whole", "halved"))
+        session = Session(plugins, CPU, log.debug)
+        record, directory = run(session, whole)
+        psnr = record.metrics["psnr"].mean
+        hold(psnr is not None and math.isfinite(psnr), f"the PSNR is {psnr}", "the decoded scene cannot be drawn")
+        model = train_in(session, whole, directory).model
+        steps = sum(stage.iterations for stage in entry.load()(plugins, resolved.config).stages())
+        resumed = "resumes bit-equal" if steps > 1 else "nothing to resume"
+        if steps > 1:
+            _check_resume(model.digest(), halved, plugins, steps // 2)
+        _check_encoding(entry.load()(plugins, resolved.config), model)
+        file = directory / "scene.swz"
+        digests = {open_model(file, plugins, CPU)[0].digest() for _ in range(2)}
+        hold(
+            digests == {record.file.digest},
+            "the file decodes to another model here than in a fresh process",
+            "decode() must be a function of the file: no random numbers, no state",
+        )
+        hostile = _check_hostile(file)
+    return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}; {hostile}"
+
+
+def _lengths(config: type[Params], prefix: str = "") -> Iterator[str]:
+    """Dotted keys of a configuration that are numbers of steps of a stage: all called `iterations`, or ending so."""
+    for name, field in config.model_fields.items():
+        if name.endswith("iterations"):
+            yield prefix + name
+        elif isinstance(field.annotation, type) and issubclass(field.annotation, Params):
+            yield from _lengths(field.annotation, f"{prefix}{name}.")
+
+
+def _check_resume(expected: str, request: RunRequest, plugins: PluginManager, stop_after: int) -> None:
+    """Train again, interrupted after some steps and resumed as by another process; hold it to the same model."""
+    directory = request.out / "demo-tiny" / request.resolved.method / request.resolved.rate
+    for stop in (stop_after, None):
+        session = Session(plugins, CPU, log.debug)
+        with directory_lock(directory), contextlib.suppress(KeyboardInterrupt):
+            found = train_in(session, request, directory, stop_after=stop)
+    hold(
+        found.model.digest() == expected,
+        f"a training that is interrupted after {stop_after} steps and resumed ends as another model",
+        "state lives in parameters, buffers or state_dict_extra; random numbers come from context.generator(name)",
+    )
+
+
+def _check_encoding(method: Method, model: Any) -> None:
+    before, files = model.digest(), []
+    for _ in range(2):
+        writer = ContainerWriter(method.name, method.version)
+        with torch.no_grad():
+            method.encode(model, writer)
+        files.append(writer.to_bytes())
+    hold(model.digest() == before, "encode changes the model", "work on copies")
+    hold(files[0] == files[1], "encoding twice gives two files", "seed what is random in encode()")
+
+
+def _check_hostile(file: Path) -> str:
+    """Show the decoder damaged files, in a process of its own that may crash or hang."""
+    command = [sys.executable, "-m", "sw_kit.checks.hostile_child", str(file), str(HOSTILE)]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HOSTILE_S)
+    except subprocess.TimeoutExpired as error:
+        raise BrokenContractError(
+            f"{HOSTILE} damaged files take more than {HOSTILE_S} s", "hold counts against reader.allow before a loop"
+        ) from error
+    if done.returncode != 0:
+        raise BrokenContractError(
+            f"a damaged file ends the process (status {done.returncode}): {done.stderr.strip()[-300:]}",
+            "check lengths before native code sees them",
+        )
+    told: Mapping[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    hold(
+        not told["problems"],
+        f"{len(told['problems'])} of {HOSTILE} damaged files: {'; '.join(told['problems'][:2])}",
+        "decode() raises BitstreamError: read values with reader.integer/number/array, code inside reader.decoding(), "
+        "and reader.allow(bytes, what) before allocating",
+    )
+    return f"{told['refused']} of {HOSTILE} damaged files refused"

@@ -1,0 +1,293 @@
+"""Every check can fail: on something that does not keep the contract, with a reason and what mends it."""
+
+from __future__ import annotations
+
+import sys
+import types
+
+import pytest
+import torch
+from sw_kit.checks import registration
+from sw_kit.checks.behaviour import BEHAVIOUR
+from sw_kit.checks.fields import check_entry
+from sw_kit.checks.methods import check_configuration
+from sw_kit.checks.small_run import _check_encoding, _lengths
+from sw_kit.checks.targets import check_target
+from sw_kit.finding import BrokenContractError, NotCheckedError, PackageCheck
+from sw_kit.samples import some_gaussians
+
+from splatwizard_core.api import Method, OptimizationParams, Params, Stage
+from splatwizard_core.tooling import Entry, PluginInfo, load_plugins
+
+PLUGINS = load_plugins()
+
+
+@pytest.fixture
+def entry_of(monkeypatch):
+    """entry_of(kind, target, **declared): an entry whose target is this object."""
+
+    def make(kind, target, **declared):
+        module = types.ModuleType("sw_bad_things")
+        module.target = target
+        monkeypatch.setitem(sys.modules, "sw_bad_things", module)
+        return Entry(kind, "bad-thing", "sw_bad_things:target", "one line", declared, "sw-bad", "0.1")
+
+    return make
+
+
+@pytest.fixture
+def installed(tmp_path, monkeypatch):
+    """installed(source, requires): a distribution sw-bad with one module sw_bad."""
+
+    def make(source, requires=("splatwizard-core>=0.2,<0.3",)):
+        (tmp_path / "sw_bad.py").write_text(source)
+        info = tmp_path / "sw_bad-0.1.dist-info"
+        info.mkdir()
+        lines = "".join(f"Requires-Dist: {line}\n" for line in requires)
+        (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: sw-bad\nVersion: 0.1\n{lines}\n")
+        monkeypatch.syspath_prepend(tmp_path)
+        monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{':'.join(filter(None, sys.path))}")
+        return PluginInfo("bad", "sw-bad", "0.1", "sw_bad")
+
+    return make
+
+
+HOOK = """
+from splatwizard_core.api import hookimpl
+
+@hookimpl
+def register_methods(registry):
+    {}
+"""
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [("import torch", "imports torch"), ("print('hello')", "prints 'hello'"), ("1 / 0", "ZeroDivisionError"),
+     ("import time; t = time.process_time()\n    while time.process_time() < t + 0.02: pass", "ms of CPU")],
+)  # fmt: skip
+def test_registration_that_is_not_light(installed, line, said):
+    with pytest.raises(BrokenContractError, match=said):
+        registration.check_light(installed(HOOK.format(line)))
+
+
+@pytest.mark.parametrize(
+    ("requires", "said"),
+    [((), "does not require splatwizard-core"), (("splatwizard-core",), "no lower or no upper"),
+     (("splatwizard-core>=0.2",), "no upper bound"), (("splatwizard-core~=0.2", "numpy"), "no version of numpy")],
+)  # fmt: skip
+def test_requirements_without_versions(installed, requires, said):
+    with pytest.raises(BrokenContractError, match=said):
+        registration.check_requirements(installed("", requires))
+
+
+@pytest.mark.parametrize(
+    ("source", "said"),
+    [("from splatwizard_core.runs.run import run", r"splatwizard_core.runs.run.run \(sw_bad.py\)"),
+     ("def f():\n    import sw_codecs.testing", "sw-codecs without requiring"),
+     ("from splatwizard_core import api, runs", "splatwizard_core.runs")],
+)  # fmt: skip
+def test_imports_of_what_is_not_promised(installed, source, said):
+    with pytest.raises(BrokenContractError, match=said):
+        registration.check_imports(installed(source))
+
+
+def test_what_only_a_type_checker_reads_may_come_from_anywhere(installed):
+    source = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from splatwizard_core.runs.run import run\n"
+    registration.check_imports(installed(source + "from splatwizard_core.api import Camera"))
+
+
+def test_a_plugin_that_did_not_load():
+    with pytest.raises(BrokenContractError, match="the plugin is broken: no such"):
+        registration.check_loads(PluginInfo("bad", "sw-bad", "0.1", "sw_bad", error="no such module"))
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [(Entry("method", "a name", "m:C", "one line"), "nobody can type"),
+     (Entry("method", "name", "m:C", ""), "summary"),
+     (Entry("method", "name", "m:C", "two\nlines"), "summary"),
+     (Entry("method", "name", "m:C", "line", {"rates": "r1"}), "must be a list of names"),
+     (Entry("method", "name", "m:C", "line", {"rate": ["r1"]}), "'rate', which its kind does not have"),
+     (Entry("metric", "name", "m:C", "line"), "does not declare 'direction'"),
+     (Entry("metric", "name", "m:C", "line", {"direction": "up"}), "direction='up'"),
+     (Entry("coder", "name", "m:C", "line", {"codes": "colours"}), "codes='colours'"),
+     (Entry("exporter", "name", "m:C", "line", {"suffix": "ply"}), "suffix='ply'"),
+     (Entry("command", "name", "m:C", "line", {"position": print}), "no plain value")],
+)  # fmt: skip
+def test_fields_that_are_not_legal(entry, said):
+    with pytest.raises(BrokenContractError, match=said):
+        check_entry(entry)
+
+
+def test_an_unknown_feature_of_a_rasterizer():
+    with pytest.raises(Exception, match="unknown features"):
+        check_entry(Entry("rasterizer", "name", "m:C", "line", {"features": ["GLOSS"]}))
+
+
+class NeedsAnArgument:
+    uses_statistics = False
+
+    def __init__(self, power):
+        pass
+
+    def score(self, model, cameras, rasterizer, background=None):
+        pass
+
+
+class NoBackground(NeedsAnArgument):
+    def __init__(self):
+        pass
+
+    def score(self, model, cameras, rasterizer):
+        pass
+
+
+@pytest.mark.parametrize(
+    ("kind", "target", "declared", "said"),
+    [("pruner", NeedsAnArgument, {}, "cannot be made with its defaults"),
+     ("pruner", NoBackground, {}, "cannot be called so"),
+     ("pruner", object, {}, r"has no score\(\)"),
+     ("metric", lambda render: 0.0, {}, "cannot be called with 2 arguments"),
+     ("command", print, {}, "use @click.command"),
+     ("dataset", NoBackground, {}, r"has no detect\(\)"),
+     ("coder", NoBackground, {"codes": "arrays"}, r"has no encode\(\)")],
+)  # fmt: skip
+def test_targets_without_the_contracts_form(entry_of, kind, target, declared, said):
+    with pytest.raises(BrokenContractError, match=said):
+        check_target(entry_of(kind, target, **declared), PLUGINS)
+
+
+class Pruner:
+    uses_statistics = False
+
+    def __init__(self):
+        self.calls = 0
+
+    def score(self, model, cameras, rasterizer, background=None):
+        self.calls += 1
+        return self.of(model, cameras)
+
+
+class ChangesModel(Pruner):
+    def of(self, model, cameras):
+        model.means.data += 1
+        return model.opacities.detach()
+
+
+class ChangesGradients(Pruner):
+    def of(self, model, cameras):
+        model.means.sum().backward()
+        return model.opacities.detach()
+
+
+class Forgets(Pruner):
+    def of(self, model, cameras):
+        return model.opacities.detach() + self.calls
+
+
+class ByFirstCamera(Pruner):
+    def of(self, model, cameras):
+        return (model.means.detach() - cameras[0].center).norm(dim=1)
+
+
+class OneForAll(Pruner):
+    def of(self, model, cameras):
+        return model.opacities.mean()
+
+
+@pytest.mark.parametrize(
+    ("pruner", "said"),
+    [(ChangesModel, "changes the model"), (ChangesGradients, "changes gradients"), (Forgets, "other scores"),
+     (ByFirstCamera, "reverse order"), (OneForAll, "for 200 Gaussians")],
+)  # fmt: skip
+def test_pruners_that_do_more_than_score(entry_of, pruner, said):
+    with pytest.raises(BrokenContractError, match=said):
+        BEHAVIOUR["pruner"](entry_of("pruner", pruner), PLUGINS)
+
+
+def in_place(render, truth):
+    return float(render.sub_(truth).abs().mean())
+
+
+@pytest.mark.parametrize(
+    ("metric", "direction", "said"),
+    [(lambda a, b: (a - b).abs().mean(), "lower", "returns a Tensor"), (in_place, "lower", "changes the images"),
+     (lambda a, b: float((a - b).abs().mean()), "higher", "says the opposite"),
+     (lambda a, b: float("nan"), "lower", "returns nan"),
+     (lambda a, b: float(torch.rand(())), "lower", "a second call")],
+)  # fmt: skip
+def test_metrics_that_are_no_function_of_two_images(entry_of, metric, direction, said):
+    with pytest.raises(BrokenContractError, match=said):
+        BEHAVIOUR["metric"](entry_of("metric", metric, direction=direction), PLUGINS)
+
+
+@pytest.mark.parametrize(
+    ("score", "said"),
+    [(lambda path: 0.5, "that is no scene"), (lambda path: 2, "a number in 0..1"), (lambda path: None, "a number"),
+     (lambda path: 0.9 if (path / "sparse").is_dir() else 0.0, "another family")],
+)  # fmt: skip
+def test_families_that_claim_what_is_not_theirs(entry_of, score, said):
+    family = types.SimpleNamespace(detect=score, load=lambda path, options: None)
+    with pytest.raises(BrokenContractError, match=said):
+        BEHAVIOUR["dataset"](entry_of("dataset", family), PLUGINS)
+
+
+class Config(OptimizationParams):
+    strength: float = 1.0
+
+
+class BadMethod(Method):
+    name = "bad-thing"
+    Config = OptimizationParams
+
+    def stages(self):
+        return [Stage(self.config)]
+
+    def encode(self, model, writer):
+        model.means.data += 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "declared", "said"),
+    [({"name": "other"}, {}, "called 'other'"), ({}, {"rates": ["r1", "r2"]}, "rates are declared"),
+     ({"PRESETS": {"paper": {}}}, {"presets": ["paper"]}, "no preset quick"),
+     ({"DEFAULT_RATE": "r9"}, {}, "DEFAULT_RATE is 'r9'"), ({"Config": Config}, {}, "no description of strength"),
+     ({"RATES": {"r1": {"no_such_key": 1}}}, {}, "no_such_key"),
+     ({"stages": lambda self: []}, {}, "return one or more")],
+)  # fmt: skip
+def test_declarations_of_a_method_that_do_not_fit_it(entry_of, changes, declared, said):
+    entry = entry_of("method", type("Changed", (BadMethod,), changes), **declared)
+    with pytest.raises(Exception, match=said):
+        check_configuration(entry, PLUGINS)
+
+
+def test_an_encoder_that_changes_its_model():
+    with pytest.raises(BrokenContractError, match="encode changes the model"):
+        _check_encoding(BadMethod(PLUGINS, None), some_gaussians())
+
+
+def test_every_length_of_a_stage_is_found():
+    class Block(Params):
+        iterations: int = 1
+        steps: int = 2
+
+    class Nested(OptimizationParams):
+        base_iterations: int = 3
+        block: Block = Block()
+
+    assert list(_lengths(Nested)) == ["iterations", "base_iterations", "block.iterations"]
+
+
+def test_a_finding_tells_reason_and_cure_and_never_raises():
+    def raising(error):
+        def check():
+            raise error
+
+        return PackageCheck("sw-bad", "name", check).finding()
+
+    broken = raising(BrokenContractError("why", "do this"))
+    assert (broken.state, broken.detail, broken.mend) == ("broken", "why", "do this")
+    assert raising(NotCheckedError("no GPU", "find one")).state == "missing"
+    assert raising(SystemExit(3)).detail == "SystemExit: 3"
+    assert PackageCheck("sw-bad", "name", lambda: "fine").finding().state == "ok"

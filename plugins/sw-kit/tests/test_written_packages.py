@@ -1,0 +1,82 @@
+"""What `sw new-plugin` writes works: its own tests pass, it is listed, and it passes `sw check-plugin`."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+_spec = importlib.util.spec_from_file_location("kit_packages", Path(__file__).parent / "kit_packages.py")
+assert _spec is not None
+assert _spec.loader is not None
+packages = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(packages)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    return packages.one_of_each(tmp_path_factory.mktemp("written"))
+
+
+def run(written, *command, cwd):
+    return subprocess.run(
+        [sys.executable, *command], cwd=cwd, env=packages.environment(written.values()), capture_output=True, text=True
+    )
+
+
+def check(written, kinds, cwd, *options):
+    """Findings of `sw check-plugin` on the packages of these kinds."""
+    names = [written[kind].name for kind in kinds]
+    done = run(written, "-m", "splatwizard_core", "check-plugin", *names, "--json", *options, cwd=cwd)
+    assert done.returncode in (0, 1), done.stderr
+    return json.loads(done.stdout)["checks"]
+
+
+@pytest.mark.pipeline
+def test_the_tests_of_every_kind_pass(written, tmp_path):
+    tests = [str(package / "tests") for package in written.values()]
+    done = run(
+        written, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--import-mode=importlib", f"--rootdir={tmp_path}",
+        *tests, cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-3000:]
+
+
+@pytest.mark.pipeline
+def test_every_kind_but_methods_keeps_its_contract(written, tmp_path):
+    """Of the rasterizer that is the slow part of its own tests, so it is left to those."""
+    kinds = [kind for kind in written if kind not in ("method", "post-training", "anchors", "rasterizer")]
+    found = check(written, kinds, tmp_path)
+    assert [row for row in found if row["state"] != "ok"] == []
+    assert sum("keeps the contract" in row["name"] for row in found) == 4
+
+
+@pytest.mark.pipeline
+@pytest.mark.parametrize("kind", ["anchors", pytest.param("method", marks=pytest.mark.slow),
+                                  pytest.param("post-training", marks=pytest.mark.slow),
+                                  pytest.param("rasterizer", marks=pytest.mark.slow)])  # fmt: skip
+def test_a_method_passes_the_whole_check(written, tmp_path, kind):
+    """By default anchors: a plain AnchorModel in an AnchorStage. Post-training is the tutorial's."""
+    found = check(written, [kind], tmp_path)
+    assert [row for row in found if row["state"] != "ok"] == []
+    if kind != "rasterizer":
+        (row,) = [row for row in found if row["name"].endswith("runs on a tiny scene")]
+        assert "40 steps" in row["detail"]
+        assert "resumes bit-equal" in row["detail"]
+
+
+@pytest.mark.pipeline
+@pytest.mark.slow
+def test_a_method_that_only_encodes_passes_too(written, tmp_path):
+    """A stage without steps: what post-training methods have that only code a trained scene."""
+    package = packages.write_package(tmp_path, packages.kinds()["post-training"], packages.legal_names("only-encodes"))
+    path = package / "src" / "sw_only_encodes" / "stage.py"
+    stage = "    @property\n    def iterations(self):\n        return 0\n\n    def register_pre_task"
+    path.write_text(path.read_text().replace("    def register_pre_task", stage, 1))
+    found = check({"only-encodes": package}, ["only-encodes"], tmp_path)
+    assert [row for row in found if row["state"] != "ok"] == []
+    assert any(row["detail"].startswith("0 steps") for row in found)
