@@ -30,8 +30,8 @@ from typing import Any
 import torch
 from torch.profiler import ProfilerActivity, profile, record_function
 
+from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
@@ -41,10 +41,10 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
-from splatwizard_core.training import rng
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import StepRecord, Trainer
+from splatwizard_native import seeded
 
 SECTION = "section: "
 WAITS_ON_CUDA = ("cudaStreamSynchronize", "cudaDeviceSynchronize", "cudaEventSynchronize")
@@ -293,7 +293,7 @@ def anchors(method: str, args: argparse.Namespace, session: Session, folder: str
     scene = session.scene(resolved)
     made = make_method(session.plugins, resolved)
     rasterizer = NegotiatedRasterizer(session.plugins, device=session.device)
-    with rng.seeded(args.seed):
+    with seeded(args.seed):
         model = made.create_model(scene, stream(args.seed, "init")).to(session.device)
         trainer = trainer_of(made.stages()[0], model, scene, resolved.ppl, rasterizer)
         phases = phases_of(method, trainer.stage)

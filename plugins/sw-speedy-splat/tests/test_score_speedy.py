@@ -4,8 +4,8 @@ import pytest
 import torch
 from sw_finetuning.pruning import lowest
 
+from splatwizard_core.gaussians.inputs import rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel
-from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer

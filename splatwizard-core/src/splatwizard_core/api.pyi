@@ -23,8 +23,8 @@ from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.files import replacing as replacing
 from splatwizard_core.gaussians.inputs import SH as SH
 from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
+from splatwizard_core.gaussians.inputs import rgb_to_dc as rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel
-from splatwizard_core.gaussians.spherical_harmonics import rgb_to_dc as rgb_to_dc
 from splatwizard_core.gaussians.splat_model import SplatModel as SplatModel
 from splatwizard_core.method import Method as Method
 from splatwizard_core.method import create_method as create_method

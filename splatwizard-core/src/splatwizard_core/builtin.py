@@ -28,7 +28,6 @@ def register_commands(registry: Registry) -> None:
         ("info", "info:info", "what is in a file or scene"),
         ("list-plugins", "list_plugins:list_plugins", "what is installed, what is broken and why"),
         ("schedule", "schedule:schedule", "a method's plan as a table"),
-        ("build-kernels", "build_kernels:build_kernels", "compile all native modules ahead of time"),
         ("completion", "completion:completion", "completion for bash, zsh or fish"),
     )):  # fmt: skip
         registry.add(name, f"splatwizard_core.cli.{target}", summary=summary, position=position)

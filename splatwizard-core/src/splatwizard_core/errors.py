@@ -5,6 +5,7 @@ A message says what is wrong (with the value), where, and what to do, in one or 
 
 from __future__ import annotations
 
+import errno
 import re
 from collections.abc import Iterable, Sequence
 
@@ -96,6 +97,14 @@ class NothingToDo(UserInputError):  # noqa: N818 (the specification names it)
 
 class RunLockedError(UserInputError):
     """Another process is writing into this run directory, or may be."""
+
+
+FULL = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "the file may not grow that large here (file system, or `ulimit -f`)",
+}
+"""What the system says of a disk that takes no more."""
 
 
 class DiskFullError(SplatwizardError):

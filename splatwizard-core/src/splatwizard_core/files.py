@@ -8,10 +8,10 @@ import functools
 import hashlib
 import json
 import os
-import platform
 import re
 import secrets
 import shutil
+import socket
 import tempfile
 import time
 import zlib
@@ -19,17 +19,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.errors import DiskFullError
+from splatwizard_core.errors import FULL, DiskFullError
 
 TEMPORARY = r"\.(\d+)-(?:([0-9a-f]{8})-)?[0-9a-f]{8}\.tmp"
 """The end of a temporary file's name, after `.NAME`: the process that writes it, where its number holds (`_numbering`;
 0.1 did not say), and a random part."""
 
-FULL = {
-    errno.ENOSPC: "the disk is full",
-    errno.EDQUOT: "the disk quota is used up",
-    errno.EFBIG: "the file may not grow that large here (file system, or `ulimit -f`)",
-}
 FOREIGN_SECONDS = 86_400.0
 """Silence after which the temporary of another container or machine counts as left behind."""
 YOUNGER_SECONDS = 2.0
@@ -177,7 +172,7 @@ def _numbering() -> str:
     try:
         where = Path("/proc/sys/kernel/random/boot_id").read_text() + os.readlink("/proc/self/ns/pid")
     except OSError:
-        where = platform.node()
+        where = socket.gethostname()
     return f"{zlib.crc32(where.encode()):08x}"
 
 

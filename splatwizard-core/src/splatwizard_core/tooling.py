@@ -31,7 +31,7 @@ MODULES = {
     "evaluation.metrics": "MetricInfo short_reason",
     "errors": "RunLockedError",
     "rendering.negotiation": "NegotiatedRasterizer",
-    "cli.options": "console debug_option json_option options print_json say set_option",
+    "cli.options": "console debug_option json_option options print_json print_table say set_option",
     "cli.complete": "name_of",
     "cli.paths": "OUTPUT_FILE OUTPUT_FOLDER existing_file",
     "cli.setup": "Choices",

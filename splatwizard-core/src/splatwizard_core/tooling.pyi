@@ -4,6 +4,7 @@ from splatwizard_core.cli.options import debug_option as debug_option
 from splatwizard_core.cli.options import json_option as json_option
 from splatwizard_core.cli.options import options as options
 from splatwizard_core.cli.options import print_json as print_json
+from splatwizard_core.cli.options import print_table as print_table
 from splatwizard_core.cli.options import say as say
 from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE

@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-import json
-
-from splatwizard_core.cli.main import main
-from splatwizard_core.errors import FORESEEN, SplatwizardError
-from splatwizard_core.plugins import kernels
 from splatwizard_core.plugins.kernels import CORE_MODULES, declared_modules
 from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_native import NativeBuildError, NativeModule, resolve_module
+from splatwizard_native import NativeModule, resolve_module
 
 
 def test_modules_of_entries_come_after_the_cores_each_once():
@@ -25,21 +20,3 @@ def test_modules_of_entries_come_after_the_cores_each_once():
 def test_every_native_module_of_the_core_exists():
     assert CORE_MODULES
     assert all(isinstance(resolve_module(target), NativeModule) for target in CORE_MODULES)
-
-
-def test_what_cannot_be_built_is_an_error_for_the_user(capsys, monkeypatch):
-    assert issubclass(NativeBuildError, FORESEEN)
-    assert not issubclass(NativeBuildError, SplatwizardError)  # the base does not know the core
-    monkeypatch.setenv("CXX", "no-such-compiler")
-    assert main(["build-kernels"]) == 1
-    assert capsys.readouterr().err == "error: $CXX is 'no-such-compiler', which is not there: unset CXX or correct it\n"
-
-
-def test_build_kernels_reports_each_module_and_ends_with_status_1_if_one_fails(capsys, monkeypatch):
-    monkeypatch.setattr(kernels, "CORE_MODULES", ("no_such_module:X",))
-    monkeypatch.setattr("splatwizard_core.cli.build_kernels.load_plugins", lambda: PluginManager([]))
-    monkeypatch.setenv("CXX", "true")  # there, and not called
-    assert main(["build-kernels", "--json"]) == 1
-    (row,) = json.loads(capsys.readouterr().out)["modules"]
-    assert (row["name"], row["state"], row["path"]) == ("no_such_module:X", "failed", None)
-    assert "no_such_module" in row["error"]

@@ -18,8 +18,8 @@ from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.rng import Streams
-from splatwizard_core.training.scalars import Verdict, read_scalars
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
+from splatwizard_native import Verdict, read_scalars
 
 TWO_GIB = 2 << 30
 TORCH_SAYS = "CUDA out of memory. Tried to allocate 2.00 GiB. GPU 0 has a total capacity of 8.00 GiB of which"

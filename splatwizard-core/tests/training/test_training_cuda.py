@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from splatwizard_core.training.losses import _ssim_torch, photometric_loss
+from splatwizard_core.training.losses import photometric_loss
 from splatwizard_native import AdamUpdate, adam_steps
 from splatwizard_native.fused.native import TRAINING
+from splatwizard_native.fused.photometric import _ssim_torch
 
 pytestmark = [
     pytest.mark.cuda,

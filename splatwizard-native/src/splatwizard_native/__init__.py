@@ -14,13 +14,28 @@ if TYPE_CHECKING:
     from splatwizard_native.cuda_toolkit import find_nvcc, nvcc_version
     from splatwizard_native.fused.adam import AdamUpdate, adam_steps
     from splatwizard_native.fused.photometric import Padding, photometric
+    from splatwizard_native.machine import describe_machine
     from splatwizard_native.memory import MemoryMeter, peak_rss_bytes, reset_peak_rss, rss_bytes, synchronize
     from splatwizard_native.module import NativeModule
+    from splatwizard_native.random_states import (
+        capture_random_states,
+        preserved_random_states,
+        restore_random_states,
+        seeded,
+    )
+    from splatwizard_native.scalars import Verdict, read_scalars
     from splatwizard_native.settings import cache_root
     from splatwizard_native.toolchain import find_compiler
 
 # Imported on first use: who only catches the errors, as every command does, need not wait for the rest.
 _LATER = {
+    "capture_random_states": "random_states",
+    "preserved_random_states": "random_states",
+    "restore_random_states": "random_states",
+    "seeded": "random_states",
+    "describe_machine": "machine",
+    "Verdict": "scalars",
+    "read_scalars": "scalars",
     "AdamUpdate": "fused.adam",
     "adam_steps": "fused.adam",
     "Padding": "fused.photometric",
@@ -51,18 +66,25 @@ __all__ = [
     "NativeBuildError",
     "NativeModule",
     "Padding",
+    "Verdict",
     "adam_steps",
     "available_cores",
     "build_all",
     "cache_root",
+    "capture_random_states",
+    "describe_machine",
     "find_compiler",
     "find_nvcc",
     "nvcc_version",
     "peak_rss_bytes",
     "photometric",
+    "preserved_random_states",
+    "read_scalars",
     "reset_peak_rss",
     "resolve_module",
+    "restore_random_states",
     "rss_bytes",
+    "seeded",
     "synchronize",
 ]
 

@@ -1,4 +1,4 @@
-"""Registers the command `sw doctor`."""
+"""Registers the commands that get a machine ready: `sw doctor` and `sw build-kernels`."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -7,3 +7,5 @@ from splatwizard_core.api import Registry, hookimpl
 def register_commands(registry: Registry) -> None:
     registry.add("doctor", "sw_doctor.command:doctor", position=20,
                  summary="what works here, and what to install for the rest")  # fmt: skip
+    registry.add("build-kernels", "sw_doctor.build_kernels:build_kernels", position=10,
+                 summary="compile all native modules ahead of time")  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
+from sw_reference.spherical_harmonics import sh_colors
 
 
 def splat_colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOptions) -> Tensor:
@@ -12,7 +13,7 @@ def splat_colors(g: GaussianInputs, rows: Tensor, cam: Camera, opt: RasterOption
     if g.colors is not None:
         return g.colors[rows]
     assert g.sh is not None
-    return g.sh.colors_from(cam.center, g.means, rows=rows, clamp=opt.clamp_color)
+    return sh_colors(g.sh, cam.center, g.means, rows=rows, clamp=opt.clamp_color)
 
 
 def background_image(opt: RasterOptions, channels: int, cam: Camera, like: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
+from sw_reference.spherical_harmonics import sh_colors
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec
@@ -69,7 +70,7 @@ class SpeedyScore:
             colors = g.colors
             if colors is None:
                 assert g.sh is not None
-                colors = g.sh.colors_from(camera.center, g.means)
+                colors = sh_colors(g.sh, camera.center, g.means)
             for one in torch.eye(3, device=model.device):  # with one channel left, the sum is that channel
                 behind = None if background is None else background * one
                 yield replace(g, sh=None, colors=colors * one), [camera], behind

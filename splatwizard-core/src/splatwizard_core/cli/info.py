@@ -82,9 +82,7 @@ def _part(facts: dict[str, Any], *names: str) -> dict[str, Any]:
 
 
 def _ply_facts(path: Path) -> dict[str, Any]:
-    from splatwizard_core.plugins.interchange import load_ply
-
-    model = load_ply(existing(str(path)))
+    model = load_plugins().importers.load("ply")(existing(str(path)))
     means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()
     sound = means.isfinite().all(1) & scales.isfinite().all(1) & opacities.isfinite()
     known = bool(sound.any())  # else there is no box and no median

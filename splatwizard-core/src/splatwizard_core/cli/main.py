@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import logging
 import math
 import os
@@ -16,8 +15,7 @@ import click
 
 from splatwizard_core.cli.complete import VARIABLE
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
-from splatwizard_core.errors import FORESEEN, DiskFullError, SplatwizardError
-from splatwizard_core.files import FULL
+from splatwizard_core.errors import FORESEEN, FULL, DiskFullError, SplatwizardError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
 
@@ -63,6 +61,8 @@ class LazyGroup(click.Group):
             return super().resolve_command(ctx, args)
         except click.UsageError as error:
             package = package_of("command", args[0])
+            import difflib
+
             near = difflib.get_close_matches(args[0], self.list_commands(ctx), n=1)
             hint = f"did you mean '{near[0]}'?" if near else "`sw --help` lists all"
             if package is not None:

@@ -35,7 +35,7 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     """
     from splatwizard_core.plugins.origins import Origins
     from splatwizard_core.runs.phases import stage_parts
-    from splatwizard_core.training.plan import format_plan, plan_rows, row_facts
+    from splatwizard_core.training.plan import format_plan, plan_rows
     from splatwizard_core.training.scheduler import build_schedulers
 
     plugins = load_plugins()
@@ -47,12 +47,12 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     for stage in stages:
         pre, post = build_schedulers(stage, resolved.ppl)
         if as_json:
-            plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
+            plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations, verbose=verbose)
             found.append(
                 {
                     "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,
                     "taught_by": list(stage.taught_by), "provided_by": stage_parts(origins, stage, resolved.ppl),
-                    "plan": [row_facts(row, verbose=verbose) for row in plan],
+                    "plan": plan,
                 }
             )  # fmt: skip
             continue

@@ -11,7 +11,14 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.errors import ShapeError
-from splatwizard_core.gaussians.spherical_harmonics import eval_sh, rgb_to_dc
+
+SH_C0 = 0.28209479177387814
+"""Value of the basis function of degree 0."""
+
+
+def rgb_to_dc(rgb: Tensor) -> Tensor:
+    """The degree-0 coefficient whose colour is `rgb` from every side; any shape."""
+    return (rgb - 0.5) / SH_C0
 
 
 @dataclass
@@ -36,21 +43,6 @@ class SH:
     def from_rgb(cls, rgb: Tensor) -> SH:
         """Degree 0: colours [N,3] that are the same from every side."""
         return cls(dense=rgb_to_dc(rgb)[:, None], active_degree=0)
-
-    def colors_from(self, center: Tensor, means: Tensor, *, rows: Tensor | None = None, clamp: bool = True) -> Tensor:
-        """Colours as seen from `center`: max(0, 0.5 + SH), [N,3]; differentiable in coefficients and `means`.
-
-        center  [3] camera centre, world units, not on a mean
-        means   [N,3] world units
-        rows    which Gaussians; None: all
-        clamp   False leaves negative values (sensitivity passes)
-        """
-        sh = self.to_dense()
-        if rows is not None:
-            sh, means = sh[rows], means[rows]
-        raw = eval_sh(sh, torch.nn.functional.normalize(means - center, dim=-1), self.active_degree) + 0.5
-        # clamp's gradient passes at raw == 0, as the specification wants.
-        return raw.clamp(min=0) if clamp else raw
 
     def to_dense(self) -> Tensor:
         """[N,K,3], differentiable with respect to whatever is stored."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import importlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -184,5 +183,7 @@ def nearest(kind: str, name: str, installed: list[str]) -> str:
     package = package_of(kind, name)
     if package is not None:
         return f"it comes with {package}: pip install {package}"
+    import difflib
+
     near = difflib.get_close_matches(name, installed, n=1)
     return f"did you mean '{near[0]}'?" if near else f"installed: {', '.join(installed) or 'none'}"

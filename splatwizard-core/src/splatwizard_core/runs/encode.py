@@ -102,12 +102,10 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
 
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
     """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
-    from splatwizard_core.plugins.interchange import load_ply
-
     session.load_kernels()
     if path.suffix != ".ply":
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
-    model = load_ply(path).to(session.device).eval().requires_grad_(False)
+    model = session.plugins.importers.load("ply")(path).to(session.device).eval().requires_grad_(False)
     method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
     raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))

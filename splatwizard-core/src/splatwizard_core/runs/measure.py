@@ -13,7 +13,6 @@ import torch
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.plugins.interchange import load_ply
 from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
@@ -177,7 +176,8 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
 
     def open_file() -> Opened:
         if path.suffix == ".ply":
-            return Opened(load_ply(path).to(session.device).eval().requires_grad_(False), {})
+            gaussians = session.plugins.importers.load("ply")(path)
+            return Opened(gaussians.to(session.device).eval().requires_grad_(False), {})
         model, reader = open_model(path, session.plugins, session.device)
         return Opened(model, reader.raster, reader.made_on is not None)
 

@@ -17,8 +17,7 @@ from typing import Any
 from splatwizard_core.errors import ConfigError, SplatwizardError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.method import Method
-from splatwizard_core.plugins import PluginManager
-from splatwizard_core.plugins.interchange import load_ply
+from splatwizard_core.plugins import PluginManager, load_plugins
 from splatwizard_core.runs.config import INIT, ResolvedConfig, content_hash, resolve
 from splatwizard_core.runs.session import Session
 from splatwizard_core.training.keys import field_at, input_files, is_beside_method, value_at
@@ -162,7 +161,7 @@ def check_model(path: str) -> GaussianModel:
         if file.read(4) == b"SPWZ":
             raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")
     try:
-        model = load_ply(where)
+        model = load_plugins().importers.load("ply")(where)
     except SplatwizardError as error:
         reason = str(error).removeprefix(f"{where}: ").removeprefix(f"{where.name}: ")
         raise UserInputError(f"init: {path}: {reason}") from None

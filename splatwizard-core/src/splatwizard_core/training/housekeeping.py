@@ -12,13 +12,11 @@ import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.progress import track
-from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
 from splatwizard_core.training.interrupt import InterruptGuard
-from splatwizard_core.training.scalars import read_scalars
 from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
-from splatwizard_native import synchronize
+from splatwizard_native import preserved_random_states, read_scalars, synchronize
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun
@@ -99,7 +97,7 @@ class Housekeeping:
         try:
             self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
             if run.on_step is not None:
-                with rng.preserved():
+                with preserved_random_states():
                     run.on_step(model, record)
             self._log_step(record)
             if run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0:
@@ -156,7 +154,7 @@ class Housekeeping:
         synchronize(self.trainer.device)
         modes = {module: module.training for module in model.modules()}
         # Peak memory is that of the loop alone; an evaluation measures memory of its own.
-        with self.run.meter.excluded(), rng.preserved(), torch.no_grad():
+        with self.run.meter.excluded(), preserved_random_states(), torch.no_grad():
             model.eval()
             try:
                 metrics = evaluate(model, step)

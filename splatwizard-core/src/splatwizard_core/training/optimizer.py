@@ -127,7 +127,7 @@ class SplatOptimizer:
 
         New rows get zero moments; step counters stay. Raises ShapeError if rows do not fit.
         """
-        count = self._check_rows(model, rows)
+        count = self._check_new(model, rows)
 
         def longer(tensor: Tensor, new: Tensor | None = None) -> Tensor:
             added = tensor.new_zeros(count, *tensor.shape[1:]) if new is None else new.detach().to(tensor)
@@ -136,25 +136,13 @@ class SplatOptimizer:
         for name in model.ROWS:
             self._put(model, name, longer(attrgetter(name)(model).detach(), rows.get(name)), longer)
 
-    def _check_rows(self, model: SplatModel, rows: Mapping[str, Tensor]) -> int:
-        counts = set()
-        for name in rows:
-            if name not in model.ROWS:
-                raise ShapeError(f"append_rows: '{name}' is not among the rows of {type(model).__name__}")
+    def _check_new(self, model: SplatModel, rows: Mapping[str, Tensor]) -> int:
+        """Return how many rows are new. Raises ShapeError."""
+        _check_rows(model, rows, "append_rows")
         for name in model.ROWS:
-            old = attrgetter(name)(model)
-            new = rows.get(name)
-            if new is None:
-                if isinstance(old, nn.Parameter):
-                    raise ShapeError(f"append_rows: new rows of parameter '{name}' are missing")
-                continue
-            if new.shape[1:] != old.shape[1:] or new.dim() != old.dim():
-                raise ShapeError(
-                    f"append_rows: '{name}' must be [n, {', '.join(map(str, old.shape[1:]))}], got {list(new.shape)}",
-                    actual=new.shape,
-                    expected=("n", *old.shape[1:]),
-                )
-            counts.add(new.shape[0])
+            if name not in rows and isinstance(attrgetter(name)(model), nn.Parameter):
+                raise ShapeError(f"append_rows: new rows of parameter '{name}' are missing")
+        counts = {len(new) for new in rows.values()}
         if len(counts) != 1:
             raise ShapeError(f"append_rows: all rows need one count, got {sorted(counts)}")
         return counts.pop()
@@ -197,15 +185,7 @@ class SplatOptimizer:
         Raises ShapeError if rows do not fit.
         """
         forget = index if forget is None else forget
-        for name, new in rows.items():
-            expected = (len(index), *attrgetter(name)(model).shape[1:]) if name in model.ROWS else None
-            if expected is None or new.shape != expected:
-                raise ShapeError(
-                    f"set_rows: '{name}' must be one of the rows of {type(model).__name__} and "
-                    f"{list(expected or ())}, got {list(new.shape)}",
-                    actual=new.shape,
-                    expected=expected,
-                )
+        _check_rows(model, rows, "set_rows", len(index))
         for name in model.ROWS:
             new = attrgetter(name)(model).detach()
             if name in rows:
@@ -279,6 +259,20 @@ class SplatOptimizer:
         if state is not None and change is not None:
             state.tensors = {key: change(each) for key, each in state.tensors.items()}
         return tensor
+
+
+def _check_rows(model: SplatModel, rows: Mapping[str, Tensor], doing: str, count: int | None = None) -> None:
+    """Raise ShapeError unless all are rows of the model, `count` of each if that is given."""
+    for name, new in rows.items():
+        if name not in model.ROWS:
+            raise ShapeError(f"{doing}: '{name}' is not among the rows of {type(model).__name__}")
+        row = attrgetter(name)(model).shape[1:]
+        if new.shape[1:] != row or new.dim() == 0 or count not in (None, len(new)):
+            expected = ("n" if count is None else count, *row)
+            wanted = ", ".join(map(str, expected))
+            raise ShapeError(
+                f"{doing}: '{name}' must be [{wanted}], got {list(new.shape)}", actual=new.shape, expected=expected
+            )
 
 
 def _parameter(model: SplatModel, name: str) -> nn.Parameter:

@@ -16,18 +16,17 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training import rng
 from splatwizard_core.training.checkpoint import Checkpoint, CheckpointStore, DamagedCheckpointError, differences
 from splatwizard_core.training.housekeeping import Evaluate, Housekeeping, OnStep, Progress
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.plan import plan_rows, row_facts
+from splatwizard_core.training.plan import plan_rows
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.run_log import RunLog
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage, StageContext
 from splatwizard_core.training.timing import StageClock
 from splatwizard_core.training.trainer import Trainer
-from splatwizard_native import MemoryMeter
+from splatwizard_native import MemoryMeter, seeded
 
 __all__ = ["TrainOutcome", "TrainingRun", "TrainingStopped"]
 
@@ -117,7 +116,7 @@ class TrainingRun:
         self.meter.start()
         model: SplatModel | None = None
         first = 0
-        with rng.seeded(self.ppl.seed):
+        with seeded(self.ppl.seed):
             trainer = None if self.store is None else self.store.restored(self._resumed)
             if trainer is None:
                 self.run_log.clear()
@@ -209,7 +208,7 @@ class TrainingRun:
         """Return a stage's plan for the record."""
         pre, post = build_schedulers(stage, self.ppl)
         rows = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
-        return {"stage": name, "iterations": stage.iterations, "tasks": [row_facts(r) for r in rows]}
+        return {"stage": name, "iterations": stage.iterations, "tasks": rows}
 
     def _run_stage(self, trainer: Trainer) -> None:
         """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""

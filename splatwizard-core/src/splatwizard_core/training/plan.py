@@ -118,38 +118,29 @@ class Registration:
         return steps[first : None if total is None else max(first, bisect.bisect_right(steps, total))]
 
 
-@dataclass(frozen=True)
-class PlanRow:
-    """One line of a printed plan.
+def plan_rows(
+    pre: Sequence[Registration], post: Sequence[Registration], *, total: int | None = None, verbose: bool = False
+) -> list[dict[str, Any]]:
+    """Return the rows of a plan as plain values, in order of execution.
 
-    stage       "Pre" or "Post"
-    overlaps    the same callable stands in this stage once more and both fire at some step: it runs twice there
-    first, last, count      first step, last step and number of executions up to the last step; None: never
-    """
-
-    stage: str
-    task: str
-    plan: str
-    priority: int
-    overlaps: bool
-    first: int | None
-    last: int | None
-    count: int
-
-
-def plan_rows(pre: Sequence[Registration], post: Sequence[Registration], *, total: int | None = None) -> list[PlanRow]:
-    """Return the rows of a plan.
-
-    pre, post   registrations in order of execution
     total       last step T; None: as far as the plans reach
+    verbose     also "first", "last" (None: never) and "count": the executions up to T
+
+    A row has "overlaps" if its callable stands in its stage once more and both fire at some step: it runs twice there.
     """
     rows = []
     for title, registrations in (("Pre", pre), ("Post", post)):
         for r in registrations:
-            steps = r.fires_in(0, total)
-            overlaps = any(_overlap(r, other, total) for other in registrations if other is not r)
-            first, last = (steps[0], steps[-1]) if steps else (None, None)
-            rows.append(PlanRow(title, r.name, describe_when(r.when), r.priority, overlaps, first, last, len(steps)))
+            row: dict[str, Any] = {
+                "stage": title, "task": r.name, "plan": describe_when(r.when), "priority": r.priority
+            }  # fmt: skip
+            if any(_overlap(r, other, total) for other in registrations if other is not r):
+                row["overlaps"] = True
+            if verbose:
+                steps = r.fires_in(0, total)
+                first, last = (steps[0], steps[-1]) if steps else (None, None)
+                row |= {"first": first, "last": last, "count": len(steps)}
+            rows.append(row)
     return rows
 
 
@@ -176,10 +167,10 @@ def format_plan(
     origin      (task) -> whose it is, a column of the table if any of them is another package's; "" for the stage's own
     """
     cells = [["Stage", "Task", "Plan", *(["First", "Last", "Runs"] if verbose else [])]]
-    for row in plan_rows(pre.registrations, post.registrations, total=total):
-        plan = f"{row.plan} (overlaps)" if row.overlaps else row.plan
-        extra = ["-" if v is None else str(v) for v in (row.first, row.last, row.count)] if verbose else []
-        cells.append([row.stage, row.task, plan, *extra])
+    for row in plan_rows(pre.registrations, post.registrations, total=total, verbose=verbose):
+        plan = f"{row['plan']} (overlaps)" if "overlaps" in row else row["plan"]
+        extra = ["-" if row[k] is None else str(row[k]) for k in ("first", "last", "count")] if verbose else []
+        cells.append([row["stage"], row["task"], plan, *extra])
     if origin is not None:
         owners = [origin(r.task) for r in (*pre.registrations, *post.registrations)]
         if any(owners):
@@ -188,16 +179,6 @@ def format_plan(
     lines = [" | ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in cells]
     lines.insert(1, "-+-".join("-" * w for w in widths))
     return "\n".join(lines)
-
-
-def row_facts(row: PlanRow, *, verbose: bool = False) -> dict[str, Any]:
-    """Return one row as plain values."""
-    facts: dict[str, Any] = {"stage": row.stage, "task": row.task, "plan": row.plan, "priority": row.priority}
-    if row.overlaps:
-        facts["overlaps"] = True
-    if verbose:
-        facts |= {"first": row.first, "last": row.last, "count": row.count}
-    return facts
 
 
 def plan_lines(registrations: Sequence[Registration]) -> list[str]:

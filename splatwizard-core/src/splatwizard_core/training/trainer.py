@@ -27,16 +27,15 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
-from splatwizard_core.training import rng
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
-from splatwizard_core.training.scalars import Verdict
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import CameraIterator, Stage
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
+from splatwizard_native import Verdict, capture_random_states, restore_random_states
 
 CHECK_EVERY = 32
 """Steps between questions to a GPU whether the losses are finite; each is answered at the next one, so that none is
@@ -257,7 +256,7 @@ class Trainer:
             "optimizer": self.optimizer.state_dict(),
             "sampler": self.sampler.state_dict(),
             "streams": self.streams.state_dict(),
-            "rng": rng.capture(),
+            "rng": capture_random_states(),
         }
 
     def load_state_dict(self, state: dict[str, Any], step: int) -> None:
@@ -268,5 +267,5 @@ class Trainer:
         # The sampler's generator is one of the streams: both hold the same state.
         self.streams.load_state_dict(state["streams"])
         self.sampler.load_state_dict(state["sampler"])
-        rng.restore(state["rng"])
+        restore_random_states(state["rng"])
         self.step = step

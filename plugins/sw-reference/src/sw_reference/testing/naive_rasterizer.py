@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianInputs, RasterOptions
+from sw_reference.spherical_harmonics import sh_colors
 
 Note = Callable[["Tensor | float", float], None]
 MaskedNote = Callable[..., None]
@@ -226,7 +227,7 @@ def _color(g: GaussianInputs, i: int, R: Tensor, tau: Tensor, opt: RasterOptions
     if g.colors is not None:
         return g.colors[i]
     assert g.sh is not None
-    raw = g.sh.colors_from(-R.T @ tau, g.means, rows=torch.tensor([i]), clamp=False)[0]
+    raw = sh_colors(g.sh, -R.T @ tau, g.means, rows=torch.tensor([i]), clamp=False)[0]
     if not opt.clamp_color:
         return raw
     note(raw + 1, 1.0)  # absolute distance to zero

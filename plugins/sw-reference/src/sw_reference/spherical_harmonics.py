@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import ShapeError
+from splatwizard_core.api import SH, ShapeError
 
 C0 = 0.28209479177387814
 C1 = 0.4886025119029199
@@ -16,11 +16,6 @@ C3 = (
     -0.5900435899266435, 2.890611442640554, -0.4570457994644658, 0.3731763325901154,
     -0.4570457994644658, 1.445305721320277, -0.5900435899266435,
 )  # fmt: skip
-
-
-def rgb_to_dc(rgb: Tensor) -> Tensor:
-    """The degree-0 coefficient whose colour is `rgb` from every side; any shape."""
-    return (rgb - 0.5) / C0
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
@@ -61,3 +56,19 @@ def eval_sh(sh: Tensor, directions: Tensor, active_degree: int) -> Tensor:
     degree = min(active_degree, math.isqrt(sh.shape[1]) - 1)
     basis = sh_basis(directions, degree)  # [N, k]
     return (basis[:, :, None] * sh[:, : basis.shape[1]]).sum(dim=1)
+
+
+def sh_colors(sh: SH, center: Tensor, means: Tensor, *, rows: Tensor | None = None, clamp: bool = True) -> Tensor:
+    """Return colours as seen from `center`: max(0, 0.5 + SH), [N,3]; differentiable in coefficients and `means`.
+
+    center  [3] camera centre, world units, not on a mean
+    means   [N,3] world units
+    rows    which Gaussians; None: all
+    clamp   False leaves negative values (sensitivity passes)
+    """
+    dense = sh.to_dense()
+    if rows is not None:
+        dense, means = dense[rows], means[rows]
+    raw = eval_sh(dense, torch.nn.functional.normalize(means - center, dim=-1), sh.active_degree) + 0.5
+    # clamp's gradient passes at raw == 0, as the specification wants.
+    return raw.clamp(min=0) if clamp else raw

@@ -6,14 +6,21 @@ from dataclasses import asdict
 
 import click
 
-from splatwizard_core.cli import options as shared
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.plugins.kernels import declared_modules
+from splatwizard_core.tooling import (
+    debug_option,
+    declared_modules,
+    json_option,
+    load_plugins,
+    options,
+    print_json,
+    print_table,
+    say,
+)
 from splatwizard_native import build_all
 
 
 @click.command("build-kernels", short_help="compile all native modules ahead of time")
-@shared.options(
+@options(
     click.option(
         "--portable", is_flag=True,
         help="For any CPU of this architecture, with run-time dispatch.  [default: for this machine's CPU]",
@@ -29,7 +36,7 @@ from splatwizard_native import build_all
     ),
     click.option("--force", is_flag=True, help="Compile also what is up to date."),
     click.option("--jobs", type=click.IntRange(min=1), metavar="N", help="Compilers at once.  [default: the cores]"),
-    shared.json_option, shared.debug_option,
+    json_option, debug_option,
 )  # fmt: skip
 def build_kernels(
     portable: bool, into_packages: bool, cuda: bool, force: bool, jobs: int | None, as_json: bool
@@ -40,12 +47,12 @@ def build_kernels(
     """
     rows = build_all(
         declared_modules(load_plugins()), march="portable" if portable else "native", into_packages=into_packages,
-        force=force, cuda=cuda, jobs=jobs, say=shared.say,
+        force=force, cuda=cuda, jobs=jobs, say=say,
     )  # fmt: skip
     if as_json:
-        shared.print_json({"modules": [{**asdict(row), "path": row.path and str(row.path)} for row in rows]})
+        print_json({"modules": [{**asdict(row), "path": row.path and str(row.path)} for row in rows]})
     else:
-        shared.print_table(["module", "state", "seconds"], [[r.name, r.state, f"{r.seconds:.1f}"] for r in rows])
+        print_table(["module", "state", "seconds"], [[r.name, r.state, f"{r.seconds:.1f}"] for r in rows])
         for row in (r for r in rows if r.error is not None):
             click.echo(row.error, err=True)
     if any(row.error is not None for row in rows):
