@@ -32,10 +32,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatwizard_core.cores import available_cores
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.manager import load_plugins
 from splatwizard_core.runs.pretrained import named_scenes
+from splatwizard_native import available_cores
 
 METHODS = "3dgs,3dgs:mcmc,lightgaussian,chimerags,hac,cat-3dgs"
 SWEEPS = ("3dgs",)  # all of whose rate points share one training

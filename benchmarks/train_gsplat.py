@@ -23,6 +23,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
+from sw_gaussians.start import gaussians_from_points
 from torch import Tensor, nn
 
 from splatwizard_core.gaussians.model import GaussianModel
@@ -72,7 +73,7 @@ def train(args: argparse.Namespace, gsplat: Any, reset: Callable[..., None], dev
     assert scene.points is not None
     mcmc, version = args.strategy == "mcmc", str(gsplat.__version__)
     background = scene.background.to(device)
-    p = parameters(GaussianModel.from_points(scene.points, max_sh_degree=3).to(device), mcmc=mcmc)
+    p = parameters(gaussians_from_points(scene.points, max_sh_degree=3).to(device), mcmc=mcmc)
     rates = {"means": 1.6e-4 * scene.extent, "scales": 5e-3, "quats": 1e-3, "opacities": 5e-2, "sh0": 2.5e-3,
              "shN": 1.25e-4}  # fmt: skip
     fused = {"fused": True} if device.type == "cuda" else {}

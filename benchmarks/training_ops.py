@@ -19,9 +19,9 @@ from collections.abc import Callable
 import torch
 from torch.nn import functional as F  # noqa: N812
 
-from splatwizard_core.training import losses
 from splatwizard_core.training.losses import photometric_loss
 from splatwizard_native import AdamUpdate, adam_steps
+from splatwizard_native.fused import photometric as fused
 from splatwizard_native.fused.native import TRAINING
 
 # Floats a Gaussian: means, first and other spherical harmonics, opacity, scales, quaternion.
@@ -93,7 +93,7 @@ def loss_variants(height: int, width: int, device: str = "cpu") -> dict[str, Cal
 
     return {
         "fused (ours)": ours,
-        "torch, separable (our fallback)": lambda: torch_loss(lambda a, b: losses._ssim_torch(a, b, "same")),
+        "torch, separable (our fallback)": lambda: torch_loss(lambda a, b: fused._ssim_torch(a, b, "same")),
         "torch, conv2d 11x11": lambda: torch_loss(ssim_conv2d),
     }
 

@@ -168,11 +168,11 @@ def test_a_misspelt_hook_is_broken_with_its_name(core, make_plugin):
     assert "register_comands" in core.plugins()["sw-hello"]["error"]
 
 
-def test_core_and_one_plugin_work_alone(core, wheels):
+def test_core_and_one_plugin_with_its_library_work_alone(core, wheels):
     """The wheels hold everything: a codec round trip in an environment that never saw the source tree."""
-    core.install(wheels["sw-codecs"])
+    core.install(wheels["sw-codecs"], wheels["sw-gaussians"])
     plugins = core.plugins()
-    assert set(plugins) == {"splatwizard-core", "sw-codecs"}
+    assert set(plugins) == {"splatwizard-core", "sw-codecs", "sw-gaussians"}
     assert plugins["sw-codecs"]["error"] is None
     code = (
         "import numpy as np, splatwizard_core, sw_codecs\n"

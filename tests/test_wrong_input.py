@@ -92,6 +92,8 @@ ROWS = [
     Row("decode {grey.swz} --repeats -1", "Invalid value for '--repeats'"),
     Row("render {grey.swz} --views some", "'some' is not one of 'test', 'train', 'all'"),
     Row("build-kernels --jobs 0", "Invalid value for '--jobs'"),
+    Row("new-plugin 'a b' --into {new}", "'a b'"),
+    Row("check-plugin sw-nothing", "sw-nothing"),
     Row("data synth {new} --size huge", "'huge' is not one of 'demo', 'tiny'"),
     Row("eval {grey.swz} --scene demo:tiny --set iterations=3", "of no use here"),
     # Devices.

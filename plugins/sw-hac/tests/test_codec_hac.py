@@ -257,7 +257,10 @@ def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path
     (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
     bound = measure.opener(tmp_path / "scene.swz", Session(PLUGINS, torch.device("cpu"), print))().device_bound
     scene, quality = SimpleNamespace(protocol=Protocol("test")), SimpleNamespace(metrics={})
-    assert measure._flags(scene, quality, SimpleNamespace(kind="cuda"), bound) == flags
+    assert (
+        measure._flags(scene, quality, SimpleNamespace(kind="cuda"), device_bound=bound, bad_rows=0, contended=False)
+        == flags
+    )
 
 
 def test_a_weight_that_does_not_fit_half_precision_is_named():

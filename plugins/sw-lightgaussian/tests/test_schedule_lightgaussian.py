@@ -5,8 +5,9 @@ from types import SimpleNamespace
 import pytest
 import torch
 from sw_finetuning.fine_tuning import FineTuningStage
+from sw_gaussians.start import gaussians_from_points
 
-from splatwizard_core.api import GaussianModel, PointCloud
+from splatwizard_core.api import PointCloud
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
@@ -167,7 +168,7 @@ def test_pruning_goes_on_with_the_moments_of_the_3dgs_training(asked, restored):
 
     config = LightGaussianConfig()
     config = config.model_copy(update={"prune": config.prune.model_copy(update={"optimizer": asked})})
-    model = GaussianModel.from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)), max_sh_degree=3)
+    model = gaussians_from_points(PointCloud(torch.rand(20, 3), torch.rand(20, 3)), max_sh_degree=3)
     scene = SimpleNamespace(extent=1.0)
     trained = FineTuningStage(config, config.prune.lr).create_optimizer(model, scene)
     for parameter in model.parameters():
@@ -185,6 +186,6 @@ def test_pruning_goes_on_with_the_moments_of_the_3dgs_training(asked, restored):
 
 
 def test_a_scene_from_a_file_has_no_moments_to_go_on_with():
-    model = GaussianModel.from_points(PointCloud(torch.rand(5, 3), torch.rand(5, 3)), max_sh_degree=3)
+    model = gaussians_from_points(PointCloud(torch.rand(5, 3), torch.rand(5, 3)), max_sh_degree=3)
     stage = PruneStage(LightGaussianConfig(), Significance())
     assert stage.create_optimizer(model, SimpleNamespace(extent=1.0)).states == {}

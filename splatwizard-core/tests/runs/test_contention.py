@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from splatwizard_core.native import core_time
-from splatwizard_core.native.core_time import CoreTime
 from splatwizard_core.runs import fresh
 from splatwizard_core.runs.contention import contended_phases, contention
+from splatwizard_native import CoreTime, core_time
 
 
 @pytest.mark.parametrize(("waited", "told"), [(0, {}), (3 * 10**12, {"train": 0.25})])

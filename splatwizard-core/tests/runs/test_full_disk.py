@@ -86,7 +86,7 @@ def here(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) ->
         told: dict[str, Any] = json.loads(capsys.readouterr().out)
         return told
 
-    def decode(path: Path, device: str, *, repeats: int) -> dict[str, Any]:
+    def decode(path: Path, device: str, *, repeats: int, threads: int) -> dict[str, Any]:
         return in_this_process(["decode", str(path), "--device", device, "--repeats", str(repeats), "--json"])
 
     monkeypatch.setattr(run_module, "run_fresh", in_this_process)

@@ -13,11 +13,19 @@ if TYPE_CHECKING:
     from splatwizard_core.tooling import Check
     from sw_kit.finding import PackageCheck
 
+
 COLOURS = {"ok": "green", "missing": "yellow", "broken": "red"}
 
 
+def _installed(context: click.Context, parameter: click.Parameter, incomplete: str) -> list[str]:
+    """Complete the name of an installed distribution with plugins."""
+    from splatwizard_core.tooling import load_plugins
+
+    return [info.distribution for info in load_plugins().plugins if info.distribution.startswith(incomplete)]
+
+
 @click.command("check-plugin", short_help="hold a package to the contracts")
-@click.argument("distributions", metavar="[DIST]...", nargs=-1)
+@click.argument("distributions", metavar="[DIST]...", nargs=-1, shell_complete=_installed)
 @click.option("--quick", is_flag=True, help="Only what takes no run: registration, fields, signatures, presets.")
 @options(set_option, json_option, debug_option)
 def check_plugin(distributions: tuple[str, ...], quick: bool, sets: tuple[str, ...], as_json: bool) -> None:
