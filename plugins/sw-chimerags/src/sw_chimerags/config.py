@@ -98,5 +98,6 @@ class ChimeraConfig(OptimizationParams):
         "float32", description="positions in the file: without loss, rounded, or on 2^16 steps of the bounding box"
     )
     prefer: list[str] = Field(
-        ["flash", "tcgs", "speedy", "standard"], description="what should draw the file, best first; the others do else"
+        ["flash", "tcgs", "speedy", "standard"],
+        description="what should draw the file, best first; any other rasterizer if none of them can",
     )
