@@ -185,7 +185,7 @@ def test_rows_that_do_not_fit_are_refused():
     model, optimizer = model_of([0.5] * 4)
     with pytest.raises(ShapeError, match=r"'means' must be .*\[2, 3\], got \[1, 3\]"):
         optimizer.set_rows(model, torch.tensor([0, 1]), {"means": torch.zeros(1, 3)})
-    with pytest.raises(ShapeError, match="'colour' must be one of the rows"):
+    with pytest.raises(ShapeError, match="'colour' is not among the rows of"):
         optimizer.set_rows(model, torch.tensor([0]), {"colour": torch.zeros(1)})
 
 
