@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 from dataclasses import dataclass
+from email.message import Message
+from email.parser import HeaderParser
 
 from packaging.requirements import InvalidRequirement, Requirement
 
@@ -28,20 +31,18 @@ class PluginInfo:
 
 def plugin_info(entry_point: importlib.metadata.EntryPoint) -> PluginInfo:
     """Facts of a plugin before it is imported."""
-    # Each access of `metadata` parses the file anew.
-    metadata = entry_point.dist.metadata if entry_point.dist else {"Name": entry_point.name, "Version": ""}
-    return PluginInfo(entry_point.name, metadata["Name"], metadata["Version"], entry_point.value)
+    header = _header(entry_point.dist)
+    return PluginInfo(entry_point.name, header["Name"] or entry_point.name, header["Version"] or "", entry_point.value)
 
 
 def names_of(entry_point: importlib.metadata.EntryPoint) -> set[str]:
     """Names that a user may call a plugin: its entry point, its distribution; normalised."""
-    dist = entry_point.dist
-    return {normal_name(name) for name in (entry_point.name, dist.metadata["Name"] if dist else None) if name}
+    return {normal_name(name) for name in (entry_point.name, _header(entry_point.dist)["Name"]) if name}
 
 
 def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | None:
     """The first dependency of `dist` that is not installed, or not in a version that it takes, with the cure."""
-    for text in (dist.requires if dist else None) or []:
+    for text in _header(dist).get_all("Requires-Dist", []):
         try:
             requirement = Requirement(text)
         except InvalidRequirement:
@@ -58,7 +59,19 @@ def unmet_requirement(dist: importlib.metadata.Distribution | None) -> str | Non
     return None
 
 
+def _header(dist: importlib.metadata.Distribution | None) -> Message:
+    """The metadata of a distribution without its description, which takes most of the time to parse.
+
+    Empty for one whose metadata is missing or no text.
+    """
+    text = None
+    with contextlib.suppress(UnicodeDecodeError):
+        text = dist and (dist.read_text("METADATA") or dist.read_text("PKG-INFO"))
+    return HeaderParser().parsestr((text or "").partition("\n\n")[0])
+
+
 @functools.cache
 def _installed_version(distribution: str) -> str:
     """Version of a distribution, looked up once: plugins need the same few. Raises PackageNotFoundError."""
-    return importlib.metadata.version(distribution)
+    found = importlib.metadata.distribution(distribution)
+    return _header(found)["Version"] or found.version
