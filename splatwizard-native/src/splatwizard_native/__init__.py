@@ -1,95 +1,68 @@
-"""C++ and CUDA modules for torch: found prebuilt, cached, or compiled on first use. Importing this imports no torch."""
+"""C++ and CUDA modules for torch, the fused loss and Adam, and what a program asks of its machine.
+
+Importing this imports no torch.
+"""
 
 from __future__ import annotations
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from splatwizard_native.errors import CompilerMissingError, NativeBuildError
+from splatwizard_native.errors import CompilerMissingError as CompilerMissingError
+from splatwizard_native.errors import NativeBuildError as NativeBuildError
 
 if TYPE_CHECKING:
-    from splatwizard_native.build import BuildRow, build_all, resolve_module
-    from splatwizard_native.core_time import CoreTime
-    from splatwizard_native.cores import available_cores
-    from splatwizard_native.cuda_toolkit import find_nvcc, nvcc_version
-    from splatwizard_native.fused.adam import AdamUpdate, adam_steps
-    from splatwizard_native.fused.photometric import Padding, photometric
-    from splatwizard_native.machine import describe_machine
-    from splatwizard_native.memory import MemoryMeter, peak_rss_bytes, reset_peak_rss, rss_bytes, synchronize
-    from splatwizard_native.module import NativeModule
-    from splatwizard_native.random_states import (
-        capture_random_states,
-        preserved_random_states,
-        restore_random_states,
-        seeded,
-    )
-    from splatwizard_native.scalars import Verdict, read_scalars
-    from splatwizard_native.settings import cache_root
-    from splatwizard_native.toolchain import find_compiler
+    from splatwizard_native.build import BuildRow as BuildRow
+    from splatwizard_native.build import build_all as build_all
+    from splatwizard_native.build import resolve_module as resolve_module
+    from splatwizard_native.core_time import CoreTime as CoreTime
+    from splatwizard_native.cores import available_cores as available_cores
+    from splatwizard_native.cuda_toolkit import find_nvcc as find_nvcc
+    from splatwizard_native.cuda_toolkit import nvcc_version as nvcc_version
+    from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
+    from splatwizard_native.fused.adam import adam_steps as adam_steps
+    from splatwizard_native.fused.photometric import Padding as Padding
+    from splatwizard_native.fused.photometric import photometric as photometric
+    from splatwizard_native.machine import describe_machine as describe_machine
+    from splatwizard_native.memory import MemoryMeter as MemoryMeter
+    from splatwizard_native.memory import peak_rss_bytes as peak_rss_bytes
+    from splatwizard_native.memory import reset_peak_rss as reset_peak_rss
+    from splatwizard_native.memory import rss_bytes as rss_bytes
+    from splatwizard_native.memory import synchronize as synchronize
+    from splatwizard_native.module import NativeModule as NativeModule
+    from splatwizard_native.random_states import capture_random_states as capture_random_states
+    from splatwizard_native.random_states import preserved_random_states as preserved_random_states
+    from splatwizard_native.random_states import restore_random_states as restore_random_states
+    from splatwizard_native.random_states import seeded as seeded
+    from splatwizard_native.scalars import Verdict as Verdict
+    from splatwizard_native.scalars import read_scalars as read_scalars
+    from splatwizard_native.settings import cache_root as cache_root
+    from splatwizard_native.toolchain import find_compiler as find_compiler
 
 # Imported on first use: who only catches the errors, as every command does, need not wait for the rest.
-_LATER = {
-    "capture_random_states": "random_states",
-    "preserved_random_states": "random_states",
-    "restore_random_states": "random_states",
-    "seeded": "random_states",
-    "describe_machine": "machine",
-    "Verdict": "scalars",
-    "read_scalars": "scalars",
-    "AdamUpdate": "fused.adam",
-    "adam_steps": "fused.adam",
-    "Padding": "fused.photometric",
-    "photometric": "fused.photometric",
-    "CoreTime": "core_time",
-    "available_cores": "cores",
-    "MemoryMeter": "memory",
-    "peak_rss_bytes": "memory",
-    "reset_peak_rss": "memory",
-    "rss_bytes": "memory",
-    "synchronize": "memory",
-    "BuildRow": "build",
-    "build_all": "build",
-    "resolve_module": "build",
-    "find_nvcc": "cuda_toolkit",
-    "nvcc_version": "cuda_toolkit",
-    "NativeModule": "module",
-    "cache_root": "settings",
-    "find_compiler": "toolchain",
+MODULES = {
+    "build": "BuildRow build_all resolve_module",
+    "core_time": "CoreTime",
+    "cores": "available_cores",
+    "cuda_toolkit": "find_nvcc nvcc_version",
+    "errors": "CompilerMissingError NativeBuildError",
+    "fused.adam": "AdamUpdate adam_steps",
+    "fused.photometric": "Padding photometric",
+    "machine": "describe_machine",
+    "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
+    "module": "NativeModule",
+    "random_states": "capture_random_states preserved_random_states restore_random_states seeded",
+    "scalars": "Verdict read_scalars",
+    "settings": "cache_root",
+    "toolchain": "find_compiler",
 }
+"""Module -> the names that are offered here."""
+_HOMES = {name: module for module, names in MODULES.items() for name in names.split()}
 
-__all__ = [
-    "AdamUpdate",
-    "BuildRow",
-    "CompilerMissingError",
-    "CoreTime",
-    "MemoryMeter",
-    "NativeBuildError",
-    "NativeModule",
-    "Padding",
-    "Verdict",
-    "adam_steps",
-    "available_cores",
-    "build_all",
-    "cache_root",
-    "capture_random_states",
-    "describe_machine",
-    "find_compiler",
-    "find_nvcc",
-    "nvcc_version",
-    "peak_rss_bytes",
-    "photometric",
-    "preserved_random_states",
-    "read_scalars",
-    "reset_peak_rss",
-    "resolve_module",
-    "restore_random_states",
-    "rss_bytes",
-    "seeded",
-    "synchronize",
-]
+__all__ = list(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _LATER:
+    if name not in _HOMES:
         raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"{__name__}.{_LATER[name]}"), name)
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
