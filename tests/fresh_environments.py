@@ -41,7 +41,7 @@ for project in projects:
     os.chdir(project)
     print(build_wheel(out))
 """
-"""What pip does with a project whose build backend is hatchling, for many of them in one process."""
+"""Program that builds wheels of many hatchling projects in one process, as pip does for each."""
 
 
 def build_wheels(projects: Sequence[Path], out: Path) -> list[Path]:

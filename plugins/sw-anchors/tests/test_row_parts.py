@@ -1,4 +1,4 @@
-"""What a header says of widths decides no memory: contexts are computed a few rows at a time, with equal results."""
+"""Contexts are computed a few rows at a time, with equal results: widths in a header do not decide memory."""
 
 import torch
 from sw_anchors import attribute_sections

@@ -1,4 +1,4 @@
-"""What `sw new-plugin` writes works: its own tests pass, it is listed, and it passes `sw check-plugin`."""
+"""Packages that `sw new-plugin` writes work: their tests pass, they are listed, and they pass `sw check-plugin`."""
 
 from __future__ import annotations
 

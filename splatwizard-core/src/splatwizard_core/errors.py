@@ -104,7 +104,7 @@ FULL = {
     errno.EDQUOT: "the disk quota is used up",
     errno.EFBIG: "the file may not grow that large here (file system, or `ulimit -f`)",
 }
-"""What the system says of a disk that takes no more."""
+"""Error number of a disk that takes no more -> reason for the message."""
 
 
 class DiskFullError(SplatwizardError):
