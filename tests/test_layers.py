@@ -39,9 +39,8 @@ ROOMS = {
     "builtin": {"plugins"},
     "__main__": {"cli"},
     # The faces import what they lend when somebody asks for it.
-    "lending": set(),
-    "api": {"lending"},
-    "tooling": {"lending"},
+    "api": set(),
+    "tooling": set(),
     **{module: set() for module in BELOW_ALL},
 }
 """Room of the core -> the rooms that it may import when it runs. What only a type checker reads is free."""

@@ -5,7 +5,7 @@ docs/plugins.md describes each. Everything else in `splatwizard_core` may change
 
 from __future__ import annotations
 
-from splatwizard_core.lending import lend
+from splatwizard_native import lend
 
 MODULES = {
     "plugins.hookspecs": "hookimpl",

@@ -5,7 +5,7 @@ Documented in docs/plugins.md; unlike `api` it is not promised to stay as it is.
 
 from __future__ import annotations
 
-from splatwizard_core.lending import lend
+from splatwizard_native import lend
 
 MODULES = {
     "plugins.manager": "load_plugins",

@@ -5,11 +5,11 @@ Importing this imports no torch.
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from splatwizard_native.errors import CompilerMissingError as CompilerMissingError
 from splatwizard_native.errors import NativeBuildError as NativeBuildError
+from splatwizard_native.lending import lend as lend
 
 if TYPE_CHECKING:
     from splatwizard_native.build import BuildRow as BuildRow
@@ -46,6 +46,7 @@ MODULES = {
     "cores": "available_cores",
     "cuda_toolkit": "find_nvcc nvcc_version",
     "errors": "CompilerMissingError NativeBuildError",
+    "lending": "lend",
     "fused.adam": "AdamUpdate adam_steps",
     "fused.photometric": "Padding photometric",
     "machine": "describe_machine",
@@ -57,12 +58,5 @@ MODULES = {
     "toolchain": "find_compiler",
 }
 """Module -> the names that are offered here."""
-_HOMES = {name: module for module, names in MODULES.items() for name in names.split()}
 
-__all__ = list(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__all__, __getattr__ = lend(__name__, MODULES)

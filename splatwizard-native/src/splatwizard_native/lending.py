@@ -1,4 +1,4 @@
-"""Lending of names: the faces of the core import each from its module when it is asked for."""
+"""Lending of names: a package offers names of its modules, each of which is imported when it is asked for."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 
 
 def lend(face: str, modules: Mapping[str, str]) -> tuple[list[str], Callable[[str], Any]]:
-    """Make `__all__` and `__getattr__` of the module `face`.
+    """Make `__all__` and `__getattr__` of the module `face`: a package, or a module directly in it.
 
-    modules     module of the core -> the names that it lends, separated by spaces
+    modules     module of the package, without its name -> the names that it lends, separated by spaces
     """
-    homes = {name: f"splatwizard_core.{module}" for module, names in modules.items() for name in names.split()}
+    package = face.partition(".")[0]
+    homes = {name: f"{package}.{module}" for module, names in modules.items() for name in names.split()}
 
     def find(name: str) -> Any:
         """Import what is asked for, once: a plugin that only registers itself imports no torch."""
