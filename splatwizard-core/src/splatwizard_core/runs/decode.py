@@ -19,11 +19,10 @@ from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.progress import track
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
 from splatwizard_core.runs.session import Session
-from splatwizard_native import CoreTime, MemoryMeter, synchronize
+from splatwizard_native import CoreTime, MemoryMeter, synchronize, track
 
 REPEATS = 3
 

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from splatwizard_core import progress
-from splatwizard_core.progress import duration, track
+from splatwizard_native import progress
+from splatwizard_native.progress import duration, track
 
 
 def test_a_blink_of_an_eye_prints_nothing():
