@@ -38,7 +38,7 @@ void accumulate_as(const Inputs& in, const ScoreInputs& asked, at::ArrayRef<doub
   const int64_t used =
       SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(radii), seen);
   const int64_t count = SW_SELECT(count_pairs<S>)(n, slots);
-  check_pairs(count, settings);
+  check_pairs_on_cpu(count, settings);
   if (count == 0) return;
 
   const Tensor order = make_as({used}, at::kInt);

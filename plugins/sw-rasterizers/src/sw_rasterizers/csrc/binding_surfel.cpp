@@ -84,7 +84,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   const int64_t used =
       n == 0 ? 0 : SW_SELECT(project_surfels<S>)(view, g, settings, slots, planes, data<int32_t>(out.radii), seen);
   const int64_t count = SW_SELECT(count_pairs<S>)(n, slots);
-  check_pairs(count, settings);
+  check_pairs_on_cpu(count, settings);
   out.seconds.push_back(clock.lap());
 
   Tensor order = make_as({used}, at::kInt);
