@@ -9,6 +9,7 @@ import torch
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene, front_camera, with_tensors
 
 from splatwizard_core.api import Camera, GaussianInputs, RasterOptions, ScoreSpec
+from splatwizard_native import MemoryMeter
 from sw_rasterizers.inference import FlashRasterizer
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.scoring import PupRasterizer
@@ -78,6 +79,31 @@ def test_more_pairs_than_the_limit_are_refused_and_the_next_call_draws(way, devi
             way.draw(g, cam)
     monkeypatch.delenv(LIMIT)
     assert torch.equal(way.draw(g, cam), whole)
+
+
+@pytest.mark.parametrize(("way", "device"), WAYS)
+def test_pairs_of_splats_whose_colours_are_not_finite_count_too(way, device, monkeypatch):
+    """They draw nothing; but while they fill the lists, there is no room for those of the splats behind them."""
+    g, cam = full_screen(3000, way, device), front_camera(64, 64)
+    with torch.no_grad():
+        g.sh.dense[:2990] = float("nan")
+    whole = way.draw(g, cam)
+    monkeypatch.setenv(LIMIT, "2000")
+    with pytest.raises(RuntimeError, match=r"48000 splat-tile pairs are more than (2000|1000): "):
+        way.draw(g, cam)
+    monkeypatch.setenv(LIMIT, str(2 * 48_000))
+    assert torch.equal(way.draw(g, cam), whole)
+
+
+@pytest.mark.parametrize("way", [STANDARD, SURFELS], ids=["standard", "surfels"])
+def test_a_refused_call_takes_no_memory_for_its_pairs_on_the_cpu(way, monkeypatch):
+    """A thousand splats are projected at once; 16,384 tiles each are 65 MB."""
+    g, cam, memory = full_screen(1000, way, "cpu"), front_camera(2048, 2048, fx=2048.0, fy=2048.0), MemoryMeter("cpu")
+    monkeypatch.setenv(LIMIT, "100000")
+    memory.start()
+    with pytest.raises(RuntimeError, match="16384000 splat-tile pairs are more than 100000: "):
+        way.draw(g, cam)
+    assert memory.peak_bytes() < 20e6
 
 
 @ON_GPU
