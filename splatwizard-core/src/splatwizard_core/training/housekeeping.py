@@ -72,13 +72,9 @@ class Housekeeping:
     def around(self) -> Iterator[None]:
         """The loop, timed and on display; a Ctrl-C waits for the end of its step."""
         run, trainer = self.run, self.trainer
-        write, index = run.run_log.write, trainer.index
-        for scheduler in (trainer.pre, trainer.post):
-            # Knows nothing of the trainer: a ring of references would keep the optimizer's memory for a while.
-            scheduler.on_log = lambda step, name: write(index, step, task=name)
         label = f"train {run.identity.get('method', self.name)}"
         if len(run.stages) > 1:
-            label += f": {self.name} ({index + 1} of {len(run.stages)})"
+            label += f": {self.name} ({trainer.index + 1} of {len(run.stages)})"
         bar = track(label, total=trainer.stage.iterations, start=trainer.step)
         with self.guard, bar as self._bar:
             self.clock.start()
@@ -165,10 +161,15 @@ class Housekeeping:
             self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics))
 
     def _log_step(self, record: StepRecord) -> None:
-        if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every:
+        for task, line in record.said:
+            if line:
+                self._bar.say(f"step {record.step:,}, {task}: {line}")
+        facts: dict[str, Any] = {}
+        if record.step in (1, record.iterations) or record.step % self.run.ppl.log_every == 0:
+            groups = self.trainer.optimizer.groups.values()
+            facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
+        elif not (record.said or record.scalars):
             return
-        groups = self.trainer.optimizer.groups.values()
-        facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
         self._unread.append((record, facts))
         if self.trainer.device.type == "cpu" or len(self._unread) >= UNREAD_LINES:
             self._write_lines()
@@ -176,11 +177,17 @@ class Housekeeping:
     def _write_lines(self) -> None:
         if not self._unread:
             return
-        values = iter(read_scalars([x for r, _ in self._unread for x in (r.total, *r.parts.values())]))
+        tensors = [x for r, _ in self._unread for x in (r.total, *r.parts.values(), *r.scalars.values())]
+        values = iter(read_scalars(tensors))
         for record, facts in self._unread:
+            for task, said in record.said:
+                self.run.run_log.write(record.stage, record.step, task=task, **({"said": said} if said else {}))
             line: dict[str, Any] = {"view": record.view, "loss": next(values)}
             line["parts"] = {name: next(values) for name in record.parts}
             if record.seconds:
                 line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
-            self.run.run_log.write(record.stage, record.step, **line, **facts)
+            scalars = {name: next(values) for name in record.scalars}
+            content = {**(line | facts if facts else {}), **({"scalars": scalars} if scalars else {})}
+            if content:
+                self.run.run_log.write(record.stage, record.step, **content)
         self._unread.clear()

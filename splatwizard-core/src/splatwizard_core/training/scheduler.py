@@ -45,7 +45,6 @@ class Scheduler:
         if stage not in ("pre", "post"):
             raise ValueError(f"a scheduler's stage is 'pre' or 'post', not '{stage}'")
         self.stage = stage
-        self.on_log: Callable[[int, str], None] | None = None
         self.registrations: list[Registration] = []
         self._step: int | None = None  # while a step's tasks run
 
@@ -99,7 +98,7 @@ class Scheduler:
         for entry in self.registrations:
             if not entry.due(step):
                 continue
-            context.step, context.scheduler, self._step = step, self, step
+            context.step, context.scheduler, context.log.task, self._step = step, self, entry.name, step
             try:
                 result = entry.binding(context)
             except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.cuda.OutOfMemoryError):
@@ -111,8 +110,7 @@ class Scheduler:
             stop = stop or result is STOP
             if entry.log:
                 log.info("step %d: %s", step, entry.name)
-                if self.on_log is not None:
-                    self.on_log(step, entry.name)
+                context.log.say("")
         return stop
 
     def pending_late(self, step: int) -> bool:

@@ -1,0 +1,37 @@
+"""Lines and values that the schedule tasks of a step leave: for the terminal, log.jsonl, reports, and observers."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+
+class TaskLog:
+    """Takes what the tasks of one step say and measure; a task asks for it by this annotation.
+
+    task        name of the task that runs
+    said        (task, line), in order; the line is empty where a task was registered with `log`
+    scalars     curve -> value, float64 tensors on the device that they came from
+    """
+
+    def __init__(self) -> None:
+        self.task = ""
+        self.said: list[tuple[str, str]] = []
+        self.scalars: dict[str, Tensor] = {}
+
+    def say(self, line: str) -> None:
+        """Tell the user one line, in the terminal and in log.jsonl, with the step and the name of the task."""
+        self.said.append((self.task, " ".join(line.split())))
+
+    def scalar(self, name: str, value: float | Tensor) -> None:
+        """Record the value of a curve at this step; of several values the last one counts.
+
+        name    of the curve, such as "pruned"
+        value   number, or tensor of one element: it is read later, so that nobody waits for a GPU
+
+        Raises ValueError for an empty name, or a tensor of another size.
+        """
+        number = torch.as_tensor(value, dtype=torch.float64).detach().clone()
+        if not name or number.numel() != 1:
+            raise ValueError(f"curve '{name}' needs a name, and one number a step, not a shape of {list(number.shape)}")
+        self.scalars[name] = number
