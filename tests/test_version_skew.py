@@ -121,7 +121,10 @@ def test_a_plugin_too_old_to_have_the_method(tmp_path, capsys):
     path = write(
         tmp_path, method="3dgs-next", requires=requires(sw_3dgs="0.7") | {"sw-3dgs": ["0.7", "method:3dgs-next"]}
     )
-    assert said(capsys, "decode", path).endswith(f"sw-3dgs {HERE} is too old: pip install 'sw-3dgs>=0.7'")
+    assert said(capsys, "decode", path).endswith(
+        f"sw-3dgs {HERE} does not provide it (the file is newer: it was written with sw-3dgs 0.7, installed is {HERE}: "
+        "pip install 'sw-3dgs>=0.7')"
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -129,13 +132,13 @@ def test_a_newer_layout_of_a_method(tmp_path, capsys, command):
     path = write(tmp_path, method_version=2, requires=requires(sw_3dgs="0.9"))
     assert said(capsys, command, path) == (
         f"error: garden.swz: version 2 of the layout of '3dgs' is newer than 1, which sw-3dgs {HERE} reads: "
-        "upgrade it with pip install 'sw-3dgs>=0.9'"
+        "upgrade with pip install 'sw-3dgs>=0.9'"
     )
 
 
 def test_a_newer_layout_of_a_method_in_a_file_that_names_no_package(tmp_path, capsys):
     path = write(tmp_path, method_version=2, requires={})
-    assert "upgrade it with pip install --upgrade sw-3dgs" in said(capsys, "decode", path)
+    assert "upgrade with pip install --upgrade sw-3dgs" in said(capsys, "decode", path)
 
 
 @pytest.mark.parametrize("section", ["positions", "color"])
@@ -147,7 +150,7 @@ def test_a_newer_coded_stream(tmp_path, capsys, section):
     assert f"section '{section}'" in line
     assert "version 2" in line
     assert line.endswith(
-        f"(the file was written with sw-codecs 0.4, installed is {HERE}: pip install 'sw-codecs>=0.4')"
+        f"(the file is newer: it was written with sw-codecs 0.4, installed is {HERE}: pip install 'sw-codecs>=0.4')"
     )
 
 

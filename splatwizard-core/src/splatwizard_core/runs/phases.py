@@ -77,9 +77,8 @@ class StageParts:
     def since_asked(self) -> list[Part]:
         """Return the parts that served since this was last asked."""
         asked = map(part_of, _without_methods(self._loaded[self._mark :]))
-        found = unique(
-            [*self._pending, *asked, *named_parts(self._plugins, "rasterizer", sorted(self._rasterizer.served))]
-        )
+        drawn = named_parts(self._plugins, "rasterizer", sorted(self._rasterizer.served))
+        found = unique([*self._pending, *asked, *drawn])
         self._rasterizer.served.clear()
         self._mark, self._pending = len(self._loaded), []
         return found

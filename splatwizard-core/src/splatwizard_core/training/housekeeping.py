@@ -161,15 +161,14 @@ class Housekeeping:
             self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics))
 
     def _log_step(self, record: StepRecord) -> None:
-        for task, line in record.said:
-            if line:
-                self._bar.say(f"step {record.step:,}, {task}: {line}")
-        facts: dict[str, Any] = {}
-        if record.step in (1, record.iterations) or record.step % self.run.ppl.log_every == 0:
-            groups = self.trainer.optimizer.groups.values()
-            facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
-        elif not (record.said or record.scalars):
+        for task, said in record.said:
+            self.run.run_log.write(record.stage, record.step, task=task, **({"said": said} if said else {}))
+            if said:
+                self._bar.say(f"step {record.step:,}, {task}: {said}")
+        if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every and not record.scalars:
             return
+        groups = self.trainer.optimizer.groups.values()
+        facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
         self._unread.append((record, facts))
         if self.trainer.device.type == "cpu" or len(self._unread) >= UNREAD_LINES:
             self._write_lines()
@@ -180,14 +179,11 @@ class Housekeeping:
         tensors = [x for r, _ in self._unread for x in (r.total, *r.parts.values(), *r.scalars.values())]
         values = iter(read_scalars(tensors))
         for record, facts in self._unread:
-            for task, said in record.said:
-                self.run.run_log.write(record.stage, record.step, task=task, **({"said": said} if said else {}))
             line: dict[str, Any] = {"view": record.view, "loss": next(values)}
             line["parts"] = {name: next(values) for name in record.parts}
             if record.seconds:
                 line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
-            scalars = {name: next(values) for name in record.scalars}
-            content = {**(line | facts if facts else {}), **({"scalars": scalars} if scalars else {})}
-            if content:
-                self.run.run_log.write(record.stage, record.step, **content)
+            if record.scalars:
+                line["scalars"] = {name: next(values) for name in record.scalars}
+            self.run.run_log.write(record.stage, record.step, **line, **facts)
         self._unread.clear()

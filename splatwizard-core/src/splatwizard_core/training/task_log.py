@@ -10,8 +10,8 @@ class TaskLog:
     """Takes what the tasks of one step say and measure; a task asks for it by this annotation.
 
     task        name of the task that runs
-    said        (task, line), in order; the line is empty where a task was registered with `log`
-    scalars     curve -> value, float64 tensors on the device that they came from
+    said        (task, line), in order; an empty line: it was registered with `log`
+    scalars     curve -> value, float64, on the device that it came from
     """
 
     def __init__(self) -> None:
@@ -24,12 +24,9 @@ class TaskLog:
         self.said.append((self.task, " ".join(line.split())))
 
     def scalar(self, name: str, value: float | Tensor) -> None:
-        """Record the value of a curve at this step; of several values the last one counts.
+        """Record the value of the curve `name` at this step; of several values the last one counts.
 
-        name    of the curve, such as "pruned"
-        value   number, or tensor of one element: it is read later, so that nobody waits for a GPU
-
-        Raises ValueError for an empty name, or a tensor of another size.
+        value   number, or tensor of one element (else ValueError): it is read later, so that nobody waits for a GPU
         """
         number = torch.as_tensor(value, dtype=torch.float64).detach().clone()
         if not name or number.numel() != 1:
