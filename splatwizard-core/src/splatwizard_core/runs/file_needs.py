@@ -8,7 +8,7 @@ from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.coding.requirements import requirement_of
 from splatwizard_core.errors import PluginError
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.plugins.catalogue import CORE, is_ours, normal_name, package_of
+from splatwizard_core.plugins.catalogue import CORE, catalogue, is_ours, normal_name
 from splatwizard_core.runs.versions import installed
 
 
@@ -30,11 +30,9 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
     """
     verb = "was written by" if kind == "method" else "needs"
     problem = f"{reader.name} {verb} {kind} '{name}', which is not installed"
-    requirement = requirement_of(reader.requires, kind, name)
-    ours = package_of(kind, name)
-    if ours is not None and (requirement is None or normal_name(requirement.distribution) != normal_name(ours)):
-        return PluginError(f"{problem}: pip install {ours}")
-    if requirement is None:
+    writer = requirement_of(reader.requires, kind, name)
+    package = catalogue().get(kind, {}).get(name) or (writer and writer.distribution)
+    if package is None:
         broken = [p.distribution for p in plugins.broken]
         if broken:
             problem += f" (or does not load: {', '.join(broken)}, see `sw list-plugins`)"
@@ -42,17 +40,20 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
     if kind not in plugins.registries:
         command = upgrade_command(reader, CORE, importlib.metadata.version(CORE))
         return PluginError(f"{reader.name} needs a {kind}, which {CORE} does not know: {command}")
-    mine = [p for p in plugins.plugins if normal_name(p.distribution) == normal_name(requirement.distribution)]
+    mine = [p for p in plugins.plugins if normal_name(p.distribution) == normal_name(package)]
     failed = next((p for p in mine if p.error is not None), None)
     if failed is not None:
         return PluginError(f"{problem}, since {failed.distribution} {failed.version} does not load: {failed.error}")
-    have = installed(plugins, [requirement.distribution])[requirement.distribution]
+    have = installed(plugins, [package])[package]
     if not have:
-        return PluginError(f"{problem}: {requirement.command} (the package that the file names)")
+        named = writer is not None and normal_name(writer.distribution) == normal_name(package)
+        command = (
+            f"{writer.command} (the package that the file names)" if writer and named else f"pip install {package}"
+        )
+        return PluginError(f"{problem}: {command}")
     if not mine:
-        return PluginError(f"{problem}: {requirement.distribution} {have} is there, but SW_PLUGINS leaves it out")
-    problem += f": {requirement.distribution} {have} does not provide it"
-    return PluginError(problem + other_versions(reader, plugins))
+        return PluginError(f"{problem}: {package} {have} is there, but SW_PLUGINS leaves it out")
+    return PluginError(f"{problem}: {package} {have} does not provide it{other_versions(reader, plugins)}")
 
 
 def other_versions(reader: ContainerReader, plugins: PluginManager) -> str:
