@@ -106,7 +106,7 @@ def test_a_missing_entropy_model(tmp_path, capsys, only):
     only("3dgs,codecs")
     del load_plugins().entropy_models._entries["columns"]
     assert said(capsys, "decode", write(tmp_path, requires=row)).endswith(
-        f"needs entropy model 'columns', which is not installed: sw-codecs {HERE} does not provide it (the file is newer: "
+        f"entropy model 'columns', which is not installed: sw-codecs {HERE} does not provide it (the file is newer: "
         f"it was written with sw-codecs 4.5, installed is {HERE}: pip install 'sw-codecs>=4.5')"
     )
 

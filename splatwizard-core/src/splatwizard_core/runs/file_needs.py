@@ -31,7 +31,7 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
     verb = "was written by" if kind == "method" else "needs"
     problem = f"{reader.name} {verb} {kind} '{name}', which is not installed"
     writer = requirement_of(reader.requires, kind, name)
-    package = catalogue().get(kind, {}).get(name) or (writer and writer.distribution)
+    package = catalogue().get(kind, {}).get(name) or (None if writer is None else writer.distribution)
     if package is None:
         broken = [p.distribution for p in plugins.broken]
         if broken:
@@ -46,11 +46,9 @@ def missing_plugin(reader: ContainerReader, plugins: PluginManager, kind: str, n
         return PluginError(f"{problem}, since {failed.distribution} {failed.version} does not load: {failed.error}")
     have = installed(plugins, [package])[package]
     if not have:
-        named = writer is not None and normal_name(writer.distribution) == normal_name(package)
-        command = (
-            f"{writer.command} (the package that the file names)" if writer and named else f"pip install {package}"
-        )
-        return PluginError(f"{problem}: {command}")
+        if writer is not None and normal_name(writer.distribution) == normal_name(package):
+            return PluginError(f"{problem}: {writer.command} (the package that the file names)")
+        return PluginError(f"{problem}: pip install {package}")
     if not mine:
         return PluginError(f"{problem}: {package} {have} is there, but SW_PLUGINS leaves it out")
     return PluginError(f"{problem}: {package} {have} does not provide it{other_versions(reader, plugins)}")
