@@ -27,6 +27,7 @@ MODULES = {
     "rendering.info": "RasterizerInfo",
     "training.stage": "Stage StageContext CameraSampler CameraIterator",
     "training.scheduler": "Scheduler",
+    "training.task_log": "TaskLog",
     "training.plan": "When",
     "training.params": "OptimizationParams PipelineParams Params InputFile",
     "training.optimizer": "SplatOptimizer ParamGroup",
