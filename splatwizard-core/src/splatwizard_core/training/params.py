@@ -87,7 +87,7 @@ class OptimizationParams(Params):
         return values
 
     def completed(self, plugins: Any, sources: Mapping[str, str]) -> "OptimizationParams":
-        """Return this with checked settings of what it names in `plugins`; sources: dotted key -> who gave its value."""
+        """Return this with checked settings of what it names in `plugins`; sources: dotted key -> who gave a value."""
         return self
 
     def identity(self) -> dict[str, Any]:
