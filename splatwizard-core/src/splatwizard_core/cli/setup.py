@@ -122,7 +122,8 @@ class Choices:
             return chosen
         (name,) = chosen.method_names(plugins)
         method = plugins.methods.load(name)
-        wanted = resolve(method, str(read_config_file(directory / "config.toml").get("preset", "paper")), self.rate)
+        preset = str(read_config_file(directory / "config.toml").get("preset", "paper"))
+        wanted = resolve(method, preset, self.rate, plugins=plugins)
         keys = tuple(
             f"{k}." for point in method.RATES.values() for k in point if field_at(method.Config, k) is not None
         )
