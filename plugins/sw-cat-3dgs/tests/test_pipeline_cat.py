@@ -112,7 +112,9 @@ def test_float_files_hold_the_same_up_to_their_steps(scene, rasterizer, method, 
 
 
 def test_half_precision_weights_halve_their_section(scene, rasterizer, method, trained):
-    full, half = (ContainerReader(encoded(trained, method, codec__settings__weights=w), "x") for w in ("float32", "float16"))
+    full, half = (
+        ContainerReader(encoded(trained, method, codec__settings__weights=w), "x") for w in ("float32", "float16")
+    )
     assert half.sections["networks"] * 2 == full.sections["networks"]
     model = Cat3DGS(load_plugins(), None).decode(half)
     assert psnr(model, scene, rasterizer) > psnr(trained.eval(), scene, rasterizer) - 0.5

@@ -113,7 +113,9 @@ def test_another_process_decodes_the_same(tmp_path):
 
 def test_half_precision_weights_save_half_of_their_bytes():
     model = make()
-    sizes = [ContainerReader(encoded(model, codec__settings__weights=w)).sections["networks"] for w in ("float32", "float16")]
+    sizes = [
+        ContainerReader(encoded(model, codec__settings__weights=w)).sections["networks"] for w in ("float32", "float16")
+    ]
     assert sizes[0] == 2 * sizes[1]
     small = decoded(encoded(model, codec__settings__weights="float16"))
     assert torch.equal(small.mlp_color[0].weight, model.mlp_color[0].weight.half().float())
@@ -248,7 +250,9 @@ def test_float_mode_decodes_here_and_says_why_not_elsewhere():
     reader = ContainerReader(data)
     assert reader.static["made_on"] == this_machine()
     for changed in ({"device": "cpu other", "torch": torch.__version__}, {"device": "x", "torch": "1.0"}, None):
-        with pytest.raises(BitstreamError, match=r"mode 'float' decodes only where it was encoded.*codec.settings.mode=exact"):
+        with pytest.raises(
+            BitstreamError, match=r"mode 'float' decodes only where it was encoded.*codec.settings.mode=exact"
+        ):
             decoded(rewritten(data, made_on=changed))
 
 
