@@ -60,6 +60,7 @@ class PartsChoice(Choice):
     PARTS: ClassVar[tuple[str, ...]] = ("low", "high")
 
     name: str = "ours"
+    settings: dict[str, object] = {}
     low: dict[str, object] = {"power": 0.5}
     high: dict[str, object] = {}
 
