@@ -84,7 +84,14 @@ def test_presets_set_what_the_table_of_differences_says():
 @pytest.mark.parametrize("name", [*ThreeDGS.PRESETS])
 @pytest.mark.parametrize("rate", [*ThreeDGS.RATES])
 def test_every_preset_resolves_at_every_rate_point(name, rate):
-    assert resolve(ThreeDGS, name, rate).config.codec.mode in ("exact", "quantized")
+    assert resolve(ThreeDGS, name, rate).config.codec.name in ("gaussians-exact", "gaussians-quantized")
+
+
+def test_no_reset_comes_after_the_end_of_densification_on_white_either():
+    for stop, resets in ((15_000, True), (400, False)):
+        stage = stage_of(densify__stop=stop)
+        begin(stage, tiny_scene("white"))
+        assert ("reset opacity (white background)" in plan_of(stage)) == resets
 
 
 def test_fewer_iterations_alone_keep_the_plan():

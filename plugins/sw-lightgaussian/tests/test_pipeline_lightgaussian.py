@@ -21,7 +21,7 @@ from sw_lightgaussian.vectree import CodedGaussians
 
 SHORT = {
     "iterations": 12, "prune.iterations": 12, "distill.lr.sh_rest": 1e-2,
-    "codec.vq_iterations": 20, "codec.vq_batch": 200,
+    "codec.settings.iterations": 20, "codec.settings.batch": 200,
 }  # fmt: skip
 
 

@@ -29,6 +29,7 @@ MODULES = {
     "training.scheduler": "Scheduler",
     "training.task_log": "TaskLog",
     "training.plan": "When",
+    "training.overrides": "apply_overrides",
     "training.params": "OptimizationParams PipelineParams Params InputFile",
     "training.optimizer": "SplatOptimizer ParamGroup",
     "training.losses": "LossPack photometric_loss",

@@ -96,7 +96,8 @@ class AnchorStage(Stage):
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         growth = self.opt.growth
         scheduler.register_task(self.when(range(growth.stop)), self.collect_gradient_statistics)
-        for start, stop in ((growth.start, growth.pause_start), (growth.pause_end, growth.stop)):
+        pause_end = max(growth.start, growth.pause_start, growth.pause_end)
+        for start, stop in ((growth.start, min(growth.pause_start, growth.stop)), (pause_end, growth.stop)):
             if start < stop:
                 scheduler.register_task(self.when(range(start, stop, growth.interval)), self.adjust_anchor)
 

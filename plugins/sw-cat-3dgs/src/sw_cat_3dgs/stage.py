@@ -65,7 +65,8 @@ class CatStage(CodedAnchorStage):
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         phases = self.opt.phases
         scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_lr)
-        scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_cam_mask)
+        counting = max(self.opt.lr.max_steps, self.opt.growth.stop)  # as long as anchors come and go
+        scheduler.register_task(self.when(range(counting)), self.update_cam_mask)
         scheduler.register_task(1, self.update_anchor_bound)
         PhaseSwitch(self.at(phases.quantize), QUANTIZED).register(scheduler)
         scheduler.register_task(self.at(phases.triplane), self.update_anchor_bound)
