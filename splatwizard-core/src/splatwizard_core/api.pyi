@@ -64,5 +64,5 @@ from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
-from splatwizard_native.progress import track as track
 from splatwizard_core.training.task_log import TaskLog as TaskLog
+from splatwizard_native.progress import track as track
