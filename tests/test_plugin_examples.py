@@ -271,6 +271,31 @@ def test_the_fields_of_a_check_are_told():
     assert re.findall(r"(\w+)(?:=[^,]*)?(?:, |$)", told) == [field.name for field in dataclasses.fields(Check)]
 
 
+VALUES = [
+    api.Camera, api.View, api.Scene, api.SceneOptions, api.SplatModel, api.GaussianModel, api.GaussianInputs, api.SH,
+    api.RasterOptions, api.RenderResult, api.SplatOptimizer, api.ContainerWriter, api.ContainerReader,
+]  # fmt: skip
+SET_WHEN_MADE = {"static", "raster", "version", "active_sh_degree"}
+"""Attributes that a class does not name outside its `__init__`."""
+
+
+@pytest.mark.parametrize("cls", VALUES, ids=lambda cls: cls.__name__)
+def test_values_have_what_the_page_says(cls):
+    rows = re.findall(r"^\| (`.*?) \|", SECTIONS[cls.__name__], re.M)
+    told = dict(re.match(r"(\w+)(.*)", each).groups() for row in rows for each in re.findall(r"`(.+?)`", row))
+    fields = {f.name for f in dataclasses.fields(cls) if f.init} if dataclasses.is_dataclass(cls) else set()
+    assert fields <= told.keys()
+    for name, parameters in told.items():
+        member = inspect.getattr_static(cls, name, None)
+        if not parameters:
+            named = {name} & {*fields, *SET_WHEN_MADE, *cls.__annotations__, *vars(cls)}
+            assert named, f"{cls.__name__} has no {name}"
+            assert not inspect.isfunction(member), f"{cls.__name__}.{name} is a function"
+            continue
+        signature = bare_signature(getattr(cls, name))
+        assert parameters == signature.replace("<built-in function getitem>", "..."), f"{cls.__name__}.{name}"
+
+
 # The examples
 
 
