@@ -1,11 +1,10 @@
-"""docs/plugins.md as a reference: its examples make up a package that works, and its signatures are the contracts'."""
+"""docs/plugins.md as a reference: its examples make up a package, and every part of it keeps its contract."""
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
 import importlib.metadata
-import inspect
 import re
 import sys
 from collections.abc import Iterator
@@ -18,100 +17,49 @@ import pytest
 import torch
 from click.testing import CliRunner
 from PIL import Image
+from plugin_page import BLOCKS, HOOKS, PACKAGE, files_of, run, write_package
+from small_scene import HEIGHT, WIDTH, small_scene, ten_gaussians
 from sw_datasets.downloads.registry import parse_registry
 from sw_doctor.registered import run_registered
-from sw_kit.checks.fields import FIELDS
 from sw_reference.rasterizer import ReferenceRasterizer
 
-from splatwizard_core import api
 from splatwizard_core.cli.main import cli
 from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.errors import BitstreamError, CapabilityError, ConfigError, SceneError, UserInputError
 from splatwizard_core.evaluation.evaluate import evaluate
-from splatwizard_core.evaluation.metrics import MetricFactory, MetricInfo, check_settings
+from splatwizard_core.evaluation.metrics import MetricInfo, check_settings
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import create_method
 from splatwizard_core.plugins import hookspecs
 from splatwizard_core.plugins.check import Check
 from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_core.rendering.features import Feature
-from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.decode import export_model, open_model
 from splatwizard_core.runs.encode import encode
-from splatwizard_core.runs.observers import FinishedRun, FinishedRuns, StartedTraining, TrainingObserver, watched_by
-from splatwizard_core.scene.camera import Camera
+from splatwizard_core.runs.observers import FinishedRun, FinishedRuns, StartedTraining, watched_by
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.scheduler import Scheduler, build_schedulers
 from splatwizard_core.training.stage import CameraIterator
-from splatwizard_core.training.tasks import SOURCES, TaskContext
+from splatwizard_core.training.tasks import TaskContext
 from sw_codecs import testing
 
-PAGE = (Path(__file__).resolve().parents[1] / "docs" / "plugins.md").read_text("utf-8")
-PACKAGE = "sw_theirs"
-HOOKS = {name for name, hook in vars(hookspecs).items() if hasattr(hook, f"{hookspecs.PROJECT}_spec")}
 NOT_CALLED = {"register_executors"}
 """Hooks that nothing calls yet: there is nothing to show."""
-WIDTH, HEIGHT = 16, 12
 CPU = torch.device("cpu")
-
-
-def sections() -> dict[str, str]:
-    """Text by heading of the second and third level; of a hook its name, of others the heading."""
-    found = {}
-    for part in re.split(r"^###? (?=\S)", PAGE, flags=re.M)[1:]:
-        title, _, text = part.partition("\n")
-        found[title.strip("`").partition("(")[0]] = text
-    return found
-
-
-SECTIONS = sections()
-BLOCKS = [
-    (title, block)
-    for title, text in SECTIONS.items()
-    for block in re.findall(r"^```python\n(.*?)^```$", text, re.M | re.S)
-]
-
-
-def files_of(block: str) -> dict[str, str]:
-    """Parts of a block by the module that its comments name; "" for what stands before the first of them."""
-    parts = re.split(rf"^# {PACKAGE}/(\w+)\.py\n", block, flags=re.M)
-    named = list(zip(parts[1::2], parts[2::2], strict=True))
-    assert len(dict(named)) == len(named), "a block names a file twice"
-    return {**({"": parts[0]} if parts[0].strip() else {}), **dict(named)}
-
-
-def run(text: str) -> dict[str, Any]:
-    """Execute lines of the page as a script, without the `annotations` of this file; returns what they define."""
-    namespace: dict[str, Any] = {"__name__": "example"}
-    exec(compile(text, "docs/plugins.md", "exec", dont_inherit=True), namespace)
-    return namespace
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     """A folder on the path in which the package of the examples is installed."""
     folder = tmp_path_factory.mktemp("site")
-    modules: dict[str, str] = {"__init__": ""}
-    for title, block in BLOCKS:
-        for name, text in files_of(block).items():
-            assert name in ("", "plugin") or name not in modules, f"{title} writes {name}.py again"
-            modules[name] = modules.get(name, "") + text
-    del modules[""]
-    (folder / PACKAGE).mkdir()
-    for name, text in modules.items():
-        (folder / PACKAGE / f"{name}.py").write_text(text, "utf-8")
-    info = folder / f"{PACKAGE}-0.1.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-theirs\nVersion: 0.1\n")
-    (info / "entry_points.txt").write_text(f"[{hookspecs.ENTRY_POINT_GROUP}]\ntheirs = {PACKAGE}.plugin\n")
+    write_package(folder)
     sys.path.insert(0, str(folder))
     importlib.invalidate_caches()
     yield folder
@@ -136,36 +84,13 @@ def alone(site: Path) -> PluginManager:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Three views of ten points, with noise as pictures."""
-    rng = np.random.default_rng(0)
-    up = torch.tensor([0.0, 1.0, 0.0])
-    views = []
-    for i, angle in enumerate((0.0, 0.3, 0.6)):
-        eye = torch.tensor([4 * np.sin(angle), 0.0, 4 * np.cos(angle)]).float()
-        camera = Camera.look_at(eye, torch.zeros(3), up, width=WIDTH, height=HEIGHT, fov_x=0.8)
-        pixels = rng.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8)
-        views.append(View(camera, f"{i}.png", load=lambda pixels=pixels: pixels))
-    points = torch.from_numpy(rng.uniform(-0.5, 0.5, (10, 3))).float()
-    return Scene("tiny", views[:2], views[2:], PointCloud(points, torch.full((10, 3), 0.6)), Protocol("tiny"))
+    return small_scene()
 
 
 @pytest.fixture
 def model(scene: Scene) -> GaussianModel:
     """Ten Gaussians, the first of them behind every camera."""
-    means = scene.points.xyz.clone()
-    means[0] = torch.tensor([0.0, 0.0, 50.0])
-    generator = torch.Generator().manual_seed(1)
-    return GaussianModel.from_tensors(
-        means,
-        torch.randn(10, 1, 3, generator=generator),
-        torch.randn(10, 3, 3, generator=generator),
-        torch.linspace(-2, 2, 10),
-        torch.full((10, 3), -1.5),
-        torch.randn(10, 4, generator=generator),
-    )
-
-
-# The page
+    return ten_gaussians(scene)
 
 
 @pytest.mark.parametrize("hook", sorted(HOOKS - NOT_CALLED))
@@ -193,110 +118,6 @@ def test_registering_imports_no_torch(site):
         if "plugin" in files_of(block):
             imported = re.findall(r"^(?:from|import) (\S+)", files_of(block)["plugin"], re.M)
             assert imported == ["splatwizard_core.api"], f"plugin.py of {title} imports {imported}"
-
-
-CONTRACTS: dict[str, list[Any]] = {
-    "The hooks": [api.Registry],
-    "register_rasterizers": [api.Rasterizer],
-    "register_pruners": [api.Pruner],
-    "register_quantizers": [api.Quantizer],
-    "register_entropy_models": [api.EntropyModel],
-    "register_context_models": [api.ContextModel],
-    "register_coders": [api.EntropyCoder, api.PositionCodec, api.ArrayCoder, api.VectorCoder, api.GaussianCodec],
-    "register_methods": [api.Method],
-    "register_datasets": [api.Dataset],
-    "register_metrics": [MetricFactory],
-    "run_started": [TrainingObserver],
-    "Stages": [api.Stage],
-}
-ONLY = {api.Registry: ["add"], api.ContextModel: ["__call__"]}
-
-
-def members(contract: type) -> list[str]:
-    """Names of what a contract asks for."""
-    if contract in ONLY:
-        return ONLY[contract]
-    public = [name for name in {**vars(contract), **contract.__annotations__} if not name.startswith("_")]
-    made = ["__init__"] if contract in (api.Method, api.Stage) else []
-    return [*made, *public]
-
-
-def bare_signature(function: Any) -> str:
-    """Names and defaults of the parameters, as the page shows them."""
-    signature = inspect.signature(function)
-    kept = [p.replace(annotation=p.empty) for p in signature.parameters.values() if p.name != "self"]
-    return str(signature.replace(parameters=kept, return_annotation=signature.empty))
-
-
-@pytest.mark.parametrize("title", CONTRACTS)
-def test_signatures_are_those_of_the_contracts(title):
-    for contract in CONTRACTS[title]:
-        for name in members(contract):
-            member = inspect.getattr_static(contract, name, None)
-            text = f"{name}{bare_signature(member)}" if inspect.isfunction(member) else name
-            shown = re.search(rf"^    (?:.*\W)?{re.escape(text)}", SECTIONS[title], re.M)
-            assert shown, f"{title}: {contract.__name__} has {text}"
-
-
-def test_the_signature_of_register_task():
-    assert f"scheduler.register_task{bare_signature(Scheduler.register_task)}" in SECTIONS["register_tasks"]
-
-
-def test_every_annotation_that_a_task_may_have_is_listed():
-    told = set(re.findall(r"`(\w+)`", "".join(re.findall(r"^\| (`.*?) \|", SECTIONS["register_tasks"], re.M))))
-    assert {source.__name__ for source in SOURCES} | {"int"} <= told
-
-
-def test_every_feature_is_listed_with_what_asks_for_it():
-    rows = "".join(re.findall(r"^\| (`.*?) \|", SECTIONS["register_rasterizers"], re.M))
-    assert sorted(re.findall(r"`(\w+)`", rows)) == sorted(Feature.__members__)
-
-
-def test_every_field_that_an_entry_may_declare_is_told():
-    declared: dict[str, Any] = {f"register_{kind}s": fields for kind, fields in FIELDS.items()}
-    declared["register_metrics"] = {*FIELDS["metric"], *(f.name for f in dataclasses.fields(MetricInfo))}
-    known = {f.name for f in dataclasses.fields(RasterizerInfo)} - {"name", "per_device"}
-    declared["register_rasterizers"] = {*known, "on"}
-    for title, names in declared.items():
-        assert [name for name in names if f"`{name}`" not in SECTIONS[title]] == [], title
-
-
-def test_what_a_stage_is_handed_is_told():
-    told = re.findall(r"^\| `(\w+)(?:\(\w+\))?` \|", SECTIONS["Stages"], re.M)
-    assert told == [field.name for field in dataclasses.fields(api.StageContext)]
-
-
-def test_the_fields_of_a_check_are_told():
-    told = re.search(r"Check\((.*)\)\n", SECTIONS["register_checks"]).group(1)
-    assert re.findall(r"(\w+)(?:=[^,]*)?(?:, |$)", told) == [field.name for field in dataclasses.fields(Check)]
-
-
-VALUES = [
-    api.Camera, api.View, api.Scene, api.SceneOptions, api.SplatModel, api.GaussianModel, api.GaussianInputs, api.SH,
-    api.RasterOptions, api.RenderResult, api.SplatOptimizer, api.ContainerWriter, api.ContainerReader,
-]  # fmt: skip
-SET_WHEN_MADE = {"static", "raster", "version", "active_sh_degree"}
-"""Attributes that a class does not name outside its `__init__`."""
-
-
-@pytest.mark.parametrize("cls", VALUES, ids=lambda cls: cls.__name__)
-def test_values_have_what_the_page_says(cls):
-    rows = re.findall(r"^\| (`.*?) \|", SECTIONS[cls.__name__], re.M)
-    told = dict(re.match(r"(\w+)(.*)", each).groups() for row in rows for each in re.findall(r"`(.+?)`", row))
-    fields = {f.name for f in dataclasses.fields(cls) if f.init} if dataclasses.is_dataclass(cls) else set()
-    assert fields <= told.keys()
-    for name, parameters in told.items():
-        member = inspect.getattr_static(cls, name, None)
-        if not parameters:
-            named = {name} & {*fields, *SET_WHEN_MADE, *cls.__annotations__, *vars(cls)}
-            assert named, f"{cls.__name__} has no {name}"
-            assert not inspect.isfunction(member), f"{cls.__name__}.{name} is a function"
-            continue
-        signature = bare_signature(getattr(cls, name))
-        assert parameters == signature.replace("<built-in function getitem>", "..."), f"{cls.__name__}.{name}"
-
-
-# The examples
 
 
 def test_register_rasterizers(plugins, scene, model):
@@ -375,6 +196,8 @@ def test_coders_refuse_what_they_did_not_write(plugins):
     data = order.encode(np.array([[0, 0, 0], [1, 1, 1]]), 4)
     with pytest.raises(BitstreamError, match="not in order"):
         order.decode(data[:8] + data[16:] + data[8:16])
+    with pytest.raises(BitstreamError, match="not in order"):
+        order.decode((1).to_bytes(8, "little") + b"\xff" * 8)
     bomb = plugins.entropy_coders.load("deflated")()
     with pytest.raises(BitstreamError, match="not 3 symbols"):
         bomb.decode(bomb.encode(np.zeros(1000, np.int64), 4), 3, 4)
@@ -424,13 +247,17 @@ def test_register_methods(plugins, scene, tmp_path):
     decoded, reader = open_model(path, plugins, CPU)
     assert reader.method == "their-method"
     assert torch.equal(decoded.sh_dc, trained.sh_dc)
+    older = ContainerWriter("their-method", 0)
+    older.write(path)
+    with pytest.raises(BitstreamError, match="layout version 0 is unknown"):
+        open_model(path, plugins, CPU)
     nothing = dataclasses.replace(scene, points=None)
     with pytest.raises(SceneError, match="no start points"):
         method.create_model(nothing, torch.Generator())
 
 
 def test_a_stage(site, scene, model):
-    from sw_theirs.stage import TheirConfig, TheirStage  # type: ignore[import-not-found]
+    from sw_theirs.stage import TheirConfig, TheirStage
 
     stage = TheirStage(TheirConfig(iterations=2, faint=0.5))
     assert build_schedulers(stage, PipelineParams())[1].plan_lines()
