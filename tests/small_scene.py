@@ -1,13 +1,24 @@
-"""Three small views of ten points, and ten Gaussians: enough for the pure-torch rasterizer."""
+"""Three small views of ten points, ten Gaussians, and a few steps of training with the pure-torch rasterizer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from typing import Any
+
 import numpy as np
+import pytest
 import torch
+from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+from splatwizard_core.training.params import OptimizationParams, PipelineParams
+from splatwizard_core.training.pipeline import TrainingRun
+from splatwizard_core.training.stage import CameraIterator, Stage
+from splatwizard_core.training.tasks import TaskContext
 
 WIDTH, HEIGHT = 16, 12
 
@@ -39,3 +50,19 @@ def ten_gaussians(scene: Scene) -> GaussianModel:
         torch.full((10, 3), -1.5),
         torch.randn(10, 4, generator=generator),
     )
+
+
+def context_of(model: GaussianModel, scene: Scene) -> TaskContext:
+    """What tasks are given between two steps."""
+    optimizer = SplatOptimizer(model, [ParamGroup("opacity_logits", 0.05)])
+    cameras = CameraIterator(scene.train)
+    return TaskContext(PipelineParams(), OptimizationParams(), model, scene, optimizer, cameras, ReferenceRasterizer())
+
+
+def train_with(stages: Sequence[Stage], make_model: Callable[[], SplatModel], scene: Scene, on_step: Any = None) -> Any:
+    """Train all stages, without checkpoints; returns the model."""
+    training = TrainingRun(
+        stages, make_model, scene, PipelineParams(), ReferenceRasterizer(),
+        directory=None, identity={}, trained=lambda name: pytest.fail(f"asked for {name}"), on_step=on_step,
+    )  # fmt: skip
+    return training.train().model

@@ -10,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,9 +17,11 @@ import torch
 from click.testing import CliRunner
 from PIL import Image
 from plugin_page import BLOCKS, HOOKS, PACKAGE, files_of, run, write_package
-from small_scene import HEIGHT, WIDTH, small_scene, ten_gaussians
+from small_scene import HEIGHT, WIDTH, context_of, small_scene, ten_gaussians, train_with
 from sw_datasets.downloads.registry import parse_registry
 from sw_doctor.registered import run_registered
+from sw_kit.checks.fields import check_entry
+from sw_kit.checks.targets import check_target
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.cli.main import cli
@@ -42,12 +43,8 @@ from splatwizard_core.runs.observers import FinishedRun, FinishedRuns, StartedTr
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
-from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from splatwizard_core.training.params import OptimizationParams, PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun
+from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import Scheduler, build_schedulers
-from splatwizard_core.training.stage import CameraIterator
-from splatwizard_core.training.tasks import TaskContext
 from sw_codecs import testing
 
 NOT_CALLED = {"register_executors"}
@@ -111,6 +108,16 @@ def test_every_block_runs(number, site):
             run(text)
         else:
             importlib.import_module(f"{PACKAGE}.{name}")
+
+
+def test_every_entry_is_one_that_check_plugin_takes(plugins):
+    entries = [
+        entry for registry in plugins.registries.values() for entry in registry if entry.target.startswith(PACKAGE)
+    ]
+    assert {entry.kind for entry in entries} == {r.kind for r in plugins.registries.values()} - {"executor"}
+    for entry in entries:
+        check_entry(entry)
+        check_target(entry, plugins)
 
 
 def test_registering_imports_no_torch(site):
@@ -205,12 +212,6 @@ def test_coders_refuse_what_they_did_not_write(plugins):
         bomb.decode(bomb.encode(np.full(3, 3), 4), 3, 2)
 
 
-def context_of(model: GaussianModel, scene: Scene) -> TaskContext:
-    optimizer = SplatOptimizer(model, [ParamGroup("opacity_logits", 0.05)])
-    cameras = CameraIterator(scene.train)
-    return TaskContext(PipelineParams(), OptimizationParams(), model, scene, optimizer, cameras, ReferenceRasterizer())
-
-
 def test_register_tasks(plugins, scene, model):
     assert plugins.tasks.entry("prune-faint").declared["factory"] is False
     scheduler, context = Scheduler("post"), context_of(model, scene)
@@ -221,17 +222,6 @@ def test_register_tasks(plugins, scene, model):
         assert context.log.said[-1] == ("prune", f"{left} Gaussians go")
     assert model.num_rows == 8
     assert context.log.scalars["pruned"] == 0
-
-
-def train_with(stages: Any, make_model: Any, scene: Scene, on_step: Any = None) -> SplatModel:
-    return (
-        TrainingRun(
-            stages, make_model, scene, PipelineParams(), ReferenceRasterizer(),
-            directory=None, identity={}, trained=lambda name: pytest.fail(f"asked for {name}"), on_step=on_step,
-        )
-        .train()
-        .model
-    )  # fmt: skip
 
 
 def test_register_methods(plugins, scene, tmp_path):
