@@ -10,6 +10,8 @@ from splatwizard_core.plugins import hookspecs
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "plugins.md").read_text("utf-8")
 PACKAGE = "sw_theirs"
+LIBRARIES = ["sw-codecs", "sw-datasets", "sw-gaussians", "sw-reference"]
+REQUIRES = [*re.findall(r'^dependencies = \["(.*?)"\]', PAGE, re.M), *(f"{name}>=0.2" for name in LIBRARIES)]
 HOOKS = {name for name, hook in vars(hookspecs).items() if hasattr(hook, f"{hookspecs.PROJECT}_spec")}
 
 
@@ -58,5 +60,6 @@ def write_package(folder: Path) -> None:
         (folder / PACKAGE / f"{name}.py").write_text(text, "utf-8")
     info = folder / f"{PACKAGE}-0.1.dist-info"
     info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: sw-theirs\nVersion: 0.1\n")
+    requires = "".join(f"Requires-Dist: {each}\n" for each in REQUIRES)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: sw-theirs\nVersion: 0.1\n{requires}")
     (info / "entry_points.txt").write_text(f"[{hookspecs.ENTRY_POINT_GROUP}]\ntheirs = {PACKAGE}.plugin\n")

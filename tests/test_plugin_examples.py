@@ -17,7 +17,7 @@ import torch
 from click.testing import CliRunner
 from PIL import Image
 from plugin_page import BLOCKS, HOOKS, PACKAGE, files_of, run, write_package
-from small_scene import HEIGHT, WIDTH, context_of, small_scene, ten_gaussians, train_with
+from small_scene import context_of, small_scene, ten_gaussians, train_with
 from sw_datasets.downloads.registry import parse_registry
 from sw_doctor.registered import run_registered
 from sw_kit.checks.fields import check_entry
@@ -36,7 +36,7 @@ from splatwizard_core.plugins import hookspecs
 from splatwizard_core.plugins.check import Check
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.rendering.rasterizer import RasterOptions, ScoreSpec
 from splatwizard_core.runs.decode import export_model, open_model
 from splatwizard_core.runs.encode import encode
 from splatwizard_core.runs.observers import FinishedRun, FinishedRuns, StartedTraining, watched_by
@@ -128,20 +128,19 @@ def test_registering_imports_no_torch(site):
 
 
 def test_register_rasterizers(plugins, scene, model):
-    rasterizer = NegotiatedRasterizer(plugins, device="cpu", prefer=["eight-bit"])
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu", prefer=["timed"])
     camera = scene.train[0].camera
-    with torch.no_grad():
-        drawn = model.gaussians(camera, rasterizer)
-        result = rasterizer.render(drawn, camera, RasterOptions(alpha=True))
-        exact = ReferenceRasterizer().render(drawn, camera, RasterOptions())
-        assert torch.equal(rasterizer.visible_filter(drawn, camera), exact.radii)
-    assert rasterizer.served == {"eight-bit"}
-    assert result.alpha.shape == (1, HEIGHT, WIDTH)
-    assert (255 * result.image - (255 * result.image).round()).abs().max() < 1e-4  # float32
-    assert 0 < (result.image - exact.image.clamp(0, 1)).abs().max() <= 0.5 / 255 + 1e-6  # float32
-    own = plugins.rasterizers.load("eight-bit")()
-    with pytest.raises(CapabilityError, match="does not offer BACKWARD"):
-        own.render(model.gaussians(camera, own), camera, RasterOptions())
+    drawn = model.gaussians(camera, rasterizer)
+    result = rasterizer.render(drawn, camera, RasterOptions())
+    exact = ReferenceRasterizer().render(drawn, camera, RasterOptions())
+    assert torch.equal(result.image, exact.image)
+    assert torch.equal(rasterizer.visible_filter(drawn, camera), exact.radii)
+    assert result.stats.stage_seconds["render"] > 0
+    blend = RasterOptions(scores=(ScoreSpec("light", "blend"),))
+    assert rasterizer.accumulate(drawn, [camera, camera], blend).scores["light"].shape == (10,)
+    assert rasterizer.served == {"timed"}
+    with pytest.raises(CapabilityError, match="does not offer ANTIALIAS"):
+        plugins.rasterizers.load("timed")().render(drawn, camera, RasterOptions(antialias=True))
 
 
 def test_register_pruners(plugins, scene, model):
