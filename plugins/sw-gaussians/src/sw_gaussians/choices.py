@@ -177,7 +177,7 @@ class Choosing(OptimizationParams):
         """
         named = dict(_blocks(self))
         found = dict(values)
-        for name in {*named, *(old.partition(".")[0] for old in self.OLDER)}:
+        for name in sorted({*named, *(old.partition(".")[0] for old in self.OLDER)}):
             if isinstance(found.get(name), Mapping):
                 found |= {f"{name}.{key}": value for key, value in found.pop(name).items()}
         for path, block in named.items():
@@ -281,5 +281,6 @@ def _checked(model: type[BaseModel], path: str, given: Mapping[str, Any], source
 def _nested(model: type[BaseModel], path: str) -> type[BaseModel]:
     """Return a model with the settings at the dotted `path`, so that messages have their full keys."""
     for name in reversed(path.split(".")):
-        model = create_model(name, __base__=Params, **{name: (model, Field(default_factory=model))})
+        fields: dict[str, Any] = {name: (model, Field(default_factory=model))}
+        model = create_model(name, __base__=Params, **fields)
     return model
