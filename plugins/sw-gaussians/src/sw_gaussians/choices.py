@@ -44,7 +44,7 @@ class Named(Params):
 class OwnCodec(Named):
     """Codec of a method whose file no other codec can write: subclasses fix `name` and type `settings`.
 
-    name        `Literal["their-method"]`
+    name        `Literal["their-method"]`: the method's name, or that of its codec where that one is registered
     settings    block of typed fields
     """
 
