@@ -15,14 +15,13 @@ import torch
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
-from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
 from splatwizard_core.runs.session import Session
-from splatwizard_native import CoreTime, MemoryMeter, synchronize, track
+from splatwizard_native import CoreTime, MemoryMeter, replacing, synchronize, track
 
 REPEATS = 3
 
