@@ -184,5 +184,5 @@ def test_a_layout_that_is_newer_than_a_strangers_method(stranger, tmp_path, caps
     )
     assert error(capsys, write(2, {})) == f"{told}pip install --upgrade sw-martian"
     line = error(capsys, write(0, {"sw-martian": ["0.7", "method:mars"]}))
-    assert "mars layout version 0 is unknown, older than the only one that is read here, 1" in line
+    assert "mars layout version 0 is unknown, this installation reads 1; the file is older" in line
     assert line.endswith("written with sw-martian 0.7, installed is 1.2: pip install 'sw-martian==0.7')")
