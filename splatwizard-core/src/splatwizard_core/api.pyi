@@ -31,7 +31,6 @@ from splatwizard_core.method import create_method as create_method
 from splatwizard_core.plugins.hookspecs import hookimpl as hookimpl
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.registry import Registry as Registry
-from splatwizard_core.progress import track as track
 from splatwizard_core.rendering.features import Feature as Feature
 from splatwizard_core.rendering.info import RasterizerInfo as RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput as AccumOutput
@@ -53,6 +52,7 @@ from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
 from splatwizard_core.training.optimizer import SplatOptimizer as SplatOptimizer
+from splatwizard_core.training.overrides import apply_overrides as apply_overrides
 from splatwizard_core.training.params import InputFile as InputFile
 from splatwizard_core.training.params import OptimizationParams as OptimizationParams
 from splatwizard_core.training.params import Params as Params
@@ -64,3 +64,5 @@ from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
+from splatwizard_core.training.task_log import TaskLog as TaskLog
+from splatwizard_native.progress import track as track
