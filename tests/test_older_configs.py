@@ -104,3 +104,5 @@ def test_another_rate_point_of_an_older_run_changes_what_that_point_sets(tmp_pat
     codecs = [Choices(rate=rate).with_rate_of(run, plugins).resolve_one(plugins).config.codec for rate in ("r1", "r6")]
     assert [codec.name for codec in codecs] == ["gaussians-quantized", "gaussians-exact"]
     assert (codecs[0].settings["dc_step"], codecs[1].settings) == (0.2, {})
+    named = Choices(rate="r1", sets=("codec=gaussians-zstd",)).with_rate_of(run, plugins).resolve_one(plugins)
+    assert (named.config.codec.name, named.config.codec.settings) == ("gaussians-zstd", {})

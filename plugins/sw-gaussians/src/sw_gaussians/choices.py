@@ -44,7 +44,7 @@ class Named(Params):
 class OwnCodec(Named):
     """Codec of a method whose file no other codec can write: subclasses fix `name` and type `settings`.
 
-    name        `Literal["their-method"]`
+    name        `Literal["their-method"]`: the method's name, or that of its codec where that one is registered
     settings    block of typed fields
     """
 
@@ -104,7 +104,7 @@ class Choice(Named):
                 first = next(iter(given))
                 raise ConfigError(
                     f"'{first}' in {sources.get(first, 'the configuration')}: '{self.chosen}' ({key}) has no settings: "
-                    "leave it out",
+                    "leave it out, or name another one",
                     key=first,
                 )
             checked = _checked(model, f"{path}.{field}", given, sources) if model is not None else {}
@@ -177,7 +177,7 @@ class Choosing(OptimizationParams):
         """
         named = dict(_blocks(self))
         found = dict(values)
-        for name in {*named, *(old.partition(".")[0] for old in self.OLDER)}:
+        for name in sorted({*named, *(old.partition(".")[0] for old in self.OLDER)}):
             if isinstance(found.get(name), Mapping):
                 found |= {f"{name}.{key}": value for key, value in found.pop(name).items()}
         for path, block in named.items():
@@ -281,5 +281,6 @@ def _checked(model: type[BaseModel], path: str, given: Mapping[str, Any], source
 def _nested(model: type[BaseModel], path: str) -> type[BaseModel]:
     """Return a model with the settings at the dotted `path`, so that messages have their full keys."""
     for name in reversed(path.split(".")):
-        model = create_model(name, __base__=Params, **{name: (model, Field(default_factory=model))})
+        fields: dict[str, Any] = {name: (model, Field(default_factory=model))}
+        model = create_model(name, __base__=Params, **fields)
     return model

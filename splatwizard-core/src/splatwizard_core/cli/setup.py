@@ -47,7 +47,7 @@ class Choices:
             if str(given.get(key, value)) != str(value):
                 raise ConfigError(f"--{key} {value} contradicts --set {key}={given[key]}: give one of them", key=key)
             given[key] = value
-        return {**self.below, **given}
+        return {**{k: v for k, v in self.below.items() if k.partition(".")[0] not in given}, **given}
 
     def method_names(self, plugins: PluginManager) -> list[str]:
         """The methods that `--method a,b --method c` names, else the one of the configuration file, else the default.
