@@ -151,23 +151,6 @@ class RahtGaussians(GaussianModel):
             sh=coded if self.max_sh_degree else SH(dc=dc, active_degree=0),
         )
 
-    @torch.no_grad()
-    def plain(self) -> GaussianModel:
-        """Return the Gaussians that are drawn, as a model of its own, for codecs that know nothing of this one."""
-        if self.grid is None:
-            return GaussianModel.from_tensors(
-                self.means, self.sh_dc, self.sh_rest, self.opacity_logits, self.log_scales, self.quats,
-                active_sh_degree=self.active_sh_degree,
-            )  # fmt: skip
-        watching = self.detail.observing, self.scale_lattice.observing
-        self.detail.observing = self.scale_lattice.observing = False
-        attributes, log_scales, entries = self.quantised()
-        self.detail.observing, self.scale_lattice.observing = watching
-        return GaussianModel.from_tensors(
-            self.means, attributes[:, None, 4:], entries[self.code], attributes[:, 0], log_scales,
-            quats_of(attributes[:, 1:4]), active_sh_degree=self.active_sh_degree,
-        )  # fmt: skip
-
     def state_dict_extra(self) -> dict[str, Any]:
         grid = None if self.grid is None else asdict(self.grid)
         return {**super().state_dict_extra(), "grid": grid}
