@@ -86,6 +86,11 @@ def test_rotations_of_opposite_sign_do_not_cancel():
     assert np.array_equal(rows["quats"][1], quats[2])
 
 
+def test_rows_without_elements_are_merged_too():
+    _, rows, _ = merged([4, 4, 9], {"sh_rest": np.zeros((3, 0, 3), np.float32)})
+    assert rows["sh_rest"].shape == (2, 0, 3)
+
+
 def test_nothing_to_merge():
     first, rows, importance = merged(np.zeros(0, np.int64), {"x": np.zeros((0, 3), np.float32)})
     assert len(first) == len(importance) == 0

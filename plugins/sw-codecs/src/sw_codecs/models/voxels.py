@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -92,13 +93,13 @@ def one_a_voxel(
     for name, array in rows.items():
         own = array[order[starts]]
         if len(group):
-            values = array[order[members]].astype(np.float64).reshape(len(group), -1)
+            values = array[order[members]].astype(np.float64).reshape(len(group), math.prod(array.shape[1:]))
             if name == QUATS:
                 values = _aligned(values, begins[group])
             mean = np.add.reduceat(values * weight[:, None], begins) / total[:, None]
             if name == QUATS:
                 mean = _unit(mean)
-            own[shared] = mean.reshape(-1, *array.shape[1:]).astype(array.dtype)
+            own[shared] = mean.reshape(len(begins), *array.shape[1:]).astype(array.dtype)
         found[name] = own
     return order[starts], found, merged_importance
 
