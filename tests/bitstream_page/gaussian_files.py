@@ -158,9 +158,7 @@ def chimera_means(
     return (low + octree(section) / 65535 * (high - low)).astype("<f4")
 
 
-def raht(
-    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
-) -> dict[str, np.ndarray]:
+def raht(static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]) -> dict[str, np.ndarray]:
     n, blocks, degree = static["num_gaussians"], static["blocks"], static["max_sh_degree"]
     points, (low, high) = octree(sections["positions"]), array(sections["box"])
     check(len(points) == n, "number of points")
