@@ -13,7 +13,7 @@ TABLE = "unset: the published one of the scene"
 
 
 class Authors(Params):
-    """Which of the authors' values stand for what is unset."""
+    """The authors' values that stand for what is unset."""
 
     family: Family = Field(
         "auto", description="collection that the scene, known by its name, belongs to; auto: any of them"
