@@ -17,7 +17,6 @@ from torch import Tensor
 from splatwizard_core.api import ShapeError
 from sw_codecs.bits.packing import bit_length
 
-
 TILE = 1 << 18
 """Numbers of a tile on the CPU."""
 
@@ -134,7 +133,7 @@ def _transformed(rows: Tensor, plan: RahtPlan, back: bool) -> Tensor:
     merges = plan.merges(found.device, found.dtype)
     most = max((len(merge.left) for merge in merges), default=0)
     if found.device.type == "cpu":
-        # Tiles that a cache holds, in buffers that are made once: 2.8 times as fast as whole levels (benchmarks/raht.py).
+        # Tiles that a cache holds, in buffers made once: 2.8 times as fast as whole levels (benchmarks/raht.py)
         most = min(most, max(TILE // max(found.shape[1], 1), 1))
     buffers = found.new_empty(4, most, found.shape[1])
     for merge in reversed(merges) if back else merges:
