@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from sw_gaussians.choices import Choice
 
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.training.params import Params
@@ -12,10 +13,16 @@ OWN = [e.name for e in load_plugins().methods if e.distribution.startswith("sw-"
 
 
 def settings(block: Params, prefix: str = ""):
-    """Key, value and description of every field; a block's defaults are those of the object that it defaults to."""
+    """Key, value and description of every field; a block's defaults are those of the object that it defaults to.
+
+    Settings of a chosen codec or pruner are those of the one that is chosen by default.
+    """
     for name, field in type(block).model_fields.items():
         value = getattr(block, name)
-        if isinstance(value, Params):
+        if isinstance(block, Choice) and name == "settings":
+            model = getattr(block.provider(load_plugins(), prefix), "Settings", None)
+            yield from settings(model(), f"{prefix}settings.") if model is not None else ()
+        elif isinstance(value, Params):
             yield from settings(value, f"{prefix}{name}.")
         else:
             yield f"{prefix}{name}", value, field.description

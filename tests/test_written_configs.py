@@ -63,7 +63,7 @@ def test_a_run_of_an_anchor_method_encodes_again_from_its_directory(tmp_path: Pa
     assert main(["train", "--method", name, "--scene", "demo:tiny", "--device", "cpu", "--out", str(out), *sets]) == 0
     (run,) = (path.parent for path in out.rglob("config.toml"))
     sizes = []
-    for asked in ([], ["--set", "codec.weights=float32"]):
+    for asked in ([], ["--set", "codec.settings.weights=float32"]):
         file = tmp_path / f"{len(sizes)}.swz"
         assert main(["encode", str(run), "--device", "cpu", "--out", str(file), *asked]) == 0
         sizes.append(file.stat().st_size)

@@ -21,7 +21,7 @@ from sw_lightgaussian.vectree import CodedGaussians
 
 SHORT = {
     "iterations": 12, "prune.iterations": 12, "distill.lr.sh_rest": 1e-2,
-    "codec.vq_iterations": 20, "codec.vq_batch": 200,
+    "codec.settings.iterations": 20, "codec.settings.batch": 200,
 }  # fmt: skip
 
 
@@ -174,5 +174,5 @@ def test_any_codec_of_gaussians_may_hold_it(whole, plugins):
 
 def test_a_newer_layout_is_refused(plugins):
     data = ContainerWriter("lightgaussian", 2).to_bytes()
-    with pytest.raises(BitstreamError, match="upgrade sw-lightgaussian"):
+    with pytest.raises(BitstreamError, match="lightgaussian layout version 2 is unknown, newer than"):
         LightGaussian(plugins, None).decode(ContainerReader(data, "file.swz"))

@@ -31,7 +31,6 @@ from splatwizard_core.method import create_method as create_method
 from splatwizard_core.plugins.hookspecs import hookimpl as hookimpl
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.registry import Registry as Registry
-from splatwizard_core.progress import track as track
 from splatwizard_core.rendering.features import Feature as Feature
 from splatwizard_core.rendering.info import RasterizerInfo as RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput as AccumOutput
@@ -65,3 +64,5 @@ from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
+from splatwizard_core.training.task_log import TaskLog as TaskLog
+from splatwizard_native.progress import track as track

@@ -26,7 +26,6 @@ from splatwizard_core.plugins.kernels import declared_modules as declared_module
 from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
 from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
-from splatwizard_core.progress import Bar as Bar
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import open_model as open_model
@@ -46,3 +45,4 @@ from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
+from splatwizard_native.progress import Bar as Bar

@@ -1,4 +1,4 @@
-"""C++ and CUDA modules for torch, the fused loss and Adam, and what a program asks of its machine.
+"""C++ and CUDA modules for torch, the fused loss and Adam, cores and memory of a process, progress on the terminal.
 
 Importing this imports no torch.
 """
@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from splatwizard_native.memory import rss_bytes as rss_bytes
     from splatwizard_native.memory import synchronize as synchronize
     from splatwizard_native.module import NativeModule as NativeModule
+    from splatwizard_native.progress import Bar as Bar
+    from splatwizard_native.progress import duration as duration
+    from splatwizard_native.progress import track as track
     from splatwizard_native.random_states import capture_random_states as capture_random_states
     from splatwizard_native.random_states import preserved_random_states as preserved_random_states
     from splatwizard_native.random_states import restore_random_states as restore_random_states
@@ -52,6 +55,7 @@ MODULES = {
     "machine": "describe_machine",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
+    "progress": "Bar duration track",
     "random_states": "capture_random_states preserved_random_states restore_random_states seeded",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root",

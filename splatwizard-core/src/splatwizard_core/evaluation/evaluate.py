@@ -29,10 +29,10 @@ from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.registry import Entry
-from splatwizard_core.progress import track
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import View
+from splatwizard_native import track
 
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
 RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}

@@ -153,8 +153,8 @@ class ResolvedConfig:
 
         Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
         """
-        content = {**self.as_dict(), "config": self.config.identity()}
-        return content_hash({k: v for k, v in content.items() if k not in ("provenance", "metrics")})
+        beside = {k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")}
+        return content_hash(beside | {"config": self.config.identity()})
 
 
 def content_hash(content: Any) -> str:

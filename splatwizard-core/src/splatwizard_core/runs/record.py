@@ -193,7 +193,9 @@ class ProvidedBlock(Part):
 class PhaseBlock(Part):
     """One phase of a run."""
 
-    phase: str = Field(description='"train: NAME" (a stage), "train" (asked for before the first), "encode", "render"')
+    phase: str = Field(
+        description='"train: NAME" (a stage), "train" (before the first), "encode", "render", "evaluate"'
+    )
     provided_by: list[ProvidedBlock]
 
 

@@ -171,7 +171,7 @@ def _record(
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
         "contended": contended,
         "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
-        "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
+        "phases": phases_of_run(session.plugins, training, encoding, measured),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
     return schema.complete_record(schema.picked(schema.Record, values))

@@ -33,6 +33,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import CameraIterator, Stage
+from splatwizard_core.training.task_log import TaskLog
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
 from splatwizard_native import Verdict, capture_random_states, restore_random_states
@@ -49,6 +50,7 @@ class StepRecord:
     step        1-based, of this stage
     total, parts    the loss, detached scalars
     num_rows    primitives after the step
+    said, scalars   what its tasks left, as of `TaskLog`
     seconds     per stage; empty unless stages are timed
     """
 
@@ -60,6 +62,8 @@ class StepRecord:
     total: Tensor
     parts: dict[str, Tensor] = field(default_factory=dict)
     num_rows: int = 0
+    said: list[tuple[str, str]] = field(default_factory=list)
+    scalars: dict[str, Tensor] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -133,7 +137,7 @@ class Trainer:
         context, mark = self.context, self._mark
         if self.stage_clock is not None:
             self.stage_clock.start()
-        context.result = context.loss = None
+        context.result, context.loss, context.log = None, None, TaskLog()
         with torch.no_grad():
             stop = self.pre.exec(step, context)
         self._check_rows(step)
@@ -171,7 +175,7 @@ class Trainer:
         # The graph and its buffers end with the step, not with the next one's render.
         context.result = context.loss = None
         self.stopped = stop
-        record.num_rows = self._num_rows()
+        record.num_rows, record.said, record.scalars = self._num_rows(), context.log.said, context.log.scalars
         return record
 
     def _mark(self, part: str) -> None:
