@@ -11,13 +11,13 @@ EVERY = [(family, scene) for family, table in SCENES.items() for scene in table]
 
 def test_all_published_scenes_are_there():
     assert {family: len(table) for family, table in SCENES.items()} == {
-        "nerf-synthetic": 8, "mip-nerf360": 9, "tanks-and-temples": 2, "deep-blending": 2,
+        "nerf_synthetic": 8, "mipnerf360": 9, "tandt": 2, "db": 2,
     }  # fmt: skip
 
 
 def test_values_at_c1():
     assert published("lego", "auto", "c1") == Published(14, 4096, 0.10, 0.05, 66, 1.6)
-    assert published("kitchen", "mip-nerf360", "c1") == Published(19, 8192, 0.14, 0.1, 66, 0.4)
+    assert published("kitchen", "mipnerf360", "c1") == Published(19, 8192, 0.14, 0.1, 66, 0.4)
     assert published("ficus", "auto", "c1").blocks == 50
     assert published("truck", "auto", "c1").tau == 0.38
 
@@ -48,8 +48,8 @@ def test_exceptions():
 
 def test_a_scene_that_nobody_knows_has_ours_and_the_grid_of_its_family():
     assert published("fox", "auto", "c1") == Published(20, 2048, 0.2, 0.1, 66, 0.4)
-    assert published("fox", "nerf-synthetic", "c1").depth == 14
-    assert published("lego", "mip-nerf360", "c1") == Published()  # another scene of that name
+    assert published("fox", "nerf_synthetic", "c1").depth == 14
+    assert published("lego", "mipnerf360", "c1") == Published()  # another scene of that name
     assert published("fox", "auto", "c3") == Published(tau=0.3, blocks=57)
 
 

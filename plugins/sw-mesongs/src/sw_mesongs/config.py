@@ -15,9 +15,7 @@ TABLE = "unset: the published one of the scene"
 class Authors(Params):
     """The authors' values that stand for what is unset."""
 
-    family: Family = Field(
-        "auto", description="collection that the scene, known by its name, belongs to; auto: any of them"
-    )
+    family: Family = Field("auto", description="data set whose scene of that name is meant; auto: any of them")
     point: Point = Field(
         "c1", description="configuration of the authors: c1, c2 or c3; tk-c1: of the Splatwizard paper"
     )

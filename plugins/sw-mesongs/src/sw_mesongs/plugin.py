@@ -7,7 +7,7 @@ from splatwizard_core.api import Registry, hookimpl
 def register_methods(registry: Registry) -> None:
     registry.add("mesongs", "sw_mesongs.method:MesonGS",
                  summary="MesonGS (Xie et al. 2024): prune, octree, RAHT, codebook, fine-tune what is decoded",
-                 presets=["paper", "nerf-synthetic", "mip-nerf360", "tanks-and-temples", "deep-blending", "quick"],
+                 presets=["paper", "nerf_synthetic", "mipnerf360", "tandt", "db", "quick"],
                  rates=["r1", "r2", "r3", "r4"])  # fmt: skip
 
 

@@ -6,10 +6,10 @@ from typing import Any
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     # The values of a scene are found by its name in any family.
     "paper": {},
-    "nerf-synthetic": {"authors.family": "nerf-synthetic"},
-    "mip-nerf360": {"authors.family": "mip-nerf360"},
-    "tanks-and-temples": {"authors.family": "tanks-and-temples"},
-    "deep-blending": {"authors.family": "deep-blending"},
+    "nerf_synthetic": {"authors.family": "nerf_synthetic"},
+    "mipnerf360": {"authors.family": "mipnerf360"},
+    "tandt": {"authors.family": "tandt"},
+    "db": {"authors.family": "db"},
     # For a CPU and the demo scene: fewer and larger steps, since the scene itself was trained for 2,000 only; a smaller
     # codebook by k-means; coarser positions.
     "quick": {

@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
-Family = Literal["auto", "nerf-synthetic", "mip-nerf360", "tanks-and-temples", "deep-blending"]
+Family = Literal["auto", "nerf_synthetic", "mipnerf360", "tandt", "db"]
 Point = Literal["c1", "c2", "c3", "tk-c1"]
 
 
@@ -41,15 +41,15 @@ class Published:
 
 OTHERS: Mapping[str, Published] = {
     "auto": Published(),
-    "nerf-synthetic": Published(depth=14),
-    "mip-nerf360": Published(),
-    "tanks-and-temples": Published(),
-    "deep-blending": Published(),
+    "nerf_synthetic": Published(depth=14),
+    "mipnerf360": Published(),
+    "tandt": Published(),
+    "db": Published(),
 }
 """Family -> values at c1 of a scene that is not in the table. Ours."""
 
 SCENES: Mapping[str, Mapping[str, Published]] = {
-    "nerf-synthetic": {
+    "nerf_synthetic": {
         "chair": Published(14, 2048, 0.06, 0.03, 62, 1.6),
         "drums": Published(14, 2048, 0.18, 0.05, 66, 1.6),
         "ficus": Published(14, 2048, 0.28, 0.03, 50, 1.6),
@@ -59,7 +59,7 @@ SCENES: Mapping[str, Mapping[str, Published]] = {
         "mic": Published(14, 2048, 0.30, 0.03, 52, 0.4),
         "ship": Published(14, 8192, 0.18, 0.03, 66, 0.4),
     },
-    "mip-nerf360": {
+    "mipnerf360": {
         "bicycle": Published(20, 2048, 0.30, 0.03, 66, 0.6),
         "bonsai": Published(19, 2048, 0.24, 0.1, 66, 0.4),
         "counter": Published(19, 2048, 0.12, 0.1, 66, 0.4),
@@ -70,11 +70,11 @@ SCENES: Mapping[str, Mapping[str, Published]] = {
         "stump": Published(20, 2048, 0.20, 0.01, 66, 0.04),
         "treehill": Published(20, 2048, 0.20, 0.1, 66, 0.2),
     },
-    "tanks-and-temples": {
+    "tandt": {
         "train": Published(20, 4096, 0.12, 0.1, 66, 0.2),
         "truck": Published(20, 4096, 0.38, 0.1, 66, 0.8),
     },
-    "deep-blending": {
+    "db": {
         "drjohnson": Published(20, 2048, 0.41, 0.1, 66, 0.4),
         "playroom": Published(20, 2048, 0.0, 0.1, 66, 0.4),
     },
