@@ -207,3 +207,24 @@ def test_a_newer_layout_and_another_codec_are_refused(plugins, whole):
     writer.static["codec"] = "gaussians-exact"
     with pytest.raises(BitstreamError, match="codec"):
         decoded(plugins, writer.to_bytes())
+
+
+@pytest.mark.cuda
+def test_what_a_gpu_trains_decodes_on_the_cpu_to_what_was_drawn(plugins, toy):
+    from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+
+    gpu, cpu = (NegotiatedRasterizer(plugins, device=device) for device in ("cuda", "cpu"))
+    method = configured(plugins)
+    trained = copy.deepcopy(toy.truth).cuda()
+    model = (
+        TrainingRun(
+            list(method.stages()), lambda: None, toy.scene, PipelineParams(), gpu, identity={},
+            trained={"3dgs": trained}.__getitem__,
+        )
+        .train()
+        .model
+    )  # fmt: skip
+    assert model.device.type == "cuda"
+    found = decoded(plugins, encoded(method, model))
+    ours = drawn(copy.deepcopy(model).cpu().eval(), toy.scene, cpu)
+    assert torch.allclose(drawn(found, toy.scene, cpu), ours, atol=1e-4)

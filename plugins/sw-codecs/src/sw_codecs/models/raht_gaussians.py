@@ -60,6 +60,7 @@ class RahtGaussians(GaussianModel):
         self.codebook = nn.Parameter(self.sh_rest.new_zeros(0, *self.sh_rest.shape[1:]))
         self.detail = FakeQuantAffine(bits, channels=CHANNELS, blocks=blocks)
         self.scale_lattice = FakeQuantAffine(bits, channels=3, blocks=blocks)
+        self.to(self.means.device)
         self._plan: tuple[Tensor, RahtPlan] | None = None
 
     @classmethod
