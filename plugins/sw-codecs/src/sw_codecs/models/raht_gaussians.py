@@ -162,7 +162,7 @@ class RahtGaussians(GaussianModel):
         grid = extra["grid"]
         self.grid = None
         if grid is not None:
-            low, high = (tuple(map(float, grid[corner])) for corner in ("low", "high"))
+            low, high = ((float(x), float(y), float(z)) for x, y, z in (grid["low"], grid["high"]))
             self.grid = VoxelGrid(low, high, int(grid["depth"]), grid["anchor"])
 
 

@@ -17,20 +17,22 @@ from torch import Tensor
 from splatwizard_core.api import ShapeError
 from sw_codecs.bits.packing import bit_length
 
-TILE = 1 << 18
+TILE = 1 << 16
 """Numbers of a tile on the CPU."""
 
 
 @dataclass(frozen=True)
 class Merge:
-    """All pairs of nodes that merge at one bit of the codes, P of them.
+    """All pairs of nodes that merge at one bit of the codes, P of them: of each the left node, then the right one.
 
-    left, right  [P] int64, row of the first leaf of either node
-    a, b         [P, 1] float, sqrt(w / (w + v)) and sqrt(v / (w + v)) of their numbers of leaves w and v
+    rows        [2 P] int64, row of the first leaf of the node
+    partners    [2 P] int64, that of the other node
+    a, b        [2 P, 1] float, sqrt(w / (w + v)) and sqrt(v / (w + v)) of their numbers of leaves w and v; b of the
+                right one is negative
     """
 
-    left: Tensor
-    right: Tensor
+    rows: Tensor
+    partners: Tensor
     a: Tensor
     b: Tensor
 
@@ -65,7 +67,7 @@ class RahtPlan:
         key = (device, dtype)
         if key not in self._moved:
             self._moved[key] = [
-                Merge(m.left.to(device), m.right.to(device), m.a.to(device, dtype), m.b.to(device, dtype))
+                Merge(m.rows.to(device), m.partners.to(device), m.a.to(device, dtype), m.b.to(device, dtype))
                 for m in self._merges
             ]
         return self._moved[key]
@@ -106,13 +108,13 @@ def _merges(codes: npt.NDArray[np.uint64]) -> list[Merge]:
     a, b = np.sqrt(w / total), np.sqrt(v / total)
     order = np.argsort(bit, kind="stable")
     borders = np.flatnonzero(np.diff(bit[order])) + 1
-    return [
-        Merge(
-            torch.from_numpy(left[part]), torch.from_numpy(row[part]),
-            torch.from_numpy(a[part, None]), torch.from_numpy(b[part, None]),
-        )
-        for part in np.split(order, borders)
-    ]  # fmt: skip
+
+    def levels(of_left: npt.NDArray[Any], of_right: npt.NDArray[Any], *tail: int) -> list[Tensor]:
+        both = np.stack([of_left, of_right], 1)[order]
+        return [torch.from_numpy(part.reshape(-1, *tail)) for part in np.split(both, borders)]
+
+    each = levels(left, row), levels(row, left), levels(a, a, 1), levels(b, -b, 1)
+    return [Merge(*level) for level in zip(*each, strict=True)]
 
 
 class _Raht(torch.autograd.Function):
@@ -128,33 +130,23 @@ class _Raht(torch.autograd.Function):
         return _transformed(grad, ctx.plan, not ctx.back), None, None
 
 
-def _transformed(rows: Tensor, plan: RahtPlan, back: bool) -> Tensor:
-    found = rows.detach().clone(memory_format=torch.contiguous_format)
+def _transformed(values: Tensor, plan: RahtPlan, back: bool) -> Tensor:
+    found = values.detach().clone(memory_format=torch.contiguous_format)
     merges = plan.merges(found.device, found.dtype)
-    most = max((len(merge.left) for merge in merges), default=0)
+    most = max((len(merge.rows) for merge in merges), default=0)
     if found.device.type == "cpu":
-        # Tiles that a cache holds, in buffers made once: 2.8 times as fast as whole levels (benchmarks/raht.py)
-        most = min(most, max(TILE // max(found.shape[1], 1), 1))
-    buffers = found.new_empty(4, most, found.shape[1])
+        # Tiles that a cache holds, in buffers made once: 2.8 times as fast as whole levels (benchmarks/raht.py).
+        most = min(most, 2 * max(TILE // max(found.shape[1], 1), 1))
+    own, other = found.new_empty(2, most, found.shape[1])
     for merge in reversed(merges) if back else merges:
-        for start in range(0, len(merge.left), most):
-            _butterfly(found, merge, slice(start, start + most), buffers, back)
+        for start in range(0, len(merge.rows), most):
+            part = slice(start, start + most)
+            rows = merge.rows[part]
+            x, y = own[: len(rows)], other[: len(rows)]
+            torch.index_select(found, 0, rows, out=x)
+            torch.index_select(found, 0, merge.partners[part], out=y)
+            # No product is fused with the sum: all machines agree.
+            x.mul_(merge.a[part])
+            y.mul_(merge.b[part])
+            found.index_copy_(0, rows, x.sub_(y) if back else x.add_(y))
     return found
-
-
-def _butterfly(found: Tensor, merge: Merge, part: slice, buffers: Tensor, back: bool) -> None:
-    """Replace the rows of some pairs by low and high, or `back`. No product is fused with a sum: all machines agree."""
-    left, right, a, b = merge.left[part], merge.right[part], merge.a[part], merge.b[part]
-    c, d, first, product = buffers[:, : len(left)]
-    torch.index_select(found, 0, left, out=c)
-    torch.index_select(found, 0, right, out=d)
-    torch.mul(c, a, out=first)
-    torch.mul(d, b, out=product)
-    if back:
-        first.sub_(product)
-        second = c.mul_(b).add_(d.mul_(a))
-    else:
-        first.add_(product)
-        second = d.mul_(a).sub_(c.mul_(b))
-    found.index_copy_(0, left, first)
-    found.index_copy_(0, right, second)
