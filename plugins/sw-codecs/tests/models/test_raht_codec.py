@@ -261,6 +261,19 @@ def test_hostile_files_raise_nothing_else(plugins):
     assert refused > 100
 
 
+def test_decoding_does_not_depend_on_the_number_of_threads(plugins):
+    reader = ContainerReader(written(plugins, model_of(4000)).to_bytes(), "f")
+    threads = torch.get_num_threads()
+    try:
+        found = []
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            found.append(Raht(plugins).decode(reader).digest())
+    finally:
+        torch.set_num_threads(threads)
+    assert found[0] == found[1]
+
+
 @pytest.mark.cuda
 def test_what_a_gpu_writes_decodes_alike(plugins):
     settled = settled_copy(model_of(3000), RahtSettings(**QUICK), seed=0)
