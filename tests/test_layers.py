@@ -22,7 +22,7 @@ from import_graph import (
 
 import splatwizard_native
 
-BELOW_ALL = {"errors", "files", "streams"}
+BELOW_ALL = {"errors", "streams"}
 """Single modules that know no room."""
 BELOW_RUNS = {"training", "coding", "evaluation", "rendering", "gaussians", "scene", "plugins"}
 ROOMS = {

@@ -6,10 +6,11 @@ import pytest
 from sw_gaussians.choices import Choice
 
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.training.params import Params
 
 PAGES = Path(__file__).parent.parent / "docs" / "methods"
-OWN = [e.name for e in load_plugins().methods if e.distribution.startswith("sw-") and "test" not in e.distribution]
+OWN = [entry.name for entry in load_plugins().methods if is_ours(entry.distribution)]
 
 
 def settings(block: Params, prefix: str = ""):
@@ -28,7 +29,7 @@ def settings(block: Params, prefix: str = ""):
             yield f"{prefix}{name}", value, field.description
 
 
-@pytest.mark.parametrize("method", [name for name in OWN if name != "third-party"])
+@pytest.mark.parametrize("method", OWN)
 def test_the_page_lists_every_setting_with_its_default(method):
     lines = (PAGES / f"{method}.md").read_text().splitlines()
     for key, default, description in settings(load_plugins().methods.load(method).Config()):
@@ -37,4 +38,4 @@ def test_the_page_lists_every_setting_with_its_default(method):
 
 
 def test_all_methods_of_this_repository_are_looked_at():
-    assert {path.stem for path in PAGES.glob("*.md")} <= set(OWN)
+    assert {path.stem for path in PAGES.glob("*.md")} == set(OWN)

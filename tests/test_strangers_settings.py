@@ -99,7 +99,7 @@ def test_their_settings_are_parsed_recorded_and_reach_their_codec(sw, tmp_path: 
     [
         ("codec.settings.levle=7", "unknown key 'codec.settings.levle' in --set: did you mean 'codec.settings.level'?"),
         ("codec.settings.level=70", "must be less than or equal to 9 (effort)"),
-        ("prune.settings.power=2", "'their-pruner' (prune.pruner) has no settings: leave it out"),
+        ("prune.settings.power=2", "'their-pruner' (prune.pruner) has no settings: leave it out, or name another one"),
     ],
 )
 def test_a_wrong_setting_of_theirs_ends_before_anything_runs(sw, tmp_path: Path, setting: str, told: str):

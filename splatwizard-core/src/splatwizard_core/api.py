@@ -41,10 +41,9 @@ MODULES = {
     ),
     "evaluation.image": "ssim_map",
     "evaluation.metrics": "MetricSetup PreparedMetric",
-    "files": "replacing",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""
-BASE = {"progress": "track"}
+BASE = {"errors": "ForeseenError", "files": "replacing", "progress": "track"}
 """The same of splatwizard-native."""
 
 __all__, __getattr__ = lend(__name__, MODULES, BASE)

@@ -16,10 +16,6 @@ from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
-from splatwizard_core.files import file_sha256 as file_sha256
-from splatwizard_core.files import new_folder as new_folder
-from splatwizard_core.files import write_atomic as write_atomic
-from splatwizard_core.files import write_json as write_json
 from splatwizard_core.plugins.check import Check as Check
 from splatwizard_core.plugins.check import State as State
 from splatwizard_core.plugins.kernels import declared_modules as declared_modules
@@ -45,4 +41,8 @@ from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
+from splatwizard_native.files import file_sha256 as file_sha256
+from splatwizard_native.files import new_folder as new_folder
+from splatwizard_native.files import write_atomic as write_atomic
+from splatwizard_native.files import write_json as write_json
 from splatwizard_native.progress import Bar as Bar

@@ -104,7 +104,7 @@ class Choice(Named):
                 first = next(iter(given))
                 raise ConfigError(
                     f"'{first}' in {sources.get(first, 'the configuration')}: '{self.chosen}' ({key}) has no settings: "
-                    "leave it out",
+                    "leave it out, or name another one",
                     key=first,
                 )
             checked = _checked(model, f"{path}.{field}", given, sources) if model is not None else {}

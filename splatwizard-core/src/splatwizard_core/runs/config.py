@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
-from splatwizard_core.files import file_sha256
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.locate import is_procedural
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
+from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:
     from splatwizard_core.method import Method

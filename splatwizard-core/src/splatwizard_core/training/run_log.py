@@ -12,7 +12,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.files import naming_full_disk, write_atomic
+from splatwizard_native import naming_full_disk, write_atomic
 
 
 class RunLog:

@@ -15,14 +15,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import (
-    DeviceMemoryError,
-    EmptyModel,
-    NothingToDo,
-    TaskError,
-    TrainingDiverged,
-    out_of_memory,
-)
+from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
@@ -36,7 +29,7 @@ from splatwizard_core.training.stage import CameraIterator, Stage
 from splatwizard_core.training.task_log import TaskLog
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
-from splatwizard_native import Verdict, capture_random_states, restore_random_states
+from splatwizard_native import DeviceMemoryError, Verdict, capture_random_states, out_of_memory, restore_random_states
 
 CHECK_EVERY = 32
 """Steps between questions to a GPU whether the losses are finite; each is answered at the next one, so that none is
