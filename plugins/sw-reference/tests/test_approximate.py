@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.rasterizer_checks import checks_for
 

@@ -15,7 +15,7 @@ from sw_reference.testing.raster_scenes import with_tensors
 CheckFunction = Callable[[Rasterizer, str], None]
 
 SLACK = {"approx-fp16": 1.5 / 255, "approx-uint8": 1.5 / 255}
-"""Declared exactness -> difference of a value of 0..1 that is no fault: a step of an 8-bit picture, and its rounding."""
+"""Declared exactness -> difference of a value of 0..1 that is no fault: a step of an 8-bit picture and its rounding."""
 _slack: ContextVar[float] = ContextVar("slack", default=0.0)
 
 
