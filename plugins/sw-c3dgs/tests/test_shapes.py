@@ -4,9 +4,8 @@ import math
 
 import pytest
 import torch
-from sw_reference.projection import covariances, rotation_matrices
-
 from sw_c3dgs.shapes import FULL, UPPER, decomposed, normalised_covariances, of_trace_one, split_scales
+from sw_reference.projection import covariances, rotation_matrices
 
 
 def random(n=200, seed=0):
@@ -33,7 +32,7 @@ def test_scales_far_below_float32_do_not_underflow():
 @pytest.mark.parametrize("log_scales", [[0.0, 0.0, 0.0], [0.0, 0.0, -3.0], [1.0, -2.0, -2.0], [2.0, 0.5, -4.0]])
 def test_a_decomposed_covariance_is_the_same_one_also_with_repeated_eigenvalues(log_scales):
     _, quats = random(50)
-    log_factors, shapes = split_scales(torch.tensor([log_scales], dtype=torch.float64).repeat(50, 1))
+    _, shapes = split_scales(torch.tensor([log_scales], dtype=torch.float64).repeat(50, 1))
     before = normalised_covariances(shapes, quats)
     found, rotations = decomposed(before)
     assert torch.allclose(normalised_covariances(found, rotations), before, atol=1e-5)

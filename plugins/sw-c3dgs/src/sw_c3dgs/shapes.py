@@ -19,8 +19,10 @@ TINY = 1e-8
 
 def split_scales(log_scales: Tensor) -> tuple[Tensor, Tensor]:
     """Log factors [n] and shapes [n,3] >= 0 of unit length for log scales [n,3]: log scale = log factor + log shape."""
-    log_factors = 0.5 * torch.logsumexp(2 * log_scales, dim=1)
-    return log_factors, torch.exp(log_scales - log_factors[:, None])
+    largest = log_scales.amax(1, keepdim=True)
+    relative = torch.exp(log_scales - largest)
+    norm = torch.linalg.vector_norm(relative, dim=1, keepdim=True)
+    return (largest + norm.log())[:, 0], relative / norm
 
 
 def normalised_covariances(shapes: Tensor, quats: Tensor) -> Tensor:
