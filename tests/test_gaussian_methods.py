@@ -61,7 +61,7 @@ def test_by_default_every_bit_comes_back_at_236_bytes_a_gaussian(name):
 @pytest.mark.parametrize("name", METHODS)
 def test_every_codec_of_gaussians_serves(name, codec):
     reader = written(name, model_of(), codec=codec)
-    assert reader.static["codec"] == codec
+    assert PLUGINS.methods.load(name)(PLUGINS, None).codec_of(reader) == codec
     assert 0 < decoded(name, reader).num_rows <= 60
 
 

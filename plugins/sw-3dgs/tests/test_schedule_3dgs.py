@@ -83,7 +83,7 @@ def test_presets_set_what_the_table_of_differences_says():
 @pytest.mark.parametrize("name", [*ThreeDGS.PRESETS])
 @pytest.mark.parametrize("rate", [*ThreeDGS.RATES])
 def test_every_preset_resolves_at_every_rate_point(name, rate):
-    assert resolve(ThreeDGS, name, rate).config.codec.mode in ("exact", "quantized")
+    assert resolve(ThreeDGS, name, rate).config.codec.name in ("gaussians-exact", "gaussians-quantized")
 
 
 def test_fewer_iterations_alone_keep_the_plan():

@@ -28,6 +28,7 @@ MODULES = {
     "training.stage": "Stage StageContext CameraSampler CameraIterator",
     "training.scheduler": "Scheduler",
     "training.plan": "When",
+    "training.overrides": "apply_overrides",
     "training.params": "OptimizationParams PipelineParams Params InputFile",
     "training.optimizer": "SplatOptimizer ParamGroup",
     "training.losses": "LossPack photometric_loss",

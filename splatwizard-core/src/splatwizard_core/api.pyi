@@ -53,6 +53,7 @@ from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
 from splatwizard_core.training.optimizer import SplatOptimizer as SplatOptimizer
+from splatwizard_core.training.overrides import apply_overrides as apply_overrides
 from splatwizard_core.training.params import InputFile as InputFile
 from splatwizard_core.training.params import OptimizationParams as OptimizationParams
 from splatwizard_core.training.params import Params as Params

@@ -5,6 +5,7 @@ import tracemalloc
 
 import pytest
 import torch
+from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.method import GaussianMethod
 from sw_gaussians.ply import export_ply
 
@@ -12,7 +13,6 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
-from splatwizard_core.training.params import OptimizationParams
 
 
 @pytest.fixture(scope="module")
@@ -35,14 +35,14 @@ class SomeMethod(GaussianMethod):
 
     name = "some-method"
 
-    def codec_choice(self):
-        return self.choice
+
+class SomeConfig(Choosing):
+    codec: CodecChoice
 
 
 def written(plugins, name, model, **settings):
     writer = ContainerWriter("some-method", 1)
-    method = type("Chosen", (SomeMethod,), {"choice": (name, settings)})
-    method(plugins, OptimizationParams()).encode(model, writer)
+    SomeMethod(plugins, SomeConfig(codec=CodecChoice(name=name, settings=settings))).encode(model, writer)
     return writer
 
 

@@ -9,8 +9,9 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
+from pydantic import Field
 
-from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec
+from splatwizard_core.api import GaussianModel, Params, RasterOptions, ScoreSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -19,6 +20,17 @@ if TYPE_CHECKING:
 
 Kind = Literal["v_important_score", "important_score", "max_v_important_score", "count", "opacity"]
 VolumeNorm = Literal["unclamped", "paper_clamp"]
+
+
+class SignificanceSettings(Params):
+    """Settings of the pruner `lightgaussian`."""
+
+    kind: Kind = Field("v_important_score", description="which score, see the README")
+    v_pow: float = Field(0.1, ge=0, description="power of the volume")
+    volume_norm: VolumeNorm = Field(
+        "unclamped", description="as in the authors' code, or paper_clamp: relative to the 90th percentile, at most 1"
+    )
+    use_transmittance: bool = Field(True, description="False: the score of early versions of the paper")
 
 
 class Significance:
@@ -35,6 +47,7 @@ class Significance:
     It is the opacity itself, not alpha: a hit at the rim of a splat counts as much as one at its centre.
     """
 
+    Settings = SignificanceSettings
     uses_statistics = False
 
     def __init__(

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
-from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError
+from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError, VQSettings
 from sw_lightgaussian.significance import volume_factor
 
 if TYPE_CHECKING:
@@ -48,7 +48,9 @@ class CodedGaussians(GaussianModel):
 
 
 class VecTree:
-    """Settings: those of `importance-vq`, and the seed of its codebook's training."""
+    """Settings: those of `importance-vq`; `seed` is of its codebook's training."""
+
+    Settings = VQSettings
 
     def __init__(self, plugins: PluginManager, *, seed: int = 0, **settings: Any) -> None:
         self.plugins, self.seed = plugins, seed

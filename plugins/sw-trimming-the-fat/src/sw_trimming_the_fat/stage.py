@@ -7,7 +7,6 @@ import math
 from typing import TYPE_CHECKING
 
 from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
-from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore, scores_of
 from sw_gaussians.statistics import GRADIENT_STATISTICS, collect_statistics
 
@@ -50,7 +49,7 @@ class TrimmingStage(FineTuningStage):
     def __init__(self, config: TrimmingTheFatConfig, plugins: PluginManager) -> None:
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
         self.prune = config.prune
-        self.pruner = load_pruner(plugins, config.prune.pruner)
+        self.pruner = config.prune.load(plugins)
         self.statistics = self.pruner.uses_statistics and config.prune.statistics == "fresh"
 
     def begin(self, context: StageContext) -> SplatModel:

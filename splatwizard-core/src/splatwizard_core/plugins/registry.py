@@ -166,15 +166,19 @@ class Coders(Generic[T]):
         """Sorted names that can be asked for."""
         return [entry.name for entry in self._registry if entry.declared.get("codes") == self.codes]
 
-    def load(self, name: str) -> Callable[..., T]:
-        """The class or factory called `name`. Raises PluginError if none of this sort is."""
+    def entry(self, name: str) -> Entry:
+        """The entry called `name`. Raises PluginError if none of this sort is."""
         if name in self._registry and name not in self.names:
             raise PluginError(
                 f"coder '{name}' does not code {self.codes}; those that do: {', '.join(self.names) or 'none'}",
                 kind=self._registry.kind,
                 name=name,
             )
-        found: Callable[..., T] = self._registry.load(name)
+        return self._registry.entry(name)
+
+    def load(self, name: str) -> Callable[..., T]:
+        """The class or factory called `name`. Raises PluginError as `entry` does, or if the import fails."""
+        found: Callable[..., T] = self._registry.load(self.entry(name).name)
         return found
 
 

@@ -130,7 +130,7 @@ class ResolvedConfig:
 
     def config_content(self) -> dict[str, Any]:
         """Return the method's hyper-parameters, with what its input files hold in place of where they lie."""
-        config = self.config.model_dump(mode="json")
+        config = self.config.identity()
         for key, digest in self._input_digests.items():
             set_at(config, key, digest)
         return config
@@ -153,7 +153,8 @@ class ResolvedConfig:
 
         Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
         """
-        return content_hash({k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")})
+        content = {**self.as_dict(), "config": self.config.identity()}
+        return content_hash({k: v for k, v in content.items() if k not in ("provenance", "metrics")})
 
 
 def content_hash(content: Any) -> str:
@@ -275,6 +276,7 @@ def resolve(
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
     ):
+        layer = config.spelled(layer)
         given: dict[type[Params], dict[str, Any]] = {method.Config: {}, PipelineParams: {}, SceneParams: {}}
         for key, value in layer.items():
             block = next((block for block in given if field_at(block, key) is not None), None)
@@ -292,6 +294,7 @@ def resolve(
         config = apply_overrides(config, given[method.Config], source=source)
         ppl = apply_overrides(ppl, given[PipelineParams], source=source)
         reading = apply_overrides(reading, given[SceneParams], source=source)
+    config = config.completed(plugins, provenance)
     scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,
