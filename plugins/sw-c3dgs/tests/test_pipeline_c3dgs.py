@@ -11,7 +11,7 @@ from sw_c3dgs.model import SharedGaussians
 from sw_reference.projection import covariances
 
 from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel
-from splatwizard_core.errors import EmptyModel, SceneError, SplatwizardError
+from splatwizard_core.errors import EmptyModel, SceneError
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
@@ -172,12 +172,6 @@ def test_any_codec_of_gaussians_may_hold_it(whole, plugins, codec):
     found = C3DGS(plugins, None).decode(ContainerReader(encoded(method, model), "file.swz"))
     assert isinstance(found, GaussianModel)
     assert torch.allclose(rows(found), rows(gathered(model)), atol=1e-6)  # opacities of which the file has logits
-
-
-def test_a_setting_that_the_codec_lacks_is_told(whole, plugins):
-    method = C3DGS(plugins, apply_overrides(C3DGSConfig(), {"codec.settings.arrays": "zip"}, source="test"))
-    with pytest.raises((ValueError, SplatwizardError), match="arrays"):
-        encoded(method, whole[1])
 
 
 def test_scenes_that_are_no_gaussians_are_refused(train, whole):

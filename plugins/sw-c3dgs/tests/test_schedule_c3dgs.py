@@ -4,6 +4,7 @@ import pytest
 from sw_c3dgs.config import C3DGSConfig
 from sw_c3dgs.method import C3DGS
 
+from splatwizard_core.api import create_method
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
@@ -87,5 +88,8 @@ def test_the_plugin_declares_what_the_class_has(plugins):
 
 
 def test_an_unknown_codec_is_told_before_anything_is_trained(plugins):
-    with pytest.raises(ConfigError, match=r"no codec for Gaussians is called 'zip'; installed: .*gaussians-indexed"):
+    with pytest.raises(ConfigError, match=r"no coder is called 'zip'; installed: .*gaussians-indexed"):
         stage_of(plugins, codec__name="zip")
+    with pytest.raises(ConfigError, match="arrays"):
+        create_method(plugins, "c3dgs", {"codec.settings.arrays": "zip"})
+    assert create_method(plugins, "c3dgs", {"codec": "gaussians-exact"}).config.codec.settings == {}

@@ -1,11 +1,12 @@
 """Hyper-parameters of C3DGS. Defaults: the paper's and the authors' code, which agree in numbers."""
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from pydantic import Field
 from sw_finetuning.fine_tuning import FineTuningRates
+from sw_gaussians.choices import Choosing, CodecChoice
 
-from splatwizard_core.api import OptimizationParams, Params
+from splatwizard_core.api import Params
 from sw_codecs.codebooks.sharing import Training
 
 
@@ -56,14 +57,7 @@ class Rates(FineTuningRates):
         return found
 
 
-class Codec(Params):
-    """The codec of the file."""
-
-    name: str = Field("gaussians-indexed", description="which codec for Gaussians")
-    settings: dict[str, Any] = Field({}, description="its settings, by their keys")
-
-
-class C3DGSConfig(OptimizationParams):
+class C3DGSConfig(Choosing):
     """Everything that can be set for C3DGS."""
 
     FULL_ITERATIONS: ClassVar[int] = 5_000
@@ -77,4 +71,4 @@ class C3DGSConfig(OptimizationParams):
     shape: Shapes = Field(Shapes(), description="codebook of shapes")
     factors: Factors = Field(Factors(), description="factors on both codebooks")
     lr: Rates = Field(Rates(), description="step sizes")
-    codec: Codec = Field(Codec(), description="what the file holds")
+    codec: CodecChoice = Field(CodecChoice(name="gaussians-indexed"), description="what writes the file")

@@ -9,9 +9,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from splatwizard_core.api import SH, GaussianInputs, GaussianModel, RasterOptions, track
+from splatwizard_core.api import SH, GaussianInputs, GaussianModel, Params, RasterOptions, track
 from sw_c3dgs.shapes import normalised_covariances, split_scales
 
 if TYPE_CHECKING:
@@ -69,12 +70,21 @@ def sensitivities(
     return color / max(pixels, 1), sums[2].amax(1) / max(pixels, 1)
 
 
+class SensitivitySettings(Params):
+    """Settings of the pruner `sensitivity`."""
+
+    kind: Kind = Field(
+        "color", description="color: the largest derivative by an SH coefficient; shape: by an entry of the covariance"
+    )
+
+
 class Sensitivity:
     """Pruner `sensitivity`: how much the training pictures change with a Gaussian's colour, or with its shape.
 
     kind    color: the largest derivative by an SH coefficient; shape: by an entry of the covariance of trace 1
     """
 
+    Settings = SensitivitySettings
     uses_statistics = False
 
     def __init__(self, *, kind: Kind = "color") -> None:

@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 
-from splatwizard_core.api import BitstreamError
+from splatwizard_core.api import BitstreamError, Params
 from sw_codecs.codebooks.sharing import Training, share_vectors
 from sw_codecs.quantizers.fake_quant import FakeQuantAffine
 
@@ -38,6 +39,17 @@ def index_dtype(entries: int) -> np.dtype[Any]:
     return np.dtype(np.uint16 if entries <= 1 << 16 else np.uint32)
 
 
+class SensitivityVQSettings(Params):
+    """Settings of `sensitivity-vq`."""
+
+    threshold: float = Field(0.6e-6, ge=0, description="more sensitive vectors keep their own entry; as the scores")
+    size: int = Field(4096, ge=1, le=1 << 20, description="entries that the others share")
+    training: Training = Field("batch-mean", description="the published loop; ema: ours; kmeans: passes over all")
+    iterations: int = Field(100, ge=0, description="batches, or passes")
+    batch: int = Field(1 << 18, ge=1, description="vectors of each batch, drawn with replacement")
+    decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook each batch leaves")
+
+
 class SensitivityVQ:
     """Float vectors to four byte strings and back.
 
@@ -48,6 +60,8 @@ class SensitivityVQ:
                 of the shared entries, see `share_vectors`
     device      where they are trained: "cpu", where equal arguments give equal bytes, or "cuda"
     """
+
+    Settings = SensitivityVQSettings
 
     def __init__(
         self,
