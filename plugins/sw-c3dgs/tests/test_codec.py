@@ -3,15 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from sw_gaussians.ply import export_ply, load_ply
+from sw_kit.hostile_files import Mutator, Parts, Tally, attempt
+
+from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter, GaussianModel, SplatwizardError
 from sw_c3dgs.codec import IndexedCodec
 from sw_c3dgs.coded import QUANTIZED
 from sw_c3dgs.indexed import IndexedGaussians
 from sw_c3dgs.method import C3DGS
 from sw_c3dgs.model import SharedGaussians
-from sw_gaussians.ply import export_ply, load_ply
-from sw_kit.hostile_files import Mutator, Parts, Tally, attempt
-
-from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter, GaussianModel, SplatwizardError
 from sw_codecs.positions.ordering import spatial_order
 from sw_codecs.testing import check_gaussian_codec
 

@@ -2,11 +2,11 @@
 
 import pytest
 import torch
+
+from splatwizard_core.api import ParamGroup, RasterOptions, SplatOptimizer
 from sw_c3dgs.coded import QUANTIZED
 from sw_c3dgs.indexed import IndexedGaussians
 from sw_c3dgs.model import SharedGaussians
-
-from splatwizard_core.api import ParamGroup, RasterOptions, SplatOptimizer
 
 
 @pytest.fixture

@@ -4,10 +4,6 @@ import copy
 
 import pytest
 import torch
-from sw_c3dgs.config import C3DGSConfig
-from sw_c3dgs.indexed import IndexedGaussians
-from sw_c3dgs.method import C3DGS
-from sw_c3dgs.model import SharedGaussians
 from sw_reference.projection import covariances
 
 from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel
@@ -15,6 +11,10 @@ from splatwizard_core.errors import EmptyModel, SceneError
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from sw_c3dgs.config import C3DGSConfig
+from sw_c3dgs.indexed import IndexedGaussians
+from sw_c3dgs.method import C3DGS
+from sw_c3dgs.model import SharedGaussians
 
 SHORT = {
     "iterations": 12, "color.size": 16, "shape.size": 16, "color.iterations": 10, "shape.iterations": 10,

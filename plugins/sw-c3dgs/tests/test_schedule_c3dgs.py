@@ -1,14 +1,14 @@
 """The plan is the published one, and so are the step sizes, thresholds and codebooks."""
 
 import pytest
-from sw_c3dgs.config import C3DGSConfig
-from sw_c3dgs.method import C3DGS
 
 from splatwizard_core.api import create_method
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
+from sw_c3dgs.config import C3DGSConfig
+from sw_c3dgs.method import C3DGS
 
 PLAN = """\
 Stage | Task        | Plan

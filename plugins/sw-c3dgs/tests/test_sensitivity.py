@@ -2,11 +2,11 @@
 
 import pytest
 import torch
-from sw_c3dgs.sensitivity import Sensitivity, sensitivities
-from sw_c3dgs.shapes import UPPER, split_scales
 from sw_finetuning.pruning import scores_of
 
 from splatwizard_core.api import SH, CameraIterator, GaussianInputs, GaussianModel, RasterOptions
+from sw_c3dgs.sensitivity import Sensitivity, sensitivities
+from sw_c3dgs.shapes import UPPER, split_scales
 
 SH_C0 = 0.28209479177387814
 

@@ -4,8 +4,9 @@ import math
 
 import pytest
 import torch
-from sw_c3dgs.shapes import FULL, UPPER, decomposed, normalised_covariances, of_trace_one, split_scales
 from sw_reference.projection import covariances, rotation_matrices
+
+from sw_c3dgs.shapes import FULL, UPPER, decomposed, normalised_covariances, of_trace_one, split_scales
 
 
 def random(n=200, seed=0):

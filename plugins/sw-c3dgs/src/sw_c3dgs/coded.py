@@ -37,7 +37,7 @@ class CodedGaussians:
     shape_index: NDArray[np.int64]
 
     def values(self, name: str) -> NDArray[np.float32]:
-        """What the symbols of a name stand for: one float32 product, the same on every machine."""
+        """Values of the symbols of a name: one float32 product, the same on every machine."""
         at = QUANTIZED.index(name)
         found: NDArray[np.float32] = (self.symbols[name].astype(np.int32) - self.zeros[at]).astype(np.float32)
         return found * self.steps[at]

@@ -40,7 +40,7 @@ class Shapes(Codebook):
 
 
 class Factors(Params):
-    """What the rate points turn."""
+    """Factors that the rate points set."""
 
     thresholds: float = Field(1.0, ge=0, description="times both thresholds: more of it, fewer own entries")
     sizes: float = Field(1.0, gt=0, le=16, description="times both sizes")

@@ -113,7 +113,7 @@ class IndexedGaussians(GaussianModel):
         )
 
     def coded(self) -> CodedGaussians:
-        """What this was decoded from, symbol by symbol."""
+        """Form that this was decoded from, symbol by symbol."""
         tensors = (
             self.opacity_values, self.log_factors, self.color_dc, self.color_rest, self.shape_scales, self.shape_quats,
         )  # fmt: skip

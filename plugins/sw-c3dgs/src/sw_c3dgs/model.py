@@ -122,7 +122,7 @@ class SharedGaussians(SplatModel):
 
     @torch.no_grad()
     def coded(self) -> CodedGaussians:
-        """What a file holds of these Gaussians. Raises ValueError for values that are not finite."""
+        """Form in which a file holds these Gaussians. Raises ValueError for values that are not finite."""
         symbols, steps, zeros = {}, [], []
         for name, value in self._activated().items():
             quantizer = self.quantizers[name]
