@@ -13,6 +13,7 @@ Gaussians along a Morton curve, entries of codebooks by their first use:
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -62,7 +63,7 @@ class IndexedCodec:
         coded = coded.in_order(spatial_order(_cells(coded.means), bits=CELLS))
         n, colors, shapes = len(coded.means), len(coded.symbols["dc"]), len(coded.symbols["shape"])
         bands = 1 + coded.symbols["rest"].shape[1]
-        degree = round(bands**0.5) - 1
+        degree = math.isqrt(bands) - 1
         writer.raster["sh_degree"] = degree
         writer.static.update(
             num_gaussians=n, num_colors=colors, num_shapes=shapes, max_sh_degree=degree, arrays=self.settings.arrays
@@ -139,7 +140,8 @@ def _cells(means: NDArray[np.float16]) -> NDArray[np.int64]:
     points = means.astype(np.float64)
     low = points.min(0)
     width = np.maximum(points.max(0) - low, 1e-300)
-    return ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
+    cells: NDArray[np.int64] = ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
+    return cells
 
 
 def _decoded_bytes(n: int, colors: int, shapes: int, bands: int) -> int:

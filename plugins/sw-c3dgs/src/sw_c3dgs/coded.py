@@ -39,8 +39,9 @@ class CodedGaussians:
     def values(self, name: str) -> NDArray[np.float32]:
         """Values of the symbols of a name: one float32 product, the same on every machine."""
         at = QUANTIZED.index(name)
-        found: NDArray[np.float32] = (self.symbols[name].astype(np.int32) - self.zeros[at]).astype(np.float32)
-        return found * self.steps[at]
+        whole = self.symbols[name].astype(np.int32) - self.zeros[at]
+        found: NDArray[np.float32] = whole.astype(np.float32) * self.steps[at]
+        return found
 
     def in_order(self, order: NDArray[np.int64]) -> CodedGaussians:
         """The Gaussians in this order [N], and only entries that one of them uses, numbered by their first use."""

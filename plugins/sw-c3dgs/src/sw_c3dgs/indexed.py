@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,7 +58,7 @@ class IndexedGaussians(GaussianModel):
 
     @property
     def max_sh_degree(self) -> int:
-        return round((1 + self.color_rest.shape[1]) ** 0.5) - 1
+        return math.isqrt(1 + self.color_rest.shape[1]) - 1
 
     @property
     def opacities(self) -> Tensor:

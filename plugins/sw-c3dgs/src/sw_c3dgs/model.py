@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -77,7 +78,7 @@ class SharedGaussians(SplatModel):
     @property
     def sh_degree(self) -> int:
         """The highest SH band; all are active."""
-        return round((1 + self.sh_rest.shape[1]) ** 0.5) - 1
+        return math.isqrt(1 + self.sh_rest.shape[1]) - 1
 
     def counts(self) -> dict[str, int]:
         return {"num_gaussians": self.num_rows, "num_colors": len(self.sh_dc), "num_shapes": len(self.shapes)}

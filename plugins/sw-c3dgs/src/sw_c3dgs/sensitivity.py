@@ -5,6 +5,7 @@ Source: C3DGS (arXiv 2401.02436), section on parameter sensitivity.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
@@ -51,7 +52,7 @@ def sensitivities(
     sums = [torch.zeros_like(leaf) for leaf in (dc, rest, shape)]
     asked = [dc, rest, shape] if rest.shape[1] else [dc, shape]
     into = sums if rest.shape[1] else [sums[0], sums[2]]
-    degree = round((1 + rest.shape[1]) ** 0.5) - 1
+    degree = math.isqrt(1 + rest.shape[1]) - 1
     options, pixels = RasterOptions(clamp_color=False), 0
     with track("sensitivity", total=len(cameras)) as bar:
         for camera in cameras:

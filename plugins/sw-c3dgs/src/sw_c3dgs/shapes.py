@@ -45,7 +45,7 @@ def decomposed(found: Tensor) -> tuple[Tensor, Tensor]:
 
     Eigenvalues that are not positive, as of a codebook entry that is no covariance, become 1e-12.
     """
-    parts = [_decomposed(block) for block in found.detach().double().split(BLOCK)]
+    parts = [_decomposed(block) for block in torch.split(found.detach().double(), BLOCK)]
     if not parts:
         return found.new_zeros(0, 3), found.new_zeros(0, 4)
     shapes, quats = (torch.cat(each).to(found.dtype) for each in zip(*parts, strict=True))
