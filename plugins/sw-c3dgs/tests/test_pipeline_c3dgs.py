@@ -143,6 +143,21 @@ def test_stopped_and_resumed_equals_one_go(train, whole, tmp_path, stop):
     assert train(directory=tmp_path)[1].digest() == whole[1].digest()
 
 
+def test_resuming_does_not_depend_on_the_layout_of_the_scene_that_it_starts_from(train, toy, tmp_path):
+    """Of which all Gaussians stay, so that a resumed model keeps the tensors that it began with."""
+    _, seen = train(iterations=0, factors__thresholds=0.0)
+    start = GaussianModel(
+        *(getattr(gathered(seen), name).detach() for name in GaussianModel.ROWS[:6]), active_sh_degree=3
+    )
+    start.means.data = start.means.data.T.contiguous().T
+    with pytest.raises(TrainingStopped):
+        train(start=start, directory=tmp_path, stop_after=6)
+    resumed = train(start=start, directory=tmp_path)[1]
+    assert resumed.num_rows == start.num_rows
+    assert all(each.is_contiguous() for each in resumed.parameters())
+    assert resumed.digest() == train(start=start)[1].digest()
+
+
 @pytest.mark.parametrize("iterations", [0, 1, 3])
 def test_a_run_of_hardly_any_steps_makes_codebooks_and_a_file(train, plugins, iterations, tmp_path):
     method, model = train(iterations=iterations, directory=tmp_path)

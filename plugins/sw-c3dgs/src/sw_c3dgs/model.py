@@ -69,10 +69,14 @@ class SharedGaussians(SplatModel):
         """Copies of a model's Gaussians, each with a colour and a shape of its own."""
         log_factors, shapes = split_scales(model.log_scales.detach())
         own = torch.arange(model.num_rows, device=model.device)
+        # Row after row, whatever the layout of the originals: Adam rounds by layout, and a resumed model keeps these.
+        raw = {
+            name: getattr(model, name).detach().clone(memory_format=torch.contiguous_format)
+            for name in ("means", "opacity_logits", "sh_dc", "sh_rest", "quats")
+        }
         return cls(
-            means=model.means.detach().clone(), opacity_logits=model.opacity_logits.detach().clone(),
-            log_factors=log_factors, color_index=own, shape_index=own.clone(), sh_dc=model.sh_dc.detach().clone(),
-            sh_rest=model.sh_rest.detach().clone(), shapes=shapes, quats=model.quats.detach().clone(),
+            log_factors=log_factors.contiguous(), shapes=shapes.contiguous(), color_index=own, shape_index=own.clone(),
+            **raw,
         )  # fmt: skip
 
     @property
