@@ -60,6 +60,7 @@ class PartsChoice(Choice):
     PARTS: ClassVar[tuple[str, ...]] = ("low", "high")
 
     name: str = "ours"
+    settings: dict[str, object] = {}
     low: dict[str, object] = {"power": 0.5}
     high: dict[str, object] = {}
 
@@ -218,7 +219,7 @@ def test_an_older_setting_of_another_provider_is_left_out_as_it_was(config):
 
 
 def test_an_older_key_that_never_was_is_unknown(config):
-    with pytest.raises(ConfigError, match="unknown key 'vq.bit'"):
+    with pytest.raises(ConfigError, match=r"unknown key 'vq\.bit'"):
         config({"vq.bit": 3})
 
 

@@ -9,9 +9,10 @@ from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.method import GaussianMethod
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
+from splatwizard_core.errors import BitstreamError, ConfigError, PluginError, SceneError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.registry import Coders, Registry
+from splatwizard_core.training.params import OptimizationParams
 
 SHAPES = {"means": (3,), "sh_dc": (1, 3), "sh_rest": (0, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
 
@@ -81,10 +82,18 @@ def test_a_codec_that_is_not_one_of_gaussians_is_told_before_anything_is_trained
     assert error.value.key == "codec.name"
 
 
+def test_a_config_whose_codec_is_a_name_alone_is_the_authors_to_change(plugins):
+    class Older(OptimizationParams):
+        codec: str = "toy-codec"
+
+    with pytest.raises(PluginError, match=r"method 'toy' cannot be used: `codec` of its Older must be a CodecChoice"):
+        Toy(plugins, Older())
+
+
 def test_another_layout_version_is_refused(plugins, model):
     reader = written(plugins, model)
     reader.version = 7
-    with pytest.raises(BitstreamError, match=r"version 7.*upgrade sw-of-toys"):
+    with pytest.raises(BitstreamError, match=r"toy layout version 7 is unknown, newer than"):
         Toy(plugins, None).decode(reader)
 
 

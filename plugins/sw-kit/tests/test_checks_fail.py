@@ -143,6 +143,46 @@ class NoBackground(NeedsAnArgument):
         pass
 
 
+class Scores:
+    uses_statistics = False
+
+    def __init__(self, power=1.0):
+        pass
+
+    def score(self, model, cameras, rasterizer, background=None):
+        pass
+
+
+class WithoutDefault(Scores):
+    class Settings(Params):
+        power: float
+
+
+class NotTaken(Scores):
+    class Settings(Params):
+        strength: float = 1.0
+
+
+class OtherDefault(Scores):
+    class Settings(Params):
+        power: float = 2.0
+
+
+class NoModel(Scores):
+    Settings = 3
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [(WithoutDefault, "Settings is a pydantic model"), (NotTaken, "unexpected keyword argument 'strength'"),
+     (OtherDefault, "'power' is 1.0 or 2.0 by default"), (NoModel, "cannot be made with its Settings")],
+)  # fmt: skip
+def test_settings_that_the_class_is_not_made_with(entry_of, target, said):
+    assert "has the signatures" in check_target(entry_of("pruner", Scores), PLUGINS)
+    with pytest.raises(BrokenContractError, match=said):
+        check_target(entry_of("pruner", target), PLUGINS)
+
+
 @pytest.mark.parametrize(
     ("kind", "target", "declared", "said"),
     [("pruner", NeedsAnArgument, {}, "cannot be made with its defaults"),

@@ -69,12 +69,10 @@ class Method:
     def check_version(self, reader: ContainerReader) -> None:
         """Raise BitstreamError for another layout version than the method's own: for a `decode` that reads no other."""
         if reader.version != self.version:
-            methods = self.plugins.methods
-            known = self.name in methods
-            package = methods.entry(self.name).distribution if known else f"the package of {self.name}"
+            relation = "older" if reader.version < self.version else "newer"
             raise BitstreamError(
-                f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade {package}"
+                f"{reader.name}: {self.name} layout version {reader.version} is unknown, {relation} than the only one "
+                f"that is read here, {self.version}: install the release of its package that wrote it"
             )
 
 

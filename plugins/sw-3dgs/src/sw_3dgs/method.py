@@ -64,4 +64,4 @@ class ThreeDGS(GaussianMethod):
             del writer.static[HEADER_KEY]
 
     def codec_of(self, reader: ContainerReader) -> str:
-        return MODES[reader.text("mode", choices=MODES)] if "mode" in reader.static else super().codec_of(reader)
+        return MODES[reader.text("mode", choices=list(MODES))] if "mode" in reader.static else super().codec_of(reader)

@@ -62,6 +62,7 @@ class Codec(Choice):
     PARTS: ClassVar[tuple[str, ...]] = ("sh2", "sh3")
 
     name: str = Field("importance-vq", description="coder of vectors: any registered one")
+    settings: dict[str, object] = Field({}, description="settings of the chosen one, by its own keys")
     sh2: dict[str, object] = Field({"ratio": 0.8}, description="settings for the degree-2 group alone, which win")
     sh3: dict[str, object] = Field({"ratio": 0.6}, description="the same for the degree-3 group")
 

@@ -44,13 +44,13 @@ class Named(Params):
 class OwnCodec(Named):
     """Codec of a method whose file no other codec can write: subclasses fix `name` and type `settings`.
 
-    name        `Literal["their-method"]`
+    name        `Literal["their-method"]`: the method's name, or that of its codec where that one is registered
     settings    block of typed fields
     """
 
 
 class Choice(Named):
-    """Provider of a kind, by name, and its settings.
+    """Provider of a kind, by name, and its settings: a subclass has a field for the name and `settings`, a dict.
 
     REGISTRY    attribute of the plugin manager that knows the names
     PARTS       further fields with settings, each for a part of the work alone; they win over `settings`
@@ -58,8 +58,6 @@ class Choice(Named):
 
     REGISTRY: ClassVar[str]
     PARTS: ClassVar[tuple[str, ...]] = ()
-
-    settings: dict[str, object] = Field({}, description="settings of the chosen one, by its own keys")
 
     def provider(self, plugins: PluginManager, key: str) -> Callable[..., Any]:
         """Return the class that is registered under the name.
@@ -106,7 +104,7 @@ class Choice(Named):
                 first = next(iter(given))
                 raise ConfigError(
                     f"'{first}' in {sources.get(first, 'the configuration')}: '{self.chosen}' ({key}) has no settings: "
-                    "leave it out",
+                    "leave it out, or name another one",
                     key=first,
                 )
             checked = _checked(model, f"{path}.{field}", given, sources) if model is not None else {}
@@ -120,6 +118,7 @@ class CodecChoice(Choice):
     REGISTRY: ClassVar[str] = "gaussian_codecs"
 
     name: str = Field(description="codec of the file: any registered one of Gaussians")
+    settings: dict[str, object] = Field({}, description="settings of the chosen one, by its own keys")
 
     def load(self, plugins: PluginManager) -> GaussianCodec:
         """Return the codec with its settings. Raises PluginError."""
@@ -134,6 +133,7 @@ class PrunerChoice(Choice):
     NAME: ClassVar[str] = "pruner"
 
     pruner: str = Field(description="whose scores decide: any registered pruner")
+    settings: dict[str, object] = Field({}, description="settings of the chosen one, by its own keys")
 
     def load(self, plugins: PluginManager, key: str = "prune.pruner") -> Pruner:
         """Return the pruner with its settings: a method asks in `stages`, before anything is trained.
@@ -148,7 +148,7 @@ class PrunerChoice(Choice):
 
 
 class Moved(NamedTuple):
-    """Where a key of an older release stands now.
+    """New place of a key of an older release.
 
     keys        one or several; a setting is dropped where another provider than `provider` is chosen
     default     value that the older release had
@@ -177,7 +177,7 @@ class Choosing(OptimizationParams):
         """
         named = dict(_blocks(self))
         found = dict(values)
-        for name in {*named, *(old.partition(".")[0] for old in self.OLDER)}:
+        for name in sorted({*named, *(old.partition(".")[0] for old in self.OLDER)}):
             if isinstance(found.get(name), Mapping):
                 found |= {f"{name}.{key}": value for key, value in found.pop(name).items()}
         for path, block in named.items():
@@ -281,5 +281,6 @@ def _checked(model: type[BaseModel], path: str, given: Mapping[str, Any], source
 def _nested(model: type[BaseModel], path: str) -> type[BaseModel]:
     """Return a model with the settings at the dotted `path`, so that messages have their full keys."""
     for name in reversed(path.split(".")):
-        model = create_model(name, __base__=Params, **{name: (model, Field(default_factory=model))})
+        fields: dict[str, Any] = {name: (model, Field(default_factory=model))}
+        model = create_model(name, __base__=Params, **fields)
     return model

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from splatwizard_core.api import GaussianModel, Method, SceneError
+from splatwizard_core.api import GaussianModel, Method, PluginError, SceneError
+from sw_gaussians.choices import CodecChoice
 
 if TYPE_CHECKING:
     import torch
@@ -32,8 +33,15 @@ class GaussianMethod(Method):
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
         """Raise ConfigError for a codec that is not installed: now, and not when all is trained."""
         super().__init__(plugins, config)
-        if config is not None:
-            self.config.codec.provider(plugins, "codec.name")
+        if config is None:
+            return
+        codec = getattr(config, "codec", None)
+        if not isinstance(codec, CodecChoice):
+            raise PluginError(
+                f"method '{self.name}' cannot be used: `codec` of its {type(config).__name__} must be a CodecChoice of "
+                "sw_gaussians.choices; its author has to change that"
+            )
+        codec.provider(plugins, "codec.name")
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Raise SceneError: a stage starts from a trained scene, and there is no start from points."""

@@ -36,7 +36,7 @@ class DistillRates(FineTuningRates):
 
 
 class Score(PrunerChoice):
-    """What keeps its own colours in the file."""
+    """The pruner whose scores say what keeps its own colours in the file."""
 
     pruner: str = Field("lightgaussian", description="whose scores say what matters for the file: any pruner")
 

@@ -18,6 +18,7 @@ from splatwizard_core.api import (
     Rasterizer,
     Scene,
     SplatOptimizer,
+    TaskLog,
 )
 from sw_trimming_the_fat.score import doomed, mean_gradients
 
@@ -110,6 +111,7 @@ class PruneBelowBoth:
         rasterizer: Rasterizer,
         scene: Scene,
         step: int,
+        told: TaskLog,
     ) -> None:
         scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
         goes = doomed(scores, self.level)
@@ -119,7 +121,8 @@ class PruneBelowBoth:
         if gone == before:
             raise EmptyModel(step)
         optimizer.keep_rows(model, ~goes, carry_grad=True)
-        log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
+        told.say(f"pruned {gone:,} of {before:,} Gaussians, {before - gone:,} left")
+        told.scalar("pruned", gone)
 
     def _explain(self, model: GaussianModel, views: int) -> None:
         """Raise, or warn, if too many Gaussians have no gradient for anything to be below the quantile."""

@@ -15,9 +15,9 @@ import click
 
 from splatwizard_core.cli.complete import VARIABLE
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
-from splatwizard_core.errors import FORESEEN, FULL, DiskFullError, SplatwizardError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
+from splatwizard_native import FULL, DiskFullError, ForeseenError
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import Entry
@@ -112,7 +112,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
-    if VARIABLE in os.environ and isinstance(error, SplatwizardError):
+    if VARIABLE in os.environ and isinstance(error, ForeseenError):
         return error.exit_status  # the shell asks for completions: TAB is not the place to say what is wrong
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
@@ -132,9 +132,9 @@ def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     if isinstance(error, OSError) and error.errno in FULL:
         # What did not go through our own writing may not say where.
         error = DiskFullError(str(error.filename or "a file"), FULL[error.errno])
-    if isinstance(error, FORESEEN):
+    if isinstance(error, ForeseenError):
         _say(f"error: {error}")
-        return error.exit_status if isinstance(error, SplatwizardError) else 1
+        return error.exit_status
     add_debug = "" if debug else " (a traceback: add --debug)"
     if isinstance(error, OSError) and error.strerror is not None:
         at = "" if error.filename is None else f"{error.filename}: "

@@ -47,7 +47,7 @@ class Choices:
             if str(given.get(key, value)) != str(value):
                 raise ConfigError(f"--{key} {value} contradicts --set {key}={given[key]}: give one of them", key=key)
             given[key] = value
-        return {**self.below, **given}
+        return {**{k: v for k, v in self.below.items() if k.partition(".")[0] not in given}, **given}
 
     def method_names(self, plugins: PluginManager) -> list[str]:
         """The methods that `--method a,b --method c` names, else the one of the configuration file, else the default.
@@ -122,7 +122,8 @@ class Choices:
             return chosen
         (name,) = chosen.method_names(plugins)
         method = plugins.methods.load(name)
-        wanted = resolve(method, str(read_config_file(directory / "config.toml").get("preset", "paper")), self.rate)
+        preset = str(read_config_file(directory / "config.toml").get("preset", "paper"))
+        wanted = resolve(method, preset, self.rate, plugins=plugins)
         keys = tuple(
             f"{k}." for point in method.RATES.values() for k in point if field_at(method.Config, k) is not None
         )

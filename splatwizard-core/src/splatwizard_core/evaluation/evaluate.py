@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, SceneError, out_of_memory
+from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.evaluation.image import prepare_render
 from splatwizard_core.evaluation.metrics import (
     MetricInfo,
@@ -25,14 +25,13 @@ from splatwizard_core.evaluation.metrics import (
     noting_failure,
     prepare_metric,
 )
-from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.registry import Entry
-from splatwizard_core.progress import track
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import View
+from splatwizard_native import out_of_memory, replacing, track
 
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
 RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}

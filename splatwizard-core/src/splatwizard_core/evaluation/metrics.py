@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import FORESEEN, CapabilityError, ConfigError, PluginError
+from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.registry import Entry, TypedRegistry
+from splatwizard_native import ForeseenError
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -202,7 +203,7 @@ def noting_failure(entry: Entry, reasons: dict[str, str]) -> Iterator[None]:
         yield
     except (PluginError, CapabilityError) as error:
         reasons[entry.name] = str(error)
-    except (*FORESEEN, torch.cuda.OutOfMemoryError):
+    except (ForeseenError, torch.cuda.OutOfMemoryError):
         raise
     except (Exception, SystemExit) as error:
         reasons[entry.name] = f"metric '{entry.name}' of {entry.distribution} {entry.version} failed: {one_line(error)}"

@@ -12,7 +12,7 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import FORESEEN, CapabilityError, PluginError
+from splatwizard_core.errors import CapabilityError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
 from splatwizard_core.plugins.manager import PluginManager
@@ -22,7 +22,7 @@ from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
-from splatwizard_native import NativeBuildError
+from splatwizard_native import ForeseenError, NativeBuildError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -114,7 +114,7 @@ class NegotiatedRasterizer:
             try:
                 rasterizer = self._make(best.name)
                 break
-            except FORESEEN as error:
+            except ForeseenError as error:
                 self._fail(best.name, error)
         asked, composing = "+".join(sorted(wanted)) or "plain", ""
         if missing := wanted - best.features:
@@ -143,7 +143,7 @@ class NegotiatedRasterizer:
         entry = self._registry.entry(name)
         try:
             made: Rasterizer = entry.load()()
-        except FORESEEN:
+        except ForeseenError:
             raise
         except (Exception, SystemExit) as error:
             reason = f"{type(error).__name__}: {error}"

@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
-from splatwizard_core.files import file_sha256
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.locate import is_procedural
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
+from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:
     from splatwizard_core.method import Method
@@ -153,8 +153,8 @@ class ResolvedConfig:
 
         Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
         """
-        content = {**self.as_dict(), "config": self.config.identity()}
-        return content_hash({k: v for k, v in content.items() if k not in ("provenance", "metrics")})
+        beside = {k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")}
+        return content_hash(beside | {"config": self.config.identity()})
 
 
 def content_hash(content: Any) -> str:
