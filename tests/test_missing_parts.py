@@ -184,5 +184,19 @@ def test_a_layout_that_is_newer_than_a_strangers_method(stranger, tmp_path, caps
     )
     assert error(capsys, write(2, {})) == f"{told}pip install --upgrade sw-martian"
     line = error(capsys, write(0, {"sw-martian": ["0.7", "method:mars"]}))
-    assert "mars layout version 0 is unknown, older than the only one that is read here, 1" in line
+    assert "mars layout version 0 is unknown, this installation reads 1; the file is older" in line
     assert line.endswith("written with sw-martian 0.7, installed is 1.2: pip install 'sw-martian==0.7')")
+
+
+def test_a_part_that_is_there_but_of_another_sort_is_damage_and_not_missing(tmp_path, capsys):
+    """A hostile header: the octree codes positions, and no package to install makes it a codec of Gaussians."""
+    from sw_kit.hostile_files import Parts
+
+    parts = Parts.of((GOLDEN / "trimming_the_fat_zstd_v1.swz").read_bytes())
+    parts.header["static"]["codec"] = "octree"
+    parts.header["requires"] = {"sw-codecs": ["9.9", "coder:octree"]}
+    path = tmp_path / "scene.swz"
+    path.write_bytes(parts.join())
+    line = error(capsys, path)
+    assert "header value 'codec' is 'octree', must be one of gaussians-exact, " in line
+    assert "not installed" not in line

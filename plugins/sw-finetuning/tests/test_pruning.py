@@ -73,7 +73,7 @@ def test_the_task_removes_rows_and_moments_and_sees_every_camera_once(scene):
     log = TaskLog()
     PruneByScore(pruner, {1: 0.8, 5: 0.5})(gaussians, optimizer, CameraIterator(scene.train), None, scene, 5, log)
     assert torch.equal(gaussians.means, before[5:])
-    assert [line for _, line in log.said] == ["pruned 5 of 10 primitives, 5 left"]
+    assert [line for _, line in log.said] == ["removed 5 of 10 primitives, 5 left"]
     assert log.scalars["pruned"].item() == 5
     assert optimizer.moments("means")[0].shape == (5, 3)
     assert gaussians.means.grad is None

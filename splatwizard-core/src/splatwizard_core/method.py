@@ -69,10 +69,12 @@ class Method:
     def check_version(self, reader: ContainerReader) -> None:
         """Raise BitstreamError for another layout version than the method's own: for a `decode` that reads no other."""
         if reader.version != self.version:
-            relation = "older" if reader.version < self.version else "newer"
+            known = self.plugins.methods
+            package = known.entry(self.name).distribution if self.name in known else f"the package of {self.name}"
+            advice = f"newer: upgrade {package}" if reader.version > self.version else f"older: get an older {package}"
             raise BitstreamError(
-                f"{reader.name}: {self.name} layout version {reader.version} is unknown, {relation} than the only one "
-                f"that is read here, {self.version}: install the release of its package that wrote it"
+                f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
+                f"{self.version}; the file is {advice}"
             )
 
 

@@ -97,7 +97,7 @@ class PruneByScore:
         if left == 0:
             raise EmptyModel(step)
         optimizer.keep_rows(model, ~doomed, carry_grad=self.carry_grad)
-        log.say(f"pruned {before - left:,} of {before:,} primitives, {left:,} left")
+        log.say(f"removed {before - left:,} of {before:,} primitives, {left:,} left")
         log.scalar("pruned", before - left)
 
 

@@ -121,7 +121,7 @@ class PruneBelowBoth:
         if gone == before:
             raise EmptyModel(step)
         optimizer.keep_rows(model, ~goes, carry_grad=True)
-        told.say(f"pruned {gone:,} of {before:,} Gaussians, {before - gone:,} left")
+        told.say(f"removed {gone:,} of {before:,} Gaussians, {before - gone:,} left")
         told.scalar("pruned", gone)
 
     def _explain(self, model: GaussianModel, views: int) -> None:

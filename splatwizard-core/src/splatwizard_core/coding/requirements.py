@@ -51,10 +51,6 @@ class Requirement:
         """Whether the file was written with a later release than `version`."""
         return _release(self.version) > _release(version)
 
-    def is_older_than(self, version: str) -> bool:
-        """Whether the file was written with an earlier release than `version`."""
-        return _release(self.version) < _release(version)
-
 
 def dump_requirements(requirements: Iterable[Requirement]) -> dict[str, list[str]]:
     """The header value: {distribution: [version, "kind:name", ...]}.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+from dataclasses import replace
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.coding.requirements import requirement_of
@@ -62,7 +63,8 @@ def other_versions(reader: ContainerReader, plugins: PluginManager) -> str:
     here = {normal_name(plugin.distribution): plugin.version for plugin in plugins.plugins if plugin.version}
     pairs = [(each, here[name]) for each in reader.requires if (name := normal_name(each.distribution)) in here]
     newer = [(each, have) for each, have in pairs if each.is_newer_than(have)]
-    older = [(each, have) for each, have in pairs if each.is_older_than(have) and not is_ours(each.distribution)]
+    theirs = [(each, have) for each, have in pairs if not is_ours(each.distribution)]
+    older = [(each, have) for each, have in theirs if replace(each, version=have).is_newer_than(each.version)]
     if not (newer or older):
         return ""
     relation, sign = ("newer", ">=") if newer else ("older", "==")
