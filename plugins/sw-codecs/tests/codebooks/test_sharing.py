@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from splatwizard_core.api import ShapeError
+from sw_codecs.codebooks import sharing
 from sw_codecs.codebooks.sharing import share_vectors
 
 
@@ -48,6 +49,15 @@ def test_no_more_distinct_vectors_than_entries_stand_for_themselves():
         found = share(x, torch.zeros(200), training=training)
         assert torch.equal(found.entries[found.index], x)
         assert len(found.entries) == 5
+
+
+def test_of_many_vectors_the_distinct_ones_are_not_counted(monkeypatch):
+    monkeypatch.setattr(sharing, "COUNTED", 199)
+    points = torch.randn(5, 3, generator=generator()) * 10
+    x = points[torch.randint(5, (200,), generator=generator())]
+    found = share(x, torch.zeros(200), training="kmeans", iterations=3)
+    assert torch.allclose(found.entries[found.index], x, atol=1e-4)
+    assert len(found.entries) == 5
 
 
 def test_one_entry_goes_to_the_mean_that_is_weighted_by_sensitivity():

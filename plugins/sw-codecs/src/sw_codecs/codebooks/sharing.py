@@ -18,6 +18,8 @@ from sw_codecs.quantizers.vector_quantizer import VectorQuantizer
 
 Training = Literal["batch-mean", "ema", "kmeans"]
 
+COUNTED = 1 << 16  # vectors of which the distinct ones are counted: torch.unique takes a tensor for each of more
+
 
 @dataclass(frozen=True)
 class SharedVectors:
@@ -50,7 +52,8 @@ def share_vectors(
     """Codebook of vectors [n, d] float, weighted by their sensitivity [n], which may hold -inf but no NaN.
 
     threshold   vectors of higher sensitivity keep an entry of their own
-    size        entries at most that the others share; with no more distinct vectors than that, these are the entries
+    size        entries at most that the others share; with no more distinct vectors than that (of up to 2^16 vectors in
+                all), these are the entries
     training    "batch-mean" and "ema": that rule of `VectorQuantizer.train`, the first the published one, for
                 `iterations` batches of `batch` vectors with `decay`; "kmeans": as many passes over all of them
     generator   seeds the codebook; on a CPU equal arguments give equal results
@@ -67,8 +70,10 @@ def share_vectors(
     x = x.detach()
     keeps = sensitivity > threshold
     own, others = keeps.nonzero().squeeze(1), (~keeps).nonzero().squeeze(1)
-    shared, codes = torch.unique(x[others], dim=0, return_inverse=True) if len(others) else (x[:0], others)
-    if len(shared) > size:
+    shared, codes = x[:0], others
+    if 0 < len(others) <= COUNTED:
+        shared, codes = torch.unique(x[others], dim=0, return_inverse=True)
+    if len(others) > COUNTED or len(shared) > size:
         rows, weights = x[others], sensitivity[others].double().clamp_min(0)
         used = weights if bool((weights > 0).any()) else None
         quantizer = VectorQuantizer(size, decay=decay)
