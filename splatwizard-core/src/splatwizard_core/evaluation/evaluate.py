@@ -22,6 +22,7 @@ from splatwizard_core.evaluation.metrics import (
     MetricSettings,
     MetricSetup,
     PreparedMetric,
+    measured,
     noting_failure,
     prepare_metric,
 )
@@ -172,7 +173,7 @@ def evaluate(
             for entry in (e for e in wanted if e.name not in missing):
                 drawn_image = exact if MetricInfo.of(entry).unrounded else image
                 with noting_failure(entry, missing):
-                    values[entry.name].append(float(ready[entry.name].compute(drawn_image, truth)))
+                    values[entry.name].append(measured(entry, ready[entry.name], drawn_image, truth))
             visible += int(result.visible.sum())
             drawn += len(result.inputs)
             if save_to is not None:

@@ -100,7 +100,7 @@ class Scheduler:
                 result = entry.binding(context)
             except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.cuda.OutOfMemoryError):
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise TaskError(self.stage, step, entry.name, error) from error
             finally:
                 self._step = None
