@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians.ply import export_ply, load_ply
-from sw_kit.hostile_files import Mutator, Parts, Tally, attempt
 
 from splatwizard_core.api import BitstreamError, ContainerReader, ContainerWriter, GaussianModel, SplatwizardError
 from sw_c3dgs.codec import IndexedCodec
@@ -16,6 +15,12 @@ from sw_codecs.positions.ordering import spatial_order
 from sw_codecs.testing import check_gaussian_codec
 
 SECTIONS = {"xyz", "color_index", "shape_index", "steps", "zeros", *QUANTIZED}
+
+
+@pytest.fixture
+def hostile():
+    """The maker of hostile files, of a package that this one does not need."""
+    return pytest.importorskip("sw_kit.hostile_files", reason="sw-kit is not installed")
 
 
 def sharing(make, n=60, colors=7, shapes=5, degree=3):
@@ -159,26 +164,26 @@ def test_lattices_that_no_quantizer_has(plugins, make, section, data, told):
     ("key", "value"),
     [("num_gaussians", 2**32 - 1), ("num_colors", 61), ("num_shapes", 0), ("max_sh_degree", 4), ("arrays", "octree")],
 )
-def test_header_values_that_cannot_be(plugins, make, key, value):
-    parts = Parts.of(written(plugins, sharing(make)))
+def test_header_values_that_cannot_be(plugins, make, hostile, key, value):
+    parts = hostile.Parts.of(written(plugins, sharing(make)))
     parts.header["static"][key] = value
     with pytest.raises(BitstreamError):
         read(plugins, parts.join())
 
 
-def test_a_few_entries_for_a_million_gaussians_are_not_gathered_before_the_claim_is_checked(plugins, make):
-    parts = Parts.of(written(plugins, sharing(make)))
+def test_a_few_entries_for_a_million_gaussians_are_not_gathered_before_the_claim_is_checked(plugins, make, hostile):
+    parts = hostile.Parts.of(written(plugins, sharing(make)))
     parts.header["static"]["num_gaussians"] = 2**30
     with pytest.raises(BitstreamError, match="may stand for at most"):
         read(plugins, parts.join())
 
 
-def test_hostile_files_are_refused_or_decoded_and_nothing_else(plugins, make):
+def test_hostile_files_are_refused_or_decoded_and_nothing_else(plugins, make, hostile):
     seeds = [
         written(plugins, sharing(make)), written(plugins, sharing(make, n=9, degree=1), arrays="byte-planes"),
         written(plugins, make.cloud(0)),
     ]  # fmt: skip
-    mutator, tally = Mutator(3), Tally()
+    mutator, tally = hostile.Mutator(3), hostile.Tally()
     for round_ in range(400):
         data, kind = mutator.file(seeds)
 
@@ -192,7 +197,7 @@ def test_hostile_files_are_refused_or_decoded_and_nothing_else(plugins, make):
             assert model.sh_rest.shape[0] == model.num_rows
             return "decoded"
 
-        attempt(decode, f"{round_}, {kind}", 1 << 28, tally, plugins_may_miss=True)
+        hostile.attempt(decode, f"{round_}, {kind}", 1 << 28, tally, plugins_may_miss=True)
     assert not tally.problems, tally.problems[:3]
     assert tally.outcomes["refused"] > 200
     assert tally.outcomes["decoded"] > 5
