@@ -70,6 +70,15 @@ def test_scenes_below_the_data_folder_are_offered_by_dataset(tmp_path, monkeypat
     assert offered("run --scene") == ["<dir>", "demo"]
 
 
+def test_a_command_that_cannot_be_imported_spoils_no_completion(monkeypatch):
+    plugins = load_plugins()
+    monkeypatch.setattr(plugins.commands, "_entries", dict(plugins.commands._entries))
+    plugins.commands.add("martian", "no_such_module:command", summary="from Mars")
+    assert offered("", "mart") == ["martian"]
+    assert {"run", "martian"} <= set(offered(""))
+    assert offered("", "--h") == ["--help"]
+
+
 def test_a_restriction_to_a_plugin_that_is_not_there_offers_nothing_and_says_nothing(monkeypatch, capsys):
     for name, value in {
         "SW_PLUGINS": "no-such-plugin", complete.VARIABLE: "bash_complete", "COMP_WORDS": "sw ", "COMP_CWORD": "1"

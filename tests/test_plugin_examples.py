@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import importlib.metadata
+import os
 import re
 import sys
 from collections.abc import Iterator
@@ -20,8 +21,7 @@ from plugin_page import BLOCKS, HOOKS, PACKAGE, files_of, run, write_package
 from small_scene import context_of, small_scene, ten_gaussians, train_with
 from sw_datasets.downloads.registry import parse_registry
 from sw_doctor.registered import run_registered
-from sw_kit.checks.fields import check_entry
-from sw_kit.checks.targets import check_target
+from sw_kit.suite import checks_of
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.cli.main import cli
@@ -63,6 +63,12 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     sys.path.remove(str(folder))
     for name in [name for name in sys.modules if name.partition(".")[0] == PACKAGE]:
         del sys.modules[name]
+
+
+@pytest.fixture
+def installed(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Child processes find the package too."""
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(site), *filter(None, sys.path)]))
 
 
 @pytest.fixture(scope="module")
@@ -110,14 +116,14 @@ def test_every_block_runs(number, site):
             importlib.import_module(f"{PACKAGE}.{name}")
 
 
-def test_every_entry_is_one_that_check_plugin_takes(plugins):
-    entries = [
-        entry for registry in plugins.registries.values() for entry in registry if entry.target.startswith(PACKAGE)
-    ]
+def test_check_plugin_finds_nothing_wrong(plugins, installed, monkeypatch):
+    monkeypatch.setattr("sw_kit.suite.load_plugins", lambda: plugins)
+    entries = plugins.provided_by(next(info for info in plugins.plugins if info.key == "theirs"))
     assert {entry.kind for entry in entries} == {r.kind for r in plugins.registries.values()} - {"executor"}
-    for entry in entries:
-        check_entry(entry)
-        check_target(entry, plugins)
+    checks = checks_of("sw-theirs", quick=True)
+    assert len(checks) > len(entries)
+    for check in checks:
+        check()
 
 
 def test_registering_imports_no_torch(site):
@@ -332,10 +338,9 @@ def test_register_importers(plugins, model, tmp_path):
             plugins.importers.load("points")(path)
 
 
-def test_register_checks(plugins, site, monkeypatch):
+def test_register_checks(plugins, installed):
     found = [Check("radio", "aerial", "missing", "none is plugged in", "buy one")]
     assert plugins.checks.load("radio")() == found
-    monkeypatch.setenv("PYTHONPATH", f"{site}:{':'.join(filter(None, sys.path))}")
     assert run_registered(plugins.checks.entry("radio")) == found
 
 

@@ -100,8 +100,8 @@ def test_the_fields_of_a_check_are_told():
 
 VALUES = [
     api.Camera, api.View, api.Scene, api.SceneOptions, api.SplatModel, api.GaussianModel, api.GaussianInputs, api.SH,
-    api.RasterOptions, api.RenderResult, api.SplatOptimizer, api.CameraSampler, api.ContainerWriter,
-    api.ContainerReader,
+    api.RasterOptions, api.ScoreSpec, api.RenderResult, api.OptimizationParams, api.PipelineParams, api.SplatOptimizer,
+    api.CameraSampler, api.ContainerWriter, api.ContainerReader,
 ]  # fmt: skip
 SET_WHEN_MADE = {"static", "raster", "version", "active_sh_degree", "views", "generator"}
 """Attributes that a class does not name outside its `__init__`."""
@@ -112,6 +112,7 @@ def test_values_have_what_the_page_says(cls):
     rows = re.findall(r"^\| (`.*?) \|", SECTIONS[cls.__name__], re.M)
     told = dict(re.match(r"(\w+)(.*)", each).groups() for row in rows for each in re.findall(r"`(.+?)`", row))
     fields = {f.name for f in dataclasses.fields(cls) if f.init} if dataclasses.is_dataclass(cls) else set()
+    fields |= set(getattr(cls, "model_fields", ()))
     assert fields <= told.keys()
     for name, parameters in told.items():
         member = inspect.getattr_static(cls, name, None)
@@ -135,7 +136,8 @@ def test_functions_have_the_signatures_of_the_page():
 def test_errors_carry_the_facts_of_the_page():
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|", SECTIONS["Errors"], re.M))
     input_errors = [name for name in rows if issubclass(getattr(api, name), UserInputError)]
-    assert [*rows] == ["SplatwizardError", "UserInputError", *input_errors[1:], "EmptyModel"]
+    bases = ["ForeseenError", "SplatwizardError", "UserInputError"]
+    assert [*rows] == [*bases, *input_errors[1:], "EmptyModel"]
     for name in input_errors:
         told = re.search(r"\[(.*)\]", rows[name])
         facts = re.findall(r"\w+", told.group(1)) if told else []

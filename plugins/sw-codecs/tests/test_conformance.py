@@ -108,7 +108,11 @@ ARRAYS = {
     "packed-bits": np.arange(40, dtype=np.int64) * 1000,
 }
 
-QUICK = {"importance-vq": {"iterations": 5, "batch": 100}, "vectree": {"iterations": 5, "batch": 100}}
+QUICK = {
+    "importance-vq": {"iterations": 5, "batch": 100},
+    "vectree": {"iterations": 5, "batch": 100},
+    "raht": {"vq_steps": 5},
+}
 """Settings with which a coder that trains a codebook takes no minutes."""
 
 

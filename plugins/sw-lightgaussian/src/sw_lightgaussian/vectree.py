@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_finetuning.volume import volume_factor
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
 from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError, VQSettings
-from sw_lightgaussian.significance import volume_factor
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager

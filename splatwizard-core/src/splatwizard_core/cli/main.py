@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from splatwizard_core.cli.complete import VARIABLE
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
@@ -44,6 +45,13 @@ class LazyGroup(click.Group):
         """One line a command, from the registry: `sw --help` imports none of them."""
         with formatter.section("Commands"):
             formatter.write_dl([(entry.name, entry.summary) for entry in command_entries()])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Commands from the registry: TAB imports none of them, and so suffers from no stranger's."""
+        options = click.Command.shell_complete(self, ctx, incomplete)
+        return options + [
+            CompletionItem(e.name, help=e.summary) for e in command_entries() if e.name.startswith(incomplete)
+        ]
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
         with _ended_by_reader():
