@@ -33,6 +33,7 @@ if TYPE_CHECKING:
         uniform,
         vector_quantizer,
     )
+    from sw_codecs.vectors import residual_vq
 
     # mypy holds each class that is registered below to its contract.
     QUANTIZERS: list[Callable[..., api.Quantizer]] = [
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     ARRAY_CODERS: list[Callable[..., api.ArrayCoder]] = [
         byte_planes.BytePlanes, byte_planes.FloatDelta, packed_bits.PackedBits,
     ]  # fmt: skip
+    VECTOR_CODERS: list[Callable[..., api.VectorCoder]] = [residual_vq.ResidualVQ]
     GAUSSIAN_CODECS: list[Callable[..., api.GaussianCodec]] = [
         codecs.Exact, codecs.Quantized, codecs.Ply, codecs.Lossless,
     ]  # fmt: skip
@@ -136,6 +138,8 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="float32 positions without loss: steps as byte planes, zstd")  # fmt: skip
     registry.add("packed-bits", "sw_codecs.arrays.packed_bits:PackedBits", codes="arrays",
                  summary="indices of 1 to 16 bits, packed")  # fmt: skip
+    registry.add("residual-vq", "sw_codecs.vectors.residual_vq:ResidualVQ", codes="vectors",
+                 summary="vectors as sums of codebook entries, indices Huffman coded or packed")  # fmt: skip
     registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip
     registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians",

@@ -1,0 +1,1 @@
+"""Coders of float vectors with loss, by codebooks."""
