@@ -18,7 +18,7 @@ log = logging.getLogger(__name__)
 
 
 class MaskQuantizer(Protocol):
-    """The quantizer `ste-mask`: 0 or 1 ahead, the sigmoid's gradient back; 1 where the sigmoid is above its threshold."""
+    """The quantizer `ste-mask`: 1 where the sigmoid is above its threshold, else 0; the gradient is the sigmoid's."""
 
     def forward(self, x: Tensor) -> Tensor: ...
 

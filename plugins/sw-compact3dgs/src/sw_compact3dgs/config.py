@@ -1,0 +1,77 @@
+"""Hyper-parameters of Compact3DGS. Defaults are those of the authors' code for real scenes."""
+
+from typing import Annotated
+
+from pydantic import Field
+from sw_gaussians.config import GaussianTraining
+
+from splatwizard_core.api import Params
+
+
+class Mask(Params):
+    """The learned volume mask."""
+
+    init: float = Field(1.0, ge=-4, le=10, description="logit at the start; sigmoid(1) = 0.731")
+    threshold: float = Field(0.01, gt=0, lt=1, description="a Gaussian is on where the sigmoid is above this")
+    lr: float = Field(0.01, ge=0, description="Adam step size of the logits")
+    weight: float = Field(5e-4, ge=0, description="lambda_m: weight of the mean sigmoid in the loss")
+    factor: float = Field(1.0, ge=0, description="multiplies `mask.weight`: what the rate points set")
+    interval: int = Field(1_000, ge=1, description="steps between removals once densification is over")
+
+
+class Grid(Params):
+    """The hash grid that colours come from."""
+
+    levels: int = Field(16, ge=1, le=32, description="resolutions")
+    features: int = Field(2, ge=1, le=8, description="numbers of an entry")
+    coarsest: int = Field(16, ge=2, le=1024, description="vertices an axis of the first level")
+    growth: float = Field(1.447, ge=1, le=4, description="ratio of the resolutions of successive levels")
+    log2_size: int = Field(19, ge=3, le=24, description="T: a level has at most 2^T entries")
+    halvings: int = Field(0, ge=0, le=8, description="subtracted from T, down to 3: what the rate points set")
+
+    @property
+    def log2_table(self) -> int:
+        """Logarithm of the most entries of a level."""
+        return max(self.log2_size - self.halvings, 3)
+
+
+class Network(Params):
+    """The network behind the grid, and step sizes of both."""
+
+    hidden: int = Field(64, ge=1, le=256, description="width of the two hidden layers")
+    lr: float = Field(0.01, gt=0, description="Adam step size of grid and network")
+    warm_up: int = Field(100, ge=0, description="steps over which it rises from a hundredth")
+    lr_steps: list[Annotated[int, Field(ge=1)]] = Field(
+        [5_000, 15_000, 25_000], description="steps after which it is multiplied by `network.lr_factor`"
+    )
+    lr_factor: float = Field(0.33, gt=0, le=1, description="its factor at each of these")
+
+
+class RVQ(Params):
+    """Residual vector quantisation of scales and rotations, once each."""
+
+    start: int = Field(29_000, ge=1, description="first step that renders quantised shapes and trains their codebooks")
+    size: int = Field(64, ge=1, le=4096, description="entries of a stage")
+    stages: int = Field(6, ge=1, le=16, description="stages: entries whose sum is a scale or a rotation")
+    lr: float = Field(1e-4, ge=0, description="Adam step size of the entries")
+
+
+class Codec(Params):
+    """Settings of the file."""
+
+    pp: bool = Field(True, description="post-processing: 8-bit opacity and grid, coded indices, packed positions")
+    coder: str = Field("huffman", description="entropy coder of the post-processing, by name")
+    grid_threshold: float = Field(0.1, ge=0, description="post-processing makes values of the grid up to this zero")
+
+
+class Compact3DGSConfig(GaussianTraining):
+    """Everything that can be set for Compact3DGS.
+
+    Inherited keys of what it has not (`mcmc`, `sparse_adam`, learning rates of SH) must stay off or have no effect.
+    """
+
+    mask: Mask = Field(Mask(), description="the volume mask")
+    grid: Grid = Field(Grid(), description="hash grid")
+    network: Network = Field(Network(), description="network behind the grid")
+    rvq: RVQ = Field(RVQ(), description="codebooks of scales and rotations")
+    codec: Codec = Field(Codec(), description="what the file holds")

@@ -1,0 +1,50 @@
+"""Named configurations, and the rate points: how strongly Gaussians are taken out, and the smallest grid."""
+
+from collections.abc import Mapping
+from typing import Any
+
+PRESETS: Mapping[str, Mapping[str, Any]] = {
+    # The authors' values for real scenes (Mip-NeRF 360, Tanks and Temples, Deep Blending), plan of Splatwizard's paper.
+    "paper": {},
+    # Their strict comparison makes 600 the first densification.
+    "inria": {"densify.start": 600},
+    # The authors' values for Synthetic-NeRF and DTU.
+    "synthetic": {
+        "grid.log2_size": 16,
+        "mask.weight": 4e-3,
+        "mask.lr": 1e-3,
+        "network.lr": 1e-3,
+        "network.lr_steps": [25_000],
+    },
+    "quick": {
+        "iterations": 1500,
+        "sh_interval": 1500,
+        "lr.max_steps": 1500,
+        "lr.position_init": 8e-4,
+        "lr.position_final": 8e-6,
+        "lr.scales": 1e-2,
+        "lr.quats": 2e-3,
+        "densify.start": 200,
+        "densify.stop": 900,
+        "densify.grad_threshold": 4e-4,
+        "mask.lr": 0.03,
+        "mask.interval": 100,
+        "grid.levels": 8,
+        "grid.growth": 1.6,
+        "grid.log2_size": 13,
+        "network.lr_steps": [700, 1000, 1300],
+        "rvq.start": 1300,
+        "rvq.lr": 1e-3,
+    },
+}
+
+# Of the weight of the preset: 5e-4 for real scenes, 4e-3 for synthetic ones.
+RATES: Mapping[str, Mapping[str, Any]] = {
+    "r1": {"mask.factor": 8.0, "grid.halvings": 2},
+    "r2": {"mask.factor": 8.0},
+    "r3": {"mask.factor": 4.0},
+    "r4": {"mask.factor": 2.0},
+    "r5": {"mask.factor": 1.0},  # published, with post-processing
+    "r6": {"mask.factor": 0.5},
+    "r7": {"mask.factor": 1.0, "codec.pp": False},  # published, without post-processing
+}
