@@ -76,9 +76,7 @@ class ColorField(nn.Module):
         """Numbers in the grid of such a field, before anything is allocated. Raises ValueError for too fine a level."""
         found = [resolution for _, resolution in real_levels(levels, coarsest, coarsest * growth ** (levels - 1))]
         if found[-1] > MAX_RESOLUTION:
-            raise ValueError(
-                f"the last level of the grid has {found[-1]:,} vertices an axis, at most {MAX_RESOLUTION:,}"
-            )
+            raise ValueError(f"the finest level has {found[-1]:,} vertices an axis, at most {MAX_RESOLUTION:,} can be")
         return features * sum(table_size(resolution, 3, log2_size) for resolution in found)
 
     def features(self, means: Tensor) -> Tensor:
