@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from compact_models import encoded, generator, make
+from compact_models import decoded, encoded, generator, make
 from sw_compact3dgs.decoded import DecodedGaussians
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
@@ -15,12 +15,12 @@ RASTERIZER = ReferenceRasterizer()
 def test_a_model_gives_the_same_file_on_either_device():
     on_cpu, on_cuda = encoded(make()), encoded(make().cuda())
     assert on_cpu == on_cuda
-    assert decode(on_cuda).digest() == decode(on_cpu).digest()
+    assert decoded(on_cuda).digest() == decoded(on_cpu).digest()
 
 
 def test_a_decoded_file_has_the_same_values_on_either_device_and_colours_up_to_rounding():
-    found, cam = decode(encoded(make())), front_camera()
-    moved = decode(encoded(make())).cuda()
+    found, cam = decoded(encoded(make())), front_camera()
+    moved = decoded(encoded(make())).cuda()
     assert isinstance(moved, DecodedGaussians)
     assert moved.digest() == found.digest()
     for model in (found, moved):
