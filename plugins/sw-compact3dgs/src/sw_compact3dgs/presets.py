@@ -16,7 +16,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "network.lr": 1e-3,
         "network.lr_steps": [25_000],
     },
-    # The plan scaled down for a CPU and the demo scene: a small grid, step sizes for few steps, four stages of codebooks.
+    # The plan scaled down for a CPU and the demo scene: a small grid, step sizes for few steps, codebooks of 4 stages.
     "quick": {
         "iterations": 1800,
         "sh_interval": 1800,
