@@ -3,9 +3,21 @@
 from typing import Annotated
 
 from pydantic import Field
-from sw_gaussians.config import GaussianTraining
+from sw_gaussians.config import Densify, GaussianTraining, Loss
+from sw_gaussians.config import LearningRates as GaussianRates
 
-from splatwizard_core.api import Params
+from splatwizard_core.api import OptimizationParams, Params
+
+
+class LearningRates(Params):
+    """Adam step sizes of the Gaussians; those of mask, grid and codebooks stand beside what they train."""
+
+    position_init: float = Field(1.6e-4, gt=0, description="of the means at step 0, times the scene extent")
+    position_final: float = Field(1.6e-6, gt=0, description="of the means at step `max_steps`, times the scene extent")
+    max_steps: int = Field(30_000, ge=1, description="steps over which the position rate decays")
+    opacity: float = Field(0.05, ge=0, description="of the opacity logits")
+    scales: float = Field(5e-3, ge=0, description="of the log scales")
+    quats: float = Field(1e-3, ge=0, description="of the quaternions")
 
 
 class Mask(Params):
@@ -64,14 +76,25 @@ class Codec(Params):
     grid_threshold: float = Field(0.1, ge=0, description="post-processing makes values of the grid up to this zero")
 
 
-class Compact3DGSConfig(GaussianTraining):
-    """Everything that can be set for Compact3DGS.
+class Compact3DGSConfig(OptimizationParams):
+    """Everything that can be set for Compact3DGS."""
 
-    Inherited keys of what it has not (`mcmc`, `sparse_adam`, learning rates of SH) must stay off or have no effect.
-    """
-
+    lr: LearningRates = Field(LearningRates(), description="step sizes of the Gaussians")
+    densify: Densify = Field(Densify(), description="adaptive density control")
+    loss: Loss = Field(Loss(), description="photometric loss")
     mask: Mask = Field(Mask(), description="the volume mask")
     grid: Grid = Field(Grid(), description="hash grid")
     network: Network = Field(Network(), description="network behind the grid")
     rvq: RVQ = Field(RVQ(), description="codebooks of scales and rotations")
     codec: Codec = Field(Codec(), description="what the file holds")
+
+    @property
+    def base(self) -> GaussianTraining:
+        """Hyper-parameters of the stage of 3DGS inside. What they add (SH, MCMC) has no effect or is off."""
+        return GaussianTraining(
+            iterations=self.iterations,
+            scale_schedule=self.scale_schedule,
+            lr=GaussianRates(**vars(self.lr)),
+            densify=self.densify,
+            loss=self.loss,
+        )

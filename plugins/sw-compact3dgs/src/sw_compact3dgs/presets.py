@@ -19,7 +19,6 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     # The plan scaled down for a CPU and the demo scene: a small grid, step sizes for few steps, codebooks of 4 stages.
     "quick": {
         "iterations": 1800,
-        "sh_interval": 1800,
         "lr.max_steps": 1800,
         "lr.position_init": 8e-4,
         "lr.position_final": 8e-6,

@@ -7,7 +7,6 @@ from sw_gaussians.volume_mask import VolumeMaskedGaussians, mask_prune, prune_by
 from torch import Tensor
 
 from splatwizard_core.api import (
-    ConfigError,
     LossPack,
     OptimizationParams,
     ParamGroup,
@@ -53,16 +52,8 @@ class Compact3DGSStage(ThreeDGSStage):
     name = "compact3dgs"
 
     def __init__(self, opt: Compact3DGSConfig) -> None:
-        super().__init__(opt)
-        if opt.mcmc.enabled:
-            raise ConfigError(
-                "compact3dgs has density control of its own: mcmc.enabled must be false", key="mcmc.enabled"
-            )
-        if opt.sparse_adam != "off":
-            raise ConfigError(
-                "the mask's weight in the loss must reach hidden Gaussians too: sparse_adam must be off",
-                key="sparse_adam",
-            )
+        super().__init__(opt.base)
+        self.opt = opt
         self.own = opt
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
