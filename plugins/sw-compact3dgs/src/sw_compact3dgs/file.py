@@ -165,19 +165,21 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedGaussians:
                 raise BitstreamError("holds values that are not finite")
         with reader.decoding("opacities") as data:
             opacities = _decode_opacities(data, n, plugins, coder)
-        with reader.decoding("grid") as data:
-            table = _decode_grid(data, _levels(color), plugins, coder)
     else:
         halves = reader.array("positions", dtype="float16", shape=(n, 3), finite=True)
         opacities = _floats(reader.array("opacities", dtype="float16", shape=(n,), finite=True))
-        table = _floats(reader.array("grid", dtype="float16", shape=(color.grid.table.numel(),), finite=True))
     sizes = [layer.weight.numel() for layer in color.layers]
     weights = _floats(reader.array("network", dtype="float16", shape=(sum(sizes),), finite=True))
-    with torch.no_grad():
-        color.grid.table.copy_(table.view_as(color.grid.table))
-        for layer, part in zip(color.layers, weights.split(sizes), strict=True):
-            layer.weight.copy_(part.view_as(layer.weight))
+    for layer, part in zip(color.layers, weights.split(sizes), strict=True):
+        layer.weight.data.copy_(part.view_as(layer.weight))
     scales, quats = (_vectors(reader, plugins, prefix, n, width) for prefix, width in SHAPES.items())
+    # Last, since it is the largest: a file that is damaged elsewhere was refused before.
+    if processed:
+        with reader.decoding("grid") as data:
+            table = _decode_grid(data, _levels(color), plugins, coder)
+    else:
+        table = _floats(reader.array("grid", dtype="float16", shape=(color.grid.table.numel(),), finite=True))
+    color.grid.table.data = table.view_as(color.grid.table)
     return DecodedGaussians(
         _floats(halves), opacities.clamp(0, 1), scales.clamp_min(SMALLEST_SCALE), quats, color=color
     )  # fmt: skip
@@ -215,23 +217,25 @@ def _decode_opacities(data: bytes, n: int, plugins: PluginManager, coder: str) -
     if len(data) < OPACITY.size:
         raise BitstreamError(f"is {len(data)} bytes, too few for its range")
     low, step = (np.array([value], np.float32) for value in OPACITY.unpack(data[: OPACITY.size]))
+    lattice = plugins.quantizers.load("uniform").decode(
+        torch.arange(256), {"low": low, "step": step, "bits": np.array([8], np.uint8)}
+    )
     model = _bytes_model(plugins, coder)
-    symbols = torch.from_numpy(model.decode(data[OPACITY.size :], model.Context(256, n=n)))
-    side = {"low": low, "step": step, "bits": np.array([8], np.uint8)}
-    found: Tensor = plugins.quantizers.load("uniform").decode(symbols, side)
-    return found
+    return torch.from_numpy(lattice.numpy()[model.decode(data[OPACITY.size :], model.Context(256, n=n))])
 
 
 def _decode_grid(data: bytes, levels: NDArray[np.uint8], plugins: PluginManager, coder: str) -> Tensor:
     if len(data) < GRID.size:
         raise BitstreamError(f"is {len(data)} bytes, too few for its scale")
     scale, zero = GRID.unpack(data[: GRID.size])
+    # The 256 points of the lattice, looked up: millions of multiplications less.
+    lattice = plugins.quantizers.load("fake-quant").decode(
+        torch.arange(256),
+        {"scale": np.array([[scale]], np.float32), "zero": np.array([[zero]], np.int32), "bits": np.uint8(8)},
+    )
     model = _bytes_model(plugins, coder)
     context = model.Context(256, index=levels, tables=int(levels[-1]) + 1)
-    symbols = torch.from_numpy(model.decode(data[GRID.size :], context))
-    side = {"scale": np.array([[scale]], np.float32), "zero": np.array([[zero]], np.int32), "bits": np.uint8(8)}
-    found: Tensor = plugins.quantizers.load("fake-quant").decode(symbols, side)
-    return found
+    return torch.from_numpy(lattice.numpy()[model.decode(data[GRID.size :], context)])
 
 
 def _vectors(reader: ContainerReader, plugins: PluginManager, prefix: str, n: int, width: int) -> Tensor:

@@ -33,14 +33,14 @@ VERSION = 1
 HEADER = struct.Struct("<BBBHI")
 PACKED = "packed-bits"
 MAX_SIZE = 1 << 15
-MAX_STAGES = 64
+MAX_STAGES = 16
 
 
 class ResidualVQ:
     """Float vectors to three byte strings and back.
 
     size        entries K of a stage, 1..2^15
-    stages      S, 1..64
+    stages      S, 1..16
     iterations  passes of k-means over the vectors for each stage
     coder       of the indices: `packed-bits`, or an entropy coder that takes tables, by name
     half        float16 codebooks
