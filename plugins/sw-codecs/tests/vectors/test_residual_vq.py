@@ -37,8 +37,7 @@ def test_every_coder_of_indices_gives_the_same_vectors(coder, half):
 
 def test_trained_codebooks_are_kept_to_the_bit():
     x, books = vectors(), torch.randn(4, 16, D, generator=torch.Generator().manual_seed(1))
-    coder = make()
-    coder.codebooks = books
+    coder = make(codebooks=books)
     quantizer = ResidualVectorQuantizer(16, 4, dim=D)
     quantizer.codebooks.data = books
     parts = encode(coder, x)
@@ -48,10 +47,8 @@ def test_trained_codebooks_are_kept_to_the_bit():
 
 
 def test_codebooks_of_another_shape_are_refused():
-    coder = make()
-    coder.codebooks = torch.zeros(4, 16, D + 1)
     with pytest.raises(ValueError, match="codebooks"):
-        encode(coder, vectors())
+        encode(make(codebooks=torch.zeros(4, 16, D + 1)), vectors())
 
 
 def test_more_stages_leave_less():

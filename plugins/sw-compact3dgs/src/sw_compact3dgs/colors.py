@@ -30,7 +30,8 @@ def contract(means: Tensor) -> Tensor:
     """
     x = means.float()
     r = torch.linalg.vector_norm(x, dim=1, keepdim=True).clamp_min(1.0)
-    return x * ((2 - 1 / r) / r) / 4 + 0.5
+    found: Tensor = x * ((2 - 1 / r) / r) / 4 + 0.5
+    return found
 
 
 class ColorField(nn.Module):
@@ -64,12 +65,16 @@ class ColorField(nn.Module):
         )  # fmt: skip
         widths = [self.grid.width + DIRECTION_VALUES + 1, hidden, hidden, 3]
         self.layers = nn.ModuleList(nn.Linear(a, b, bias=False) for a, b in itertools.pairwise(widths))
-        for layer in self.layers:
-            assert isinstance(layer, nn.Linear)
+        for weight in self.weights:
             if generator is None:
-                nn.init.zeros_(layer.weight)
+                nn.init.zeros_(weight)
             else:
-                nn.init.xavier_uniform_(layer.weight, generator=generator)
+                nn.init.xavier_uniform_(weight, generator=generator)
+
+    @property
+    def weights(self) -> list[nn.Parameter]:
+        """Weights of the three layers, [outputs, inputs]."""
+        return [layer.get_parameter("weight") for layer in self.layers]
 
     @staticmethod
     def numbers(*, levels: int, features: int, coarsest: int, growth: float, log2_size: int) -> int:
@@ -87,7 +92,11 @@ class ColorField(nn.Module):
     @torch.no_grad()
     def all_features(self, means: Tensor) -> Tensor:
         """`features` of many Gaussians in bounded memory."""
-        return torch.cat([self.features(part) for part in means.split(ROWS)]) if len(means) else self.features(means)
+        return (
+            torch.cat([self.features(part) for part in torch.split(means, ROWS)])
+            if len(means)
+            else self.features(means)
+        )
 
     def coefficients(self, features: Tensor, means: Tensor, center: Tensor) -> Tensor:
         """SH coefficients of degree 0, [N,3], of Gaussians seen from `center` [3]; 0 is the colour 0.5.

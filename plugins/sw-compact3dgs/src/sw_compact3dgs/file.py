@@ -74,15 +74,15 @@ def encode(model: CompactGaussians, writer: ContainerWriter, plugins: PluginMana
         writer.add_array("positions", means.astype(np.float16))
         writer.add_array("opacities", opacities.astype(np.float16))
         writer.add_array("grid", _halves(table.numpy(), "the colour grid").reshape(-1))
-    weights = np.concatenate([layer.weight.detach().numpy().reshape(-1) for layer in model.color.layers])
+    weights = np.concatenate([weight.detach().numpy().reshape(-1) for weight in model.color.weights])
     writer.add_array("network", _halves(weights, "the colour network"))
     for prefix, values, quantizer in (
         ("scales", model.scales, model.scale_vq), ("rotations", model.unit_quats(), model.quat_vq),
     ):  # fmt: skip
         coder = plugins.vector_coders.load("residual-vq")(
-            plugins, size=quantizer.size, stages=quantizer.stages, coder=codec.coder if codec.pp else "packed-bits"
-        )
-        coder.codebooks = quantizer.codebooks
+            plugins, size=quantizer.size, stages=quantizer.stages, codebooks=quantizer.codebooks,
+            coder=codec.coder if codec.pp else "packed-bits",
+        )  # fmt: skip
         for part, data in coder.encode(values.numpy(), np.ones(n)).items():
             writer.add(f"{prefix}/{part}", data)
     writer.allow(_decoded_bytes(n, table.numel(), grid.width), f"a model of {n:,} Gaussians")
@@ -140,7 +140,7 @@ def _encode_opacities(opacities: NDArray[Any], plugins: PluginManager, coder: st
 
 def _encode_grid(table: Tensor, levels: NDArray[np.uint8], plugins: PluginManager, codec: Codec) -> bytes:
     """Small values become zero, which is a point of the lattice; its ends are those of all values."""
-    quantizer = plugins.quantizers.load("fake-quant")(8)
+    quantizer: Any = plugins.quantizers.load("fake-quant")(8)
     values = table.reshape(-1)
     if not bool(torch.isfinite(values).all()):
         raise SplatwizardError("the colour grid holds values that are not finite: it cannot be encoded")
@@ -168,10 +168,10 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> DecodedGaussians:
     else:
         halves = reader.array("positions", dtype="float16", shape=(n, 3), finite=True)
         opacities = _floats(reader.array("opacities", dtype="float16", shape=(n,), finite=True))
-    sizes = [layer.weight.numel() for layer in color.layers]
+    sizes = [weight.numel() for weight in color.weights]
     weights = _floats(reader.array("network", dtype="float16", shape=(sum(sizes),), finite=True))
-    for layer, part in zip(color.layers, weights.split(sizes), strict=True):
-        layer.weight.data.copy_(part.view_as(layer.weight))
+    for weight, part in zip(color.weights, torch.split(weights, sizes), strict=True):
+        weight.data.copy_(part.view_as(weight))
     scales, quats = (_vectors(reader, plugins, prefix, n, width) for prefix, width in SHAPES.items())
     # Last, since it is the largest: a file that is damaged elsewhere was refused before.
     if processed:
@@ -217,7 +217,7 @@ def _decode_opacities(data: bytes, n: int, plugins: PluginManager, coder: str) -
     if len(data) < OPACITY.size:
         raise BitstreamError(f"is {len(data)} bytes, too few for its range")
     low, step = (np.array([value], np.float32) for value in OPACITY.unpack(data[: OPACITY.size]))
-    lattice = plugins.quantizers.load("uniform").decode(
+    lattice = plugins.quantizers.load("uniform")(8).decode(
         torch.arange(256), {"low": low, "step": step, "bits": np.array([8], np.uint8)}
     )
     model = _bytes_model(plugins, coder)
@@ -229,7 +229,7 @@ def _decode_grid(data: bytes, levels: NDArray[np.uint8], plugins: PluginManager,
         raise BitstreamError(f"is {len(data)} bytes, too few for its scale")
     scale, zero = GRID.unpack(data[: GRID.size])
     # The 256 points of the lattice, looked up: millions of multiplications less.
-    lattice = plugins.quantizers.load("fake-quant").decode(
+    lattice = plugins.quantizers.load("fake-quant")(8).decode(
         torch.arange(256),
         {"scale": np.array([[scale]], np.float32), "zero": np.array([[zero]], np.int32), "bits": np.uint8(8)},
     )

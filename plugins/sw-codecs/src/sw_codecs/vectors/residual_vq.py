@@ -45,8 +45,7 @@ class ResidualVQ:
     coder       of the indices: `packed-bits`, or an entropy coder that takes tables, by name
     half        float16 codebooks
     device      where codebooks are fitted and searched; equal arguments give equal bytes on a CPU
-
-    codebooks   [S, K, d] that were trained elsewhere, to be set before `encode`; None: k-means fits them to the vectors
+    codebooks   [S, K, d] that were trained elsewhere; None: k-means fits them to the vectors
     """
 
     def __init__(
@@ -59,6 +58,7 @@ class ResidualVQ:
         coder: str = "huffman",
         half: bool = False,
         device: torch.device | str = "cpu",
+        codebooks: torch.Tensor | None = None,
     ) -> None:
         if not 1 <= size <= MAX_SIZE or not 1 <= stages <= MAX_STAGES or iterations < 0:
             raise ValueError(
@@ -66,8 +66,7 @@ class ResidualVQ:
                 "and >= 0"
             )
         self.plugins, self.size, self.stages, self.iterations = plugins, size, stages, iterations
-        self.coder, self.half, self.device = coder, half, device
-        self.codebooks: torch.Tensor | None = None
+        self.coder, self.half, self.device, self.codebooks = coder, half, device, codebooks
 
     def encode(self, vectors: NDArray[Any], importance: NDArray[Any], seed: int = 0) -> dict[str, bytes]:
         """The parts of `vectors` [n, d].
