@@ -7,7 +7,7 @@ from sw_compact3dgs.decoded import DecodedGaussians
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
-pytestmark = [pytest.mark.cuda, pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")]
+pytestmark = pytest.mark.cuda
 
 RASTERIZER = ReferenceRasterizer()
 
