@@ -18,8 +18,10 @@ if _workers > 1:
 LONG_FIRST = (
     "tests/test_documented_commands.py",
     "tests/test_strangers.py",
+    "tests/test_hostile_plugins.py",
     "tests/test_packages_alone.py",
     "tests/test_plugins_installed.py",
+    "tests/test_neighbours.py",
     "tests/test_gaussian_methods.py",
     "splatwizard-core/tests/runs/test_survival.py",
     "tests/test_written_configs.py",

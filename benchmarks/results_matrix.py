@@ -99,20 +99,27 @@ def parse_scene(text: str) -> tuple[str, str]:
     return (text, "") if not scene or scene.startswith("demo") else (scene, images)
 
 
+def asked(text: str) -> tuple[str, str, str]:
+    """Split METHOD[:PRESET][@RATE+RATE...] into method, preset and a comma list of rates."""
+    name, _, rates = text.partition("@")
+    method, _, variant = name.partition(":")
+    return method, variant, rates.replace("+", ",")
+
+
 def jobs(args: argparse.Namespace, plugins: PluginManager) -> list[Job]:
     """Everything that is to run, in the order in which to start: seed by seed, then the longest first."""
     found = []
-    methods = [name.partition(":")[::2] for name in args.methods.split(",")]
-    plain = {method for method, variant in methods if not variant}
+    methods = [asked(text) for text in args.methods.split(",")]
+    plain = {method for method, variant, _ in methods if not variant}
     for seed in map(int, args.seeds.split(",")):
         for scene, images in map(parse_scene, args.scenes.split(",")):
-            for method, variant in methods:
+            for method, variant, own in methods:
                 cls = plugins.methods.load(method)
                 bases = named_scenes(cls(plugins, cls.Config()))
-                rates = "all" if method in SWEEPS and not variant else "default"
+                rates = own or args.rates or ("all" if method in SWEEPS and not variant else "default")
                 steps = cls.Config.FULL_ITERATIONS
                 needed_soon = 10**6 if any(m not in SWEEPS for m in plain) and method in SWEEPS and not variant else 0
-                found.append(Job(method, variant, scene, images, seed, args.rates or rates,
+                found.append(Job(method, variant, scene, images, seed, rates,
                                  bases[0] if bases else "", steps + needed_soon, cls.DEFAULT_RATE))  # fmt: skip
     return sorted(found, key=lambda job: (job.seed, -job.cost))
 
@@ -230,8 +237,8 @@ class Matrix:
             print(f"{told.count(False)} of {len(told)} files were not measured alone: the same command goes on")
 
     def _unmeasured(self, job: Job, run: Path) -> bool:
-        """Whether it lacks its figures; of a sweep the default rate point alone gets them."""
-        wanted = job.rates != "all" or run.name == job.default_rate
+        """Whether it lacks its figures; of several rate points the default one alone gets them."""
+        wanted = ("," not in job.rates and job.rates != "all") or run.name == job.default_rate
         return wanted and not _read(run / "matrix.json").get("quiet")
 
     def _measure(self, job: Job, run: Path, gpus: queue.SimpleQueue[str]) -> bool:
@@ -269,7 +276,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="where the runs are kept")
     parser.add_argument("--scenes", required=True, help="comma list of SCENE[:PICTURES], as --scene and --images")
-    parser.add_argument("--methods", default=METHODS, help=f"comma list of METHOD[:PRESET] (default: {METHODS})")
+    parser.add_argument(
+        "--methods", default=METHODS, help=f"comma list of METHOD[:PRESET][@RATE+RATE...] (default: {METHODS})"
+    )
     parser.add_argument("--seeds", default="0,1,2", help="comma list (default: 0,1,2)")
     parser.add_argument("--rates", default="", help="of every method (default: all of 3dgs, the default of the others)")
     parser.add_argument("--preset", default="paper", help="of what names none (default: paper)")

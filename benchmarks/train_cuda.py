@@ -11,6 +11,9 @@ as both trainers report it; PSNR is the mean over the held-out views, memory the
 --profile trains ours once more and says, of windows of steps early, half-way and late: wall clock, the time in which
 the GPU had work, kernels launched, and what took longest on the device and on the host (torch.profiler slows the host
 down, so it watches other steps than the clock).
+
+--records FILE appends a line of JSON a training, of which `python tools/results.py tables` makes the table of
+docs/results.md (docs/records/trainers/gsplat.jsonl).
 """
 
 from __future__ import annotations
@@ -23,6 +26,7 @@ import subprocess
 import sys
 import time
 from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +56,18 @@ class Figures:
     psnr: float
     gaussians: int
     peak_mib: float
+    trainer: str = "splatwizard"
     note: str = ""
+
+    def record(self, scene: str, args: argparse.Namespace) -> str:
+        """A line of JSON with the fields of `Training` in tools/trainer_records.py."""
+        values = {
+            "trainer": self.trainer, "scene": scene, "plan": "3dgs", "steps": args.iterations, "seed": args.seed,
+            "psnr": self.psnr, "gaussians": self.gaussians, "per_second": self.iterations_per_second,
+            "peak_mib": self.peak_mib, "device": torch.cuda.get_device_name(),
+            "date": datetime.now(timezone.utc).date().isoformat(), "note": self.note,
+        }  # fmt: skip
+        return json.dumps(values) + "\n"
 
 
 @dataclass
@@ -154,8 +169,9 @@ def theirs(folder: str, pictures: str | None, iterations: int, seed: int) -> Fig
     if done.returncode != 0 or not lines:
         return f"it failed: {(done.stderr.strip().splitlines() or ['no output'])[-1][:200]}"
     found = json.loads(lines[-1].removeprefix("RESULT "))
-    note = f"gsplat {found['gsplat']}, SSIM of {found['ssim_impl']}, opacities reset by {found['reset']}"
-    return Figures(found["iters"] / found["train_s"], found["psnr"], found["n"], found["peak_mib"], note)
+    note = f"SSIM of {found['ssim_impl']}, opacities reset by {found['reset']}"
+    speed = found["iters"] / found["train_s"]
+    return Figures(speed, found["psnr"], found["n"], found["peak_mib"], f"gsplat {found['gsplat']}", note)
 
 
 def main() -> None:
@@ -163,6 +179,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]")
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--records", type=Path, metavar="FILE", help="append a line of JSON a training")
     parser.add_argument("--profile", action="store_true", help="also where a step's time goes")
     args = parser.parse_args()
     if not torch.cuda.is_available():
@@ -179,7 +196,7 @@ def main() -> None:
         if isinstance(other, str):
             print(f"  gsplat: not measured, {other}")
         else:
-            print(_row("gsplat", other))
+            print(_row(other.trainer, other))
             ratio = mine.iterations_per_second / other.iterations_per_second
             ratios.append(ratio)
             memory = mine.peak_mib / other.peak_mib
@@ -187,6 +204,9 @@ def main() -> None:
                 f"  ours / gsplat: {ratio:.2f} x its/s, {mine.psnr - other.psnr:+.2f} dB, {memory:.2f} x memory",
                 flush=True,
             )
+        if args.records is not None:
+            with args.records.open("a", encoding="utf-8") as file:
+                file.writelines(f.record(name, args) for f in (mine, other) if not isinstance(f, str))
         if args.profile:
             last = args.iterations - 2 * WINDOW - 10
             watch = Watch(tuple(step for step in (1010, args.iterations // 2 + 10, last) if step > 0))

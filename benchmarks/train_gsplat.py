@@ -98,6 +98,12 @@ def train(args: argparse.Namespace, gsplat: Any, reset: Callable[..., None], dev
         )  # fmt: skip
         return image[0].permute(2, 0, 1), info
 
+    @torch.no_grad()
+    def psnr() -> float:
+        errors = [(render(v, 3)[0].clamp(0, 1) - v[1]).square().mean() for v in test_views]
+        return float((-10 * torch.stack(errors).log10()).mean())
+
+    measured: dict[int, float] = {}
     generator = torch.Generator().manual_seed(args.seed)
     torch.manual_seed(args.seed)
     order: list[int] = []
@@ -126,18 +132,18 @@ def train(args: argparse.Namespace, gsplat: Any, reset: Callable[..., None], dev
         optimizers["means"].param_groups[0]["lr"] = rate
         if mcmc:
             strategy.step_post_backward(p, optimizers, state, step, info, lr=rate)
-            continue
-        strategy.step_post_backward(p, optimizers, state, step, info, packed=False)
-        if resets(step, version=version, stop=strategy.refine_stop_iter, every=strategy.reset_every):
+        else:
+            strategy.step_post_backward(p, optimizers, state, step, info, packed=False)
+        if step + 1 in args.psnr_at:
+            measured[step + 1] = psnr()
+        if not mcmc and resets(step, version=version, stop=strategy.refine_stop_iter, every=strategy.reset_every):
             reset(params=p, optimizers=optimizers, state=state, value=strategy.prune_opa * RESET_OPACITY)
     synchronize()
     seconds = time.perf_counter() - began
     peak = torch.cuda.max_memory_allocated() / 2**20 if device.type == "cuda" else 0.0
-    with torch.no_grad():
-        errors = [(render(v, 3)[0].clamp(0, 1) - v[1]).square().mean() for v in test_views]
     return {
         "gsplat": version, "strategy": args.strategy, "iters": args.iterations, "seed": args.seed, "train_s": seconds,
-        "psnr": float((-10 * torch.stack(errors).log10()).mean()), "n": len(p["means"]), "peak_mib": peak,
+        "psnr": psnr(), "psnr_at": measured, "n": len(p["means"]), "peak_mib": peak,
         "ssim_impl": f"splatwizard, padding {args.padding}", "reset": "this trainer" if resets(
             1, version=version, stop=2, every=1) else "gsplat", "protocol": scene.protocol.id,
     }  # fmt: skip
@@ -151,6 +157,8 @@ def main() -> None:
     parser.add_argument("--strategy", choices=["default", "mcmc"], default="default")
     parser.add_argument("--cap", type=int, default=1_000_000, help="most Gaussians of mcmc (default: 1,000,000)")
     parser.add_argument("--padding", choices=["valid", "same"], default="valid", help="of SSIM in the loss")
+    parser.add_argument("--psnr-at", type=int, nargs="*", default=[], metavar="STEP",
+                        help="PSNR after these steps too; the plan is the same for any --iterations")  # fmt: skip
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--device", default="cuda")
     args = parser.parse_args()

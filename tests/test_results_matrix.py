@@ -125,3 +125,11 @@ def test_an_interrupted_process_is_given_time_for_its_checkpoint(script, monkeyp
     assert (tmp_path / "ready").exists()
     assert status == 1  # the run did not finish, whatever its own status
     assert noted.read_text() == "checkpoint"
+
+
+def test_rates_of_one_method_stand_behind_its_name(start):
+    given = start("--methods", "3dgs@r2+r6,hac", "--seeds", "0")
+    rates = {
+        words[words.index("--method") + 1]: words[words.index("--rate") + 1] for words in given if words[0] == "run"
+    }
+    assert rates == {"3dgs": "r2,r6", "hac": "default"}

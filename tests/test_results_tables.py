@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.fixture
 def tools(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    for name in ("results", "result_records"):
+    for name in ("results", "result_records", "trainer_records"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("results")
 
@@ -47,6 +47,26 @@ def test_every_record_file_is_shown_and_every_record_is_read(tools):
     for path in tools.RECORDS.glob("*.jsonl"):
         assert path.stem in shown
         assert tools.read(path)
+    assert {path.stem for path in (tools.RECORDS / "trainers").iterdir()} <= shown
+
+
+def test_a_trainer_stands_beside_ours_with_means_and_without_speeds_of_shared_gpus(tools, tmp_path):
+    import trainer_records
+
+    ours = trainer_records.Training(
+        trainer="splatwizard", scene="room", plan="mcmc", steps=7000, seed=0, psnr=30.0, gaussians=9, per_second=800.0,
+        peak_mib=100.0, device="GPU", date="2026-01-01", note="",
+    )  # fmt: skip
+    theirs = replace(ours, trainer="other 1.0", per_second=200.0, note="SSIM of its own")
+    lines = [ours, replace(ours, seed=1, psnr=31.0), theirs, replace(theirs, seed=1, per_second=None)]
+    (tmp_path / "trainers").mkdir()
+    text = "".join(json.dumps(vars(line)) + "\n" for line in lines)
+    (tmp_path / "trainers" / "x.jsonl").write_text(text, encoding="utf-8")
+    row = tools.table("trainers", "x", tmp_path).splitlines()[2]
+    assert row == "| room | mcmc | 7,000 | 30.50 ± 0.71 | 30.00 ± 0.00 | 800 | - | - | 100 | 100 | 2 |"
+    (tmp_path / "trainers" / "x.jsonl").write_text('{"trainer": "x"}\n', encoding="utf-8")
+    with pytest.raises(SystemExit, match="line 1"):
+        tools.table("trainers", "x", tmp_path)
 
 
 def test_mean_deviation_and_number_of_seeds(tools, record):

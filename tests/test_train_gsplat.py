@@ -48,10 +48,19 @@ def test_the_loop_hands_gsplat_what_it_expects(version, resets, strategy):
         rasterization=rasterization,
     )  # fmt: skip
     values: list[float] = []
-    asked = {"scene": "demo:tiny", "images": "", "cap": 10, "padding": "valid", "seed": 0, "iterations": 5}
+    asked = {
+        "scene": "demo:tiny",
+        "images": "",
+        "cap": 10,
+        "padding": "valid",
+        "seed": 0,
+        "iterations": 5,
+        "psnr_at": [3],
+    }
     args = argparse.Namespace(**asked, strategy=strategy)
     found = script.train(args, fake, lambda **given: values.append(given["value"]), torch.device("cpu"))
     assert values == (resets if strategy == "default" else [])
     assert (found["iters"], found["ssim_impl"]) == (5, "splatwizard, padding valid")
     assert found["reset"] == ("this trainer" if resets else "gsplat")
     assert 0 < found["psnr"] < 60
+    assert list(found["psnr_at"]) == [3]

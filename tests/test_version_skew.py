@@ -91,24 +91,23 @@ def test_a_missing_method_of_a_file_that_names_no_package(tmp_path, capsys):
 def test_a_missing_coder(tmp_path, capsys, only, command):
     only("3dgs")
     path = write(tmp_path, requires=requires(sw_codecs="sw-coders-of-mars=2.0"))
-    assert said(capsys, command, path) == (
-        "error: garden.swz needs coder 'octree', which is not installed: "
-        "pip install 'sw-coders-of-mars>=2.0' (the package that the file names)"
+    assert said(capsys, command, path) == (  # a name of ours is ours, whatever the file says
+        f"error: garden.swz needs coder 'octree', which is not installed: sw-codecs {HERE} is there, "
+        "but SW_PLUGINS leaves it out"
     )
 
 
 def test_a_missing_entropy_model(tmp_path, capsys, only):
     only("3dgs")
     row = requires()
-    row["sw-codecs"] = ["0.1.0"]
-    row["sw-models"] = ["4.5", "entropy model:columns"]
+    row["sw-codecs"] = ["4.5", "entropy model:columns"]
     # The octree is asked for first, and the file does not say who provides it.
     assert "needs coder 'octree'" in said(capsys, "decode", write(tmp_path, requires=row))
     only("3dgs,codecs")
     del load_plugins().entropy_models._entries["columns"]
     assert said(capsys, "decode", write(tmp_path, requires=row)).endswith(
-        "needs entropy model 'columns', which is not installed: "
-        "pip install 'sw-models>=4.5' (the package that the file names)"
+        f"entropy model 'columns', which is not installed: sw-codecs {HERE} does not provide it (the file is newer: "
+        f"it was written with sw-codecs 4.5, installed is {HERE}: pip install 'sw-codecs>=4.5')"
     )
 
 
@@ -121,7 +120,10 @@ def test_a_plugin_too_old_to_have_the_method(tmp_path, capsys):
     path = write(
         tmp_path, method="3dgs-next", requires=requires(sw_3dgs="0.7") | {"sw-3dgs": ["0.7", "method:3dgs-next"]}
     )
-    assert said(capsys, "decode", path).endswith(f"sw-3dgs {HERE} is too old: pip install 'sw-3dgs>=0.7'")
+    assert said(capsys, "decode", path).endswith(
+        f"sw-3dgs {HERE} does not provide it (the file is newer: it was written with sw-3dgs 0.7, installed is {HERE}: "
+        "pip install 'sw-3dgs>=0.7')"
+    )
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -129,13 +131,13 @@ def test_a_newer_layout_of_a_method(tmp_path, capsys, command):
     path = write(tmp_path, method_version=2, requires=requires(sw_3dgs="0.9"))
     assert said(capsys, command, path) == (
         f"error: garden.swz: version 2 of the layout of '3dgs' is newer than 1, which sw-3dgs {HERE} reads: "
-        "upgrade it with pip install 'sw-3dgs>=0.9'"
+        "upgrade with pip install 'sw-3dgs>=0.9'"
     )
 
 
 def test_a_newer_layout_of_a_method_in_a_file_that_names_no_package(tmp_path, capsys):
     path = write(tmp_path, method_version=2, requires={})
-    assert "upgrade it with pip install --upgrade sw-3dgs" in said(capsys, "decode", path)
+    assert "upgrade with pip install --upgrade sw-3dgs" in said(capsys, "decode", path)
 
 
 @pytest.mark.parametrize("section", ["positions", "color"])
@@ -147,7 +149,7 @@ def test_a_newer_coded_stream(tmp_path, capsys, section):
     assert f"section '{section}'" in line
     assert "version 2" in line
     assert line.endswith(
-        f"(the file was written with sw-codecs 0.4, installed is {HERE}: pip install 'sw-codecs>=0.4')"
+        f"(the file is newer: it was written with sw-codecs 0.4, installed is {HERE}: pip install 'sw-codecs>=0.4')"
     )
 
 
@@ -175,13 +177,13 @@ def test_a_newer_container_that_says_nothing(tmp_path, capsys, header):
 
 def test_info_needs_no_plugin(tmp_path, capsys, only):
     only("")
-    path = write(tmp_path, requires=requires(sw_3dgs="sw-3dgs-of-mars=5.0"))
+    path = write(tmp_path, requires=requires() | {"sw-3dgs-of-mars": ["5.0", "coder:martian"]})
     assert main(["info", str(path), "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert sum(facts["bytes"].values()) == facts["size"] == path.stat().st_size
     assert {"header", "positions", "color", "sh1", "sh3"} <= set(facts["bytes"])
     assert facts["requires"]["sw-3dgs-of-mars"] == "5.0"
-    assert set(facts["missing"]) == {"method 3dgs", "coder octree", "entropy model columns"}
+    assert set(facts["missing"]) == {"method 3dgs", "coder octree", "entropy model columns", "coder martian"}
     assert main(["info", str(path)]) == 0
     shown = capsys.readouterr().out
     assert "positions" in shown

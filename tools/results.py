@@ -5,7 +5,8 @@
     python tools/results.py tables --check       # status 1 where a table and its records disagree; writes nothing
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
-file docs/records/SCENE.jsonl. Values are means over the seeds ± the deviation of the sample (n - 1).
+file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl. Values are means over the seeds
+± the deviation of the sample (n - 1).
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import trainer_records
 from result_records import MIB, RECORDS, ROOT, SmallRecord, extract, merged, read, write
 
 from splatwizard_core.tooling import load_plugins
@@ -135,8 +137,10 @@ TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
 
 def table(name: str, scene: str, records_at: Path = RECORDS) -> str:
     """Write one table, and below it where its records come from. Raises SystemExit for a name that is none."""
+    if name == "trainers":
+        return trainer_records.table(records_at / "trainers" / f"{scene}.jsonl")
     if name not in TABLES:
-        raise SystemExit(f"no table is called '{name}'; one of {', '.join(TABLES)}")
+        raise SystemExit(f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers'])}")
     path = records_at / f"{scene}.jsonl"
     if not path.exists():
         return f"*No records of {scene} yet.*\n"

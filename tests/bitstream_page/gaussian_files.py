@@ -200,3 +200,70 @@ def compact(
         "color.grid.table": table.astype("<f4").reshape(sum(sizes), features),
         **layers,
     }
+
+
+def raht(static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]) -> dict[str, np.ndarray]:
+    n, blocks, degree = static["num_gaussians"], static["blocks"], static["max_sh_degree"]
+    points, (low, high) = octree(sections["positions"]), array(sections["box"])
+    check(len(points) == n, "number of points")
+    offset = 0.5 if static["anchor"] == "center" else 0.0
+    means = low + (points + offset) * ((high - low) * 2.0 ** -static["depth"])
+    steps = byte_planes(sections["steps"], "f4", (blocks, 10), unzstd)
+
+    def lattice(name: str, rows: int, start: int, stop: int) -> np.ndarray:
+        symbols = np.array(columns(sections[name], rows, stop - start), np.float32).reshape(stop - start, rows).T
+        sizes = [rows // blocks + (block < rows % blocks) for block in range(blocks)]
+        return np.repeat(steps[:, start:stop], sizes, axis=0) * symbols
+
+    first = array(sections["mean"])[None]
+    coefficients = np.concatenate([first, lattice("detail", max(n - 1, 0), 0, 7)]).astype(np.float64)[:n]
+    raht_inverse(coefficients, [sum(morton_bits(point)) for point in points.tolist()])
+    half = coefficients[:, 1:4] / 2
+    (cx, cy, cz), (sx, sy, sz) = (part.T for part in cosine_and_sine(half))
+    quats = [cz * cy * cx + sz * sy * sx, cz * cy * sx - sz * sy * cx, cz * sy * cx + sz * cy * sx,
+             sz * cy * cx - cz * sy * sx]  # fmt: skip
+    bands = (degree + 1) ** 2 - 1
+    rest = np.zeros((n, 0, 3), np.float32)
+    if degree:
+        (index,) = columns(sections["index"], n, 1)
+        entries = byte_planes(sections["codebook"], "f2", (static["codebook_size"], 3 * bands), unzstd)
+        rest = entries.astype(np.float32)[index].reshape(n, bands, 3)
+    found = {
+        "means": means, "sh_dc": coefficients[:, None, 4:], "sh_rest": rest, "opacity_logits": coefficients[:, 0],
+        "log_scales": lattice("scales", n, 7, 10), "quats": np.stack(quats, 1),
+    }  # fmt: skip
+    return {name: values.astype(np.float32) for name, values in found.items()}
+
+
+def morton_bits(point: list[int]) -> list[int]:
+    """The bits of a Morton code that are set, as numbers."""
+    return [1 << (3 * bit + axis) for axis in range(3) for bit in range(21) if point[axis] >> bit & 1]
+
+
+def raht_inverse(rows: np.ndarray, codes: list[int]) -> None:
+    """Coefficients become values, in place."""
+    merges = []
+    for i in range(1, len(codes)):
+        h = (codes[i - 1] ^ codes[i]).bit_length() - 1
+        left = bisect.bisect_left(codes, codes[i] >> (h + 1), key=lambda code, h=h: code >> (h + 1))
+        end = bisect.bisect_right(codes, codes[i] >> h, key=lambda code, h=h: code >> h)
+        merges.append((h, left, i, end))
+    for _, left, i, end in sorted(merges, reverse=True):
+        w, v = float(i - left), float(end - i)
+        a, b = np.sqrt(w / (w + v)), np.sqrt(v / (w + v))
+        low, high = rows[left].copy(), rows[i].copy()
+        rows[left], rows[i] = a * low - b * high, b * low + a * high
+
+
+def cosine_and_sine(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    h, j = 1.5707963267341256, 6.077100506506192e-11
+    q = np.rint(x / (h + j))
+    r = (x - q * h) - q * j
+    t = r * r
+    c, s = np.zeros_like(x), np.zeros_like(x)
+    for i in range(9, -1, -1):
+        c = c * t + (-1) ** i / math.factorial(2 * i)
+        s = s * t + (-1) ** i / math.factorial(2 * i + 1)
+    s = s * r
+    quarter = q.astype(int) % 4
+    return np.choose(quarter, [c, -s, -c, s]), np.choose(quarter, [s, c, -s, -c])

@@ -173,6 +173,15 @@ def compact_gaussians(n: int, settings: Mapping[str, Any]) -> SplatModel:
     return model
 
 
+def settled(n: int, degree: int = 3, anchor: str = "center") -> GaussianModel:
+    """Gaussians of MesonGS on an octree of three levels, some voxels shared, in three blocks."""
+    from sw_codecs.models.raht_gaussians import settled_copy
+    from sw_codecs.models.raht_settings import RahtSettings
+
+    settings = RahtSettings(depth=3, blocks=3, codebook_size=4, vq_training="kmeans", vq_steps=2, anchor=anchor)
+    return settled_copy(procedural(n, degree), settings, seed=0)
+
+
 SMALL_VQ = {"vq.size": 4, "vq.iterations": 0}
 
 Case = tuple[str, str, dict[str, Any], Callable[[], SplatModel]]
@@ -214,6 +223,10 @@ CASES: dict[str, Case] = {
     "chimerags_uniform16_v1": ("chimerags", "r1", {**SMALL_VQ, "xyz": "uniform16"}, lambda: masked(20, 0)),
     "chimerags_float16_v1": ("chimerags", "r4", {**SMALL_VQ, "xyz": "float16", "prefer": []}, lambda: masked(5, 5)),
     "chimerags_empty_v1": ("chimerags", "r3", SMALL_VQ, lambda: masked(0, 0)),
+    "mesongs_v1": ("mesongs", "r4", {}, lambda: settled(60)),
+    "mesongs_corner_v1": ("mesongs", "r1", {}, lambda: settled(20, 0, "corner")),
+    "mesongs_one_v1": ("mesongs", "r2", {}, lambda: settled(1, 1)),
+    "mesongs_empty_v1": ("mesongs", "r3", {}, lambda: settled(0)),
 }
 """File -> method, rate point, other values of its configuration, model."""
 

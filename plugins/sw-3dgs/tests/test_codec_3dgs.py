@@ -18,8 +18,9 @@ from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
 from sw_codecs.models.gauge import canonical
 from sw_codecs.models.quantized import lattice, reconstruct
+from sw_codecs.models.settings import QuantizedSettings
 
-QUANTIZED = [name for name in ThreeDGS.RATES if ThreeDGS.RATES[name]["codec.mode"] == "quantized"]
+QUANTIZED = [name for name in ThreeDGS.RATES if ThreeDGS.RATES[name]["codec.name"] == "gaussians-quantized"]
 
 
 def random_model(n: int, degree: int = 3, active: int | None = None, seed: int = 0) -> GaussianModel:
@@ -42,6 +43,10 @@ def random_model(n: int, degree: int = 3, active: int | None = None, seed: int =
 def method(rate: str | None = None, **values) -> ThreeDGS:
     overrides = {**(ThreeDGS.RATES[rate] if rate else {}), **values}
     return ThreeDGS(load_plugins(), apply_overrides(ThreeDGSConfig(), overrides, source="test"))
+
+
+def settings_of(rate: str) -> QuantizedSettings:
+    return QuantizedSettings.model_validate(method(rate).config.codec.settings)
 
 
 def encoded(model: GaussianModel, rate: str | None = None, **values) -> bytes:
@@ -73,8 +78,8 @@ def test_exact_mode_costs_236_bytes_a_gaussian():
 
 
 def test_default_is_the_exact_mode():
-    assert ThreeDGS.RATES[ThreeDGS.DEFAULT_RATE]["codec.mode"] == "exact"
-    assert ThreeDGSConfig().codec.mode == "exact"
+    assert ThreeDGS.RATES[ThreeDGS.DEFAULT_RATE]["codec.name"] == "gaussians-exact"
+    assert ThreeDGSConfig().codec.name == "gaussians-exact"
 
 
 @pytest.mark.parametrize("rate", QUANTIZED)
@@ -82,7 +87,7 @@ def test_default_is_the_exact_mode():
 def test_the_decoder_rebuilds_what_the_encoder_reconstructs(rate, n, degree, active):
     model = random_model(n, degree, active)
     sort = load_plugins().coders.load("octree").sort
-    layout, cells, symbols = lattice(model, method(rate).config.codec, sort)
+    layout, cells, symbols = lattice(model, settings_of(rate), sort)
     expected = reconstruct(layout, cells, symbols)
     found = decoded(encoded(model, rate))
     assert bits(found) == bits(expected)
@@ -106,7 +111,7 @@ def test_errors_stay_within_half_a_step(rate):
     model = random_model(400)
     with torch.no_grad():
         model.opacity_logits.clamp_(min=-5)
-    codec = method(rate).config.codec
+    codec = settings_of(rate)
     found = decoded(encoded(model, rate))
     assert found.num_rows == 400
     row = by_position(found, model)
@@ -170,9 +175,9 @@ def test_a_value_beyond_the_lattice_is_an_error_and_is_not_clipped(name, step):
     with torch.no_grad():
         model.opacity_logits.fill_(0.0)
         getattr(model, name)[3] = 2e6  # at step 1: two million steps, which is fine
-    found = decoded(encoded(model, "r4", **{f"codec.{step}_step": 1.0}))
+    found = decoded(encoded(model, "r4", **{f"codec.settings.{step}_step": 1.0}))
     torch.testing.assert_close(getattr(found, name).max().item(), 2e6, atol=2.0, rtol=0)
-    with pytest.raises(UserInputError, match=rf"'{name}' .*codec\.{step}_step"):
+    with pytest.raises(UserInputError, match=rf"'{name}' .*codec\.settings\.{step}_step"):
         encoded(model, "r4", **{f"codec.{step}_step": 1e-6})
 
 
@@ -194,7 +199,7 @@ def test_a_few_bytes_never_stand_for_many_gaussians():
     model = random_model(1)
     many = GaussianModel(*(p.detach().expand(100_000, *p.shape[1:]) for p in model.parameters()))
     with pytest.raises(SplatwizardError, match="more than a reader accepts"):
-        encoded(many, "r1", **{"codec.position_bits": 8})
+        encoded(many, "r1", **{"codec.settings.position_bits": 8})
     # A stranger who writes it all the same is refused before anything is allocated.
     data = rebuilt(encoded(random_model(30), "r1"), static={"num_gaussians": 200_000})
     tracemalloc.start()

@@ -24,6 +24,6 @@ def test_the_readme_names_every_preset_and_rate_point_with_its_steps():
     assert all(f"`{name}`" in text for name in PRESETS)
     for name, values in RATES.items():
         row = next(line for line in text.splitlines() if line.startswith(f"| `{name}`"))
-        if values["codec.mode"] == "quantized":
-            steps = [v for k, v in values.items() if k != "codec.mode"]
+        if values["codec.name"] == "gaussians-quantized":
+            steps = [v for k, v in values.items() if k != "codec.name"]
             assert [float(cell) for cell in row.split("|")[2:-1]] == steps

@@ -19,6 +19,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.training.task_log import TaskLog
 from splatwizard_core.training.tasks import TaskContext
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
@@ -83,7 +84,14 @@ def test_presets_set_what_the_table_of_differences_says():
 @pytest.mark.parametrize("name", [*ThreeDGS.PRESETS])
 @pytest.mark.parametrize("rate", [*ThreeDGS.RATES])
 def test_every_preset_resolves_at_every_rate_point(name, rate):
-    assert resolve(ThreeDGS, name, rate).config.codec.mode in ("exact", "quantized")
+    assert resolve(ThreeDGS, name, rate).config.codec.name in ("gaussians-exact", "gaussians-quantized")
+
+
+def test_no_reset_comes_after_the_end_of_densification_on_white_either():
+    for stop, resets in ((15_000, True), (400, False)):
+        stage = stage_of(densify__stop=stop)
+        begin(stage, tiny_scene("white"))
+        assert ("reset opacity (white background)" in plan_of(stage)) == resets
 
 
 def test_fewer_iterations_alone_keep_the_plan():
@@ -171,7 +179,7 @@ def test_a_pause_after_a_reset_skips_densification():
     task = PruneAndDensify(pause_after_reset=200)
     for step, ran in ((100, True), (2900, True), (3000, False), (3100, False), (3200, True), (6100, False)):
         model.denom.fill_(1.0)
-        task(model, optimizer, scene, ThreeDGSConfig(), step)
+        task(model, optimizer, scene, ThreeDGSConfig(), step, TaskLog())
         assert (not model.denom.any()) is ran, step
 
 
@@ -183,7 +191,7 @@ def test_the_last_step_neither_densifies_nor_resets():
     before = model.opacity_logits.detach().clone()
     for step, runs in ((6000, False), (3000, True)):
         model.denom.fill_(1.0)
-        PruneAndDensify()(model, optimizer, scene, ThreeDGSConfig(iterations=6000), step)
+        PruneAndDensify()(model, optimizer, scene, ThreeDGSConfig(iterations=6000), step, TaskLog())
         assert (not model.denom.any()) is runs, step
         ResetOpacity(ceiling=0.001)(model, optimizer, ThreeDGSConfig(iterations=6000), step)
         assert (not torch.equal(model.opacity_logits[:1], before[:1])) is runs, step

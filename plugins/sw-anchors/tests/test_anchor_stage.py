@@ -77,6 +77,22 @@ def test_a_plain_model_is_trained_by_the_plain_stage():
     assert not torch.equal(model.mlp_color[2].weight, before)
 
 
+@pytest.mark.parametrize(
+    ("growth", "plans"),
+    [
+        ({"stop": 2000}, ["range(1500, 2000, 100)"]),
+        ({"stop": 3500}, ["range(1500, 3000, 100)"]),
+        ({"stop": 1500}, []),
+        ({"start": 3500}, ["range(4000, 15000, 100)"]),
+        ({"start": 5000}, ["range(5000, 15000, 100)"]),
+        ({"pause_end": 2000}, ["range(1500, 3000, 100)", "range(3000, 15000, 100)"]),
+    ],
+)
+def test_anchors_are_adjusted_between_start_and_stop_but_in_the_pause(growth, plans):
+    _, post = build_schedulers(AnchorStage(AnchorParams(growth=AnchorGrowth(**growth))), PipelineParams())
+    assert [str(each.when) for each in post.registrations if each.name == "adjust anchor"] == plans
+
+
 def test_a_scaled_plan_keeps_its_shape():
     stage = CodedAnchorStage(CodedAnchorParams(iterations=600, scale_schedule=True))
     plan = format_plan(*build_schedulers(stage, PipelineParams()))

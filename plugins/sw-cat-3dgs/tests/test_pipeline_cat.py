@@ -68,7 +68,7 @@ def test_stopping_changes_nothing(train, tmp_path):
 
 @pytest.mark.parametrize("mode", ["exact", "float"])
 def test_the_estimate_is_the_size_of_the_file(method, trained, mode):
-    reader = ContainerReader(encoded(trained, method, codec__mode=mode), "test.swz")
+    reader = ContainerReader(encoded(trained, method, codec__settings__mode=mode), "test.swz")
     bits = estimated_bits(trained)
     framing = 30  # bytes of a section's first block
     for name, estimate in bits.items():
@@ -101,18 +101,20 @@ def test_exact_symbols_do_not_depend_on_the_block(method, trained, monkeypatch, 
 
 
 def test_float_files_hold_the_same_up_to_their_steps(scene, rasterizer, method, trained):
-    exact, floats = (decoded(encoded(trained, method, codec__mode=mode)) for mode in ("exact", "float"))
+    exact, floats = (decoded(encoded(trained, method, codec__settings__mode=mode)) for mode in ("exact", "float"))
     assert torch.equal(exact.anchors, floats.anchors)
     assert torch.equal(exact.masks, floats.masks)
     assert abs(psnr(exact, scene, rasterizer) - psnr(floats, scene, rasterizer)) < 0.3
     assert (
-        ContainerReader(encoded(trained, method, codec__mode="float"), "x").static["made_on"]["torch"]
+        ContainerReader(encoded(trained, method, codec__settings__mode="float"), "x").static["made_on"]["torch"]
         == torch.__version__
     )
 
 
 def test_half_precision_weights_halve_their_section(scene, rasterizer, method, trained):
-    full, half = (ContainerReader(encoded(trained, method, codec__weights=w), "x") for w in ("float32", "float16"))
+    full, half = (
+        ContainerReader(encoded(trained, method, codec__settings__weights=w), "x") for w in ("float32", "float16")
+    )
     assert half.sections["networks"] * 2 == full.sections["networks"]
     model = Cat3DGS(load_plugins(), None).decode(half)
     assert psnr(model, scene, rasterizer) > psnr(trained.eval(), scene, rasterizer) - 0.5

@@ -19,12 +19,12 @@ from sw_chimerags.file import POSITIONS, ROW_BYTES
 from sw_chimerags.method import ChimeraGS
 from sw_chimerags.model import LOWER
 
-EXACT = {"vq.ratio2": 0.0, "vq.ratio3": 0.0}
+EXACT = {"codec.sh2.ratio": 0.0, "codec.sh3.ratio": 0.0}
 
 
 def writer_of(model, **sets) -> ContainerWriter:
     writer = ContainerWriter("chimerags", ChimeraGS.version)
-    values = {"vq.iterations": 3, **{key.replace("__", "."): value for key, value in sets.items()}}
+    values = {"codec.settings.iterations": 3, **{key.replace("__", "."): value for key, value in sets.items()}}
     ChimeraGS(load_plugins(), resolve(ChimeraGS, "paper", sets=values).config).encode(model, writer)
     return writer
 
@@ -67,7 +67,7 @@ def test_a_group_lies_along_a_curve_through_its_own_box(student):
 
 def test_what_matters_keeps_its_own_colour(student):
     model = student(on=40)
-    found = decoded(writer_of(model, vq__ratio2=0.75, vq__ratio3=0.5))
+    found = decoded(writer_of(model, codec__sh2__ratio=0.75, codec__sh3__ratio=0.5))
     ours, theirs = by_place(model), by_place(found)
     exact = (found.sh_dc[theirs] == model.sh_dc[ours].half().float()).all(dim=2).squeeze(1)
     on = model.mask_on()[ours]
@@ -131,7 +131,7 @@ def test_equal_models_make_equal_files(student):
 
 
 def test_the_toolkits_codebook_makes_another_file_of_the_same_layout(student):
-    toolkit = writer_of(student(), vq__preset="toolkit")
+    toolkit = writer_of(student(), codec__settings__training="official")
     assert toolkit.to_bytes() != writer_of(student()).to_bytes()
     assert decoded(toolkit).num_rows == 120
 
@@ -153,7 +153,7 @@ def test_what_cannot_be_written_is_told(student):
     with pytest.raises(TypeError, match="distilled"):
         writer_of(GaussianModel.from_tensors(*(torch.zeros(0, *s) for s in ((3,), (1, 3), (15, 3), (), (3,), (4,)))))
     with pytest.raises(ConfigError, match="importance-vq"):
-        writer_of(student(), vq__codec="range")
+        writer_of(student(), codec="range")
 
 
 def test_no_gaussians_at_all(student):

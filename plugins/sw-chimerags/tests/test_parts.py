@@ -43,7 +43,7 @@ def scene(everybody):
 
 def method_of(plugins, preset="paper", rate=None, **sets) -> ChimeraGS:
     values = {key.replace("__", "."): value for key, value in sets.items()}
-    return ChimeraGS(plugins, resolve(ChimeraGS, preset, rate, sets=values).config)
+    return ChimeraGS(plugins, resolve(ChimeraGS, preset, rate, sets=values, plugins=plugins).config)
 
 
 def test_the_plan_is_speedy_splats_and_the_published_one(everybody):
@@ -116,7 +116,7 @@ def test_rate_points_remove_less_and_less():
     ("key", "value"),
     [
         ("score__pruner", "no-such"),
-        ("vq__codec", "range"),
+        ("codec", "range"),
         ("train__method", "chimerags"),
         ("score__pruner", "trimming-the-fat"),
     ],
@@ -131,10 +131,10 @@ def test_parts_that_cannot_serve_are_told_in_a_line(everybody, key, value):
 
 @pytest.mark.pipeline
 def test_student_teacher_score_and_coder_of_others_need_names_alone(everybody, scene):
-    """--set train.method=theirs --set distill.teacher=theirs --set score.pruner=their-order --set vq.codec=..."""
+    """--set train.method=theirs --set distill.teacher=theirs --set score.pruner=their-order --set codec=..."""
     method = method_of(
         everybody, "quick", train__method="theirs", student__nudge="-0.5", student__preset="paper",
-        distill__teacher="theirs", distill__iterations="4", score__pruner="their-order", vq__codec="their-vectors",
+        distill__teacher="theirs", distill__iterations="4", score__pruner="their-order", codec="their-vectors",
         mask__weight="100", distill__pseudo_views="false", steps__colors="0", xyz="float32",
     )  # fmt: skip
     first, second = method.stages()
@@ -164,12 +164,12 @@ def test_student_teacher_score_and_coder_of_others_need_names_alone(everybody, s
 SHORT = {
     "iterations": 60, "student.prune.start": 20, "student.prune.interval": 20, "student.prune.stop": 55,
     "student.base.densify.start": 10, "student.base.densify.interval": 10, "student.base.densify.stop": 40,
-    "train.soft": 0.2, "distill.iterations": 20, "vq.iterations": 5,
+    "train.soft": 0.2, "distill.iterations": 20, "codec.settings.iterations": 5,
 }  # fmt: skip
 
 
 def run(plugins, scene, directory=None, stop_after=None):
-    method = ChimeraGS(plugins, resolve(ChimeraGS, "quick", sets=SHORT).config)
+    method = ChimeraGS(plugins, resolve(ChimeraGS, "quick", sets=SHORT, plugins=plugins).config)
     teacher = gaussians_from_points(scene.points).requires_grad_(False)
     model = TrainingRun(
         method.stages(), lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(),

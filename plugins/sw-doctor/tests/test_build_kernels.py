@@ -5,14 +5,14 @@ from __future__ import annotations
 import json
 
 from splatwizard_core.cli.main import main
-from splatwizard_core.errors import FORESEEN, SplatwizardError
+from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.plugins import kernels
 from splatwizard_core.plugins.manager import PluginManager
-from splatwizard_native import NativeBuildError
+from splatwizard_native import ForeseenError, NativeBuildError
 
 
 def test_what_cannot_be_built_is_an_error_for_the_user(capsys, monkeypatch):
-    assert issubclass(NativeBuildError, FORESEEN)
+    assert issubclass(NativeBuildError, ForeseenError)
     assert not issubclass(NativeBuildError, SplatwizardError)  # the base does not know the core
     monkeypatch.setenv("CXX", "no-such-compiler")
     assert main(["build-kernels"]) == 1

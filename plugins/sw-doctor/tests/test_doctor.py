@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 from sw_doctor import child, compilers, diagnosis, packages, probe, registered, system
+from sw_doctor.cures import cure_of
 from sw_doctor.text import gigabytes, one_line
 
 from splatwizard_core.plugins import Entry, PluginManager, load_plugins
@@ -315,6 +316,54 @@ def test_an_extra_gets_what_it_lacks_or_is_put_there_anew(site, why, mend):
     assert (checks["sw-thing[fast]"].state, checks["sw-thing[fast]"].mend) == ("broken", mend)
 
 
+def test_what_only_a_stranger_needs_decides_nothing_about_the_main_job(site):
+    for name in ("old", "bad", "shared"):
+        distribution(site, name)
+    distribution(site, "sw-thing", requires=("shared>=1",))
+    distribution(site, "stranger", requires=("absent", "old>=2", "bad", "shared<1"))
+    needs = packages.collect_needs(["sw-thing"], ["stranger"])
+    checks = {c.name: c for c in packages.package_checks(needs, {"bad": "does not import: OSError", "shared": None})}
+    assert set(checks) == {"bad", "required"}  # what it has not is told in its plugin's line
+    assert (checks["bad"].state, checks["bad"].needed) == ("broken", False)
+
+
+@pytest.mark.parametrize(
+    ("why", "foreign", "mend"),
+    [
+        ("needs numpy>=9, but 2.0 is installed: pip install 'numpy>=9'", True, "pip install 'numpy>=9'"),
+        ("ModuleNotFoundError: No module named 'jax'", True, "pip install jax"),
+        ("ModuleNotFoundError: No module named 'jax'", False, "pip install jax"),
+        ("ModuleNotFoundError: No module named 'sw_thing'", False, "pip install --force-reinstall --no-deps sw-thing"),
+        ("its entry point is called 'core', which is the name of ...", True, "pip uninstall sw-thing"),
+        ("OSError: no disk", True,
+         "pip install --upgrade sw-thing  (or, to be without it: pip uninstall sw-thing)"),
+        ("OSError: no disk", False, "pip install --force-reinstall --no-deps sw-thing"),
+    ],
+)  # fmt: skip
+def test_the_cure_of_a_plugin_is_what_helps_against_its_reason(site, why, foreign, mend):
+    distribution(site, "sw-thing", sw_thing="")
+    assert cure_of("sw-thing", why, foreign=foreign) == mend
+
+
+def test_a_distribution_in_two_places_is_told_with_both(site, tmp_path, monkeypatch):
+    distribution(site, "sw-thing")
+    assert diagnosis.check_shadowed("sw-thing") is None
+    distribution(tmp_path / "other", "sw-thing")
+    monkeypatch.syspath_prepend(str(tmp_path / "other"))
+    found = diagnosis.check_shadowed("sw-thing")
+    assert found is not None
+    assert f"1.0 in {tmp_path / 'other'} is used, 1.0 in {site} is shadowed" in found.detail
+    assert not found.needed
+
+
+def test_a_process_that_a_stranger_ends_after_the_main_job_decides_nothing():
+    job = Check("main job", "sw run", "ok", "fine", needed=True)
+    answer = child.Answer([job], ("entries of sw-thing", "was killed by signal SIGSEGV"))
+    _, found = diagnosis.probed(answer)
+    assert (found.group, found.state, found.needed) == ("plugins", "broken", False)
+    assert "pip uninstall sw-thing" in (found.mend or "")
+
+
 # ------------------------------------------------------------------------------------------ child processes
 
 
@@ -412,7 +461,7 @@ def test_a_registered_check_that_fails_is_one_line_with_its_distribution(check_o
     assert how in found.detail
     assert "sw-stranger" in found.detail
     assert "\n" not in found.detail
-    assert "sw-stranger" in (found.mend or "")
+    assert ("pip install no_such_library" if "no_such" in body else "sw-stranger") in (found.mend or "")
 
 
 def test_what_a_registered_check_prints_stands_nowhere(check_of, capfd):

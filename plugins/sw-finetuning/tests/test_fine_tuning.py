@@ -73,6 +73,13 @@ def test_the_plan_is_printed_and_scaled():
     assert post.registrations[0].when == range(10)
 
 
+def test_step_sizes_are_set_to_the_end_of_a_stage_that_is_longer_than_the_published_one():
+    pre, _ = build_schedulers(Recording(Params(iterations=40_000), FineTuningRates()), None)
+    assert pre.registrations[0].when == range(40_000)
+    pre, _ = build_schedulers(Recording(Params(iterations=10), FineTuningRates()), None)
+    assert pre.registrations[0].when == range(30_000)
+
+
 def test_a_stage_starts_from_the_trained_scene_with_all_bands_and_fresh_statistics(toy):
     trained = toy.make_model(toy.scene)
     trained.active_sh_degree = 0

@@ -10,6 +10,7 @@ from splatwizard_core.errors import EmptyModel, ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.training.task_log import TaskLog
 
 
 def model(n=10):
@@ -69,8 +70,11 @@ def test_the_task_removes_rows_and_moments_and_sees_every_camera_once(scene):
     optimizer.step()
     pruner = Fixed(torch.arange(10.0))
     before = gaussians.means.detach().clone()
-    PruneByScore(pruner, {1: 0.8, 5: 0.5})(gaussians, optimizer, CameraIterator(scene.train), None, scene, 5)
+    log = TaskLog()
+    PruneByScore(pruner, {1: 0.8, 5: 0.5})(gaussians, optimizer, CameraIterator(scene.train), None, scene, 5, log)
     assert torch.equal(gaussians.means, before[5:])
+    assert [line for _, line in log.said] == ["removed 5 of 10 primitives, 5 left"]
+    assert log.scalars["pruned"].item() == 5
     assert optimizer.moments("means")[0].shape == (5, 3)
     assert gaussians.means.grad is None
     cameras, background = pruner.seen
@@ -83,7 +87,7 @@ def test_survivors_may_keep_their_gradient(scene):
     optimizer = SplatOptimizer(gaussians, [ParamGroup("means", 1e-3)])
     (gaussians.means * torch.arange(10.0)[:, None]).sum().backward()
     task = PruneByScore(Fixed(torch.arange(10.0)), 0.3, carry_grad=True)
-    task(gaussians, optimizer, CameraIterator(scene.train), None, scene, 1)
+    task(gaussians, optimizer, CameraIterator(scene.train), None, scene, 1, TaskLog())
     assert gaussians.means.grad[:, 0].tolist() == [3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0]
 
 
@@ -96,11 +100,11 @@ def test_the_count_of_the_authors_codes_takes_one_more_or_all_equal_ones(scene):
     gaussians = model()
     optimizer = SplatOptimizer(gaussians, [ParamGroup("means", 1e-3)])
     task = PruneByScore(Fixed(torch.arange(10.0)), {3: 0.3}, count_rule="official")
-    task(gaussians, optimizer, CameraIterator(scene.train), None, scene, 3)
+    task(gaussians, optimizer, CameraIterator(scene.train), None, scene, 3, TaskLog())
     assert gaussians.num_rows == 10 - (int(0.3 * 9) + 1)
     with pytest.raises(EmptyModel, match="step 3"):
         PruneByScore(Fixed(torch.zeros(7)), 0.1, count_rule="official")(
-            gaussians, optimizer, CameraIterator(scene.train), None, scene, 3
+            gaussians, optimizer, CameraIterator(scene.train), None, scene, 3, TaskLog()
         )
 
 
@@ -108,7 +112,9 @@ def test_an_empty_model_is_an_error_and_nothing_is_removed(scene):
     gaussians = model()
     optimizer = SplatOptimizer(gaussians, [ParamGroup("means", 1e-3)])
     with pytest.raises(EmptyModel, match="step 7"):
-        PruneByScore(Fixed(torch.zeros(10)), 1.0)(gaussians, optimizer, CameraIterator(scene.train), None, scene, 7)
+        PruneByScore(Fixed(torch.zeros(10)), 1.0)(
+            gaussians, optimizer, CameraIterator(scene.train), None, scene, 7, TaskLog()
+        )
     assert gaussians.num_rows == 10
 
 

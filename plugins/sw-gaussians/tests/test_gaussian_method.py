@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
-from pydantic import Field
+from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.method import GaussianMethod
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, ConfigError, SceneError
+from splatwizard_core.errors import BitstreamError, ConfigError, PluginError, SceneError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.registry import Coders, Registry
 from splatwizard_core.training.params import OptimizationParams
@@ -32,8 +32,8 @@ class ToyCodec:
         return GaussianModel.from_tensors(**{name: torch.from_numpy(array) for name, array in arrays.items()})
 
 
-class ToyConfig(OptimizationParams):
-    codec: str = Field("toy-codec", description="codec of the file")
+class ToyConfig(Choosing):
+    codec: CodecChoice = CodecChoice(name="toy-codec")
 
 
 class Toy(GaussianMethod):
@@ -75,17 +75,25 @@ def test_the_codec_of_the_config_writes_the_file_which_says_so(plugins, model):
         assert torch.equal(ours, theirs), name
 
 
-@pytest.mark.parametrize("codec", ["zip", "range"])
-def test_a_codec_that_is_not_one_of_gaussians_is_told_before_anything_is_trained(plugins, codec):
-    with pytest.raises(ConfigError, match=f"'{codec}'; installed: toy-codec") as told:
+@pytest.mark.parametrize(("codec", "told"), [("zip", "called 'zip'"), ("range", "'range' does not .* do: toy-codec")])
+def test_a_codec_that_is_not_one_of_gaussians_is_told_before_anything_is_trained(plugins, codec, told):
+    with pytest.raises(ConfigError, match=told) as error:
         Toy(plugins, ToyConfig(codec=codec))
-    assert told.value.key == "codec"
+    assert error.value.key == "codec.name"
+
+
+def test_a_config_whose_codec_is_a_name_alone_is_the_authors_to_change(plugins):
+    class Older(OptimizationParams):
+        codec: str = "toy-codec"
+
+    with pytest.raises(PluginError, match=r"method 'toy' cannot be used: `codec` of its Older must be a CodecChoice"):
+        Toy(plugins, Older())
 
 
 def test_another_layout_version_is_refused(plugins, model):
     reader = written(plugins, model)
     reader.version = 7
-    with pytest.raises(BitstreamError, match=r"version 7.*upgrade sw-of-toys"):
+    with pytest.raises(BitstreamError, match=r"toy layout version 7 is unknown, newer than"):
         Toy(plugins, None).decode(reader)
 
 

@@ -18,6 +18,7 @@ from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
+from splatwizard_core.training.task_log import TaskLog
 from sw_3dgs.method import ThreeDGS
 
 PLAN = """\
@@ -135,15 +136,18 @@ def test_the_last_step_and_the_first_are_left_alone(scene):
     with torch.no_grad():
         model.opacity_logits[:20] = math.log(0.001)
     before = model.digest()
+    log = TaskLog()
     for step, tasks in ((200, (Relocate(), Grow(), AddNoise())), (1, (AddNoise(),))):
         for task in tasks:
-            task(model, optimizer, stage.config, step)
+            task(model, optimizer, stage.config, step, *([] if isinstance(task, AddNoise) else [log]))
             assert model.digest() == before
+    assert not log.scalars
     for task in (AddNoise(), Relocate(), Grow(cap=900)):
-        task(model, optimizer, stage.config, 100)
+        task(model, optimizer, stage.config, 100, *([] if isinstance(task, AddNoise) else [log]))
         assert model.digest() != before
         before = model.digest()
     assert model.num_rows == 630
+    assert {name: value.item() for name, value in log.scalars.items()} == {"relocated": 20, "added": 30}
 
 
 def test_tasks_are_there_for_other_methods_by_name():

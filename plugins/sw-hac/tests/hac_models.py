@@ -100,7 +100,7 @@ def predictor(model, mode="exact"):
 
 def lattice_of(model, *, mode="exact", **values):
     """Geometry, integers and steps of a file by group, the values they stand for, its bits by the tables; the file."""
-    settings = method(codec__mode=mode, **values).config.codec
+    settings = method(codec__settings__mode=mode, **values).config.codec.settings
     writer, again = ContainerWriter("hac", 1), ContainerWriter("hac", 1)
     with torch.no_grad():
         codec.encode(model, writer, settings)

@@ -34,7 +34,7 @@ SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "of
 
 def test_the_header_lists_what_decoding_needs():
     writer = ContainerWriter("hac", 1)
-    codec.encode(make(n=20), writer, method().config.codec)
+    codec.encode(make(n=20), writer, method().config.codec.settings)
     assert list(dict.fromkeys(writer.required)) == [
         ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
         ("entropy model", "conditional-gaussian"),
@@ -97,7 +97,7 @@ def test_another_process_decodes_the_same(tmp_path):
     paths = []
     for weights in ("float32", "float16"):
         paths.append(tmp_path / f"{weights}.swz")
-        paths[-1].write_bytes(encoded(make(), codec__weights=weights))
+        paths[-1].write_bytes(encoded(make(), codec__settings__weights=weights))
     code = (
         "import sys, torch\n"
         "from splatwizard_core.coding.container import ContainerReader\n"
@@ -113,9 +113,11 @@ def test_another_process_decodes_the_same(tmp_path):
 
 def test_half_precision_weights_save_half_of_their_bytes():
     model = make()
-    sizes = [ContainerReader(encoded(model, codec__weights=w)).sections["networks"] for w in ("float32", "float16")]
+    sizes = [
+        ContainerReader(encoded(model, codec__settings__weights=w)).sections["networks"] for w in ("float32", "float16")
+    ]
     assert sizes[0] == 2 * sizes[1]
-    small = decoded(encoded(model, codec__weights="float16"))
+    small = decoded(encoded(model, codec__settings__weights="float16"))
     assert torch.equal(small.mlp_color[0].weight, model.mlp_color[0].weight.half().float())
 
 
@@ -237,24 +239,26 @@ def test_few_anchors_make_a_file(n):
 def test_encoding_leaves_the_model_alone_and_repeats_itself():
     model = make()
     before = model.digest()
-    assert encoded(model, codec__weights="float16") == encoded(model, codec__weights="float16")
+    assert encoded(model, codec__settings__weights="float16") == encoded(model, codec__settings__weights="float16")
     assert model.digest() == before
 
 
 def test_float_mode_decodes_here_and_says_why_not_elsewhere():
     model = make()
-    data = encoded(model, codec__mode="float")
+    data = encoded(model, codec__settings__mode="float")
     assert torch.equal(decoded(data).positions(), decoded(encoded(model)).positions())
     reader = ContainerReader(data)
     assert reader.static["made_on"] == this_machine()
     for changed in ({"device": "cpu other", "torch": torch.__version__}, {"device": "x", "torch": "1.0"}, None):
-        with pytest.raises(BitstreamError, match=r"mode 'float' decodes only where it was encoded.*codec.mode=exact"):
+        with pytest.raises(
+            BitstreamError, match=r"mode 'float' decodes only where it was encoded.*codec.settings.mode=exact"
+        ):
             decoded(rewritten(data, made_on=changed))
 
 
 @pytest.mark.parametrize(("mode", "flags"), [("exact", []), ("float", ["device-bound"])])
 def test_a_record_tells_that_a_file_is_bound_to_its_device(mode, flags, tmp_path):
-    (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__mode=mode))
+    (tmp_path / "scene.swz").write_bytes(encoded(make(n=20), codec__settings__mode=mode))
     bound = measure.opener(tmp_path / "scene.swz", Session(PLUGINS, torch.device("cpu"), print))().device_bound
     scene, quality = SimpleNamespace(protocol=Protocol("test")), SimpleNamespace(metrics={})
     assert (
@@ -268,7 +272,7 @@ def test_a_weight_that_does_not_fit_half_precision_is_named():
     with torch.no_grad():
         model.mlp_color[0].weight[0, 0] = 1e6
     with pytest.raises(ValueError, match="float16"):
-        encoded(model, codec__weights="float16")
+        encoded(model, codec__settings__weights="float16")
 
 
 def rewritten(data: bytes, sections=None, **static) -> bytes:

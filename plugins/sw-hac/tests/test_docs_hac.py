@@ -16,7 +16,7 @@ README = Path(__file__).parents[1] / "README.md"
 @pytest.mark.skipif(not PAGE.is_file(), reason="the package stands alone, without the repository's docs")
 def test_the_page_names_every_section_and_header_value():
     text = PAGE.read_text()
-    reader = ContainerReader(encoded(make(n=20), codec__mode="float"))
+    reader = ContainerReader(encoded(make(n=20), codec__settings__mode="float"))
     for name in (*reader.sections, *reader.static):
         assert f"`{name}`" in text
 

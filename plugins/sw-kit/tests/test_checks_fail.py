@@ -102,6 +102,14 @@ def test_a_plugin_that_did_not_load():
         registration.check_loads(PluginInfo("bad", "sw-bad", "0.1", "sw_bad", error="no such module"))
 
 
+def test_a_plugin_with_an_entry_that_is_refused(monkeypatch):
+    entry = Entry("metric", "psnr", "m:f", "one line", distribution="sw-bad", version="0.1", foreign=True)
+    monkeypatch.setattr(PLUGINS.metrics, "refused", [(entry, "that is a name of ours")])
+    registration.check_loads(PluginInfo("good", "sw-good", "0.1", "sw_good"))
+    with pytest.raises(BrokenContractError, match="metric 'psnr' is refused: that is a name of ours"):
+        registration.check_loads(PluginInfo("bad", "sw-bad", "0.1", "sw_bad"))
+
+
 @pytest.mark.parametrize(
     ("entry", "said"),
     [(Entry("method", "a name", "m:C", "one line"), "nobody can type"),
@@ -141,6 +149,46 @@ class NoBackground(NeedsAnArgument):
 
     def score(self, model, cameras, rasterizer):
         pass
+
+
+class Scores:
+    uses_statistics = False
+
+    def __init__(self, power=1.0):
+        pass
+
+    def score(self, model, cameras, rasterizer, background=None):
+        pass
+
+
+class WithoutDefault(Scores):
+    class Settings(Params):
+        power: float
+
+
+class NotTaken(Scores):
+    class Settings(Params):
+        strength: float = 1.0
+
+
+class OtherDefault(Scores):
+    class Settings(Params):
+        power: float = 2.0
+
+
+class NoModel(Scores):
+    Settings = 3
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [(WithoutDefault, "Settings is a pydantic model"), (NotTaken, "unexpected keyword argument 'strength'"),
+     (OtherDefault, "'power' is 1.0 or 2.0 by default"), (NoModel, "cannot be made with its Settings")],
+)  # fmt: skip
+def test_settings_that_the_class_is_not_made_with(entry_of, target, said):
+    assert "has the signatures" in check_target(entry_of("pruner", Scores), PLUGINS)
+    with pytest.raises(BrokenContractError, match=said):
+        check_target(entry_of("pruner", target), PLUGINS)
 
 
 @pytest.mark.parametrize(

@@ -109,7 +109,7 @@ def test_a_run_of_hardly_any_steps_still_prunes_and_scores(stages, iterations):
 
 
 def test_an_unknown_codec_is_told_before_anything_is_trained(stages):
-    with pytest.raises(ConfigError, match=r"no codec for Gaussians is called 'zip'; installed: .*vectree") as told:
+    with pytest.raises(ConfigError, match=r"no coder is called 'zip'; installed: .*vectree") as told:
         stages(codec__name="zip")
     assert told.value.key == "codec.name"
 
@@ -150,7 +150,7 @@ def test_rate_points_differ_in_training_and_the_codec_does_not():
     hashes = {resolve(LightGaussian, "quick", rate).training_hash() for rate in LightGaussian.RATES}
     assert len(hashes) == 5
     plain = resolve(LightGaussian, "quick").training_hash()
-    assert resolve(LightGaussian, "quick", sets={"codec.vq_ratio": 1.0}).training_hash() == plain
+    assert resolve(LightGaussian, "quick", sets={"codec.settings.ratio": 1.0}).training_hash() == plain
 
 
 def test_the_plugin_declares_what_the_class_has(plugins):

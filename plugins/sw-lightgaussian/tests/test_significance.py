@@ -5,9 +5,10 @@ import math
 import pytest
 import torch
 from sw_finetuning.pruning import lowest, removal_count
+from sw_finetuning.volume import volume_factor
 
 from splatwizard_core.gaussians.model import GaussianModel
-from sw_lightgaussian.significance import Significance, volume_factor
+from sw_lightgaussian.significance import Significance
 
 
 def alphas(camera, depth, opacity, scale):

@@ -157,7 +157,7 @@ def test_rate_points_remove_what_the_readme_says():
         ({"prune__steps": [5, 5]}, "ascend"),
         ({"prune__steps": [0, 5]}, "ascend"),
         ({"prune__fractions": [0.5, 1.0]}, "shares"),
-        ({"prune__resolution": 3}, "1, 2, 4 or 8"),
+        ({"prune__settings__resolution": 3}, "one of 1, 2, 4, 8"),
         ({"prune__pruner": "pupp"}, "no pruner is called 'pupp'; installed: .*pup-3dgs"),
     ],
 )
@@ -189,13 +189,15 @@ def test_a_round_begins_with_an_adam_that_knows_nothing(scene):
 
 def test_counts_and_nothing_is_updated_in_the_step_of_a_removal(scene, rasterizer):
     model, counts = toy_model(), {}
-    stage = stage_of(iterations=8, prune__steps=[1, 5], prune__resolution=1)
+    stage = stage_of(iterations=8, prune__steps=[1, 5], prune__settings__resolution=1)
     found = trained(
         stage, model, scene, rasterizer, on_step=lambda _, record: counts.update({record.step: record.num_rows})
     )
     assert counts == {1: 40, 2: 40, 3: 40, 4: 40, 5: 20, 6: 20, 7: 20, 8: 20}
     assert found.num_rows == 20
-    only_pruned = trained(stage_of(iterations=2, prune__steps=[1, 5], prune__resolution=1), model, scene, rasterizer)
+    only_pruned = trained(
+        stage_of(iterations=2, prune__steps=[1, 5], prune__settings__resolution=1), model, scene, rasterizer
+    )
     # Step 1 removes, step 2 is the last, which updates nothing: the survivors are rows of the model as it was.
     rows = {tuple(row) for row in model.means.detach().tolist()}
     assert {tuple(row) for row in only_pruned.means.detach().tolist()} <= rows
@@ -224,7 +226,10 @@ def test_the_lowest_scores_go(scene, rasterizer):
     scores = pruner.score(model, [view.camera for view in scene.train], rasterizer, scene.background)
     keep = scores.argsort(stable=True)[100:].sort().values
     found = trained(
-        stage_of(iterations=1, prune__steps=[1], prune__fractions=[0.5], prune__resolution=2), model, scene, rasterizer
+        stage_of(iterations=1, prune__steps=[1], prune__fractions=[0.5], prune__settings__resolution=2),
+        model,
+        scene,
+        rasterizer,
     )
     assert torch.equal(found.means, model.means[keep])
 

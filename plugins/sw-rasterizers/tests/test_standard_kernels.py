@@ -293,24 +293,3 @@ def test_registry_entry_declares_what_the_class_offers():
     assert entry.load() is StandardRasterizer
     assert {Feature[name].name for name in entry.declared["features"]} == StandardRasterizer.info.features
     assert StandardRasterizer.info.speed > ReferenceRasterizer.info.speed
-
-
-def full_screen(n: int) -> GaussianInputs:
-    """n equal splats that cover the whole picture."""
-    case = RasterCase("wide", n=n, width=64, height=64, spread=0.0, scale=(9.0, 9.0), degree=0, active_degree=0)
-    g, _ = draw_scene(case, 0, torch.float32)
-    return with_tensors(g, {"means": torch.tensor([0.0, 0.0, 4.0]).repeat(n, 1)})
-
-
-@pytest.mark.parametrize("training", [False, True])
-def test_more_splat_tile_pairs_than_the_limit_are_refused_before_they_are_listed(training, monkeypatch):
-    """858 bytes of file, 65,536 splats over 1600x1200 pixels, took 6.1 GB of pairs."""
-    g, cam, rasterizer = full_screen(50), front_camera(64, 64), StandardRasterizer()
-    g = leaves(g) if training else g
-    pairs = 50 * 16 * (2 if training else 1)  # with a backward pass a pair counts for two
-    whole = rasterizer.render(g, cam, RasterOptions()).image
-    monkeypatch.setenv("SPLATWIZARD_MAX_TILE_PAIRS", str(pairs))
-    assert torch.equal(rasterizer.render(g, cam, RasterOptions()).image, whole)
-    monkeypatch.setenv("SPLATWIZARD_MAX_TILE_PAIRS", str(pairs - 2))
-    with pytest.raises(RuntimeError, match=r"800 splat-tile pairs are more than 79[89].* SPLATWIZARD_MAX_TILE_PAIRS"):
-        rasterizer.render(g, cam, RasterOptions())

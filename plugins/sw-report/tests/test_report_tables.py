@@ -3,7 +3,7 @@
 import pytest
 from sw_report import numbers
 from sw_report.aggregate import dataset_tables, mean
-from sw_report.distortion import bd_tables, choose_anchor
+from sw_report.distortion import bd_tables, choose_anchor, drawn_metrics
 from sw_report.results_tables import (
     bd_table,
     cost_table,
@@ -183,6 +183,28 @@ def test_runs_of_different_protocols_are_not_compared(make_curve, tmp_path):
     make_curve("anchor", change=protocol(resolution=-1))
     make_curve("other", 0.5, change=protocol(resolution=4))
     assert bd_tables(collect([tmp_path]).runs, "anchor") == []
+
+
+def test_every_metric_with_a_direction_has_bd_rates_a_strangers_too(make_curve, tmp_path):
+    def with_more(content):
+        psnr = content["metrics"]["psnr"]["mean"]
+        for name, value, direction in (
+            ("l1", 1 / psnr, "lower"), ("lpips_alex", 1 / psnr, "lower"), ("lpips_vgg_3dgs", 1 / psnr, "lower"),
+            ("their_metric", 2 * psnr, "higher"), ("odd", 1 / psnr, "lower"), ("sideways", psnr, "neither"),
+        ):  # fmt: skip
+            content["metrics"][name] = {"mean": value, "per_view": [], "direction": direction}
+        content["metrics"]["psnr_unrounded"] = {"mean": psnr, "direction": "higher", "diagnostic": True}
+        content["metrics"]["broken"] = {"mean": None, "direction": "higher"}
+
+    make_curve("anchor", change=with_more)
+    make_curve("better", 0.5, change=with_more)
+    runs = collect([tmp_path]).runs
+    tables = bd_tables(runs, "anchor")
+    assert [t.metric for t in tables] == [
+        "psnr", "ssim", "lpips_vgg_3dgs", "lpips_alex", "l1", "odd", "their_metric",
+    ]  # fmt: skip
+    assert all(t.rows[0].rate.value == pytest.approx(-50) for t in tables)
+    assert drawn_metrics(runs) == ["psnr", "ssim", "lpips_vgg_3dgs", "odd", "their_metric"]
 
 
 def test_lower_is_better_is_turned(make_curve, tmp_path):

@@ -5,6 +5,7 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sw_report.plots import training_charts
 from sw_report.runs import collect
 from sw_report.training_log import log_path, read_training, thin
 
@@ -53,6 +54,35 @@ def test_a_damaged_line_is_counted_and_passed_over(tmp_path, line):
 def test_a_loss_that_is_no_number_is_no_point(tmp_path, loss):
     (tmp_path / "log.jsonl").write_text(f'{{"stage": 0, "step": 1, "loss": {loss}}}\n')
     assert read_training(tmp_path / "log.jsonl").missing == "log.jsonl holds no step"
+
+
+def test_what_tasks_recorded_is_a_curve_each(tmp_path):
+    lines = [
+        {"stage": s, "step": n, "scalars": {"pruned": 10 * n, "<b>odd</b>": None if n == 5 else 1}}
+        for s in (0, 1)
+        for n in (5, 10)
+    ]
+    lines += [{"stage": 1, "step": 11, "scalars": other} for other in ([], {"pruned": "3"}, {"x": True}, "pruned")]
+    lines.append({"stage": 1, "step": 12, "scalars": {f"curve {i}" * 20: i for i in range(40)}})
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    curves = read_training(tmp_path / "log.jsonl")
+    assert curves.scalars["pruned"] == [(5, 50), (10, 100), (15, 50), (20, 100)]
+    assert curves.scalars["<b>odd</b>"] == [(10, 1), (20, 1)]
+    assert len(curves.scalars) == 12
+    assert max(map(len, curves.scalars)) == 64
+    assert (curves.damaged, curves.missing) == (0, None)
+
+
+def test_the_page_draws_what_tasks_recorded(make_run):
+    directory = make_run("r1", keep=("log",))
+    with (directory / "log.jsonl").open("a") as file:
+        for step in (301, 302):
+            file.write(json.dumps({"stage": 0, "step": step, "scalars": {"dead <codes>": step}}) + "\n")
+        file.write(json.dumps({"stage": 0, "step": 303, "scalars": {"only once": 1}}) + "\n")
+    charts, missing = training_charts(collect([directory]).runs)
+    assert not missing
+    assert [figure.caption for figure in charts.figures][2:] == ["dead <codes>"]
+    assert "dead &lt;codes&gt; over steps" in str(charts.figures[2].svg)
 
 
 def test_a_missing_log_is_said(tmp_path):

@@ -221,7 +221,7 @@ def event(model, scene, rasterizer, task, step=100):
     before = {name: getattr(model, name).detach().clone() for name in model.ROWS}
     grads = {name: getattr(model, name).grad.clone() for name in ROWS}
     moments = {name: [m.clone() for m in optimizer.moments(name)[:2]] for name in ROWS}
-    task(context.model, context.optimizer, context.cameras, context.rasterizer, context.scene, step)
+    task(context.model, context.optimizer, context.cameras, context.rasterizer, context.scene, step, context.log)
     return optimizer, scores, before, grads, moments
 
 

@@ -27,7 +27,9 @@ MODULES = {
     "rendering.info": "RasterizerInfo",
     "training.stage": "Stage StageContext CameraSampler CameraIterator",
     "training.scheduler": "Scheduler",
+    "training.task_log": "TaskLog",
     "training.plan": "When",
+    "training.overrides": "apply_overrides",
     "training.params": "OptimizationParams PipelineParams Params InputFile",
     "training.optimizer": "SplatOptimizer ParamGroup",
     "training.losses": "LossPack photometric_loss",
@@ -39,9 +41,9 @@ MODULES = {
     ),
     "evaluation.image": "ssim_map",
     "evaluation.metrics": "MetricSetup PreparedMetric",
-    "files": "replacing",
-    "progress": "track",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""
+BASE = {"errors": "ForeseenError", "files": "replacing", "progress": "track"}
+"""The same of splatwizard-native."""
 
-__all__, __getattr__ = lend(__name__, MODULES)
+__all__, __getattr__ = lend(__name__, MODULES, BASE)

@@ -20,7 +20,6 @@ from splatwizard_core.errors import UserInputError as UserInputError
 from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
-from splatwizard_core.files import replacing as replacing
 from splatwizard_core.gaussians.inputs import SH as SH
 from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
 from splatwizard_core.gaussians.inputs import rgb_to_dc as rgb_to_dc
@@ -31,7 +30,6 @@ from splatwizard_core.method import create_method as create_method
 from splatwizard_core.plugins.hookspecs import hookimpl as hookimpl
 from splatwizard_core.plugins.manager import PluginManager as PluginManager
 from splatwizard_core.plugins.registry import Registry as Registry
-from splatwizard_core.progress import track as track
 from splatwizard_core.rendering.features import Feature as Feature
 from splatwizard_core.rendering.info import RasterizerInfo as RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput as AccumOutput
@@ -53,6 +51,7 @@ from splatwizard_core.training.losses import LossPack as LossPack
 from splatwizard_core.training.losses import photometric_loss as photometric_loss
 from splatwizard_core.training.optimizer import ParamGroup as ParamGroup
 from splatwizard_core.training.optimizer import SplatOptimizer as SplatOptimizer
+from splatwizard_core.training.overrides import apply_overrides as apply_overrides
 from splatwizard_core.training.params import InputFile as InputFile
 from splatwizard_core.training.params import OptimizationParams as OptimizationParams
 from splatwizard_core.training.params import Params as Params
@@ -64,3 +63,7 @@ from splatwizard_core.training.stage import CameraIterator as CameraIterator
 from splatwizard_core.training.stage import CameraSampler as CameraSampler
 from splatwizard_core.training.stage import Stage as Stage
 from splatwizard_core.training.stage import StageContext as StageContext
+from splatwizard_core.training.task_log import TaskLog as TaskLog
+from splatwizard_native.errors import ForeseenError as ForeseenError
+from splatwizard_native.files import replacing as replacing
+from splatwizard_native.progress import track as track

@@ -69,12 +69,12 @@ class Method:
     def check_version(self, reader: ContainerReader) -> None:
         """Raise BitstreamError for another layout version than the method's own: for a `decode` that reads no other."""
         if reader.version != self.version:
-            methods = self.plugins.methods
-            known = self.name in methods
-            package = methods.entry(self.name).distribution if known else f"the package of {self.name}"
+            known = self.plugins.methods
+            package = known.entry(self.name).distribution if self.name in known else f"the package of {self.name}"
+            advice = f"newer: upgrade {package}" if reader.version > self.version else f"older: get an older {package}"
             raise BitstreamError(
                 f"{reader.name}: {self.name} layout version {reader.version} is unknown, this installation reads "
-                f"{self.version}: upgrade {package}"
+                f"{self.version}; the file is {advice}"
             )
 
 
@@ -94,4 +94,5 @@ def create_method(
         raise ConfigError(f"'{name}' has no preset '{preset}'; it has {', '.join(cls.PRESETS)}", key="preset")
     borrowed = {k: v for k, v in cls.PRESETS[preset].items() if not is_beside_method(cls.Config, k)}
     values = {**borrowed, **dotted(config or {}, "")}
-    return cls(plugins, apply_overrides(cls.Config(), values, source=f"config of '{name}'"))
+    asked = apply_overrides(cls.Config(), values, source=(source := f"config of '{name}'"))
+    return cls(plugins, asked.completed(plugins, dict.fromkeys(values, source)))

@@ -24,8 +24,6 @@ MODULES = {
     "runs.device": "choose_device",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
-    "files": "file_sha256 new_folder write_atomic write_json",
-    "progress": "Bar",
     "coding.container": "decoded_limit",
     "evaluation.evaluate": "png_names",
     "evaluation.metrics": "MetricInfo short_reason",
@@ -37,5 +35,7 @@ MODULES = {
     "cli.setup": "Choices",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
+BASE = {"files": "file_sha256 new_folder write_atomic write_json", "progress": "Bar"}
+"""The same of splatwizard-native."""
 
-__all__, __getattr__ = lend(__name__, MODULES)
+__all__, __getattr__ = lend(__name__, MODULES, BASE)

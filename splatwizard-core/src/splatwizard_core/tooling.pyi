@@ -16,17 +16,12 @@ from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
-from splatwizard_core.files import file_sha256 as file_sha256
-from splatwizard_core.files import new_folder as new_folder
-from splatwizard_core.files import write_atomic as write_atomic
-from splatwizard_core.files import write_json as write_json
 from splatwizard_core.plugins.check import Check as Check
 from splatwizard_core.plugins.check import State as State
 from splatwizard_core.plugins.kernels import declared_modules as declared_modules
 from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
 from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
-from splatwizard_core.progress import Bar as Bar
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import open_model as open_model
@@ -46,3 +41,8 @@ from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
+from splatwizard_native.files import file_sha256 as file_sha256
+from splatwizard_native.files import new_folder as new_folder
+from splatwizard_native.files import write_atomic as write_atomic
+from splatwizard_native.files import write_json as write_json
+from splatwizard_native.progress import Bar as Bar

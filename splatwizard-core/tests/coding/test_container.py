@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 
 from splatwizard_core.coding import container
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, SceneError, SplatwizardError
+from splatwizard_core.coding.requirements import Requirement
+from splatwizard_core.errors import BitstreamError, PluginError, SceneError, SplatwizardError
 
 DTYPES = ["bool", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
 
@@ -384,6 +385,18 @@ def test_static_values_are_checked_when_asked_for():
     ):
         with pytest.raises(BitstreamError, match="header value"):
             call()
+
+
+def test_a_name_that_the_file_requires_is_a_missing_part_and_not_damage():
+    writer = ContainerWriter("m", 1)
+    writer.static = {"codec": "martian", "mode": "odd"}
+    writer.requires = [Requirement("sw-martian", "1.2", (("coder", "martian"),))]
+    reader = ContainerReader(writer.to_bytes(), "f.swz")
+    with pytest.raises(PluginError, match="must be one of gaussians-exact") as info:
+        reader.text("codec", choices=["gaussians-exact"])
+    assert (info.value.kind, info.value.name) == ("coder", "martian")
+    with pytest.raises(BitstreamError, match="must be one of plain"):
+        reader.text("mode", choices=["plain"])
 
 
 def test_the_golden_file_of_version_1_reads_as_ever():

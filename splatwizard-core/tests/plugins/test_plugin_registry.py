@@ -7,7 +7,7 @@ import types
 import pytest
 
 from splatwizard_core.errors import PluginError
-from splatwizard_core.plugins import PluginManager, hookimpl
+from splatwizard_core.plugins import Entry, PluginManager, hookimpl
 
 
 @pytest.fixture
@@ -103,3 +103,97 @@ def test_a_name_that_is_not_there_is_a_fact_of_the_error(manager_of):
     with pytest.raises(PluginError) as caught:
         manager_of(one=adds("sum")).metrics.load("product")
     assert (caught.value.kind, caught.value.name) == ("metric", "product")
+
+
+# ------------------------------------------------------------------------------------------ ours and strangers
+
+
+@pytest.fixture
+def distributions(tmp_path, monkeypatch):
+    """distributions(("sw-hac", "hac", hook), ...): entry points of installed distributions with these metric hooks."""
+
+    def install(*plugins):
+        for name, key, hook in plugins:
+            module = types.ModuleType(f"fake_{name.replace('-', '_')}")
+            module.register_metrics = hook if hasattr(hook, "splatwizard_impl") else hookimpl(hook)
+            monkeypatch.setitem(sys.modules, module.__name__, module)
+            info = tmp_path / f"{name.replace('-', '_')}-0.1.dist-info"
+            info.mkdir()
+            (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 0.1\n")
+            (info / "entry_points.txt").write_text(f"[splatwizard]\n{key} = {module.__name__}\n")
+        return [e for d in importlib.metadata.distributions(path=[str(tmp_path)]) for e in d.entry_points]
+
+    return install
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_name_that_one_of_ours_adds_is_taken_from_strangers_whoever_comes_first(distributions, order):
+    found = distributions(*((n, n[3:], adds("new")) for n in ("sw-hac", "sw-their-a", "sw-their-b")))[::order]
+    plugins = PluginManager(found)
+    assert plugins.metrics.entry("new").distribution == "sw-hac"
+    assert plugins.metrics.clashes == {}
+    told = {entry.distribution: why for entry, why in plugins.metrics.refused}
+    assert set(told) == {"sw-their-a", "sw-their-b"}
+    assert all("a name of sw-hac" in why for why in told.values())
+
+
+def test_a_name_of_ours_is_refused_though_its_package_is_left_out(distributions):
+    plugins = PluginManager(distributions(("sw-their", "their", adds("lpips_vgg"))))
+    ((entry, why),) = plugins.refused_of(plugins.plugins[0])
+    assert (entry.name, entry.foreign) == ("lpips_vgg", True)
+    assert "a name of sw-metrics" in why
+    assert "lpips_vgg" not in plugins.metrics
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_of_two_strangers_with_one_entry_point_neither_loads_whatever_the_order(distributions, order):
+    found = distributions(("sw-a", "same", adds("a")), ("sw-b", "same", adds("b")), ("sw-c", "c", adds("c")))[::order]
+    plugins = PluginManager(found)
+    assert [p.distribution for p in plugins.broken] == ["sw-a", "sw-b"]
+    assert plugins.metrics.names == ["c"]
+    assert PluginManager(found, only={"sw-a"}).metrics.names == ["a"]
+
+
+def test_what_a_wrapper_adds_after_the_others_is_its_own(distributions):
+    @hookimpl(wrapper=True)
+    def register_metrics(registry):
+        yield
+        registry.add("late", "math:fsum", summary="a sum")
+
+    plugins = PluginManager(distributions(("sw-hac", "hac", adds("new")), ("sw-their", "their", register_metrics)))
+    assert plugins.metrics.entry("late").distribution == "sw-their"
+
+
+def test_what_a_hook_prints_is_no_output(manager_of, capsys):
+    def register_metrics(registry):
+        print("loud")
+
+    manager_of(loud=register_metrics)
+    assert capsys.readouterr() == ("", "loud\n")
+
+
+@pytest.mark.parametrize(
+    ("name", "declared", "said"),
+    [("a/b", {}, "no name"), ("", {}, "no name"), ("-x", {}, "no name"), (None, {}, "no name"),
+     ("x", {"position": float("nan")}, "no plain value"), ("x", {"label": 3}, "label=3; it must be a text"),
+     ("x", {"presets": "quick"}, "a list of texts"), ("x", {"native": "no target"}, "module:attribute")],
+)  # fmt: skip
+def test_an_entry_that_is_not_legal_is_refused_alone(manager_of, name, declared, said):
+    def register_metrics(registry):
+        registry.add(name, "math:fsum", summary="a sum", **declared)
+        registry.add("fine", "math:fsum", summary="a sum")
+
+    plugins = manager_of(one=register_metrics)
+    assert plugins.broken == []
+    assert plugins.metrics.names == ["fine"]
+    ((_, why),) = plugins.metrics.refused
+    assert said in why
+
+
+def test_a_class_with_another_name_than_its_method_cannot_be_loaded(monkeypatch):
+    module = types.ModuleType("fake_methods")
+    module.Mine = type("Mine", (), {"name": "mine"})
+    monkeypatch.setitem(sys.modules, "fake_methods", module)
+    assert Entry("method", "mine", "fake_methods:Mine", "").load() is module.Mine
+    with pytest.raises(PluginError, match="method 'yours' of sw-x 1 is called 'mine' by its class"):
+        Entry("method", "yours", "fake_methods:Mine", "", distribution="sw-x", version="1").load()

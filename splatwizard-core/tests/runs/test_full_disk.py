@@ -16,8 +16,6 @@ from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.cli.main import main
-from splatwizard_core.errors import DiskFullError
-from splatwizard_core.files import TEMPORARY
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs import run as run_module
 from splatwizard_core.runs.config import parse_set, resolve
@@ -27,6 +25,8 @@ from splatwizard_core.runs.run import run, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.training.run_log import RunLog
+from splatwizard_native import DiskFullError
+from splatwizard_native.files import TEMPORARY
 
 pytestmark = pytest.mark.pipeline
 

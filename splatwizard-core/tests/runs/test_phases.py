@@ -13,6 +13,7 @@ from splatwizard_core.plugins.origins import Origins
 from splatwizard_core.runs.config import parse_set, resolve
 from splatwizard_core.runs.directory import RunRequest, run_directory
 from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.phases import named_parts, part_of, phases_of_run
 from splatwizard_core.runs.run import run, train_in
 from splatwizard_core.runs.session import Session
 from splatwizard_core.training.stage import Stage
@@ -61,7 +62,12 @@ def finished(helped_plugins, tmp_path_factory):
 
 def test_each_phase_of_a_run_names_who_served_it(finished, expected):
     record, _ = finished
-    assert told(record.model_dump()["phases"]) == expected
+    found = told(record.model_dump()["phases"])
+    measured = [name for name, metric in record.metrics.items() if metric.per_view]
+    assert {"psnr", "ssim", "l1"} <= set(measured)
+    assert [(kind, name) for kind, name, *_ in found["evaluate"]] == [("metric", name) for name in measured]
+    assert found.pop("evaluate")[0][2] == CORE[0]
+    assert found == expected
 
 
 @pytest.mark.parametrize("stop", [2, 5])
@@ -82,6 +88,17 @@ def test_what_a_scene_that_is_started_from_asks_for_is_not_told_of_the_stage(hel
         facts = train_in(session(helped_plugins), request, directory).facts
     assert [phase["phase"] for phase in facts["phases"]] == ["train: student"]
     assert [part["kind"] for part in facts["phases"][0]["provided_by"]] == ["stage", "rasterizer"]
+
+
+def test_a_metric_without_a_value_served_nothing(helped_plugins):
+    metrics = {"psnr": {"per_view": [30.0]}, "l1": {"per_view": []}, "gone": {"per_view": [1.0]}}
+    phases = phases_of_run(helped_plugins, {"phases": []}, {"parts": []}, {"rasterizers": {}, "metrics": metrics})
+    psnr = helped_plugins.metrics.entry("psnr")
+    assert psnr.distribution == CORE[0]
+    assert told(phases)["evaluate"] == [
+        ("metric", "psnr", psnr.distribution, psnr.version), ("metric", "gone", "", ""),
+    ]  # fmt: skip
+    assert named_parts(helped_plugins, "metric", ["psnr", "psnr"]) == [part_of(psnr)]
 
 
 def test_a_thing_comes_from_the_distribution_of_its_module(helped_plugins):

@@ -17,9 +17,9 @@ from typing import Any
 
 import pytest
 
-from splatwizard_core.files import TEMPORARY
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.training.checkpoint import CheckpointStore
+from splatwizard_native.files import TEMPORARY
 
 pytestmark = pytest.mark.pipeline
 

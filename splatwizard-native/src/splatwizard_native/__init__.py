@@ -1,4 +1,4 @@
-"""C++ and CUDA modules for torch, the fused loss and Adam, and what a program asks of its machine.
+"""C++ and CUDA modules for torch, the fused loss and Adam, cores and memory of a process, progress on the terminal.
 
 Importing this imports no torch.
 """
@@ -7,8 +7,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from splatwizard_native.errors import FULL as FULL
 from splatwizard_native.errors import CompilerMissingError as CompilerMissingError
+from splatwizard_native.errors import DeviceMemoryError as DeviceMemoryError
+from splatwizard_native.errors import DiskFullError as DiskFullError
+from splatwizard_native.errors import ForeseenError as ForeseenError
 from splatwizard_native.errors import NativeBuildError as NativeBuildError
+from splatwizard_native.errors import out_of_memory as out_of_memory
 from splatwizard_native.lending import lend as lend
 
 if TYPE_CHECKING:
@@ -19,6 +24,16 @@ if TYPE_CHECKING:
     from splatwizard_native.cores import available_cores as available_cores
     from splatwizard_native.cuda_toolkit import find_nvcc as find_nvcc
     from splatwizard_native.cuda_toolkit import nvcc_version as nvcc_version
+    from splatwizard_native.files import TEMPORARY as TEMPORARY
+    from splatwizard_native.files import file_sha256 as file_sha256
+    from splatwizard_native.files import naming_full_disk as naming_full_disk
+    from splatwizard_native.files import new_folder as new_folder
+    from splatwizard_native.files import remove_folder as remove_folder
+    from splatwizard_native.files import replacing as replacing
+    from splatwizard_native.files import scratch_folder as scratch_folder
+    from splatwizard_native.files import sweep as sweep
+    from splatwizard_native.files import write_atomic as write_atomic
+    from splatwizard_native.files import write_json as write_json
     from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
     from splatwizard_native.fused.adam import adam_steps as adam_steps
     from splatwizard_native.fused.photometric import Padding as Padding
@@ -30,6 +45,9 @@ if TYPE_CHECKING:
     from splatwizard_native.memory import rss_bytes as rss_bytes
     from splatwizard_native.memory import synchronize as synchronize
     from splatwizard_native.module import NativeModule as NativeModule
+    from splatwizard_native.progress import Bar as Bar
+    from splatwizard_native.progress import duration as duration
+    from splatwizard_native.progress import track as track
     from splatwizard_native.random_states import capture_random_states as capture_random_states
     from splatwizard_native.random_states import preserved_random_states as preserved_random_states
     from splatwizard_native.random_states import restore_random_states as restore_random_states
@@ -45,13 +63,18 @@ MODULES = {
     "core_time": "CoreTime",
     "cores": "available_cores",
     "cuda_toolkit": "find_nvcc nvcc_version",
-    "errors": "CompilerMissingError NativeBuildError",
+    "errors": "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory",
+    "files": (
+        "TEMPORARY file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder sweep write_atomic "
+        "write_json"
+    ),
     "lending": "lend",
     "fused.adam": "AdamUpdate adam_steps",
     "fused.photometric": "Padding photometric",
     "machine": "describe_machine",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
+    "progress": "Bar duration track",
     "random_states": "capture_random_states preserved_random_states restore_random_states seeded",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root",

@@ -30,7 +30,7 @@ def resolve_module(target: str) -> NativeModule:
     """The NativeModule that "module:attribute" names. Raises NativeBuildError."""
     try:
         found = pkgutil.resolve_name(target)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise NativeBuildError(f"native module {target} cannot be imported: {type(error).__name__}: {error}") from error
     if not isinstance(found, NativeModule):
         raise NativeBuildError(f"{target} is not a NativeModule but {type(found).__name__}")

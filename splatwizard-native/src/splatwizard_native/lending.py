@@ -8,13 +8,21 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 
-def lend(face: str, modules: Mapping[str, str]) -> tuple[list[str], Callable[[str], Any]]:
+def lend(
+    face: str, modules: Mapping[str, str], base: Mapping[str, str] | None = None
+) -> tuple[list[str], Callable[[str], Any]]:
     """Make `__all__` and `__getattr__` of the module `face`: a package, or a module directly in it.
 
     modules     module of the package, without its name -> the names that it lends, separated by spaces
+    base        the same of modules of this package
     """
-    package = face.partition(".")[0]
-    homes = {name: f"{package}.{module}" for module, names in modules.items() for name in names.split()}
+    tables = ((face.partition(".")[0], modules), (__name__.partition(".")[0], base or {}))
+    homes = {
+        name: f"{package}.{module}"
+        for package, table in tables
+        for module, names in table.items()
+        for name in names.split()
+    }
 
     def find(name: str) -> Any:
         """Import what is asked for, once: a plugin that only registers itself imports no torch."""

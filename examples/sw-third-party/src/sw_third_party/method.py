@@ -15,7 +15,7 @@ class OpacityPrune(GaussianMethod):
 
     1. PRUNE    the most transparent Gaussians of a trained 3DGS scene
     2. TRAIN    what is left, without adding anything
-    3. ENCODE   with the codec that `codec` names: version check and limits are its own and GaussianMethod's
+    3. ENCODE   with the codec that `codec.name` says: version check and limits are its own and GaussianMethod's
     """
 
     name = "opacity-prune"

@@ -1,17 +1,43 @@
 """Hyper-parameters of 3DGS. Defaults are the paper's (the plan of the Splatwizard paper where they differ)."""
 
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
 from pydantic import Field
+from sw_gaussians.choices import Choosing, CodecChoice, Moved
 from sw_gaussians.config import GaussianTraining
 
 from splatwizard_core.api import InputFile
-from sw_codecs.models.settings import Codec
+from sw_codecs.models.settings import QuantizedSettings
+
+MODES = {"exact": "gaussians-exact", "quantized": "gaussians-quantized"}
+"""Word in the header of a file, and of `codec.mode` in configs of 0.1 -> codec."""
 
 
-class ThreeDGSConfig(GaussianTraining):
+class ThreeDGSConfig(Choosing, GaussianTraining):
     """Everything that can be set for 3DGS."""
+
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        f"codec.{name}": Moved((f"codec.settings.{name}",), field.default, MODES["quantized"])
+        for name, field in QuantizedSettings.model_fields.items()
+    }
 
     sh_degree: int = Field(3, ge=0, le=3, description="highest degree of the spherical harmonics")
     init: InputFile = Field(
         "", description="a .ply to start from, with all its SH bands active; empty: the scene's points"
     )
-    codec: Codec = Field(Codec(), description="what the file holds")
+    codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+    def translated(self, values: dict[str, Any]) -> dict[str, Any]:
+        if "codec.mode" in values:
+            mode = values.pop("codec.mode")
+            values["codec.name"] = MODES.get(mode, f"gaussians-{mode}")
+        return values
+
+    def identity(self) -> dict[str, Any]:
+        content = super().identity()
+        mode = next((mode for mode, name in MODES.items() if name == self.codec.name), None)
+        if mode is not None:
+            content["codec"]["mode"] = mode
+            del content["codec"]["name"]
+        return content

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_gaussians.method import HEADER_KEY, GaussianMethod
 from sw_gaussians.ply import load_ply
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
 
-from splatwizard_core.api import GaussianModel, Method, SceneError
-from sw_3dgs.config import ThreeDGSConfig
+from splatwizard_core.api import SceneError
+from sw_3dgs.config import MODES, ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
-from sw_codecs.models import exact, quantized
 
 if TYPE_CHECKING:
     import torch
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
 
 
-class ThreeDGS(Method):
+class ThreeDGS(GaussianMethod):
     """Kerbl, Kopanas, Leimkühler, Drettakis: 3D Gaussian Splatting for Real-Time Radiance Field Rendering, 2023.
 
     Source: arXiv 2308.04079, and the authors' code where the two differ.
@@ -56,17 +56,12 @@ class ThreeDGS(Method):
         return [ThreeDGSStage(self.config)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        if not isinstance(model, GaussianModel):
-            raise TypeError(f"3dgs encodes a GaussianModel, not a {type(model).__name__}")
-        codec = self.config.codec
-        writer.static["mode"] = codec.mode
-        if codec.mode == "exact":
-            exact.encode(model, writer)
-        else:
-            quantized.encode(model, writer, codec, self.plugins)
+        """Write the model with the chosen codec, which the header calls `mode`, or `codec` if it is not one of two."""
+        super().encode(model, writer)
+        mode = next((mode for mode, name in MODES.items() if name == writer.static[HEADER_KEY]), None)
+        if mode is not None:
+            writer.static["mode"] = mode
+            del writer.static[HEADER_KEY]
 
-    def decode(self, reader: ContainerReader) -> SplatModel:
-        self.check_version(reader)
-        if reader.text("mode", choices=("exact", "quantized")) == "exact":
-            return exact.decode(reader)
-        return quantized.decode(reader, self.plugins)
+    def codec_of(self, reader: ContainerReader) -> str:
+        return MODES[reader.text("mode", choices=list(MODES))] if "mode" in reader.static else super().codec_of(reader)

@@ -35,13 +35,13 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 def _quantized(bits: int, dc: float, rest: float, opacity: float, scale: float, quat: float) -> dict[str, Any]:
     return {
-        "codec.mode": "quantized",
-        "codec.position_bits": bits,
-        "codec.dc_step": dc,
-        "codec.rest_step": rest,
-        "codec.opacity_step": opacity,
-        "codec.scale_step": scale,
-        "codec.quat_step": quat,
+        "codec.name": "gaussians-quantized",
+        "codec.settings.position_bits": bits,
+        "codec.settings.dc_step": dc,
+        "codec.settings.rest_step": rest,
+        "codec.settings.opacity_step": opacity,
+        "codec.settings.scale_step": scale,
+        "codec.settings.quat_step": quat,
     }
 
 
@@ -51,5 +51,5 @@ RATES: Mapping[str, Mapping[str, Any]] = {
     "r3": _quantized(15, 0.07, 0.055, 0.25, 0.1, 0.022),
     "r4": _quantized(16, 0.04, 0.028, 0.15, 0.06, 0.012),
     "r5": _quantized(18, 0.02, 0.012, 0.08, 0.03, 0.007),
-    "r6": {"codec.mode": "exact"},
+    "r6": {"codec.name": "gaussians-exact"},
 }

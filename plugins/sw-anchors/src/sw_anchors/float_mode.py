@@ -41,7 +41,7 @@ def read_mode(reader: ContainerReader) -> Mode:
         shown = " with torch ".join(str(v)[:40] for v in theirs.values()) if isinstance(theirs, dict) else "unknown"
         raise BitstreamError(
             f"{reader.name}: mode 'float' decodes only where it was encoded ({shown}), this is {ours['device']} with "
-            f"torch {ours['torch']}: encode with codec.mode=exact",
+            f"torch {ours['torch']}: encode with codec.settings.mode=exact",
             section="header",
         )
     return "float"

@@ -5,7 +5,6 @@ Source: Scaffold-GS (arXiv 2312.00109) as trained by HAC (arXiv 2403.14530); the
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from splatwizard_core.api import (
     SplatOptimizer,
     Stage,
     StageContext,
+    TaskLog,
     photometric_loss,
 )
 from sw_anchors.anchors import AnchorModel
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from splatwizard_core.api import OptimizationParams, PipelineParams, Scene, Scheduler, SplatModel, View
-
-log = logging.getLogger(__name__)
 
 
 class AnchorStage(Stage):
@@ -98,7 +96,8 @@ class AnchorStage(Stage):
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         growth = self.opt.growth
         scheduler.register_task(self.when(range(growth.stop)), self.collect_gradient_statistics)
-        for start, stop in ((growth.start, growth.pause_start), (growth.pause_end, growth.stop)):
+        pause_end = max(growth.start, growth.pause_start, growth.pause_end)
+        for start, stop in ((growth.start, min(growth.pause_start, growth.stop)), (pause_end, growth.stop)):
             if start < stop:
                 scheduler.register_task(self.when(range(start, stop, growth.interval)), self.adjust_anchor)
 
@@ -113,15 +112,19 @@ class AnchorStage(Stage):
             assert result.grad2d is not None
             accumulate_anchor_statistics(model, result.extras["anchors"], result.grad2d.value, result.radii)
 
-    def adjust_anchor(self, model: AnchorModel, optimizer: SplatOptimizer, step: int) -> None:
-        """Grow and prune anchors."""
+    def adjust_anchor(
+        self, model: AnchorModel, optimizer: SplatOptimizer, step: int, log: TaskLog | None = None
+    ) -> None:
+        """Grow and prune anchors; curves "grown" and "pruned"."""
         growth = self.opt.growth
         report = adjust_anchors(
             model, optimizer, step=step, generator=self.growth_draws, interval=self.steps(growth.interval),
             success=growth.success, grad_threshold=growth.grad_threshold, min_opacity=growth.min_opacity,
             levels=growth.levels, init_factor=growth.init_factor, hierarchy=growth.hierarchy,
         )  # fmt: skip
-        log.debug("step %d: %s", step, report)
+        if log is not None:
+            log.scalar("grown", report.grown)
+            log.scalar("pruned", report.pruned)
 
     # Loss
 

@@ -50,13 +50,13 @@ LIMITS = {
 def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> None:
     """Write all sections; the model stays as it is."""
     geometry, rows = kept_geometry(model)
-    mode = config.codec.mode
+    mode = config.codec.settings.mode
     context = _settled_context(model, geometry, config)
     networks = {name: copy.deepcopy(getattr(model, name)).cpu() for name in model.NETWORKS} | _networks(context)
-    round_networks(networks, config.codec.weights)
+    round_networks(networks, config.codec.settings.weights)
     _write_shape(writer, context.shape, config, context.resolution)
     add_geometry(writer, geometry)
-    add_networks(writer, networks, config.codec.weights)
+    add_networks(writer, networks, config.codec.settings.weights)
     writer.add_array("frame", context.frame.numpy().astype("<f4"))
     planes = [plane.numpy() for plane in context.triplane.integers()]
     writer.require("context model", "spatial-ar")
@@ -173,12 +173,12 @@ def _use_integers(context: CatContext, planes: list[np.ndarray]) -> None:
 
 def _write_shape(writer: ContainerWriter, shape: ContextShape, config: CatConfig, resolution: int) -> None:
     writer.static.update(
-        mode=config.codec.mode, feature_dim=shape.features, hidden=config.hidden, channels=shape.channels,
+        mode=config.codec.settings.mode, feature_dim=shape.features, hidden=config.hidden, channels=shape.channels,
         multiples=list(shape.multiples), resolution=resolution, context_hidden=shape.hidden, slices=list(shape.slices),
         slice_hidden=shape.slice_hidden, refine=int(shape.refine),
         base_steps=list(shape.base_steps),
     )  # fmt: skip
-    add_machine(writer, config.codec.mode)
+    add_machine(writer, config.codec.settings.mode)
 
 
 def _read_shape(reader: ContainerReader) -> tuple[ContextShape, int, int]:

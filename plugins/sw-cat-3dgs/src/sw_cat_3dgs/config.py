@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
+from sw_gaussians.choices import Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 
@@ -99,7 +101,7 @@ class ContextLearningRates(Params):
     spatial_init: float = Field(0.005, gt=0, description="of the spatial models before the warm-up")
 
 
-class Codec(Params):
+class FileSettings(Params):
     """Settings of the file."""
 
     mode: Literal["exact", "float"] = Field(
@@ -108,10 +110,20 @@ class Codec(Params):
     weights: Literal["float32", "float16"] = Field("float32", description="how weights of networks are stored")
 
 
-class CatConfig(CodedAnchorParams):
+class Codec(OwnCodec):
+    """The file of CAT-3DGS, which no other codec can write."""
+
+    name: Literal["cat-3dgs"] = Field("cat-3dgs", description="the file of CAT-3DGS")
+    settings: FileSettings = Field(FileSettings(), description="settings of the file")
+
+
+class CatConfig(Choosing, CodedAnchorParams):
     """Everything that can be set for CAT-3DGS."""
 
     FULL_ITERATIONS: ClassVar[int] = FULL_RUN
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        f"codec.{name}": Moved((f"codec.settings.{name}",)) for name in FileSettings.model_fields
+    }
 
     iterations: int = Field(FULL_RUN, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     bound_margin: Literal["hac", "extent", "none"] = Field(
@@ -123,7 +135,7 @@ class CatConfig(CodedAnchorParams):
     steps: Steps = Field(Steps(), description="base steps of the quantisers")
     context: Context = Field(Context(), description="the models that predict attributes")
     rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
-    codec: Codec = Field(Codec(), description="what the file holds")
+    codec: Codec = Field(Codec(), description="what writes the file")
 
     @property
     def margin(self) -> Margin:

@@ -47,7 +47,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "context.start": "statistics",
         "rate_term.scale": 0.25,
         "rate_term.triplane_sample": 0.125,
-        "codec.weights": "float16",
+        "codec.settings.weights": "float16",
     },
 }
 

@@ -12,7 +12,7 @@ from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
 
-from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer
+from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer, TaskLog
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.model import CatAnchors, Trained
 
@@ -65,7 +65,8 @@ class CatStage(CodedAnchorStage):
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         phases = self.opt.phases
         scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_lr)
-        scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_cam_mask)
+        counting = max(self.opt.lr.max_steps, self.opt.growth.stop)  # as long as anchors come and go
+        scheduler.register_task(self.when(range(counting)), self.update_cam_mask)
         scheduler.register_task(1, self.update_anchor_bound)
         PhaseSwitch(self.at(phases.quantize), QUANTIZED).register(scheduler)
         scheduler.register_task(self.at(phases.triplane), self.update_anchor_bound)
@@ -84,8 +85,10 @@ class CatStage(CodedAnchorStage):
                 self._cameras = [view.camera.to(model.device) for view in cameras]
             model.count_views(self._cameras, rasterizer)
 
-    def adjust_anchor(self, model: CatAnchors, optimizer: SplatOptimizer, step: int) -> None:  # type: ignore[override]
-        super().adjust_anchor(model, optimizer, step)
+    def adjust_anchor(  # type: ignore[override]
+        self, model: CatAnchors, optimizer: SplatOptimizer, step: int, log: TaskLog | None = None
+    ) -> None:
+        super().adjust_anchor(model, optimizer, step, log)
         model.views_stale = True  # also if as many came as went
 
     def setup_triplane(self, model: CatAnchors, optimizer: SplatOptimizer) -> None:

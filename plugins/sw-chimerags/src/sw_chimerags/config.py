@@ -3,13 +3,15 @@
 Defaults: the code of the Splatwizard paper's authors and the two methods whose parts these are; the paper has none.
 """
 
+from collections.abc import Mapping
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from sw_finetuning.distillation import DistillLoss
 from sw_finetuning.fine_tuning import FineTuningRates
+from sw_gaussians.choices import Choice, Choosing, Moved, PrunerChoice
 
-from splatwizard_core.api import OptimizationParams, Params
+from splatwizard_core.api import Params
 
 
 class Train(Params):
@@ -47,28 +49,22 @@ class Distill(Params):
     lr: FineTuningRates = Field(FineTuningRates(), description="step sizes")
 
 
-class Score(Params):
+class Score(PrunerChoice):
     """The pruner whose scores say how much each Gaussian matters for the file."""
 
-    pruner: str = Field("lightgaussian", description="whose scores: any registered pruner, with its own settings")
-    v_pow: float = Field(0.1, ge=0, description="power of the volume in the score of lightgaussian")
+    pruner: str = Field("lightgaussian", description="whose scores: any registered pruner")
 
 
-class VQ(Params):
-    """The vectors of colour, each group with a codebook of its own."""
+class Codec(Choice):
+    """The coder of the vectors of colour, each group with a codebook of its own."""
 
-    codec: str = Field("importance-vq", description="coder of vectors, by name; the keys below are those of this one")
-    preset: Literal["own", "toolkit"] = Field(
-        "own", description="toolkit: the codebook is trained by the rule of the authors' code"
-    )
-    training: Literal["ema", "kmeans"] = Field(
-        "ema", description="else: by moving averages over batches, or by passes over all vectors"
-    )
-    ratio2: float = Field(0.8, ge=0, le=1, description="share of the degree-2 group that shares the codebook")
-    ratio3: float = Field(0.6, ge=0, le=1, description="the same of the degree-3 group")
-    size: int = Field(8192, ge=2, le=1 << 16, description="entries of each codebook, at most one for 4 such vectors")
-    iterations: int = Field(1_000, ge=0, description="updates of the codebook")
-    batch: int = Field(80_000, ge=1, description="vectors of each update")
+    REGISTRY: ClassVar[str] = "vector_coders"
+    PARTS: ClassVar[tuple[str, ...]] = ("sh2", "sh3")
+
+    name: str = Field("importance-vq", description="coder of vectors: any registered one")
+    settings: dict[str, object] = Field({}, description="settings of the chosen one, by its own keys")
+    sh2: dict[str, object] = Field({"ratio": 0.8}, description="settings for the degree-2 group alone, which win")
+    sh3: dict[str, object] = Field({"ratio": 0.6}, description="the same for the degree-3 group")
 
 
 class Steps(Params):
@@ -80,10 +76,23 @@ class Steps(Params):
     quats: float = Field(0, ge=0, le=0.25, description="the same of the quaternions, which get length 1 and w >= 0")
 
 
-class ChimeraConfig(OptimizationParams):
+_SHARED = {"training": "ema", "size": 8192, "iterations": 1_000, "batch": 80_000}
+_SIGNIFICANCE = {"kind": "v_important_score", "volume_norm": "unclamped", "use_transmittance": True}
+_VQ = {"ratio": 0.6, "rows_per_code": 4.0, "decay": 0.8, "reseed": 10}
+"""Settings of `lightgaussian` and of `importance-vq` that 0.1 did not offer here."""
+
+
+class ChimeraConfig(Choosing):
     """Everything that can be set for ChimeraGS."""
 
-    ENCODING: ClassVar[tuple[str, ...]] = ("vq", "steps", "xyz", "prefer")
+    ENCODING: ClassVar[tuple[str, ...]] = ("codec", "steps", "xyz", "prefer", "vq")
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        "vq.codec": Moved(("codec.name",), "importance-vq"),
+        "vq.ratio2": Moved(("codec.sh2.ratio",), 0.8, "importance-vq"),
+        "vq.ratio3": Moved(("codec.sh3.ratio",), 0.6, "importance-vq"),
+        **{f"vq.{k}": Moved((f"codec.settings.{k}",), v, "importance-vq") for k, v in _SHARED.items()},
+        "score.v_pow": Moved(("score.settings.v_pow",), 0.1, "lightgaussian"),
+    }
 
     train: Train = Field(Train(), description="stage 1")
     student: dict[str, Any] = Field(
@@ -92,7 +101,7 @@ class ChimeraConfig(OptimizationParams):
     distill: Distill = Field(Distill(), description="stage 2")
     mask: Mask = Field(Mask(), description="which Gaussians keep SH degree 3")
     score: Score = Field(Score(), description="whose colours are kept")
-    vq: VQ = Field(VQ(), description="the colours in the file")
+    codec: Codec = Field(Codec(), description="the colours in the file")
     steps: Steps = Field(Steps(), description="roundings of what the file holds in float16")
     xyz: Literal["float32", "float16", "uniform16"] = Field(
         "float32", description="positions in the file: without loss, rounded, or on 2^16 steps of the bounding box"
@@ -101,3 +110,17 @@ class ChimeraConfig(OptimizationParams):
         ["flash", "tcgs", "speedy", "standard"],
         description="what should draw the file, best first; any other rasterizer if none of them can",
     )
+
+    def translated(self, values: dict[str, Any]) -> dict[str, Any]:
+        if values.pop("vq.preset", "own") == "toolkit":
+            values["vq.training"] = "official"
+        return values
+
+    def identity(self) -> dict[str, Any]:
+        content = super().identity()
+        if content["score"].get("settings") == _SIGNIFICANCE:
+            del content["score"]["settings"]
+        if content["codec"] == {"settings": _VQ, "sh2": {}, "sh3": {}}:
+            del content["codec"]
+            content["vq"]["preset"] = "own"
+        return content

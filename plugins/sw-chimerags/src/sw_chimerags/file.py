@@ -18,7 +18,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from splatwizard_core.api import BitstreamError, ConfigError, GaussianModel, SplatwizardError
+from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
 from sw_chimerags.model import DEGREE, LOWER, TENSORS, MaskedGaussians
 
 if TYPE_CHECKING:
@@ -35,13 +35,6 @@ BITS = 16  # bits an axis of the positions `uniform16`
 ROW_BYTES = 4 * (3 + 8 + 3 * (DEGREE + 1) ** 2)  # of a decoded Gaussian
 
 Arrays = dict[str, NDArray[Any]]
-
-
-def check_coder(plugins: PluginManager, name: str) -> None:
-    """Raise ConfigError if no coder of vectors is called so."""
-    if name not in plugins.vector_coders:
-        installed = ", ".join(plugins.vector_coders.names)
-        raise ConfigError(f"no coder of vectors is called '{name}'; installed: {installed}", key="vq.codec")
 
 
 def encode(
@@ -61,10 +54,9 @@ def encode(
     steps       roundings before float16
     xyz         one of POSITIONS
 
-    Raises ConfigError for a coder that there is not, SplatwizardError for values that are not finite and for a model
+    Raises PluginError for a coder that there is not, SplatwizardError for values that are not finite and for a model
     whose importance is not that of its Gaussians.
     """
-    check_coder(plugins, coder)
     if not model.has_importance():
         raise SplatwizardError(
             "the model was changed since the importance of its Gaussians was computed: `distill` computes it at its end"

@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from sw_finetuning.pruners import load_pruner
-
 from splatwizard_core.api import ConfigError, Method, create_method
 from sw_chimerags import file
 from sw_chimerags.config import ChimeraConfig
@@ -58,24 +56,19 @@ class ChimeraGS(Method):
         return self._student().create_model(scene, generator)
 
     def stages(self) -> Sequence[Stage]:
-        file.check_coder(self.plugins, self.config.vq.codec)  # now, and not when all is trained
+        self.config.codec.provider(self.plugins, "codec.name")  # now, and not when all is trained
         quantizer = self.plugins.quantizers.load("ste-mask")(self.config.mask.threshold)
-        score = self.config.score  # whose scores say how well the file keeps a Gaussian
-        pruner = load_pruner(self.plugins, score.pruner, {"lightgaussian": {"v_pow": score.v_pow}}, key="score.pruner")
+        pruner = self.config.score.load(self.plugins, "score.pruner")  # how well the file keeps a Gaussian
         return [*self._student().stages(), MaskedDistillation(self.config, quantizer, pruner)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, MaskedGaussians):
             raise TypeError(f"chimerags encodes what it has distilled, not a {type(model).__name__}")
-        vq = self.config.vq
-        settings: dict[str, dict[str, Any]] = {}
-        if vq.codec == "importance-vq":
-            training = "official" if vq.preset == "toolkit" else vq.training
-            shared = {"size": vq.size, "iterations": vq.iterations, "batch": vq.batch, "training": training}
-            settings = {"sh2": {"ratio": vq.ratio2, **shared}, "sh3": {"ratio": vq.ratio3, **shared}}
+        codec = self.config.codec
+        groups = {"sh2": codec.sh2, "sh3": codec.sh3}
         file.encode(
-            model, writer, self.plugins,
-            coder=vq.codec, settings=settings, steps=self.config.steps, xyz=self.config.xyz,
+            model, writer, self.plugins, coder=codec.name, steps=self.config.steps, xyz=self.config.xyz,
+            settings={group: {**codec.settings, **own} for group, own in groups.items()},
         )  # fmt: skip
         if self.config.prefer:
             writer.raster["prefer"] = list(self.config.prefer)

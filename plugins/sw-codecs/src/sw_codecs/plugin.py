@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         gaussian_exact,
         mixture,
     )
-    from sw_codecs.models import codecs
+    from sw_codecs.models import codecs, raht_codec
     from sw_codecs.positions import draco, octree, plain
     from sw_codecs.quantizers import (
         binary,
@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     ]  # fmt: skip
     VECTOR_CODERS: list[Callable[..., api.VectorCoder]] = [residual_vq.ResidualVQ]
     GAUSSIAN_CODECS: list[Callable[..., api.GaussianCodec]] = [
-        codecs.Exact, codecs.Quantized, codecs.Ply, codecs.Lossless,
+        codecs.Exact, codecs.Quantized, codecs.Ply, codecs.Lossless, raht_codec.Raht,
     ]  # fmt: skip
 
 
@@ -148,3 +148,5 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="whole Gaussian models, the .ply of 3DGS bit for bit")  # fmt: skip
     registry.add("gaussians-zstd", "sw_codecs.models.codecs:Lossless", codes="gaussians",
                  summary="whole Gaussian models, float32 as trained, packed without loss")  # fmt: skip
+    registry.add("raht", "sw_codecs.models.raht_codec:Raht", codes="gaussians",
+                 summary="whole Gaussian models: RAHT over an octree, a codebook for SH bands")  # fmt: skip

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import os
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from splatwizard_core.api import PluginError
 from splatwizard_core.tooling import Check, Entry, load_plugins
 from sw_doctor import child, compilers, packages, system
+from sw_doctor.cures import cure_of
 from sw_doctor.registered import MAIN_JOB, SECONDS, needs_of, run_registered
-from sw_doctor.text import SLOWLY, one_line
+from sw_doctor.text import OF, SLOWLY, one_line
 
 DIED_IN = {"torch": ("torch", "CUDA"), "rasterizers": ("rasterizers",), MAIN_JOB: ("sw run",)}
 PROBE = "sw_doctor.probe"
@@ -50,9 +53,8 @@ def examine() -> Diagnosis:
         probe = pool.submit(child.ask, PROBE, timeout=SECONDS)
         cxx = pool.submit(_guarded, "C++", compilers.check_cxx)
         nvcc = pool.submit(_guarded, "nvcc", compilers.check_nvcc)
-        checks, distributions = plugin_checks()
+        checks, needs = plugin_checks()
         registered = [(entry, pool.submit(run_registered, entry)) for entry in registered_entries()]
-        needs = packages.collect_needs(distributions)
         problems = pool.submit(packages.try_imports, needs.names())
         for check in (system.check_python, system.check_memory, system.check_cores, system.check_cache,
                       system.check_working_folder):  # fmt: skip
@@ -73,23 +75,29 @@ def examine() -> Diagnosis:
 
 
 def probed(answer: child.Answer) -> list[Check]:
-    """Findings of the probe; the step that it died in, if it died, is broken, and with it the main job."""
+    """Findings of the probe; the step that it died in, if it died, is broken, and with it the main job.
+
+    After the main job only what strangers provide is tried: dying there decides nothing.
+    """
     checks = list(answer.checks)
     if answer.died_in is not None:
         step, how = answer.died_in
         group = next((g for g, steps in DIED_IN.items() if step in steps), "kernels" if ":" in step else "plugins")
+        needed = not any(check.group == MAIN_JOB for check in checks)
         mend = "sw build-kernels --force" if group == "kernels" else "pip install --force-reinstall torch"
-        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, True))
+        if OF in step:
+            mend = cure_of(step.partition(OF)[2], how, foreign=True)
+        checks.append(Check(group, step, "broken", f"the process that tried it {how}", mend, needed))
     return checks
 
 
-def plugin_checks() -> tuple[list[Check], list[str]]:
-    """Check every plugin, and every name that several claim; also return the names of the distributions."""
+def plugin_checks() -> tuple[list[Check], packages.Needs]:
+    """Check every plugin, and every name that several claim or may not have; also return what they all need."""
     try:
         plugins = load_plugins()
     except PluginError as error:
         wrong = Check("plugins", "SW_PLUGINS", "broken", one_line(error), "unset SW_PLUGINS", True)
-        return [wrong], ["splatwizard-core"]
+        return [wrong], packages.collect_needs(["splatwizard-core"])
     checks = []
     restricted = os.environ.get("SW_PLUGINS")
     if restricted is not None:
@@ -100,15 +108,33 @@ def plugin_checks() -> tuple[list[Check], list[str]]:
             provided = len(plugins.provided_by(info))
             checks.append(Check("plugins", info.distribution, "ok", f"{info.version}, provides {provided}"))
             continue
-        _, found, advice = info.error.rpartition("pip install ")
-        mend = f"pip install {advice}" if found else f"pip install --upgrade --force-reinstall {info.distribution}"
+        mend = cure_of(info.distribution, info.error, foreign=info.foreign)
         checks.append(Check("plugins", info.distribution, "broken", one_line(f"{info.version}: {info.error}"), mend))
+    for info in plugins.plugins:
+        for entry, why in plugins.refused_of(info):
+            detail = one_line(f"{info.distribution} {info.version} adds it in vain: {why}")
+            checks.append(Check("plugins", f"{entry.kind} {entry.name}", "broken", detail,
+                                f"pip uninstall {info.distribution}  (what else it provides works)"))  # fmt: skip
     for kind, registry in plugins.registries.items():
         for name, entries in registry.clashes.items():
             owners = [e.distribution for e in entries]
             checks.append(Check("plugins", f"{kind} {name}", "broken", f"claimed by {' and '.join(owners)}",
-                                f"pip uninstall {owners[-1]}"))  # fmt: skip
-    return checks, [info.distribution for info in plugins.plugins]
+                                f"pip uninstall {'  (or: pip uninstall '.join(owners[:2])})"))  # fmt: skip
+    checks += [twice for info in plugins.plugins if (twice := check_shadowed(info.distribution)) is not None]
+    theirs = [info.distribution for info in plugins.plugins if info.foreign]
+    ours = [info.distribution for info in plugins.plugins if not info.foreign]
+    return checks, packages.collect_needs(ours, theirs)
+
+
+def check_shadowed(distribution: str) -> Check | None:
+    """A distribution in two places, of which the first on the path hides the other; None: it is in one."""
+    found = {Path(str(d.locate_file(""))).resolve(): d for d in importlib.metadata.distributions(name=distribution)}
+    if len(found) < 2:
+        return None
+    (used, first), (hidden, second) = list(found.items())[:2]
+    detail = f"{first.version} in {used} is used, {second.version} in {hidden} is shadowed by it"
+    mend = f"pip uninstall {distribution}  (until it is gone; then install the one that you want)"
+    return Check("plugins", f"{distribution} twice", "broken", one_line(detail), mend)
 
 
 def registered_entries() -> list[Entry]:

@@ -26,10 +26,12 @@ class Needs:
     """Third-party requirements of the distributions that `sw` is made of.
 
     required    distribution name -> requirement, of all together
+    theirs      those names in `required` that only strangers' packages need
     extras      "dist[extra]" -> its requirements
     """
 
     required: dict[str, Requirement] = field(default_factory=dict)
+    theirs: set[str] = field(default_factory=set)
     extras: dict[str, list[Requirement]] = field(default_factory=dict)
 
     def names(self) -> list[str]:
@@ -38,21 +40,25 @@ class Needs:
         return list(dict.fromkeys([*self.required, *optional]))
 
 
-def collect_needs(distributions: Iterable[str]) -> Needs:
+def collect_needs(distributions: Iterable[str], theirs: Iterable[str] = ()) -> Needs:
     """Read the metadata of these distributions, and of those below the core, which are no plugins.
 
-    What they need of each other is not listed.
+    theirs  distributions of strangers among the plugins
+
+    What they need of each other is not listed, nor what a stranger needs and has not: its plugin's line tells that.
     """
     needs = Needs()
-    names = list(dict.fromkeys(distributions))
+    foreign = set(theirs)
+    names = list(dict.fromkeys([*distributions, *foreign]))
     ours = {canonicalize_name(name) for name in names}
     for name in names:
         try:
             dist = importlib.metadata.distribution(name)
-        except PackageNotFoundError:
+            lines = dist.requires or []
+        except (PackageNotFoundError, UnicodeDecodeError):
             continue
         extras = dist.metadata.get_all("Provides-Extra") or []
-        for text in dist.requires or []:
+        for text in lines:
             try:
                 requirement = Requirement(text)
             except InvalidRequirement:
@@ -64,7 +70,12 @@ def collect_needs(distributions: Iterable[str]) -> Needs:
             if key in ours or key.startswith("sw-"):
                 continue  # the plugins' own check
             if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
-                needs.required.setdefault(key, requirement)
+                if name not in foreign:
+                    needs.theirs.discard(key)
+                    needs.required.setdefault(key, requirement)
+                elif key not in needs.required and installed(requirement) is None:
+                    needs.theirs.add(key)
+                    needs.required[key] = requirement
                 continue
             for extra in extras:
                 if requirement.marker.evaluate({"extra": extra}):
@@ -123,7 +134,7 @@ def package_checks(needs: Needs, problems: dict[str, str | None]) -> list[Check]
         spec = str(requirement).partition(";")[0].strip()
         state: State = "missing" if why == "is not installed" else "broken"
         mend = f"pip install {'' if state == 'missing' else '--upgrade --force-reinstall '}'{spec}'"
-        checks.append(Check("packages", name, state, f"{name} {why}", mend, needed=True))
+        checks.append(Check("packages", name, state, f"{name} {why}", mend, needed=name not in needs.theirs))
     checks.append(Check("packages", "required", "ok", f"{sound} of {len(needs.required)} packages work"))
     return checks + [_extra_check(extra, found, problems) for extra, found in needs.extras.items()]
 

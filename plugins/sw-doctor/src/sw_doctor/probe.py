@@ -20,13 +20,15 @@ from splatwizard_core.api import PluginError, PluginManager, SplatwizardError
 from splatwizard_core.tooling import (
     Check,
     Entry,
+    PluginInfo,
     State,
     declared_modules,
     load_plugins,
 )
 from splatwizard_native import NativeBuildError, NativeModule
 from sw_doctor.child import Step, serve
-from sw_doctor.text import SLOWLY, one_line
+from sw_doctor.cures import cure_of
+from sw_doctor.text import OF, SLOWLY, one_line
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
@@ -46,12 +48,25 @@ def steps() -> Iterator[tuple[str, Step]]:
         plugins = load_plugins()
     except PluginError:  # $SW_PLUGINS names one that is not there: the asking process says so
         return
-    for target in declared_modules(plugins):
+    theirs = {t for registry in plugins.registries.values() for e in registry if e.foreign for t in _native(e)}
+    targets = declared_modules(plugins)
+    for target in [t for t in targets if t not in theirs]:
         yield target, lambda target=target: [check_kernels(target)]  # type: ignore[misc]
-    yield "entries", lambda: check_entries(plugins)
-    yield "rasterizers", lambda: check_rasterizers(plugins)
-    yield "scenes", lambda: [check_scenes(plugins)]
     yield "sw run", lambda: [check_main_job(plugins)]
+    yield "rasterizers", lambda: check_rasterizers(plugins)
+    yield "entries", lambda: check_entries(plugins)
+    # From here on strangers' code is run as well, and may end this process: each step names whose.
+    for info in (each for each in plugins.plugins if each.foreign):
+        yield f"entries{OF}{info.distribution}", lambda info=info: check_theirs(plugins, info)  # type: ignore[misc]
+    for target in [t for t in targets if t in theirs]:
+        yield target, lambda target=target: [check_kernels(target)]  # type: ignore[misc]
+    yield "scenes", lambda: [check_scenes(plugins)]
+
+
+def _native(entry: Entry) -> list[str]:
+    """Targets of the native modules that an entry declares."""
+    declared = entry.declared.get("native") or ()
+    return [declared] if isinstance(declared, str) else list(declared)
 
 
 def _imports(module: str) -> bool:
@@ -136,7 +151,7 @@ def check_kernels(target: str) -> Check:
     """Load a native module if it is built; it compiles nothing."""
     try:
         module = pkgutil.resolve_name(target)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         why = one_line(f"cannot be imported: {type(error).__name__}: {error}")
         return Check("kernels", target, "broken", why, "install the package again")
     if not isinstance(module, NativeModule):
@@ -161,25 +176,39 @@ def check_kernels(target: str) -> Check:
 
 
 def check_entries(plugins: PluginManager) -> list[Check]:
-    """Import every lazy target of every plugin."""
-    checks, loaded = [], 0
-    for registry in plugins.registries.values():
-        for entry in registry:
-            try:
-                entry.load()
-            except (PluginError, SystemExit) as error:
-                mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
-                checks.append(Check("plugins", f"{entry.kind} {entry.name}", "broken", one_line(error), mend))
-            else:
-                loaded += 1
-    return [Check("plugins", "entries", "ok", f"{loaded} methods, rasterizers, coders, ... load"), *checks]
+    """Import every lazy target of every plugin of ours."""
+    ours = [entry for registry in plugins.registries.values() for entry in registry if not entry.foreign]
+    broken = _broken_targets(ours)
+    loaded = len(ours) - len(broken)
+    return [Check("plugins", "entries", "ok", f"{loaded} methods, rasterizers, coders, ... load"), *broken]
+
+
+def check_theirs(plugins: PluginManager, info: PluginInfo) -> list[Check]:
+    """Import every lazy target of a stranger's plugin, and let its rasterizers draw."""
+    entries = plugins.provided_by(info)
+    broken = _broken_targets(entries)
+    failed = {check.name for check in broken}
+    drawing = [e for e in entries if e.kind == "rasterizer" and f"{e.kind} {e.name}" not in failed]
+    return [*broken, *(_check_rasterizer(entry, plugins) for entry in drawing)]
+
+
+def _broken_targets(entries: Iterable[Entry]) -> list[Check]:
+    """Return one finding for each entry whose target cannot be imported."""
+    checks = []
+    for entry in entries:
+        try:
+            entry.load()
+        except PluginError as error:
+            mend = cure_of(entry.distribution, str(error), foreign=entry.foreign)
+            checks.append(Check("plugins", f"{entry.kind} {entry.name}", "broken", one_line(error), mend))
+    return checks
 
 
 def check_rasterizers(plugins: PluginManager) -> list[Check]:
-    """Let every rasterizer that can run here without a compiler draw a small picture, forward and backward."""
+    """Let every rasterizer of ours that can run here without a compiler draw a small picture, forward and backward."""
     if not len(plugins.rasterizers):
         return [Check("rasterizers", "none", "missing", "none is installed", _how_to_get([RASTERIZERS]))]
-    return [_check_rasterizer(entry, plugins) for entry in plugins.rasterizers]
+    return [_check_rasterizer(entry, plugins) for entry in plugins.rasterizers if not entry.foreign]
 
 
 def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
@@ -188,8 +217,13 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
     from splatwizard_core.api import RasterizerInfo
     from splatwizard_core.tooling import NegotiatedRasterizer
 
-    device = "cpu" if "cpu" in entry.declared.get("devices", ("cpu",)) else "cuda"
-    where = ", ".join(entry.declared.get("devices", ("cpu",)))
+    try:
+        info = RasterizerInfo.from_entry(entry)
+    except PluginError as error:
+        mend = cure_of(entry.distribution, str(error), foreign=entry.foreign)
+        return Check("rasterizers", entry.name, "broken", one_line(error), mend)
+    device = "cpu" if "cpu" in info.devices else "cuda"
+    where = ", ".join(sorted(info.devices))
     if device == "cuda" and not torch.cuda.is_available():
         return Check("rasterizers", entry.name, "missing", f"runs on {where} only, and there is none")
     lacking = _lacking_kernels(entry)
@@ -197,17 +231,16 @@ def _check_rasterizer(entry: Entry, plugins: PluginManager) -> Check:
         detail = f"its kernels '{lacking.name}' are not loaded"
         return Check("rasterizers", entry.name, lacking.state, detail, lacking.mend)
     try:
-        why = RasterizerInfo.from_entry(entry).obstacle(device)
+        why = info.obstacle(device)
         if why is not None:
             what, mend = _with_command_apart(why)
             return Check("rasterizers", entry.name, "missing", one_line(what), mend)
-        exactness = entry.declared.get("exactness", "exact")
+        entry.load()()  # for its own error: the choice below would tell of all others
         alone = [name for name in plugins.rasterizers.names if name != entry.name]
-        rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=alone, exactness=[exactness])
-        flat = "SURFEL" in entry.declared.get("needs", ())
-        _draw(rasterizer, device, backward="BACKWARD" in entry.declared.get("features", ()), axes=2 if flat else 3)
-    except Exception as error:
-        mend = f"pip install --force-reinstall --no-deps {entry.distribution}"
+        rasterizer = NegotiatedRasterizer(plugins, device=device, prefer=[entry.name], forbid=alone)
+        _draw(rasterizer, device, backward="BACKWARD" in info.features, axes=2 if "SURFEL" in info.needs else 3)
+    except (Exception, SystemExit) as error:
+        mend = cure_of(entry.distribution, str(error), foreign=entry.foreign)
         return Check("rasterizers", entry.name, "broken", one_line(f"{type(error).__name__}: {error}"), mend)
     return Check("rasterizers", entry.name, "ok", f"drew a test picture on {device} (runs on {where})")
 
@@ -220,8 +253,7 @@ def _with_command_apart(why: str) -> tuple[str, str | None]:
 
 def _lacking_kernels(entry: Entry) -> Check | None:
     """Finding about a native module that this rasterizer needs and that did not load; None if all did."""
-    native = entry.declared.get("native") or ()
-    checks = [check_kernels(target) for target in ((native,) if isinstance(native, str) else native)]
+    checks = [check_kernels(target) for target in _native(entry)]
     return next((check for check in checks if check.state != "ok"), None)
 
 
@@ -269,11 +301,9 @@ def check_scenes(plugins: PluginManager) -> Check:
         return Check("data", "SPLATWIZARD_DATA", "broken", f"{error.filename}: {error.strerror}", mend)
     if not len(plugins.datasets):
         return Check("data", "SPLATWIZARD_DATA", "missing", "no loader is installed", _how_to_get([SCENES]))
-    families = [entry.load() for entry in plugins.datasets]
-    detectors = [target() if isinstance(target, type) else target for target in families]
     found: dict[str, int] = {}
     for path in inside[:MOST_FOLDERS]:
-        if any(detector.detect(path) > 0 for detector in detectors):
+        if any(_detects(entry, path) for entry in plugins.datasets):
             found[path.parent.name] = found.get(path.parent.name, 0) + 1
     more = f" (of the first {MOST_FOLDERS} folders)" if len(inside) > MOST_FOLDERS else ""
     if not found:
@@ -281,6 +311,15 @@ def check_scenes(plugins: PluginManager) -> Check:
         return Check("data", "SPLATWIZARD_DATA", "missing", f"{folder}: no scene is in it{more}", mend)
     shown = ", ".join(f"{name} {count}" for name, count in found.items())
     return Check("data", "SPLATWIZARD_DATA", "ok", f"{folder}: {shown}{more}", facts={"scenes": found})
+
+
+def _detects(entry: Entry, path: Path) -> bool:
+    """Whether a family reads this folder; one that fails does not."""
+    try:
+        target = entry.load()
+        return bool((target() if isinstance(target, type) else target).detect(path) > 0)
+    except (Exception, SystemExit):
+        return False
 
 
 def check_main_job(plugins: PluginManager) -> Check:
@@ -299,10 +338,11 @@ def check_main_job(plugins: PluginManager) -> Check:
         resolved = resolve(plugins.methods.load(method), scene=scene)
         plugins.datasets.load(scene)
         device = choose_device(resolved.ppl.device, plugins)
-        lacking = {e.name: check for e in plugins.rasterizers if (check := _lacking_kernels(e)) is not None}
+        ours = [entry for entry in plugins.rasterizers if not entry.foreign]
+        lacking = {e.name: check for e in ours if (check := _lacking_kernels(e)) is not None}
         rasterizer = NegotiatedRasterizer(plugins, device=device, forbid=lacking)
         _draw(rasterizer, str(device), backward=True)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         told = isinstance(error, (SplatwizardError, NativeBuildError))
         why = str(error) if told else f"{type(error).__name__}: {error}"
         return Check("main job", name, "broken", one_line(why), None, needed=True)

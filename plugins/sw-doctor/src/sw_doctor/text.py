@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 SLOWLY = "slowly: the pure-torch reference draws, some hundred times slower than compiled kernels"
+OF = " of "
+"""Between the name of a step and the distribution whose code it runs."""
 
 
 def one_line(text: object, limit: int = 300) -> str:

@@ -25,7 +25,6 @@ from splatwizard_core.api import (
     Stage,
     StageContext,
     View,
-    When,
     photometric_loss,
 )
 
@@ -107,11 +106,11 @@ class FineTuningStage(Stage):
 
     rates           step sizes
     lambda_dssim    weight of 1 - SSIM in the loss
-    rates_plan      when the step sizes are set, in steps of the full run
+    rates_plan      when the step sizes are set, in steps of the full run; a longer stage sets them to its end
     statistics      render with what screen-space gradient statistics need
     """
 
-    rates_plan: When = range(30_000)
+    rates_plan: range = range(30_000)
     statistics: bool = False
 
     def __init__(self, opt: OptimizationParams, rates: FineTuningRates, *, lambda_dssim: float = 0.2) -> None:
@@ -133,7 +132,10 @@ class FineTuningStage(Stage):
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         update = UpdateRates(self.rates, starts=self.round_starts(), scale=self.opt.schedule_scale)
-        scheduler.register_task(self.when(self.rates_plan), update, name="update lr")
+        plan = self.when(self.rates_plan)
+        assert isinstance(plan, range)
+        lasting = range(plan.start, max(plan.stop, self.iterations), plan.step)
+        scheduler.register_task(lasting, update, name="update lr")
 
     def round_starts(self) -> Sequence[int]:
         """Steps of this run at which the decays of the rates begin anew."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import math
 from collections.abc import Mapping
 from typing import Literal
@@ -19,9 +18,8 @@ from splatwizard_core.api import (
     ShapeError,
     SplatModel,
     SplatOptimizer,
+    TaskLog,
 )
-
-log = logging.getLogger(__name__)
 
 CountRule = Literal["exact", "official"]
 
@@ -59,7 +57,7 @@ def up_to(scores: Tensor, fraction: float) -> Tensor:
 
 
 class PruneByScore:
-    """Schedule task: scores every primitive over the training views and removes the lowest.
+    """Schedule task: scores every primitive over the training views and removes the lowest; says how many ("pruned").
 
     pruner      whose scores
     fractions   share that goes, 0..1: of the count at that step. A number, or step -> number
@@ -88,6 +86,7 @@ class PruneByScore:
         rasterizer: Rasterizer,
         scene: Scene,
         step: int,
+        log: TaskLog,
     ) -> None:
         scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
         fraction = self.fractions[step] if isinstance(self.fractions, Mapping) else self.fractions
@@ -98,7 +97,8 @@ class PruneByScore:
         if left == 0:
             raise EmptyModel(step)
         optimizer.keep_rows(model, ~doomed, carry_grad=self.carry_grad)
-        log.info("step %d: pruned %d of %d primitives, %d left", step, before - left, before, left)
+        log.say(f"removed {before - left:,} of {before:,} primitives, {left:,} left")
+        log.scalar("pruned", before - left)
 
 
 @torch.no_grad()

@@ -4,42 +4,42 @@ Every draw comes from a stream that is named after the step, so there is no stat
 draws what the uninterrupted one drew there. At the last step nothing is moved: no update follows that could repair it.
 """
 
-import logging
-
-from splatwizard_core.api import GaussianModel, OptimizationParams, SplatOptimizer, stream
+from splatwizard_core.api import GaussianModel, OptimizationParams, SplatOptimizer, TaskLog, stream
 from sw_gaussians import mcmc
-
-log = logging.getLogger(__name__)
 
 
 class Relocate:
-    """Moves dead Gaussians onto live ones (sw_gaussians.mcmc.relocate)."""
+    """Moves dead Gaussians onto live ones (sw_gaussians.mcmc.relocate); curve "relocated"."""
 
     def __init__(self, *, min_opacity: float = 0.005) -> None:
         self.min_opacity = min_opacity
 
-    def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
+    def __call__(
+        self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int, log: TaskLog
+    ) -> None:
         if step >= opt.iterations:
             return
         draws = stream(model.split_seed, f"relocate/{step}")
         moved = mcmc.relocate(model, optimizer, draws, min_opacity=self.min_opacity)
-        log.debug("step %d: %d Gaussians relocated", step, moved)
+        log.scalar("relocated", moved)
 
 
 class Grow:
-    """Adds Gaussians up to a cap (sw_gaussians.mcmc.grow)."""
+    """Adds Gaussians up to a cap (sw_gaussians.mcmc.grow); curve "added"."""
 
     def __init__(self, *, cap: int = 1_000_000, growth: float = 0.05, min_opacity: float = 0.005) -> None:
         self.cap, self.growth, self.min_opacity = cap, growth, min_opacity
 
-    def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
+    def __call__(
+        self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int, log: TaskLog
+    ) -> None:
         if step >= opt.iterations:
             return
         draws = stream(model.split_seed, f"grow/{step}")
         added = mcmc.grow(
             model, optimizer, draws, cap=self.cap, growth=self.growth, min_opacity=self.min_opacity
         )  # fmt: skip
-        log.debug("step %d: %d Gaussians added, %d now", step, added, model.num_rows)
+        log.scalar("added", added)
 
 
 class AddNoise:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING
 
-from splatwizard_core.api import ConfigError, GaussianModel, Method, SceneError
+from splatwizard_core.api import GaussianModel, Method, PluginError, SceneError
+from sw_gaussians.choices import CodecChoice
 
 if TYPE_CHECKING:
     import torch
@@ -26,29 +26,22 @@ HEADER_KEY = "codec"
 class GaussianMethod(Method):
     """Base of methods that leave it to a codec how their Gaussians are written, as those do that only prune.
 
-    A subclass says in `stages` how it trains; its Config has a key `codec`, the name of the codec, or it says in
-    `codec_choice` where the codec and its settings stand. Its first stage starts from a trained scene, or it has a
-    `create_model` of its own.
-
-    CODEC_KEY   key of the config that names the codec
+    A subclass says in `stages` how it trains; its Config is a `Choosing` with a block `codec`, a `CodecChoice`. Its
+    first stage starts from a trained scene, or it has a `create_model` of its own.
     """
-
-    CODEC_KEY: ClassVar[str] = "codec"
 
     def __init__(self, plugins: PluginManager, config: OptimizationParams | None) -> None:
         """Raise ConfigError for a codec that is not installed: now, and not when all is trained."""
         super().__init__(plugins, config)
         if config is None:
             return
-        name, known = self.codec_choice()[0], plugins.gaussian_codecs.names
-        if name not in known:
-            raise ConfigError(
-                f"no codec for Gaussians is called '{name}'; installed: {', '.join(known)}", key=self.CODEC_KEY
+        codec = getattr(config, "codec", None)
+        if not isinstance(codec, CodecChoice):
+            raise PluginError(
+                f"method '{self.name}' cannot be used: `codec` of its {type(config).__name__} must be a CodecChoice of "
+                "sw_gaussians.choices; its author has to change that"
             )
-
-    def codec_choice(self) -> tuple[str, Mapping[str, Any]]:
-        """Return the name of the codec and its settings, from the config."""
-        return self.config.codec, {}
+        codec.provider(plugins, "codec.name")
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Raise SceneError: a stage starts from a trained scene, and there is no start from points."""
@@ -63,12 +56,14 @@ class GaussianMethod(Method):
         """
         if not isinstance(model, GaussianModel):
             raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
-        name, settings = self.codec_choice()
-        writer.static[HEADER_KEY] = name
-        self.plugins.gaussian_codecs.load(name)(self.plugins, **settings).encode(model, writer)
+        writer.static[HEADER_KEY] = self.config.codec.name
+        self.config.codec.load(self.plugins).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         """Return the model, by whichever codec has written it. Raises BitstreamError."""
         self.check_version(reader)
-        name = reader.text(HEADER_KEY, choices=self.plugins.gaussian_codecs.names)
-        return self.plugins.gaussian_codecs.load(name)(self.plugins).decode(reader)
+        return self.plugins.gaussian_codecs.load(self.codec_of(reader))(self.plugins).decode(reader)
+
+    def codec_of(self, reader: ContainerReader) -> str:
+        """Return the name of the codec that the header of a file states. Raises BitstreamError."""
+        return reader.text(HEADER_KEY, choices=self.plugins.gaussian_codecs.names)

@@ -123,7 +123,7 @@ class ThreeDGSStage(Stage):
             name="prune and densify",
         )
         reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
-        if self.white and densify.white_reset > 0:
+        if self.white and 0 < densify.white_reset < densify.stop:
             # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
             scheduler.register_task(
                 self.when(densify.white_reset), reset_opacity, name="reset opacity (white background)"

@@ -9,13 +9,9 @@ would lose about 0.8 dB (lego, 7,000 steps), one cut to a multiple of 3,000 almo
 short runs are taken before the densification of their last step, too.
 """
 
-import logging
-
-from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer
+from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, TaskLog
 from sw_gaussians import density
 from sw_gaussians.learning_rate import exponential_lr
-
-log = logging.getLogger(__name__)
 
 
 class UpdateLearningRate:
@@ -58,7 +54,7 @@ class PruneAndDensify:
 
     size_rules_after    steps before which nothing is pruned for its size: the first reset interval
     pause_after_reset   steps after a multiple of `reset_interval` at which nothing happens; 0: no pause
-    The other settings are those of `densify_and_prune`.
+    The other settings are those of `densify_and_prune`. Curves: "cloned", "split", "pruned", numbers of Gaussians.
     """
 
     def __init__(
@@ -86,13 +82,20 @@ class PruneAndDensify:
         self.reset_interval, self.pause_after_reset = reset_interval, pause_after_reset
 
     def __call__(
-        self, model: GaussianModel, optimizer: SplatOptimizer, scene: Scene, opt: OptimizationParams, step: int
+        self,
+        model: GaussianModel,
+        optimizer: SplatOptimizer,
+        scene: Scene,
+        opt: OptimizationParams,
+        step: int,
+        log: TaskLog,
     ) -> None:
         paused = step >= self.reset_interval and step % self.reset_interval < self.pause_after_reset
         if paused or step >= opt.iterations:
             return
         report = density.densify_and_prune(model, optimizer, step=step, extent=scene.extent, **self.settings)
-        log.debug("step %d: %s", step, report)
+        for name in ("cloned", "split", "pruned"):
+            log.scalar(name, getattr(report, name))
 
 
 class ResetOpacity:

@@ -37,7 +37,7 @@ from sw_hac.predictors import PREDICTORS, BlockPrediction
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
-    from sw_hac.config import Codec
+    from sw_hac.config import FileSettings
 
 log = logging.getLogger(__name__)
 
@@ -46,7 +46,7 @@ SECTIONS = {"features": "features", "scales": "scalings", "offsets": "offsets"}
 LIMITS = {"feature_dim": 256, "hidden": 256, "grid_hidden": 256, "grid_features": 16}
 
 
-def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec) -> None:
+def encode(model: HACAnchors, writer: ContainerWriter, settings: FileSettings) -> None:
     """Write all sections; the model stays as it is."""
     if model.phase != ENTROPY:
         log.warning(
@@ -54,16 +54,16 @@ def encode(model: HACAnchors, writer: ContainerWriter, codec: Codec) -> None:
         )
     model = copy.deepcopy(model).to("cpu").eval()
     model.fold_units()
-    round_networks(model.networks(), codec.weights)
+    round_networks(model.networks(), settings.weights)
     geometry, rows = kept_geometry(model)
-    add_header(model, writer, codec)
+    add_header(model, writer, settings)
     add_geometry(writer, geometry)
     writer.add("grids", Bernoulli().encode(model.grid.signs().numpy()))
-    add_networks(writer, model.networks(), codec.weights)
+    add_networks(writer, model.networks(), settings.weights)
 
     writer.require("context model", "integer-mlp")
-    attributes = AttributeEncoder(model, rows, list(SECTIONS.values()), codec.mode)
-    walk(attributes, PREDICTORS[codec.mode](model.grid, model.mlp_grid, model.shape, model.base_steps), geometry)
+    attributes = AttributeEncoder(model, rows, list(SECTIONS.values()), settings.mode)
+    walk(attributes, PREDICTORS[settings.mode](model.grid, model.mlp_grid, model.shape, model.base_steps), geometry)
     attributes.write(writer)
     writer.allow(len(rows) * model.shape.decoded_bytes, f"a model of {len(rows):,} anchors")
 
@@ -99,13 +99,13 @@ def walk(attributes: AttributeCoder, predict: Callable[[Tensor], BlockPrediction
             attributes.code(Block(section, group, rows), *predicted[group], present)
 
 
-def add_header(model: HACAnchors, writer: ContainerWriter, codec: Codec) -> None:
+def add_header(model: HACAnchors, writer: ContainerWriter, settings: FileSettings) -> None:
     """Add the header values that say how the sections are to be read."""
     space, planes = model.grid.grids[0], model.grid.grids[1]
     assert isinstance(space, HashGrid)
     assert isinstance(planes, HashGrid)
     writer.static.update(
-        mode=codec.mode,
+        mode=settings.mode,
         base_steps=list(model.base_steps),
         feature_dim=model.shape.features,
         hidden=model.mlp_opacity[0].out_features,
@@ -115,7 +115,7 @@ def add_header(model: HACAnchors, writer: ContainerWriter, codec: Codec) -> None
         grid_planes=[level.resolution for level in planes.levels],
         grid_log2=[space.log2_size, planes.log2_size],
     )
-    add_machine(writer, codec.mode)
+    add_machine(writer, settings.mode)
 
 
 def _read_grid(reader: ContainerReader, features: int) -> MixedHashGrid:

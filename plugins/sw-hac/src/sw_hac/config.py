@@ -1,10 +1,12 @@
 """Hyper-parameters of HAC. Defaults are those of the paper's experiments on Mip-NeRF 360."""
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 from sw_anchors.lattice import Margin
 from sw_anchors.params import CodedAnchorLearningRates, CodedAnchorParams
+from sw_gaussians.choices import Choosing, Moved, OwnCodec
 
 from splatwizard_core.api import Params
 
@@ -77,7 +79,7 @@ class Steps(Params):
         return self.features, self.scales, self.offsets
 
 
-class Codec(Params):
+class FileSettings(Params):
     """Settings of the file."""
 
     mode: Literal["exact", "float"] = Field(
@@ -86,8 +88,19 @@ class Codec(Params):
     weights: Literal["float32", "float16"] = Field("float32", description="type of the networks' weights")
 
 
-class HACConfig(CodedAnchorParams):
+class Codec(OwnCodec):
+    """The file of HAC, which no other codec can write."""
+
+    name: Literal["hac"] = Field("hac", description="the file of HAC")
+    settings: FileSettings = Field(FileSettings(), description="settings of the file")
+
+
+class HACConfig(Choosing, CodedAnchorParams):
     """Everything that can be set for HAC."""
+
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        f"codec.{name}": Moved((f"codec.settings.{name}",)) for name in FileSettings.model_fields
+    }
 
     bound_margin: Literal["hac", "extent", "none"] = Field(
         "hac", description="room around the anchors on their 16-bit lattice; hac: as published; extent: 10 %"
@@ -97,7 +110,7 @@ class HACConfig(CodedAnchorParams):
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
     rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
-    codec: Codec = Field(Codec(), description="what the file holds")
+    codec: Codec = Field(Codec(), description="what writes the file")
 
     @property
     def margin(self) -> Margin:

@@ -55,7 +55,7 @@ class HAC(Method):
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, HACAnchors):
             raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
-        codec.encode(model, writer, self.config.codec)
+        codec.encode(model, writer, self.config.codec.settings)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)

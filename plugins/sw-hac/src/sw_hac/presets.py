@@ -47,7 +47,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "lr.grid_final": 1e-3,
         "lr.mlp_grid_init": 0.01,
         "lr.mlp_grid_final": 5e-4,
-        "codec.weights": "float16",
+        "codec.settings.weights": "float16",
     },
 }
 

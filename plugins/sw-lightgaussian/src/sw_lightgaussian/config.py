@@ -1,15 +1,17 @@
 """Hyper-parameters of LightGaussian. Defaults: the authors' scripts, which is what the paper's figures belong to."""
 
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from sw_finetuning.distillation import DistillLoss
 from sw_finetuning.fine_tuning import FineTuningRates
 from sw_finetuning.pruning import CountRule
+from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 
-from splatwizard_core.api import OptimizationParams, Params
-from sw_lightgaussian.importance_vq import Training
-from sw_lightgaussian.significance import Kind, VolumeNorm
+from splatwizard_core.api import Params
+from sw_lightgaussian.importance_vq import VQSettings
+from sw_lightgaussian.significance import SignificanceSettings
 
 
 class PruneRates(FineTuningRates):
@@ -33,18 +35,13 @@ class DistillRates(FineTuningRates):
     decay_interval: int = Field(500, ge=1, description="steps between two of these factors")
 
 
-class Score(Params):
-    """Global significance: what is pruned (by the own pruner), and what keeps its own colours in the file."""
+class Score(PrunerChoice):
+    """The pruner whose scores say what keeps its own colours in the file."""
 
-    kind: Kind = Field("v_important_score", description="which score, see the README")
-    v_pow: float = Field(0.1, ge=0, description="power of the volume")
-    volume_norm: VolumeNorm = Field(
-        "unclamped", description="as in the authors' code, or paper_clamp: relative to the 90th percentile, at most 1"
-    )
-    use_transmittance: bool = Field(True, description="False: the score of early versions of the paper")
+    pruner: str = Field("lightgaussian", description="whose scores say what matters for the file: any pruner")
 
 
-class Prune(Params):
+class Prune(PrunerChoice):
     """Stage 1: remove the least significant, then recover."""
 
     iterations: int = Field(
@@ -77,28 +74,38 @@ class Distill(Params):
     lr: DistillRates = Field(DistillRates(), description="step sizes")
 
 
-class Codec(Params):
-    """The codec of the file."""
-
-    name: str = Field("vectree", description="which codec for Gaussians; the keys below are those of vectree")
-    vq_ratio: float = Field(0.6, ge=0, le=1, description="share of the Gaussians whose colours are vector-quantised")
-    codebook_size: int = Field(8192, ge=2, le=1 << 16, description="codebook entries at most")
-    rows_per_code: float = Field(4, ge=1, description="and no more than one for so many such Gaussians, a power of two")
-    vq_iterations: int = Field(1000, ge=0, description="updates of the codebook")
-    vq_batch: int = Field(80_000, ge=1, description="Gaussians of each update")
-    vq_decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook's averages each update keeps")
-    vq_reseed: int = Field(10, ge=0, description="entries that may start afresh after an update")
-    vq_training: Training = Field("ema", description="official: the rule of the authors' code; kmeans: passes over all")
+_CODEC_KEYS = {
+    "vq_ratio": "ratio", "codebook_size": "size", "rows_per_code": "rows_per_code", "vq_iterations": "iterations",
+    "vq_batch": "batch", "vq_decay": "decay", "vq_reseed": "reseed", "vq_training": "training",
+}  # fmt: skip
+_SCORE, _CODEC = SignificanceSettings.model_fields, VQSettings.model_fields
 
 
-class LightGaussianConfig(OptimizationParams):
+class LightGaussianConfig(Choosing):
     """Everything that can be set for LightGaussian."""
 
     FULL_ITERATIONS: ClassVar[int] = 5_000
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        # One score decided what is pruned and what matters for the file.
+        **{
+            f"score.{k}": Moved((f"prune.settings.{k}", f"score.settings.{k}"), _SCORE[k].default, "lightgaussian")
+            for k in _SCORE
+        },
+        **{
+            f"codec.{old}": Moved((f"codec.settings.{k}",), _CODEC[k].default, "vectree")
+            for old, k in _CODEC_KEYS.items()
+        },
+    }
 
     iterations: int = Field(5_000, ge=1, description="steps of the distillation")
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the losses; the rest is that of L1")
-    score: Score = Field(Score(), description="global significance")
+    score: Score = Field(Score(), description="what keeps its own colours in the file")
     prune: Prune = Field(Prune(), description="stage 1")
     distill: Distill = Field(Distill(), description="stage 2")
-    codec: Codec = Field(Codec(), description="what the file holds")
+    codec: CodecChoice = Field(CodecChoice(name="vectree"), description="what writes the file")
+
+    def identity(self) -> dict[str, Any]:
+        content = super().identity()
+        if content["score"]["pruner"] == "lightgaussian":  # 0.1 knew no other
+            del content["score"]["pruner"]
+        return content

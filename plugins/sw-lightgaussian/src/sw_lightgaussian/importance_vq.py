@@ -24,8 +24,9 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 
-from splatwizard_core.api import BitstreamError
+from splatwizard_core.api import BitstreamError, Params
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
@@ -37,6 +38,19 @@ HALF_MAX = 65504.0
 MAX_CODES = 1 << 16
 
 Training = Literal["ema", "official", "kmeans"]
+
+
+class VQSettings(Params):
+    """Settings of `importance-vq`, and of the codec `vectree`."""
+
+    ratio: float = Field(0.6, ge=0, le=1, description="share of the vectors that share a codebook, the least important")
+    size: int = Field(8192, ge=2, le=1 << 16, description="codebook entries at most")
+    rows_per_code: float = Field(4, ge=1, description="and no more than one for so many such vectors, a power of two")
+    iterations: int = Field(1000, ge=0, description="updates of the codebook")
+    batch: int = Field(80_000, ge=1, description="vectors of each update")
+    decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook's averages each update keeps")
+    reseed: int = Field(10, ge=0, description="entries that may start afresh after an update")
+    training: Training = Field("ema", description="official: the rule of the authors' code; kmeans: passes over all")
 
 
 class PartError(BitstreamError):
@@ -80,6 +94,8 @@ class ImportanceVQ:
                     with `decay` and up to `reseed` entries that start afresh each time; "kmeans", passes over all rows
     device          where it is trained: "cpu", where equal arguments give equal bytes, or "cuda"
     """
+
+    Settings = VQSettings
 
     def __init__(
         self,

@@ -23,9 +23,9 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
             "distill", position_init=2e-4, position_final=8e-6, position_offset=0, max_steps=5000,
             sh_dc=1e-2, sh_rest=6e-3, scales=1e-2, quats=2e-3,
         ),
-        "codec.codebook_size": 1024,
-        "codec.vq_training": "kmeans",
-        "codec.vq_iterations": 20,
+        "codec.settings.size": 1024,
+        "codec.settings.training": "kmeans",
+        "codec.settings.iterations": 20,
     },
 }  # fmt: skip
 

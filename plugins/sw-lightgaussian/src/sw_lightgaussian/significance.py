@@ -9,8 +9,10 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
+from pydantic import Field
+from sw_finetuning.volume import VolumeNorm, volume_factor
 
-from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec
+from splatwizard_core.api import GaussianModel, Params, RasterOptions, ScoreSpec
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -18,7 +20,17 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer, SplatModel
 
 Kind = Literal["v_important_score", "important_score", "max_v_important_score", "count", "opacity"]
-VolumeNorm = Literal["unclamped", "paper_clamp"]
+
+
+class SignificanceSettings(Params):
+    """Settings of the pruner `lightgaussian`."""
+
+    kind: Kind = Field("v_important_score", description="which score, see the README")
+    v_pow: float = Field(0.1, ge=0, description="power of the volume")
+    volume_norm: VolumeNorm = Field(
+        "unclamped", description="as in the authors' code, or paper_clamp: relative to the 90th percentile, at most 1"
+    )
+    use_transmittance: bool = Field(True, description="False: the score of early versions of the paper")
 
 
 class Significance:
@@ -35,6 +47,7 @@ class Significance:
     It is the opacity itself, not alpha: a hit at the rim of a splat counts as much as one at its centre.
     """
 
+    Settings = SignificanceSettings
     uses_statistics = False
 
     def __init__(
@@ -84,18 +97,3 @@ class Significance:
             hits += view["hits"].long()
             caught += view["caught"]
         return hits, caught
-
-
-def volume_factor(log_scales: Tensor, v_pow: float, norm: VolumeNorm = "unclamped") -> Tensor:
-    """(V / V_ref)^v_pow [N] for log_scales [N,3], V their exponential's product; V_ref and norm: see Significance."""
-    log_volume = log_scales.sum(dim=1)
-    n = len(log_volume)
-    if n == 0:
-        return log_volume
-    descending = log_volume.sort(descending=True).values
-    # Logarithms, since the volume of three tiny scales underflows.
-    if norm == "paper_clamp":
-        ratio = (log_volume - descending[min(int(0.1 * n), n - 1)]).clamp_max(0)
-    else:
-        ratio = log_volume - descending[int(0.9 * n)]
-    return (v_pow * ratio).exp()

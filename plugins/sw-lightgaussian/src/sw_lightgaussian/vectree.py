@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_finetuning.volume import volume_factor
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
-from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError
-from sw_lightgaussian.significance import volume_factor
+from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError, VQSettings
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
@@ -48,7 +48,9 @@ class CodedGaussians(GaussianModel):
 
 
 class VecTree:
-    """Settings: those of `importance-vq`, and the seed of its codebook's training."""
+    """Settings: those of `importance-vq`; `seed` is of its codebook's training."""
+
+    Settings = VQSettings
 
     def __init__(self, plugins: PluginManager, *, seed: int = 0, **settings: Any) -> None:
         self.plugins, self.seed = plugins, seed

@@ -2,26 +2,21 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, Literal
+from collections.abc import Mapping
+from typing import ClassVar
 
 from pydantic import Field, model_validator
 from sw_finetuning.fine_tuning import FineTuningRates
 from sw_finetuning.pruning import CountRule
+from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 
-from splatwizard_core.api import OptimizationParams, Params
 
-
-class Prune(Params):
+class Prune(PrunerChoice):
     """The rounds: each begins with a removal."""
 
     pruner: str = Field("pup-3dgs", description="whose scores: any registered pruner")
     steps: list[int] = Field([1, 5_001], description="first step of each round: it removes, and updates nothing")
     fractions: list[float] = Field([0.8, 0.5], description="share that goes in each round, of what is left")
-    resolution: Literal[1, 2, 4, 8] = Field(
-        4,
-        description="the score draws views at 1/resolution of their width and height; "
-        "4 is for photographs of 1,000 pixels and more, 1 for small ones",
-    )
     count_rule: CountRule = Field(
         "exact", description="official: all up to the score at index int(share (N - 1)), as in the authors' code"
     )
@@ -49,13 +44,17 @@ class Rates(FineTuningRates):
     decay: float = Field(0.95, gt=0, le=1, description="factor on all rates but that of the means, again and again")
 
 
-class Pup3DGSConfig(OptimizationParams):
+class Pup3DGSConfig(Choosing):
     """Everything that can be set for PUP 3D-GS."""
 
     FULL_ITERATIONS: ClassVar[int] = 10_000
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        "codec": Moved(("codec.name",)),
+        "prune.resolution": Moved(("prune.settings.resolution",), 4, "pup-3dgs"),
+    }
 
     iterations: int = Field(10_000, ge=1, description="steps after the trained scene, all rounds together")
     prune: Prune = Field(Prune(), description="what is removed when")
     lr: Rates = Field(Rates(), description="step sizes; each round begins with them anew")
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the loss; the rest is that of L1")
-    codec: str = Field("gaussians-exact", description="codec of the file, by name")
+    codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")

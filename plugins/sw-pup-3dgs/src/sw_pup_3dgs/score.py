@@ -11,12 +11,13 @@ Source: PUP 3D-GS (arXiv 2406.10219), and the authors' code with its later fix: 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from splatwizard_core.api import ConfigError, GaussianModel, RasterOptions
+from splatwizard_core.api import ConfigError, GaussianModel, Params, RasterOptions
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer, SplatModel
@@ -28,6 +29,16 @@ AT_ONCE = 1 << 16
 """Blocks whose eigenvalues are computed together: 19 MB of float64."""
 
 
+class FisherSettings(Params):
+    """Settings of the pruner `pup-3dgs`."""
+
+    resolution: Literal[1, 2, 4, 8] = Field(
+        4,
+        description="the score draws views at 1/resolution of their width and height; "
+        "4 is for photographs of 1,000 pixels and more, 1 for small ones",
+    )
+
+
 class FisherScore:
     """Pruner `pup-3dgs`.
 
@@ -35,11 +46,12 @@ class FisherScore:
                 of the small picture stands for a patch, as published
     """
 
+    Settings = FisherSettings
     uses_statistics = False
 
     def __init__(self, resolution: int = 4) -> None:
         if resolution not in RESOLUTIONS:
-            raise ConfigError(f"prune.resolution is {resolution}, must be one of {', '.join(map(str, RESOLUTIONS))}")
+            raise ConfigError(f"resolution is {resolution}, must be one of {', '.join(map(str, RESOLUTIONS))}")
         self.resolution = resolution
 
     @torch.no_grad()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
-from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore
 
 from splatwizard_core.api import ConfigError, SplatOptimizer
@@ -32,7 +31,7 @@ class PupStage(FineTuningStage):
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
         prune = config.prune
         self.prune = prune
-        self.pruner = load_pruner(plugins, prune.pruner, {OWN: {"resolution": prune.resolution}})
+        self.pruner = prune.load(plugins)
         self.statistics = self.pruner.uses_statistics
         if len(self.round_starts()) != len(prune.steps) or len(self.removals()) != len(prune.steps):
             raise ConfigError(f"rounds at {prune.steps} are too close together for this run", key="prune.steps")

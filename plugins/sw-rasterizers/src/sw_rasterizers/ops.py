@@ -22,7 +22,7 @@ BACKWARD_STAGES = ("blend_backward", "project_backward")
 
 
 class Flag(enum.IntFlag):
-    """Switches of one call; mirrors `Flag` in csrc/binding.cpp."""
+    """Switches of one call; those of `Flag` in csrc/binding.h that Python sets."""
 
     ANTIALIAS = 1
     CLAMP_COLOR = 2

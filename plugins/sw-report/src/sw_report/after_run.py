@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from splatwizard_core.api import Scene, SplatwizardError
+from splatwizard_core.api import ForeseenError, Scene
 from splatwizard_core.tooling import FILE_NAME as RECORD
 from splatwizard_core.tooling import FinishedRuns, write_atomic
 from sw_report.facts import read_facts
@@ -103,7 +103,7 @@ def _told(page: Path, say: Callable[[str], None]) -> Iterator[list[Path]]:
     try:
         yield []
     except Exception as error:
-        foreseen = isinstance(error, (SplatwizardError, OSError, ValueError))
+        foreseen = isinstance(error, (ForeseenError, OSError, ValueError))
         why = str(error) if foreseen else f"{type(error).__name__}: {error}"
         say(f"warning: {page} was not written: {why} (the results are whole; `sw report` makes pages, too)")
 

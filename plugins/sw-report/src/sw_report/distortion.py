@@ -8,10 +8,11 @@ from dataclasses import dataclass
 from splatwizard_core.api import UserInputError
 from sw_report.aggregate import comparable, mean
 from sw_report.declared import bd_anchor_rank
-from sw_report.numbers import main_lpips
+from sw_report.numbers import is_lpips, main_lpips, ordered_metrics
 from sw_report.rate_distortion import BdResult, bd_quality, bd_rate
 from sw_report.runs import Run, natural
 
+DIRECTIONS = ("higher", "lower")
 FLAG_TEXTS = {
     "low_overlap": "the curves share less than a quarter of their range",
     "few_points": "fewer than 4 points, joined by straight lines",
@@ -71,10 +72,20 @@ def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
 
 
 def bd_metrics(runs: Sequence[Run]) -> list[str]:
-    """Metrics that curves are compared by: PSNR, SSIM and one LPIPS, as far as they are there."""
-    known = {name for run in runs for name, metric in run.facts.metrics.items() if metric.mean is not None}
+    """Metrics that curves are compared by: all that have a direction and a value, but diagnostic ones."""
+    return ordered_metrics(
+        name
+        for run in runs
+        for name, metric in run.facts.metrics.items()
+        if metric.mean is not None and metric.direction in DIRECTIONS and not metric.diagnostic
+    )
+
+
+def drawn_metrics(runs: Sequence[Run]) -> list[str]:
+    """Metrics whose curves are drawn: those of BD-rates, but of several forms of LPIPS one, and no mean difference."""
+    known = bd_metrics(runs)
     lpips = main_lpips(known)
-    return [name for name in ("psnr", "ssim", lpips) if name in known]
+    return [name for name in known if name != "l1" and (name == lpips or not is_lpips(name))]
 
 
 def bd_tables(runs: Sequence[Run], anchor: str | None, *, pareto: bool = False, partial: bool = False) -> list[BdTable]:

@@ -8,7 +8,7 @@ from sw_report import numbers
 from sw_report.blocks import Cell, Charts, Figure, Table, columns, row
 from sw_report.charts import STYLES, Bar, Chart, Point, Series, square, stacked_bars, swatch
 from sw_report.declared import MetricStyle, metric_style
-from sw_report.distortion import bd_metrics
+from sw_report.distortion import drawn_metrics
 from sw_report.pictures import pick_evenly
 from sw_report.results_tables import metric_names
 from sw_report.runs import Run
@@ -34,7 +34,7 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
     """Quality against bytes, one chart a metric, one line a method."""
     variants = variants_of(runs)
     figures = []
-    for metric in bd_metrics(runs):
+    for metric in drawn_metrics(runs):
         style = metric_style(metric)
         lines = []
         for variant in variants:
@@ -136,7 +136,7 @@ def single_sections_table(run: Run) -> Table | None:
 
 
 def training_charts(runs: Sequence[Run]) -> tuple[Charts | None, list[str]]:
-    """Loss and primitive counts over the steps, one line for each different training; and what is missing."""
+    """Loss, counts and curves of tasks over the steps, one line for each different training; and what is missing."""
     trainings: dict[object, list[Run]] = {}
     for run in runs:
         trainings.setdefault(log_path(run), []).append(run)
@@ -184,14 +184,21 @@ def _training_figures(curves: Sequence[tuple[str, TrainingCurves]]) -> list[Figu
             unit = numbers.unit(key)
             chart = Chart(f"Number of {unit} over steps", lines, "step", borders=borders)
             figures.append(Figure(f"Number of {unit}", chart.draw()))
+    for name in dict.fromkeys(name for _, c in curves for name in c.scalars):
+        lines = [
+            Series(label, [Point(x, y) for x, y in c.scalars.get(name, [])], i, marks=False)
+            for i, (label, c) in enumerate(curves)
+        ]
+        if any(len(s.points) > 1 for s in lines):
+            figures.append(Figure(name, Chart(f"{name} over steps", lines, "step", borders=borders).draw()))
     return figures
 
 
 def view_charts(runs: Sequence[Run]) -> Charts | None:
-    """PSNR and SSIM of every test view; views in the order of the record."""
+    """First two metrics (PSNR and SSIM) of every test view; views in the order of the record."""
     shown = pick_evenly(runs, MOST_LINES)
     figures = []
-    for metric in bd_metrics(shown)[:2]:
+    for metric in drawn_metrics(shown)[:2]:
         lines = []
         for i, run in enumerate(shown):
             scores = run.facts.metrics[metric].per_view if metric in run.facts.metrics else []

@@ -1,10 +1,10 @@
-"""log.jsonl as curves: loss and primitive counts over the steps, thinned to what a chart can show."""
+"""log.jsonl as curves: loss, counts, and what tasks recorded over the steps, thinned to what a chart can show."""
 
 from __future__ import annotations
 
 import json
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,8 @@ from sw_report.runs import Run
 POINTS = 240  # a chart is about 400 px wide
 LONGEST_LINE = 1_000_000
 MOST_LINES = 2_000_000
+MOST_CURVES = 12  # that tasks recorded; a page needs an end
+LONGEST_NAME = 64
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class TrainingCurves:
 
     loss        (step, mean loss of the logged steps since the point before), at most POINTS points
     counts      unit -> (step, number of them)
+    scalars     name -> (step, value), the first MOST_CURVES that tasks recorded
     stages      (first step, index) of each stage; steps count on over stages
     lines       of the log that hold a loss
     damaged     lines that could not be read
@@ -34,6 +37,7 @@ class TrainingCurves:
     lines: int = 0
     damaged: int = 0
     missing: str | None = None
+    scalars: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
 
 def log_path(run: Run) -> Path:
@@ -49,6 +53,7 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
     """Read the curves of a log; a damaged line is counted and passed over, a missing file is said."""
     losses: list[tuple[float, float]] = []
     counts: dict[str, list[tuple[float, float]]] = {}
+    scalars: dict[str, list[tuple[float, float]]] = {}
     stages: list[tuple[int, int]] = []
     damaged, before, last = 0, 0, 0
     if not path.is_file():
@@ -72,9 +77,12 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
                 for key in entry:
                     if key.startswith("num_") and _is_number(entry[key]):
                         counts.setdefault(key, []).append((float(last), float(entry[key])))
+                for name, value in _scalars(entry):
+                    if name in scalars or len(scalars) < MOST_CURVES:
+                        scalars.setdefault(name, []).append((float(last), value))
     except OSError as error:
         return TrainingCurves([], {}, [], missing=clean(f"log.jsonl: {error.strerror}"))
-    if not losses and not counts:
+    if not (losses or counts or scalars):
         return TrainingCurves([], {}, stages, damaged=damaged, missing="log.jsonl holds no step")
     return TrainingCurves(
         thin(losses, points),
@@ -82,6 +90,7 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
         stages,
         len(losses),
         damaged,
+        scalars={name: thin(values, points) for name, values in scalars.items()},
     )
 
 
@@ -107,6 +116,13 @@ def _entry(line: str) -> dict[str, Any] | None:
         type(entry.get(key)) is int and 0 <= entry[key] < 2**53 for key in ("stage", "step")
     )
     return entry if fine else None
+
+
+def _scalars(entry: dict[str, Any]) -> list[tuple[str, float]]:
+    """Return the points of curves in a line; what is no number is none."""
+    found = entry.get("scalars")
+    pairs = found.items() if isinstance(found, dict) else ()
+    return [(clean(name)[:LONGEST_NAME], float(value)) for name, value in pairs if _is_number(value)]
 
 
 def _is_number(value: Any) -> bool:

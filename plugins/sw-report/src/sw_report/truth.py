@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from splatwizard_core.api import SplatwizardError
+from splatwizard_core.api import ForeseenError
 from sw_report.facts import RunFacts, clean
 from sw_report.runs import Run
 
@@ -104,7 +104,7 @@ class Truth:
             if candidate.name == view:
                 try:
                     return truth_pixels(candidate, scene)
-                except (SplatwizardError, OSError, ValueError) as error:
+                except (ForeseenError, OSError, ValueError) as error:
                     self.reason = clean(str(error))
                     return None
         self.reason = f"the scene has no test view {view}"
@@ -118,7 +118,7 @@ class Truth:
         for run in self._runs[:1]:
             try:
                 self._scene = opener(run)
-            except (SplatwizardError, OSError, ValueError) as error:
+            except (ForeseenError, OSError, ValueError) as error:
                 self.reason = f"the run kept none, and its scene is not here ({clean(str(error))})"
         return self._scene
 

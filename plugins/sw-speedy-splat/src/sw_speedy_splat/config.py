@@ -1,19 +1,16 @@
 """Hyper-parameters of Speedy-Splat: when and how much it prunes. All the rest is 3DGS', under `base`."""
 
-from typing import Any, Literal
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 from pydantic import Field
+from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 
-from splatwizard_core.api import OptimizationParams, Params
 
-
-class Prune(Params):
+class Prune(PrunerChoice):
     """Removals while the scene densifies ("soft": it grows back) and after that ("hard": it does not)."""
 
-    pruner: str = Field("speedy-splat", description="whose scores; any registered pruner, with its own settings")
-    channel_mode: Literal["sum", "per_channel"] = Field(
-        "sum", description="square the derivative of R + G + B, as published, or of each channel (three times the work)"
-    )
+    pruner: str = Field("speedy-splat", description="whose scores; any registered pruner")
     soft: float = Field(0.80, ge=0, lt=1, description="share that goes each time before `base.densify.stop`")
     hard: float = Field(0.30, ge=0, lt=1, description="share that goes each time from `base.densify.stop` on")
     start: int = Field(6_000, ge=1, description="first removal")
@@ -21,11 +18,16 @@ class Prune(Params):
     interval: int = Field(3_000, ge=1, description="steps between removals")
 
 
-class SpeedySplatConfig(OptimizationParams):
+class SpeedySplatConfig(Choosing):
     """Everything that can be set for Speedy-Splat."""
+
+    OLDER: ClassVar[Mapping[str, Moved]] = {
+        "codec": Moved(("codec.name",)),
+        "prune.channel_mode": Moved(("prune.settings.channel_mode",), "sum", "speedy-splat"),
+    }
 
     prune: Prune = Field(Prune(), description="what is removed when")
     base: dict[str, Any] = Field(
         {}, description="values of 3dgs by its keys (base.densify.start=600), and its preset (base.preset=inria)"
     )
-    codec: str = Field("gaussians-exact", description="codec of the file, by name")
+    codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")

@@ -14,15 +14,24 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import torch
+from pydantic import Field
 from sw_reference.spherical_harmonics import sh_colors
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel, RasterOptions, ScoreSpec
+from splatwizard_core.api import GaussianModel, Params, RasterOptions, ScoreSpec
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs, Rasterizer, SplatModel
 
 SPECS = (ScoreSpec("grad_sq", "grad_sq"), ScoreSpec("hits", "hits"))
+
+
+class SpeedySettings(Params):
+    """Settings of the pruner `speedy-splat`."""
+
+    channel_mode: Literal["sum", "per_channel"] = Field(
+        "sum", description="square the derivative of R + G + B, as published, or of each channel (three times the work)"
+    )
 
 
 class SpeedyScore:
@@ -32,6 +41,7 @@ class SpeedyScore:
                     "per_channel": the squares of the three derivatives, added
     """
 
+    Settings = SpeedySettings
     uses_statistics = False
 
     def __init__(self, channel_mode: Literal["sum", "per_channel"] = "sum") -> None:

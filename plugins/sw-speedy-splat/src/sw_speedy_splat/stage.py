@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
@@ -13,8 +12,6 @@ from sw_gaussians.wrapped_stage import WrappedStage
 if TYPE_CHECKING:
     from splatwizard_core.api import Method, OptimizationParams, PipelineParams, PluginManager, Scheduler
     from sw_speedy_splat.config import SpeedySplatConfig
-
-OWN = "speedy-splat"
 
 # Order within a step. A reset before the soft removal would make its scores meaningless: no alpha would be left that is
 # worth drawing. A pruner that reads the gradient statistics must come before the densification, which clears them.
@@ -34,7 +31,7 @@ class SpeedySplatStage(WrappedStage):
         self.name = "speedy-splat"
         self.config = config
         self.densify_stop: int = base.config.densify.stop
-        self.pruner = load_pruner(plugins, config.prune.pruner, {OWN: {"channel_mode": config.prune.channel_mode}})
+        self.pruner = config.prune.load(plugins)
 
     @property
     def iterations(self) -> int:

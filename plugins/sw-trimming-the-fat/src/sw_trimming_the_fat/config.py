@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal
 
 from pydantic import Field, model_validator
 from sw_finetuning.fine_tuning import FineTuningRates
+from sw_gaussians.choices import Choosing, CodecChoice, Moved, PrunerChoice
 
-from splatwizard_core.api import OptimizationParams, Params
 
-
-class Prune(Params):
+class Prune(PrunerChoice):
     """The removals, and the gradient statistics that they go by."""
 
     pruner: str = Field("trimming-the-fat", description="whose scores: any registered pruner")
@@ -43,13 +43,14 @@ class Prune(Params):
         return self
 
 
-class TrimmingTheFatConfig(OptimizationParams):
+class TrimmingTheFatConfig(Choosing):
     """Everything that can be set for Trimming the Fat."""
 
     FULL_ITERATIONS: ClassVar[int] = 15_000
+    OLDER: ClassVar[Mapping[str, Moved]] = {"codec": Moved(("codec.name",))}
 
     iterations: int = Field(15_000, ge=1, description="steps after the trained scene (authors' code: 10,000)")
     prune: Prune = Field(Prune(), description="what is removed when")
     lr: FineTuningRates = Field(FineTuningRates(), description="step sizes")
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the loss; the rest is that of L1")
-    codec: str = Field("gaussians-exact", description="codec of the file, by name")
+    codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")

@@ -7,7 +7,6 @@ import math
 from typing import TYPE_CHECKING
 
 from sw_finetuning.fine_tuning import FineTuningStage, collect_anew, windows_before
-from sw_finetuning.pruners import load_pruner
 from sw_finetuning.pruning import PruneByScore, scores_of
 from sw_gaussians.statistics import GRADIENT_STATISTICS, collect_statistics
 
@@ -19,6 +18,7 @@ from splatwizard_core.api import (
     Rasterizer,
     Scene,
     SplatOptimizer,
+    TaskLog,
 )
 from sw_trimming_the_fat.score import doomed, mean_gradients
 
@@ -50,7 +50,7 @@ class TrimmingStage(FineTuningStage):
     def __init__(self, config: TrimmingTheFatConfig, plugins: PluginManager) -> None:
         super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
         self.prune = config.prune
-        self.pruner = load_pruner(plugins, config.prune.pruner)
+        self.pruner = config.prune.load(plugins)
         self.statistics = self.pruner.uses_statistics and config.prune.statistics == "fresh"
 
     def begin(self, context: StageContext) -> SplatModel:
@@ -111,6 +111,7 @@ class PruneBelowBoth:
         rasterizer: Rasterizer,
         scene: Scene,
         step: int,
+        told: TaskLog,
     ) -> None:
         scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
         goes = doomed(scores, self.level)
@@ -120,7 +121,8 @@ class PruneBelowBoth:
         if gone == before:
             raise EmptyModel(step)
         optimizer.keep_rows(model, ~goes, carry_grad=True)
-        log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
+        told.say(f"removed {gone:,} of {before:,} Gaussians, {before - gone:,} left")
+        told.scalar("pruned", gone)
 
     def _explain(self, model: GaussianModel, views: int) -> None:
         """Raise, or warn, if too many Gaussians have no gradient for anything to be below the quantile."""

@@ -14,8 +14,8 @@ from splatwizard_core.cli.complete import name_of
 from splatwizard_core.cli.paths import EXISTING, OUTPUT_FOLDER
 from splatwizard_core.cli.setup import Choices, open_session, takes_choices, warn_of_metrics
 from splatwizard_core.errors import SplatwizardError
-from splatwizard_core.files import scratch_folder
 from splatwizard_core.plugins import load_plugins
+from splatwizard_native import scratch_folder
 
 
 @click.command("eval", short_help="quality, speed and memory of an encoded scene")

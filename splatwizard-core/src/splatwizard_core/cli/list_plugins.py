@@ -32,6 +32,7 @@ def gather() -> dict[str, Any]:
                 {"kind": e.kind, "name": e.name, "summary": e.summary, "target": e.target, **dict(e.declared)}
                 for e in plugins.provided_by(info)
             ],
+            "refused": [{"kind": e.kind, "name": e.name, "reason": why} for e, why in plugins.refused_of(info)],
         }
         for info in plugins.plugins
     ]
@@ -56,6 +57,8 @@ def _print(found: dict[str, Any]) -> None:
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
         if row["error"]:
             lines.append(f"[red]broken: {escape(row['error'])}[/red]")
+        for each in row["refused"]:
+            lines.append(f"[red]refused: {each['kind']} '{escape(each['name'])}': {escape(each['reason'])}[/red]")
         rows.append([escape(row["distribution"]), row["version"], "\n".join(lines) or "-"])
     shared.print_table(["distribution", "version", "provides"], rows, title="Installed packages", markup=True)
     out = shared.console()

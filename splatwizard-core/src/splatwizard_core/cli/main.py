@@ -12,12 +12,15 @@ from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import click
+from click.shell_completion import CompletionItem
 
 from splatwizard_core.cli.complete import VARIABLE
 from splatwizard_core.cli.streams import abandon_streams, ended_like_ctrl_c, open_streams, without_orders
-from splatwizard_core.errors import FORESEEN, FULL, DiskFullError, SplatwizardError
+from splatwizard_core.errors import PluginError, TaskError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import package_of
+from splatwizard_core.plugins.origins import Origins
+from splatwizard_native import FULL, DiskFullError, ForeseenError
 
 if TYPE_CHECKING:
     from splatwizard_core.plugins import Entry
@@ -42,6 +45,13 @@ class LazyGroup(click.Group):
         """One line a command, from the registry: `sw --help` imports none of them."""
         with formatter.section("Commands"):
             formatter.write_dl([(entry.name, entry.summary) for entry in command_entries()])
+
+    def shell_complete(self, ctx: click.Context, incomplete: str) -> list[CompletionItem]:
+        """Commands from the registry: TAB imports none of them, and so suffers from no stranger's."""
+        options = click.Command.shell_complete(self, ctx, incomplete)
+        return options + [
+            CompletionItem(e.name, help=e.summary) for e in command_entries() if e.name.startswith(incomplete)
+        ]
 
     def make_context(self, *args: Any, **extra: Any) -> click.Context:
         with _ended_by_reader():
@@ -106,20 +116,24 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             status = cli.main(args=arguments, prog_name="sw", standalone_mode=False)
         except BaseException as error:
-            return _report(error, debug=debug, fresh="--fresh" in arguments)
+            return _report(error, arguments, debug=debug)
     return status if isinstance(status, int) else 0
 
 
-def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
+def _report(error: BaseException, arguments: Sequence[str], *, debug: bool) -> int:
     """One or two lines on stderr, and the exit status that the error leads to."""
-    if VARIABLE in os.environ and isinstance(error, SplatwizardError):
+    if VARIABLE in os.environ and isinstance(error, ForeseenError):
         return error.exit_status  # the shell asks for completions: TAB is not the place to say what is wrong
+    culprit = _culprit(error, arguments)
+    if isinstance(error, SystemExit) and culprit:
+        _say(f"error: SystemExit: {error}{culprit}")
+        return 1
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else int(error.code is not None)
     if debug and not isinstance(error, (click.ClickException, click.Abort)):
         traceback.print_exception(error)
     if isinstance(error, (KeyboardInterrupt, click.Abort)):
-        _say(f"interrupted (the same command{' without --fresh' if fresh else ''} resumes a run)")
+        _say(f"interrupted (the same command{' without --fresh' if '--fresh' in arguments else ''} resumes a run)")
         return 130
     if isinstance(error, click.exceptions.NoArgsIsHelpError):
         _say(error.format_message())
@@ -132,16 +146,28 @@ def _report(error: BaseException, *, debug: bool, fresh: bool) -> int:
     if isinstance(error, OSError) and error.errno in FULL:
         # What did not go through our own writing may not say where.
         error = DiskFullError(str(error.filename or "a file"), FULL[error.errno])
-    if isinstance(error, FORESEEN):
-        _say(f"error: {error}")
-        return error.exit_status if isinstance(error, SplatwizardError) else 1
-    add_debug = "" if debug else " (a traceback: add --debug)"
+    if isinstance(error, ForeseenError):
+        _say(f"error: {error}{culprit if isinstance(error, TaskError) else ''}")
+        return error.exit_status
+    add_debug = culprit + ("" if debug else " (a traceback: add --debug)")
     if isinstance(error, OSError) and error.strerror is not None:
         at = "" if error.filename is None else f"{error.filename}: "
         _say(f"error: {at}{error.strerror}{add_debug}")
     elif not debug:
         _say(f"error: {type(error).__name__}: {' '.join(str(error).split()):.500}{add_debug}")
     return 2 if isinstance(error, PATH_ERRORS) else 1
+
+
+def _culprit(error: BaseException, arguments: Sequence[str]) -> str:
+    """` (in sw-theirs 0.2)` for what came up in a stranger's package; nothing where its own command exits."""
+    try:
+        plugins = load_plugins()
+        distribution, version = Origins(plugins).culprit(error)
+        command = next((word for word in arguments if not word.startswith("-")), "")
+        exits = isinstance(error, SystemExit) and plugins.commands.entry(command).distribution == distribution
+    except PluginError:  # SW_PLUGINS is what is wrong
+        return ""
+    return f" (in {distribution} {version})" if distribution and not exits else ""
 
 
 def _say(text: str) -> None:

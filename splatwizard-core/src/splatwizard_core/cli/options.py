@@ -12,11 +12,14 @@ import click
 from splatwizard_core.cli.complete import PRESET, RATE, SCENE, name_of
 from splatwizard_core.cli.paths import OUTPUT_FOLDER
 from splatwizard_core.cli.streams import without_orders
+from splatwizard_core.plugins.guards import prints_to_stderr
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 F = TypeVar("F", bound=Callable[..., Any])
+
+STDOUT = "splatwizard_core.stdout"  # key in a context's `meta`: the stream that `--json` keeps for JSON
 
 
 def _not_empty(_context: click.Context, parameter: click.Parameter, value: str | None) -> str | None:
@@ -92,7 +95,19 @@ changed_plan_option = click.option(
     "--allow-changed-plan", is_flag=True,
     help="Resume although the plan or configuration differs from the checkpoint's; the difference is printed.",
 )  # fmt: skip
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object to stdout instead of text.")
+
+
+def _json_alone(context: click.Context, _parameter: click.Parameter, asked: bool) -> bool:
+    """Until the command ends, let stdout be for `print_json`: whatever else prints does so on stderr."""
+    if asked:
+        context.meta.setdefault(STDOUT, sys.stdout)
+        context.find_root().with_resource(prints_to_stderr())
+    return asked
+
+
+json_option = click.option(
+    "--json", "as_json", is_flag=True, callback=_json_alone, help="Print one JSON object to stdout instead of text."
+)
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="Show a traceback when something fails.")
 
 
@@ -114,7 +129,9 @@ def say(message: str) -> None:
 
 def print_json(content: Any) -> None:
     """Print one JSON object on stdout; not-a-number never appears in it."""
-    click.echo(json.dumps(content, indent=2, allow_nan=False))
+    context = click.get_current_context(silent=True)
+    stdout = None if context is None else context.meta.get(STDOUT)
+    click.echo(json.dumps(content, indent=2, allow_nan=False), file=stdout)
 
 
 def print_facts(facts: dict[str, Any], as_json: bool, told: str | Callable[[dict[str, Any]], None]) -> None:

@@ -47,7 +47,7 @@ class Choices:
             if str(given.get(key, value)) != str(value):
                 raise ConfigError(f"--{key} {value} contradicts --set {key}={given[key]}: give one of them", key=key)
             given[key] = value
-        return {**self.below, **given}
+        return {**{k: v for k, v in self.below.items() if k.partition(".")[0] not in given}, **given}
 
     def method_names(self, plugins: PluginManager) -> list[str]:
         """The methods that `--method a,b --method c` names, else the one of the configuration file, else the default.
@@ -115,16 +115,20 @@ class Choices:
     def with_rate_of(self, directory: Path, plugins: PluginManager) -> Choices:
         """The same for a run directory: its config.toml, with what another rate point would change in it."""
         from splatwizard_core.runs.config import read_config_file, resolve
-        from splatwizard_core.training.keys import field_at, value_at
+        from splatwizard_core.training.keys import dotted, field_at
 
         chosen = replace(self, config_file=str(directory / "config.toml"))
         if self.rate is None:
             return chosen
         (name,) = chosen.method_names(plugins)
         method = plugins.methods.load(name)
-        wanted = resolve(method, str(read_config_file(directory / "config.toml").get("preset", "paper")), self.rate)
-        keys = {key for values in method.RATES.values() for key in values if field_at(method.Config, key) is not None}
-        return replace(chosen, rate=None, below={key: value_at(wanted.config, key) for key in keys})
+        preset = str(read_config_file(directory / "config.toml").get("preset", "paper"))
+        wanted = resolve(method, preset, self.rate, plugins=plugins)
+        keys = tuple(
+            f"{k}." for point in method.RATES.values() for k in point if field_at(method.Config, k) is not None
+        )
+        found = dotted(wanted.config.model_dump(), "").items()
+        return replace(chosen, rate=None, below={k: v for k, v in found if f"{k}.".startswith(keys)})
 
 
 def takes_choices(function: Callable[..., None]) -> Callable[..., None]:

@@ -33,8 +33,8 @@ import numpy.typing as npt
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
 from splatwizard_core.coding.strict_json import dump_strict, load_strict
-from splatwizard_core.errors import BitstreamError, SplatwizardError
-from splatwizard_core.files import write_atomic
+from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError
+from splatwizard_native import write_atomic
 
 MAGIC = b"SPWZ"
 VERSION = 1
@@ -385,10 +385,12 @@ class ContainerReader:
         return float(value)
 
     def text(self, key: str, *, choices: Sequence[str]) -> str:
-        """The string `static[key]`, one of `choices`. Raises BitstreamError otherwise."""
+        """The string `static[key]`, one of `choices`; else BitstreamError, or PluginError if the file requires it."""
         value = self.static.get(key)
         if not isinstance(value, str) or value not in choices:
-            raise self._damage(f"header value '{key}' is {value!r:.80}, must be one of {', '.join(choices)}", "header")
+            bad = self._damage(f"header value '{key}' is {value!r:.80}, must be one of {', '.join(choices)}", "header")
+            kinds = [kind for each in self.requires for kind, name in each.provided if name == value]
+            raise PluginError(str(bad), kind=kinds[0], name=value) if kinds else bad
         return value
 
     def summary(self) -> dict[str, Any]:

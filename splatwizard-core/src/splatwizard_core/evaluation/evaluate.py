@@ -15,24 +15,24 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import BitstreamError, SceneError, out_of_memory
+from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.evaluation.image import prepare_render
 from splatwizard_core.evaluation.metrics import (
     MetricInfo,
     MetricSettings,
     MetricSetup,
     PreparedMetric,
+    measured,
     noting_failure,
     prepare_metric,
 )
-from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.registry import Entry
-from splatwizard_core.progress import track
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import View
+from splatwizard_native import out_of_memory, replacing, track
 
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
 RASTER_KEYS: Mapping[str, type] = {"profile": str, "antialias": bool, "eps2d": float, "clamp_color": bool}
@@ -173,7 +173,7 @@ def evaluate(
             for entry in (e for e in wanted if e.name not in missing):
                 drawn_image = exact if MetricInfo.of(entry).unrounded else image
                 with noting_failure(entry, missing):
-                    values[entry.name].append(float(ready[entry.name].compute(drawn_image, truth)))
+                    values[entry.name].append(measured(entry, ready[entry.name], drawn_image, truth))
             visible += int(result.visible.sum())
             drawn += len(result.inputs)
             if save_to is not None:

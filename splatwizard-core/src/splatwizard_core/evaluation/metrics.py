@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import FORESEEN, CapabilityError, ConfigError, PluginError
+from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.registry import Entry, TypedRegistry
+from splatwizard_native import ForeseenError
 
 if TYPE_CHECKING:
     from pydantic import BaseModel
@@ -149,7 +150,8 @@ def check_settings(registry: TypedRegistry[AnyMetric], settings: MetricSettings)
 
     Raises ConfigError for a group or key that no installed metric has, with the nearest one, and for a bad value.
     """
-    models = {MetricInfo.of(e).group: e for e in registry if MetricInfo.of(e).settings}
+    ours_last = sorted(registry, key=lambda e: not e.foreign)  # a group of ours stays ours
+    models = {MetricInfo.of(e).group: e for e in ours_last if MetricInfo.of(e).settings}
     checked: dict[str, dict[str, Any]] = {}
     for group, given in settings.items():
         if group not in models:
@@ -182,7 +184,7 @@ def unavailable(entries: Iterable[Entry], setup: MetricSetup) -> list[str]:
         with noting_failure(entry, lines):
             line = ask(setup) if callable(ask) else None
             if line is not None:
-                lines[entry.name] = line
+                lines[entry.name] = str(line)
     return list(dict.fromkeys(lines.values()))
 
 
@@ -192,20 +194,31 @@ def prepare_metric(entry: Entry, setup: MetricSetup) -> PreparedMetric:
     return target.prepare(setup) if isinstance(target, MetricFactory) else PreparedMetric(target)
 
 
+def measured(entry: Entry, metric: PreparedMetric, render: Tensor, truth: Tensor) -> float:
+    """The value of a metric; one of a stranger gets copies of the images, so that it spoils no other's."""
+    if not entry.foreign:
+        return float(metric.compute(render, truth))
+    copies = render.clone(), truth.clone()
+    value = float(metric.compute(*copies))
+    if not (torch.equal(copies[0], render) and torch.equal(copies[1], truth)):
+        raise ValueError("it changes the images that it is given")
+    return value
+
+
 @contextlib.contextmanager
 def noting_failure(entry: Entry, reasons: dict[str, str]) -> Iterator[None]:
     """Note under the metric's name why it has no value: what it says itself, or, where it broke, package and error.
 
-    Raises the error itself if it is for the user (damaged weights), or about a GPU without memory.
+    Raises the error itself if it is for the user (damaged weights), or about a GPU without memory; not a stranger's.
     """
     try:
         yield
     except (PluginError, CapabilityError) as error:
         reasons[entry.name] = str(error)
-    except (*FORESEEN, torch.cuda.OutOfMemoryError):
-        raise
     except (Exception, SystemExit) as error:
-        reasons[entry.name] = f"metric '{entry.name}' of {entry.distribution} {entry.version} failed: {one_line(error)}"
+        if isinstance(error, (ForeseenError, torch.cuda.OutOfMemoryError)) and not entry.foreign:
+            raise
+        reasons[entry.name] = f"{entry.whose} failed: {one_line(error)}"
 
 
 def metric_identities(registry: TypedRegistry[AnyMetric], setup: MetricSetup) -> dict[str, str | None]:

@@ -20,8 +20,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.progress import track
-from splatwizard_native import MemoryMeter, synchronize
+from splatwizard_native import MemoryMeter, synchronize, track
 
 WARMUP_FRAMES = 10
 CUDA_FRAMES = 100

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import inspect
+import json
+import sys
 from collections.abc import Callable, Generator, Iterable
 from contextlib import AbstractContextManager
 from typing import Any
@@ -14,6 +17,11 @@ from splatwizard_core.errors import PluginError
 
 Guard = Callable[[str, Iterable[Any]], AbstractContextManager[None]]
 """(hook, arguments) -> a context that takes any exception of the implementation."""
+
+
+def prints_to_stderr() -> AbstractContextManager[Any]:
+    """In the block, what a stranger prints does not stand in the output of a command."""
+    return contextlib.redirect_stdout(sys.stderr)
 
 
 class GuardedHooks:
@@ -37,7 +45,10 @@ def _guarded(function: Callable[..., Any], hook: str, guard: Guard) -> Callable[
     @functools.wraps(function)  # pluggy reads options and argument names off it
     def call(*arguments: Any, **keywords: Any) -> Any:
         with guard(hook, [*arguments, *keywords.values()]):
-            return function(*arguments, **keywords)
+            found = function(*arguments, **keywords)
+            if hook == "describe_scene":  # it may only return what can be printed
+                json.dumps({**(found or {})}, allow_nan=False)
+            return found
 
     return call
 
@@ -53,7 +64,7 @@ def _guarded_wrapper(function: Callable[..., Any], hook: str, guard: Guard) -> C
         result = yield  # what the other implementations return
         if failed:
             return result
-        with guard(hook, ()):
+        with guard(hook, [*arguments, *keywords.values()]):  # what it adds now is its own too
             try:
                 inner.send(result)
             except StopIteration as end:
@@ -65,5 +76,8 @@ def _guarded_wrapper(function: Callable[..., Any], hook: str, guard: Guard) -> C
 
 def one_line(error: BaseException) -> str:
     """An exception as one line: its own text for an error that is meant for users, else with its type before it."""
-    reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
+    try:
+        reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
+    except Exception:  # a stranger's __str__
+        reason = type(error).__name__
     return " ".join(reason.split())

@@ -5,13 +5,20 @@ from __future__ import annotations
 import contextlib
 import functools
 import importlib.metadata
+import logging
+from collections.abc import Sequence
 from dataclasses import dataclass
 from email.message import Message
 from email.parser import HeaderParser
 
 from packaging.requirements import InvalidRequirement, Requirement
 
-from splatwizard_core.plugins.catalogue import normal_name
+from splatwizard_core.plugins.catalogue import is_ours, normal_name, our_distributions
+from splatwizard_core.plugins.guards import one_line
+
+log = logging.getLogger(__name__)
+
+CORE_KEY = "core"  # entry point of the core itself: it loads first and whatever SW_PLUGINS says
 
 
 @dataclass
@@ -20,6 +27,7 @@ class PluginInfo:
 
     key     name of its entry point
     error   why it could not be loaded, or None
+    foreign it is installed and none of ours
     """
 
     key: str
@@ -27,12 +35,48 @@ class PluginInfo:
     version: str
     module: str
     error: str | None = None
+    foreign: bool = False
+
+    @property
+    def is_core(self) -> bool:
+        """Whether it is the core itself, and not only called so."""
+        return self.key == CORE_KEY and not self.foreign
 
 
 def plugin_info(entry_point: importlib.metadata.EntryPoint) -> PluginInfo:
     """Facts of a plugin before it is imported."""
-    header = _header(entry_point.dist)
-    return PluginInfo(entry_point.name, header["Name"] or entry_point.name, header["Version"] or "", entry_point.value)
+    header, dist = _header(entry_point.dist), entry_point.dist
+    nameless = f"{entry_point.name} (without metadata)"  # an entry point that is called like one of ours is not it
+    name = " ".join((header["Name"] or (entry_point.name if dist is None else nameless)).split())
+    version = " ".join((header["Version"] or "").split())
+    foreign = dist is not None and not is_ours(name)
+    return PluginInfo(entry_point.name, name, version, entry_point.value, foreign=foreign)
+
+
+def installed_entry_points(group: str) -> list[importlib.metadata.EntryPoint]:
+    """Entry points of all installed distributions; one whose list cannot be read is left out with a warning."""
+    try:
+        return list(importlib.metadata.entry_points(group=group))
+    except Exception:  # of a single one, which hides all others
+        found: list[importlib.metadata.EntryPoint] = []
+        backwards = reversed(list(importlib.metadata.distributions()))  # so that the first on the path is taken
+        for name, dist in {_header(d)["Name"] or str(d.locate_file("")): d for d in backwards}.items():
+            try:
+                found += dist.entry_points.select(group=group)
+            except Exception as error:
+                log.warning("entry_points.txt of %s cannot be read: %s", name, one_line(error))
+        return found
+
+
+def taken_key(info: PluginInfo, plugins: Sequence[PluginInfo]) -> str | None:
+    """One line about whose the name of a stranger's entry point is; None: its own."""
+    key = normal_name(info.key)
+    ours = next((name for name in our_distributions() if name.partition("-")[2] == key), None)
+    others = sorted(p.distribution for p in plugins if p is not info and normal_name(p.key) == key)
+    if not (info.foreign and (ours or others)):
+        return None
+    cure = f"uninstall {info.distribution}, or have its author rename it" if ours else "uninstall one of them"
+    return f"its entry point is called '{info.key}', which is the name of {ours or ' and '.join(others)}: {cure}"
 
 
 def names_of(entry_point: importlib.metadata.EntryPoint) -> set[str]:
@@ -65,7 +109,7 @@ def _header(dist: importlib.metadata.Distribution | None) -> Message:
     Empty for one whose metadata is missing or no text.
     """
     text = None
-    with contextlib.suppress(UnicodeDecodeError):
+    with contextlib.suppress(UnicodeDecodeError, OSError):
         text = dist and (dist.read_text("METADATA") or dist.read_text("PKG-INFO"))
     return HeaderParser().parsestr((text or "").partition("\n\n")[0])
 

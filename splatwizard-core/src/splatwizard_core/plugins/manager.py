@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any
 import pluggy
 
 from splatwizard_core.errors import PluginError
-from splatwizard_core.plugins import hookspecs
+from splatwizard_core.plugins import hookspecs, loading
 from splatwizard_core.plugins.catalogue import normal_name
-from splatwizard_core.plugins.guards import guarded_hooks, one_line
-from splatwizard_core.plugins.loading import PluginInfo, names_of, plugin_info, unmet_requirement
+from splatwizard_core.plugins.guards import guarded_hooks, one_line, prints_to_stderr
+from splatwizard_core.plugins.loading import PluginInfo
 from splatwizard_core.plugins.registry import Coders, Entry, Registry, TypedRegistry
 
 if TYPE_CHECKING:
@@ -41,8 +41,6 @@ if TYPE_CHECKING:
     from splatwizard_core.training.pruner import Pruner
 
 log = logging.getLogger(__name__)
-
-CORE_KEY = "core"  # entry point of the core itself: it loads first and whatever SW_PLUGINS says
 
 
 class PluginManager:
@@ -97,8 +95,10 @@ class PluginManager:
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
         self._loaded: list[tuple[PluginInfo, object]] = []
-        for entry_point in _chosen(entry_points, only):
-            self._load(entry_point)
+        chosen = _chosen(entry_points, only)
+        self.plugins += [info for info, _ in chosen]
+        for info, entry_point in chosen:
+            self._load(info, entry_point)
         for hook, registry in self._filled_by.items():
             getattr(self._pluggy.hook, hook)(registry=registry)
         for info, hooks in self._loaded:
@@ -107,21 +107,20 @@ class PluginManager:
                 for registry in self.registries.values():
                     registry._withdraw(info.distribution)
 
-    def _load(self, entry_point: importlib.metadata.EntryPoint) -> None:
-        info = plugin_info(entry_point)
-        self.plugins.append(info)
+    def _load(self, info: PluginInfo, entry_point: importlib.metadata.EntryPoint) -> None:
+        hooks = None
         try:
-            unmet = unmet_requirement(entry_point.dist)
-            if unmet is not None:
-                raise PluginError(unmet)
-            hooks = guarded_hooks(entry_point.load(), self._pluggy, functools.partial(self._guard, info))
-            self._pluggy.register(hooks, name=entry_point.name)
-            try:
-                self._pluggy.check_pending()
-            except pluggy.PluginValidationError:
-                self._pluggy.unregister(hooks)
-                raise
+            obstacle = loading.taken_key(info, self.plugins) or loading.unmet_requirement(entry_point.dist)
+            if obstacle is not None:
+                raise PluginError(obstacle)
+            with prints_to_stderr():
+                module = entry_point.load()
+            hooks = guarded_hooks(module, self._pluggy, functools.partial(self._guard, info))
+            self._pluggy.register(hooks)
+            self._pluggy.check_pending()
         except (Exception, SystemExit) as error:  # a module that exits when it is imported must not end `sw`
+            if self._pluggy.is_registered(hooks):  # with some of its hooks
+                self._pluggy.unregister(hooks)
             info.error = one_line(error)
             log.debug("plugin %s could not be loaded", info.distribution, exc_info=True)
         else:
@@ -136,9 +135,10 @@ class PluginManager:
         registering = hook in self._filled_by
         for argument in arguments:
             if isinstance(argument, Registry):
-                argument._owner = (info.distribution, info.version)
+                argument._owner = (info.distribution, info.version, info.foreign)
         try:
-            yield
+            with contextlib.nullcontext() if hook == "run_finished" else prints_to_stderr():  # that one prints tables
+                yield
         except (Exception, SystemExit) as error:
             log.debug("plugin %s: %s failed", info.distribution, hook, exc_info=True)
             if not registering:
@@ -158,6 +158,11 @@ class PluginManager:
             clashing = [e for entries in registry.clashes.values() for e in entries]
             found += [e for e in [*registry, *clashing] if e.distribution == info.distribution]
         return found
+
+    def refused_of(self, info: PluginInfo) -> list[tuple[Entry, str]]:
+        """(entry, why) of what a plugin added in vain; all else that it added is there."""
+        refused = [each for registry in self.registries.values() for each in registry.refused]
+        return [(entry, why) for entry, why in refused if entry.distribution == info.distribution]
 
     @contextlib.contextmanager
     def recording(self) -> Iterator[list[Entry]]:
@@ -179,19 +184,20 @@ class PluginManager:
 
 def _chosen(
     entry_points: Iterable[importlib.metadata.EntryPoint], only: set[str] | None
-) -> list[importlib.metadata.EntryPoint]:
-    """The entry points to load, the core's first. Raises PluginError for a name in `only` that is not installed."""
-    found = sorted(entry_points, key=lambda e: (e.name != CORE_KEY, e.name))
+) -> list[tuple[PluginInfo, importlib.metadata.EntryPoint]]:
+    """The plugins to load: the core, ours, others by name. Raises PluginError for one in `only` that is not there."""
+    found = [(loading.plugin_info(each), each) for each in entry_points]
+    found.sort(key=lambda each: (not each[0].is_core, each[0].foreign, each[0].key, each[0].distribution))
     if only is None:
         return found
-    unknown = [name for name in sorted(only) if not any(normal_name(name) in names_of(e) for e in found)]
+    unknown = [name for name in sorted(only) if not any(normal_name(name) in loading.names_of(e) for _, e in found)]
     if unknown:
         raise PluginError(
             f"SW_PLUGINS names '{', '.join(unknown)}', which is not installed; there are: "
-            f"{', '.join(e.name for e in found if e.name != CORE_KEY) or 'no plugins'}"
+            f"{', '.join(info.key for info, _ in found if not info.is_core) or 'no plugins'}"
         )
     chosen = {normal_name(name) for name in only}
-    return [e for e in found if e.name == CORE_KEY or chosen & names_of(e)]
+    return [each for each in found if each[0].is_core or chosen & loading.names_of(each[1])]
 
 
 @functools.cache
@@ -203,4 +209,4 @@ def load_plugins() -> PluginManager:
     """
     names = os.environ.get("SW_PLUGINS")
     only = None if names is None else {n.strip() for n in names.split(",") if n.strip()}
-    return PluginManager(importlib.metadata.entry_points(group=hookspecs.ENTRY_POINT_GROUP), only)
+    return PluginManager(loading.installed_entry_points(hookspecs.ENTRY_POINT_GROUP), only)

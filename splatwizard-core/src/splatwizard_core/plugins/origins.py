@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.metadata
 import inspect
+import traceback
 from typing import Any
 
+from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.plugins.manager import PluginManager
 
 Owner = tuple[str, str]
@@ -35,15 +38,33 @@ class Origins:
         if not (inspect.isclass(thing) or inspect.isroutine(thing)):
             thing = type(thing)
         module = getattr(thing, "__module__", None) or ""
-        name = module
+        owner = self._of_module(module)
+        if owner != NOBODY:
+            return owner
+        # Several distributions in one namespace, or none that is a plugin.
+        found: set[str] = set()
+        with contextlib.suppress(Exception):  # the metadata of one of all that is installed cannot be read
+            found.update(_packages().get(module.partition(".")[0], ()))
+        if len(found) != 1:
+            return NOBODY
+        distribution = found.pop()
+        return distribution, importlib.metadata.version(distribution)
+
+    def _of_module(self, name: str) -> Owner:
         while name:
             owners = self._owners.get(name, set())
             if len(owners) == 1:
                 return next(iter(owners))
             name = name.rpartition(".")[0]
-        # Several distributions in one namespace, or none that is a plugin.
-        found = set(_packages().get(module.partition(".")[0], ()))
-        if len(found) != 1:
-            return NOBODY
-        distribution = found.pop()
-        return distribution, importlib.metadata.version(distribution)
+        return NOBODY
+
+    def culprit(self, error: BaseException) -> Owner:
+        """(distribution, version) of the plugin in whose code an exception came up, the innermost; none of ours."""
+        at: BaseException | None = error
+        found = NOBODY
+        while at is not None:
+            for frame, _ in traceback.walk_tb(at.__traceback__):
+                owner = self._of_module(frame.f_globals.get("__name__", ""))
+                found = found if owner == NOBODY or is_ours(owner[0]) else owner
+            at = at.__cause__
+        return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -9,9 +10,13 @@ from types import MappingProxyType
 from typing import Any, Generic, TypeVar
 
 from splatwizard_core.errors import PluginError
-from splatwizard_core.plugins.catalogue import is_ours, package_of
+from splatwizard_core.plugins.catalogue import catalogue, is_ours, package_of
+from splatwizard_core.plugins.fields import illegal
+from splatwizard_core.plugins.guards import prints_to_stderr
 
 T = TypeVar("T")
+
+TAKEN = "that is a name of {owner}, and stays so: uninstall this package, or have its author rename the entry"
 
 
 @dataclass(frozen=True)
@@ -24,6 +29,7 @@ class Entry:
     summary         one line for `sw list-plugins`
     declared        what the kind declares besides (a rasterizer's features, a metric's direction)
     distribution    the pip distribution it comes from, and its version
+    foreign         that is none of ours: what it provides serves who asks for it, and changes nothing for others
     """
 
     kind: str
@@ -33,19 +39,27 @@ class Entry:
     declared: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     distribution: str = ""
     version: str = ""
+    foreign: bool = False
+
+    @property
+    def whose(self) -> str:
+        """`metric 'sharpness' of sw-theirs 0.2`: how a message names it."""
+        return f"{self.kind} '{self.name}' of {self.distribution} {self.version}"
 
     def load(self) -> Any:
         """Import the target. Raises PluginError that names the distribution."""
         module_name, _, attribute = self.target.partition(":")
         try:
-            found: Any = importlib.import_module(module_name)
-            for part in attribute.split("."):
-                found = getattr(found, part)
-        except Exception as error:
-            raise PluginError(
-                f"{self.kind} '{self.name}' of {self.distribution} {self.version} could not be loaded from "
-                f"{self.target}: {type(error).__name__}: {error}"
-            ) from error
+            with prints_to_stderr():
+                found: Any = importlib.import_module(module_name)
+                for part in attribute.split("."):
+                    found = getattr(found, part)
+        except (Exception, SystemExit) as error:
+            why = f"{type(error).__name__}: {error}"
+            raise PluginError(f"{self.whose} could not be loaded from {self.target}: {why}") from error
+        own = getattr(found, "name", self.name)
+        if self.kind == "method" and own != self.name:  # files and records would name what nobody can ask for
+            raise PluginError(f"{self.whose} is called '{own}' by its class: {self.target} needs name = '{self.name}'")
         return found
 
 
@@ -56,7 +70,8 @@ class Registry:
         self.kind = kind
         self._entries: dict[str, Entry] = {}
         self._clashes: dict[str, list[Entry]] = {}
-        self._owner: tuple[str, str] = ("", "")
+        self._owner: tuple[str, str, bool] = ("", "", False)
+        self.refused: list[tuple[Entry, str]] = []  # (entry, why) of what was added in vain
         self._recorders: list[list[Entry]] = []
 
     def add(self, name: str, target: str, *, summary: str, **declared: Any) -> None:
@@ -66,17 +81,31 @@ class Registry:
         summary     one line
         declared    fields of the kind, plain values that can be printed as JSON
 
-        A name that another distribution claims too belongs to neither; asking for it is an error that names both.
+        A name of ours stays ours. One that two others claim belongs to neither: asking for it is an error that names
+        both. An entry with a name or a field that is not legal is refused alone.
         Raises PluginError if the target is malformed.
         """
-        distribution, version = self._owner
+        distribution, version, foreign = self._owner
         module_name, separator, attribute = target.partition(":")
         if not (separator and module_name and attribute):
             raise PluginError(
                 f"{distribution}: {self.kind} '{name}' has target '{target}'; it must be 'module:attribute'"
             )
-        entry = Entry(self.kind, name, target, summary, MappingProxyType(dict(declared)), distribution, version)
-        if name in self._clashes:
+        summary = " ".join(str(summary).split())
+        entry = Entry(self.kind, name, target, summary, MappingProxyType(declared), distribution, version, foreign)
+        fault = illegal(self.kind, name, declared)
+        if fault is not None:
+            self.refused.append((dataclasses.replace(entry, name=str(name)), fault))
+            return
+        rivals = [*self._clashes.get(name, ()), *filter(None, [self._entries.get(name)])]
+        owner = next((e.distribution for e in rivals if not e.foreign), catalogue().get(self.kind, {}).get(name))
+        if foreign and owner is not None:
+            self.refused.append((entry, TAKEN.format(owner=owner)))
+        elif not foreign and any(e.foreign for e in rivals):
+            self.refused += [(e, TAKEN.format(owner=distribution)) for e in rivals]
+            self._clashes.pop(name, None)
+            self._entries[name] = entry
+        elif name in self._clashes:
             self._clashes[name].append(entry)
         elif name in self._entries:
             # Neither wins: which one a name means must not depend on the order of installation.
@@ -88,6 +117,7 @@ class Registry:
         """Take back everything that one distribution added (its hook failed half way)."""
         claims = self._clashes | {n: [e] for n, e in self._entries.items()}
         left = {n: [e for e in found if e.distribution != distribution] for n, found in claims.items()}
+        self.refused = [each for each in self.refused if each[0].distribution != distribution]
         # A name that only one other still claims belongs to that one again.
         self._entries = {n: found[0] for n, found in left.items() if len(found) == 1}
         self._clashes = {n: found for n, found in left.items() if len(found) > 1}
@@ -166,15 +196,19 @@ class Coders(Generic[T]):
         """Sorted names that can be asked for."""
         return [entry.name for entry in self._registry if entry.declared.get("codes") == self.codes]
 
-    def load(self, name: str) -> Callable[..., T]:
-        """The class or factory called `name`. Raises PluginError if none of this sort is."""
+    def entry(self, name: str) -> Entry:
+        """The entry called `name`. Raises PluginError if none of this sort is."""
         if name in self._registry and name not in self.names:
             raise PluginError(
                 f"coder '{name}' does not code {self.codes}; those that do: {', '.join(self.names) or 'none'}",
                 kind=self._registry.kind,
                 name=name,
             )
-        found: Callable[..., T] = self._registry.load(name)
+        return self._registry.entry(name)
+
+    def load(self, name: str) -> Callable[..., T]:
+        """The class or factory called `name`. Raises PluginError as `entry` does, or if the import fails."""
+        found: Callable[..., T] = self._registry.load(self.entry(name).name)
         return found
 
 

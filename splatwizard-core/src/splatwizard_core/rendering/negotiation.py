@@ -12,9 +12,10 @@ from typing import TypeVar
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import FORESEEN, CapabilityError, PluginError
+from splatwizard_core.errors import CapabilityError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
+from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.plugins.manager import PluginManager
 from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.rendering.adapters import AdaptedRasterizer, adapted_requirements
@@ -22,7 +23,7 @@ from splatwizard_core.rendering.features import Feature
 from splatwizard_core.rendering.info import RasterizerInfo
 from splatwizard_core.rendering.rasterizer import AccumOutput, Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
-from splatwizard_native import NativeBuildError
+from splatwizard_native import ForeseenError, NativeBuildError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -41,7 +42,8 @@ class NegotiatedRasterizer:
     Order: preferred ones; then fast ones that serve directly; then fast ones behind an adapter; then those of speed
     0, the oracles. Within each, the higher speed. A rasterizer whose native module cannot be built is left out with
     one warning, and so is one whose entry cannot be read (it may know features of a newer core), unless it was asked
-    for by name. SW_RASTERIZER=name (for debugging) takes that one or fails.
+    for by name. One that is none of ours is taken only where it is preferred. SW_RASTERIZER=name (for debugging) takes
+    that one or fails.
     Raises PluginError for a name that is not installed.
     """
 
@@ -114,7 +116,7 @@ class NegotiatedRasterizer:
             try:
                 rasterizer = self._make(best.name)
                 break
-            except FORESEEN as error:
+            except ForeseenError as error:
                 self._fail(best.name, error)
         asked, composing = "+".join(sorted(wanted)) or "plain", ""
         if missing := wanted - best.features:
@@ -143,11 +145,12 @@ class NegotiatedRasterizer:
         entry = self._registry.entry(name)
         try:
             made: Rasterizer = entry.load()()
-        except FORESEEN:
+            if entry.foreign and made.info.name != name:
+                raise TypeError(f"its info.name is '{made.info.name}'")
+        except ForeseenError:
             raise
         except (Exception, SystemExit) as error:
-            reason = f"{type(error).__name__}: {error}"
-            raise PluginError(f"rasterizer '{name}' of {entry.distribution} cannot be made: {reason}") from error
+            raise PluginError(f"{entry.whose} cannot be made: {one_line(error)}") from error
         return made
 
     def _fail(self, name: str, error: Exception) -> None:
@@ -176,7 +179,12 @@ class NegotiatedRasterizer:
         """Whether device, the user's lists and the accepted exactness leave it."""
         if self._forced is not None:
             return info.name == self._forced
-        return self.device.type in info.devices and info.name not in self._forbid and self._accepts(info)
+        is_barred = info.name in self._forbid or self._is_uninvited(info)
+        return self.device.type in info.devices and not is_barred and self._accepts(info)
+
+    def _is_uninvited(self, info: RasterizerInfo) -> bool:
+        """Whether a stranger's rasterizer stands aside: how fast it says it is would take it into everybody's runs."""
+        return info.name not in self._prefer and self._registry.entry(info.name).foreign
 
     def _best(self, wanted: frozenset[str]) -> tuple[RasterizerInfo, str | None]:
         """(the best that can run, why a better one cannot if the user should know)."""
@@ -201,7 +209,7 @@ class NegotiatedRasterizer:
             return self._failed[info.name]
         try:
             return info.obstacle(self.device)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             return f"its probe {info.available} failed: {type(error).__name__}: {error}"
 
     def _nothing(self, wanted: frozenset[str], unavailable: dict[str, str]) -> CapabilityError:
@@ -215,6 +223,7 @@ class NegotiatedRasterizer:
                 f"{info.name} ({'/'.join(sorted(info.devices))})"
                 + (f" lacks {', '.join(sorted(lacks))}" if lacks else "")
                 + (f" draws nothing without {', '.join(sorted(needs))}" if needs else "")
+                + (" serves only where raster.prefer names it" if self._is_uninvited(info) else "")
                 + (" is forbidden" if info.name in self._forbid else "")
                 + ("" if self._accepts(info) else f" is {info.exactness}")
             )

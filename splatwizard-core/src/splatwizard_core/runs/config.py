@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
-from splatwizard_core.files import file_sha256
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.locate import is_procedural
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
 from splatwizard_core.training.params import OptimizationParams, Params, PipelineParams, SceneParams
+from splatwizard_native import file_sha256
 
 if TYPE_CHECKING:
     from splatwizard_core.method import Method
@@ -130,7 +130,7 @@ class ResolvedConfig:
 
     def config_content(self) -> dict[str, Any]:
         """Return the method's hyper-parameters, with what its input files hold in place of where they lie."""
-        config = self.config.model_dump(mode="json")
+        config = self.config.identity()
         for key, digest in self._input_digests.items():
             set_at(config, key, digest)
         return config
@@ -153,7 +153,8 @@ class ResolvedConfig:
 
         Settings of metrics are left out: what a metric's values depend on is the metric's to tell.
         """
-        return content_hash({k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")})
+        beside = {k: v for k, v in self.as_dict().items() if k not in ("provenance", "metrics")}
+        return content_hash(beside | {"config": self.config.identity()})
 
 
 def content_hash(content: Any) -> str:
@@ -275,6 +276,7 @@ def resolve(
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),
     ):
+        layer = config.spelled(layer)
         given: dict[type[Params], dict[str, Any]] = {method.Config: {}, PipelineParams: {}, SceneParams: {}}
         for key, value in layer.items():
             block = next((block for block in given if field_at(block, key) is not None), None)
@@ -292,6 +294,7 @@ def resolve(
         config = apply_overrides(config, given[method.Config], source=source)
         ppl = apply_overrides(ppl, given[PipelineParams], source=source)
         reading = apply_overrides(reading, given[SceneParams], source=source)
+    config = config.completed(plugins, provenance)
     scene_options = SceneOptions(**reading.model_dump(), seed=ppl.seed)
     return ResolvedConfig(
         method.name, preset, rate, scene_spec, config, ppl, scene_options, provenance, init, pretrained,

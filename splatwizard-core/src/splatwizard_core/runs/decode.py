@@ -15,15 +15,14 @@ import torch
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
-from splatwizard_core.files import replacing
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.progress import track
+from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.runs.contention import contention
-from splatwizard_core.runs.file_needs import missing_plugin, newer_than_installed, upgrade_command
+from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
 from splatwizard_core.runs.session import Session
-from splatwizard_native import CoreTime, MemoryMeter, synchronize
+from splatwizard_native import CoreTime, ForeseenError, MemoryMeter, replacing, synchronize, track
 
 REPEATS = 3
 
@@ -44,8 +43,8 @@ def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
         entry = plugins.methods.entry(reader.method)
         raise BitstreamError(
             f"{reader.name}: version {reader.version} of the layout of '{reader.method}' is newer than "
-            f"{method_class.version}, which {entry.distribution} {entry.version} reads: upgrade it with "
-            f"{upgrade_command(reader, entry.distribution, entry.version)}"
+            f"{method_class.version}, which {entry.distribution} {entry.version} reads: upgrade with "
+            f"{upgrade_command(reader, entry.distribution, entry.version, entry.name)}"
         )
     try:
         with torch.no_grad():
@@ -55,16 +54,11 @@ def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:
         # Asked for only now: what helped to write the file may have nothing to do with reading it.
         if error.kind is None or error.name is None:
             raise
+        if error.name in plugins.registries.get(error.kind, ()):  # it is there, and of no use in this place
+            raise BitstreamError(str(error), section="header") from error
         raise missing_plugin(reader, plugins, error.kind, error.name) from error
     except BitstreamError as error:
-        newer = newer_than_installed(reader, plugins)
-        if not newer:
-            raise
-        told = "; ".join(f"{each.distribution} {each.version}, installed is {have}" for each, have in newer)
-        wanted = " ".join(f"'{each.distribution}>={each.version}'" for each, _ in newer)
-        raise BitstreamError(
-            f"{error} (the file was written with {told}: pip install {wanted})", section=error.section
-        ) from error
+        raise BitstreamError(f"{error}{other_versions(reader, plugins)}", section=error.section) from error
     return model
 
 
@@ -168,13 +162,21 @@ def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: st
 
     name    of the exporter; None: the one whose declared suffix `path` has
 
-    Raises UserInputError if there is none, or if the model has no such form.
+    Raises UserInputError if there is none, or if the model has no such form, PluginError if the exporter breaks.
     """
     if name is None:
-        suffixes = {str(e.declared.get("suffix", "")): e.name for e in plugins.exporters}
+        ours_last = sorted(plugins.exporters, key=lambda e: not e.foreign)  # a suffix of ours stays ours
+        suffixes = {e.declared.get("suffix", ""): e.name for e in ours_last}
         name = suffixes.get(path.suffix)
         if name is None:
             known = ", ".join(f"{suffix} ({exporter})" for suffix, exporter in sorted(suffixes.items()) if suffix)
             raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
-    plugins.exporters.load(name)(model, path)
+    try:
+        plugins.exporters.load(name)(model, path)
+        if not path.exists():
+            raise RuntimeError(f"it wrote no {path}")
+    except (ForeseenError, OSError):
+        raise
+    except (Exception, SystemExit) as error:
+        raise PluginError(f"{plugins.exporters.entry(name).whose} failed: {one_line(error)}") from error
     return name

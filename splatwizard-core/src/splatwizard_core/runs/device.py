@@ -41,10 +41,9 @@ def device_reason(asked: str, chosen: torch.device, plugins: PluginManager) -> s
 
 
 def cuda_rasterizers(plugins: PluginManager) -> list[str]:
-    """List the installed rasterizers with CUDA kernels that say they can run here; a slow reference does not count."""
-    entries = [entry for entry in plugins.rasterizers if "cuda" in entry.declared.get("devices", ())]
-    infos = [info for info in map(RasterizerInfo.from_entry, entries) if info.speed > 0]
-    return [info.name for info in infos if info.obstacle("cuda") is None]
+    """List our rasterizers with CUDA kernels that say they can run here; a slow reference does not count."""
+    infos = [RasterizerInfo.from_entry(entry) for entry in plugins.rasterizers if not entry.foreign]
+    return [i.name for i in infos if "cuda" in i.devices and i.speed > 0 and i.obstacle("cuda") is None]
 
 
 def set_threads(asked: int) -> int:

@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.files import remove_folder, sweep, write_atomic, write_json
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.lock import directory_lock
 from splatwizard_core.runs.record import FILE_NAME
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.images import check_pictures, decode_all
+from splatwizard_native import remove_folder, sweep, write_atomic, write_json
 
 STEPS = "steps.json"
 CHECKPOINTS = "checkpoints"

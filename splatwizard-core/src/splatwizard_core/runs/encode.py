@@ -15,7 +15,6 @@ from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.evaluate import raster_header
-from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
@@ -29,7 +28,7 @@ from splatwizard_core.runs.pretrained import make_method
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import finished_directory, train
 from splatwizard_core.runs.versions import made_by
-from splatwizard_native import CoreTime, synchronize
+from splatwizard_native import CoreTime, file_sha256, synchronize
 
 NEEDED_KINDS = ("method", "quantizer", "entropy model", "context model", "coder")
 """Kinds that a decoder may want again; a pruner or a rasterizer has done its work by then."""

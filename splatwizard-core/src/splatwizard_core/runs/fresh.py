@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_core.files import scratch_folder
+from splatwizard_native import scratch_folder
 
 HIDDEN = ("SPLATWIZARD_DATA", "SPLATWIZARD_TEST_DATA")
 

@@ -13,7 +13,6 @@ import torch
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.progress import track
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.contention import contention
@@ -24,7 +23,7 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene, View
-from splatwizard_native import CoreTime, MemoryMeter, synchronize
+from splatwizard_native import CoreTime, MemoryMeter, synchronize, track
 
 FEWEST_SPEED_VIEWS = 8
 

@@ -1,4 +1,4 @@
-"""Providers of each phase of a run: of each stage of the training, of encoding and rendering, with their versions.
+"""Providers of each phase of a run, with their versions: of each training stage, encoding, rendering, evaluating.
 
 A part is {"kind", "name", "distribution", "version"}. Kinds are those of the registries ("rasterizer", "pruner",
 "coder", ...) and "stage", a training stage by the distribution of its class: a method that takes over another's stage
@@ -19,7 +19,7 @@ from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import Stage
 
 Part = dict[str, str]
-TRAIN, ENCODE, RENDER = "train", "encode", "render"
+TRAIN, ENCODE, RENDER, EVALUATE = "train", "encode", "render", "evaluate"
 
 
 def part_of(entry: Entry) -> Part:
@@ -32,10 +32,10 @@ def unique(parts: Iterable[Part]) -> list[Part]:
     return list({tuple(part.values()): part for part in parts}.values())
 
 
-def rasterizer_parts(plugins: PluginManager, names: Iterable[str]) -> list[Part]:
-    """Return rasterizers, given by name, as parts; one that is not installed any more has no distribution."""
-    known = plugins.rasterizers
-    return unique(part_of(known.entry(name)) if name in known else _part("rasterizer", name) for name in names)
+def named_parts(plugins: PluginManager, kind: str, names: Iterable[str]) -> list[Part]:
+    """Return things of a kind, given by name, as parts; one that is not installed any more has no distribution."""
+    known = plugins.registries[kind]
+    return unique(part_of(known.entry(name)) if name in known else _part(kind, name) for name in names)
 
 
 def stage_parts(origins: Origins, stage: Stage, ppl: PipelineParams) -> list[Part]:
@@ -77,7 +77,8 @@ class StageParts:
     def since_asked(self) -> list[Part]:
         """Return the parts that served since this was last asked."""
         asked = map(part_of, _without_methods(self._loaded[self._mark :]))
-        found = unique([*self._pending, *asked, *rasterizer_parts(self._plugins, sorted(self._rasterizer.served))])
+        drawn = named_parts(self._plugins, "rasterizer", sorted(self._rasterizer.served))
+        found = unique([*self._pending, *asked, *drawn])
         self._rasterizer.served.clear()
         self._mark, self._pending = len(self._loaded), []
         return found
@@ -103,13 +104,14 @@ def phases_of_run(
     plugins: PluginManager,
     training: Mapping[str, Any],
     encoding: Mapping[str, Any],
-    rasterizers: Mapping[str, str],
+    measured: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     """Return all phases of a run from the facts of its steps."""
     return [
         *training["phases"],
         _phase(ENCODE, encoding["parts"]),
-        _phase(RENDER, rasterizer_parts(plugins, rasterizers.values())),
+        _phase(RENDER, named_parts(plugins, "rasterizer", measured["rasterizers"].values())),
+        _phase(EVALUATE, named_parts(plugins, "metric", (n for n, m in measured["metrics"].items() if m["per_view"]))),
     ]
 
 

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_core.files import write_atomic
+from splatwizard_native import write_atomic
 
 SCHEMA: Literal[3] = 3
 FILE_NAME = "metrics.json"
@@ -193,7 +193,9 @@ class ProvidedBlock(Part):
 class PhaseBlock(Part):
     """One phase of a run."""
 
-    phase: str = Field(description='"train: NAME" (a stage), "train" (asked for before the first), "encode", "render"')
+    phase: str = Field(
+        description='"train: NAME" (a stage), "train" (before the first), "encode", "render", "evaluate"'
+    )
     provided_by: list[ProvidedBlock]
 
 

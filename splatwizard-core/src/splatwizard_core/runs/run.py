@@ -14,7 +14,6 @@ from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
 from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
-from splatwizard_core.files import file_sha256
 from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
 from splatwizard_core.runs.contention import CONTENDED, contended_phases
@@ -27,6 +26,7 @@ from splatwizard_core.runs.pretrained import make_method, training_key
 from splatwizard_core.runs.session import Session, TrainedModel
 from splatwizard_core.runs.training import total_seconds, train
 from splatwizard_core.runs.versions import changes, installed, providers
+from splatwizard_native import file_sha256
 
 MEASURING = 2  # raised when `sw decode` and `sw eval` come to report more: a step that reported less is done again
 
@@ -171,7 +171,7 @@ def _record(
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
         "contended": contended,
         "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
-        "phases": phases_of_run(session.plugins, training, encoding, measured["rasterizers"]),
+        "phases": phases_of_run(session.plugins, training, encoding, measured),
         "date": datetime.now(timezone.utc).isoformat(timespec="seconds"),
     }
     return schema.complete_record(schema.picked(schema.Record, values))

@@ -10,7 +10,6 @@ from typing import Any, Literal, TypeVar
 import torch
 
 from splatwizard_core.errors import SceneError
-from splatwizard_core.files import file_sha256
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.catalogue import package_of
@@ -20,7 +19,7 @@ from splatwizard_core.runs.config import ResolvedConfig
 from splatwizard_core.runs.scene_digest import scene_digest
 from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
-from splatwizard_native import NativeBuildError, resolve_module
+from splatwizard_native import NativeBuildError, file_sha256, resolve_module
 
 T = TypeVar("T")
 Role = Literal["trained", "start"]

@@ -10,7 +10,6 @@ from typing import Any
 from splatwizard_core.errors import SplatwizardError
 from splatwizard_core.evaluation.evaluate import evaluate, raster_header
 from splatwizard_core.evaluation.metrics import quick_metrics
-from splatwizard_core.files import sweep, write_atomic
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import Entry
 from splatwizard_core.runs import pretrained
@@ -27,7 +26,7 @@ from splatwizard_core.scene.images import decode_all
 from splatwizard_core.streams import stream
 from splatwizard_core.training.checkpoint import CheckpointStore
 from splatwizard_core.training.pipeline import TrainingRun
-from splatwizard_native import CoreTime
+from splatwizard_native import CoreTime, sweep, write_atomic
 
 STEP = "train"
 BEGUN = "begun"

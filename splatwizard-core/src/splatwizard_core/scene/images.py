@@ -7,9 +7,8 @@ from concurrent.futures import ThreadPoolExecutor
 
 import torch
 
-from splatwizard_core.progress import track
 from splatwizard_core.scene.scene import View
-from splatwizard_native import available_cores
+from splatwizard_native import available_cores, track
 
 
 def decode_all(views: Iterable[View]) -> None:

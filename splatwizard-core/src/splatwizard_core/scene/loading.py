@@ -66,7 +66,10 @@ def _recognise(path: Path, families: Families) -> str:
     scores: dict[str, float] = {}
     for entry in families:
         try:
-            scores[entry.name] = float(_family(families, entry.name).detect(path))
+            score = float(_family(families, entry.name).detect(path))
+            if not 0 <= score <= 1:
+                raise ValueError(f"detect() gave {score}; it must be in 0..1")
+            scores[entry.name] = score
         except (Exception, SystemExit) as error:  # of one family; the others are asked all the same
             log.warning("data set '%s' of %s: %s", entry.name, entry.distribution, one_line(error))
     best = max(scores.values(), default=0.0)

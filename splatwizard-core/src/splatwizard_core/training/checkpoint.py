@@ -27,9 +27,9 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from splatwizard_core.errors import CheckpointError
-from splatwizard_core.files import TEMPORARY, replacing
 from splatwizard_core.training.keys import dotted
 from splatwizard_core.training.plan import plan_digest
+from splatwizard_native import TEMPORARY, replacing
 
 T = TypeVar("T")
 log = logging.getLogger(__name__)

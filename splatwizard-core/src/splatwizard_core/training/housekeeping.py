@@ -11,12 +11,11 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
-from splatwizard_core.progress import track
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
 from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
-from splatwizard_native import preserved_random_states, read_scalars, synchronize
+from splatwizard_native import preserved_random_states, read_scalars, synchronize, track
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun
@@ -72,13 +71,9 @@ class Housekeeping:
     def around(self) -> Iterator[None]:
         """The loop, timed and on display; a Ctrl-C waits for the end of its step."""
         run, trainer = self.run, self.trainer
-        write, index = run.run_log.write, trainer.index
-        for scheduler in (trainer.pre, trainer.post):
-            # Knows nothing of the trainer: a ring of references would keep the optimizer's memory for a while.
-            scheduler.on_log = lambda step, name: write(index, step, task=name)
         label = f"train {run.identity.get('method', self.name)}"
         if len(run.stages) > 1:
-            label += f": {self.name} ({index + 1} of {len(run.stages)})"
+            label += f": {self.name} ({trainer.index + 1} of {len(run.stages)})"
         bar = track(label, total=trainer.stage.iterations, start=trainer.step)
         with self.guard, bar as self._bar:
             self.clock.start()
@@ -165,7 +160,11 @@ class Housekeeping:
             self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics))
 
     def _log_step(self, record: StepRecord) -> None:
-        if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every:
+        for task, said in record.said:
+            self.run.run_log.write(record.stage, record.step, task=task, **({"said": said} if said else {}))
+            if said:
+                self._bar.say(f"step {record.step:,}, {task}: {said}")
+        if record.step not in (1, record.iterations) and record.step % self.run.ppl.log_every and not record.scalars:
             return
         groups = self.trainer.optimizer.groups.values()
         facts = {"lr": {group.name: group.lr for group in groups}, **self.trainer.model.counts()}
@@ -176,11 +175,14 @@ class Housekeeping:
     def _write_lines(self) -> None:
         if not self._unread:
             return
-        values = iter(read_scalars([x for r, _ in self._unread for x in (r.total, *r.parts.values())]))
+        tensors = [x for r, _ in self._unread for x in (r.total, *r.parts.values(), *r.scalars.values())]
+        values = iter(read_scalars(tensors))
         for record, facts in self._unread:
             line: dict[str, Any] = {"view": record.view, "loss": next(values)}
             line["parts"] = {name: next(values) for name in record.parts}
             if record.seconds:
                 line["seconds"] = {name: round(seconds, 6) for name, seconds in record.seconds.items()}
+            if record.scalars:
+                line["scalars"] = {name: next(values) for name in record.scalars}
             self.run.run_log.write(record.stage, record.step, **line, **facts)
         self._unread.clear()

@@ -53,7 +53,7 @@ def input_files(cls: type[BaseModel]) -> list[str]:
 def field_at(cls: type[BaseModel], key: str) -> Any:
     """Return the type that stands at a dotted key; None if there is no such key.
 
-    Keys of a dict field are free; below one of `Any` they are free all the way down.
+    Keys of a dict field are free; below one of `Any` or `object` they are free all the way down.
     """
     annotation: Any = cls
     for part in key.split("."):
@@ -64,7 +64,7 @@ def field_at(cls: type[BaseModel], key: str) -> Any:
             annotation = block.model_fields[part].annotation
             continue
         annotation = next((typing.get_args(m)[1] for m in members(annotation) if typing.get_origin(m) is dict), None)
-        if annotation is None or annotation is Any:
+        if annotation in (None, Any, object):
             return annotation
     return annotation
 

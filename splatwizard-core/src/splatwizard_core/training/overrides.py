@@ -9,6 +9,7 @@ from pydantic import BaseModel, ValidationError
 
 from splatwizard_core.errors import ConfigError
 from splatwizard_core.training.keys import block_keys, field_at, set_at, suggest
+from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.values import parse_text
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -23,6 +24,7 @@ def apply_overrides(config: ModelT, values: Mapping[str, Any], *, source: str) -
     Raises ConfigError for an unknown key (with the nearest valid one) or a bad value.
     """
     cls = type(config)
+    values = config.spelled(values) if isinstance(config, OptimizationParams) else values
     content = config.model_dump()
     for key, value in values.items():
         annotation = field_at(cls, key)

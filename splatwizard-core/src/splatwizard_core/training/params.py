@@ -2,6 +2,7 @@
 
 import dataclasses
 import typing
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
@@ -80,3 +81,15 @@ class OptimizationParams(Params):
         of the longest one; the others are scaled along.
         """
         return self.iterations / self.FULL_ITERATIONS if self.scale_schedule else 1.0
+
+    def spelled(self, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return values by dotted key with today's keys in place of shorthands and of those of older releases."""
+        return values
+
+    def completed(self, plugins: Any, sources: Mapping[str, str]) -> "OptimizationParams":
+        """Return this with checked settings of what it names in `plugins`; sources: dotted key -> who gave a value."""
+        return self
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values, plain: equal ones make equal models. Renamed keys stand here under their first names."""
+        return self.model_dump(mode="json")

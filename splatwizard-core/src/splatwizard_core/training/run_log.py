@@ -12,14 +12,14 @@ import os
 from pathlib import Path
 from typing import Any
 
-from splatwizard_core.files import naming_full_disk, write_atomic
+from splatwizard_native import naming_full_disk, write_atomic
 
 
 class RunLog:
     """Appends lines to a file; None as the path: keeps nothing.
 
     Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "lr", "seconds" and the model's
-    `counts()`; or "task" (a task that logs); or "metrics" (an evaluation).
+    `counts()`, "scalars" (curves of tasks); or "task" (its name) and what it "said"; or "metrics" (an evaluation).
     """
 
     def __init__(self, path: Path | None) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import inspect
-import logging
 from collections.abc import Callable
 from dataclasses import replace
 from operator import attrgetter
@@ -19,8 +18,6 @@ from splatwizard_core.training.stage import Stage
 from splatwizard_core.training.tasks import POST_ONLY, SOURCES, TaskContext, bind
 
 __all__ = ["STOP", "Scheduler", "build_schedulers", "format_plan"]
-
-log = logging.getLogger(__name__)
 
 
 class _Stop:
@@ -45,7 +42,6 @@ class Scheduler:
         if stage not in ("pre", "post"):
             raise ValueError(f"a scheduler's stage is 'pre' or 'post', not '{stage}'")
         self.stage = stage
-        self.on_log: Callable[[int, str], None] | None = None
         self.registrations: list[Registration] = []
         self._step: int | None = None  # while a step's tasks run
 
@@ -65,7 +61,7 @@ class Scheduler:
                     it may return STOP, other return values are ignored
         priority    lower runs earlier; equal ones in order of registration
         name        in plans, logs and errors; default: the function's name with spaces
-        log         write a line each time it runs
+        log         a line in log.jsonl each time it runs
 
         A task may register others while it runs: they fire at later steps only.
         Raises TypeError or ValueError for a bad `when`, TaskSignatureError for a parameter that cannot be supplied.
@@ -99,20 +95,18 @@ class Scheduler:
         for entry in self.registrations:
             if not entry.due(step):
                 continue
-            context.step, context.scheduler, self._step = step, self, step
+            context.step, context.scheduler, context.log.task, self._step = step, self, entry.name, step
             try:
                 result = entry.binding(context)
             except (EmptyModel, TrainingDiverged, TaskSignatureError, torch.cuda.OutOfMemoryError):
                 raise
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise TaskError(self.stage, step, entry.name, error) from error
             finally:
                 self._step = None
             stop = stop or result is STOP
             if entry.log:
-                log.info("step %d: %s", step, entry.name)
-                if self.on_log is not None:
-                    self.on_log(step, entry.name)
+                context.log.say("")
         return stop
 
     def pending_late(self, step: int) -> bool:

@@ -7,7 +7,7 @@ import inspect
 import types
 import typing
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated, Any, TypeVar, Union
 
 from torch import nn
@@ -20,6 +20,7 @@ from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
 from splatwizard_core.training.stage import CameraIterator
+from splatwizard_core.training.task_log import TaskLog
 
 
 @dataclass
@@ -30,6 +31,7 @@ class TaskContext:
     cameras     the task camera iterator, independent of the training sampler
     result, loss    of the current step; None before rendering
     scheduler   filled in by the scheduler that runs the task
+    log         of the current step
     """
 
     ppl: PipelineParams
@@ -43,6 +45,7 @@ class TaskContext:
     result: RenderResult | None = None
     loss: LossPack | None = None
     scheduler: Any = None
+    log: TaskLog = field(default_factory=TaskLog)
 
 
 SOURCES: dict[type, str] = {
@@ -55,6 +58,7 @@ SOURCES: dict[type, str] = {
     SplatOptimizer: "optimizer",
     CameraIterator: "cameras",
     Rasterizer: "rasterizer",
+    TaskLog: "log",
 }
 """Annotation class (or a subclass of it) -> field of TaskContext. The module of the scheduler adds that."""
 

@@ -15,14 +15,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import (
-    DeviceMemoryError,
-    EmptyModel,
-    NothingToDo,
-    TaskError,
-    TrainingDiverged,
-    out_of_memory,
-)
+from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TrainingDiverged
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
@@ -33,9 +26,10 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import build_schedulers
 from splatwizard_core.training.stage import CameraIterator, Stage
+from splatwizard_core.training.task_log import TaskLog
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
-from splatwizard_native import Verdict, capture_random_states, restore_random_states
+from splatwizard_native import DeviceMemoryError, Verdict, capture_random_states, out_of_memory, restore_random_states
 
 CHECK_EVERY = 32
 """Steps between questions to a GPU whether the losses are finite; each is answered at the next one, so that none is
@@ -49,6 +43,7 @@ class StepRecord:
     step        1-based, of this stage
     total, parts    the loss, detached scalars
     num_rows    primitives after the step
+    said, scalars   what its tasks left, as of `TaskLog`
     seconds     per stage; empty unless stages are timed
     """
 
@@ -60,6 +55,8 @@ class StepRecord:
     total: Tensor
     parts: dict[str, Tensor] = field(default_factory=dict)
     num_rows: int = 0
+    said: list[tuple[str, str]] = field(default_factory=list)
+    scalars: dict[str, Tensor] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -133,7 +130,7 @@ class Trainer:
         context, mark = self.context, self._mark
         if self.stage_clock is not None:
             self.stage_clock.start()
-        context.result = context.loss = None
+        context.result, context.loss, context.log = None, None, TaskLog()
         with torch.no_grad():
             stop = self.pre.exec(step, context)
         self._check_rows(step)
@@ -171,7 +168,7 @@ class Trainer:
         # The graph and its buffers end with the step, not with the next one's render.
         context.result = context.loss = None
         self.stopped = stop
-        record.num_rows = self._num_rows()
+        record.num_rows, record.said, record.scalars = self._num_rows(), context.log.said, context.log.scalars
         return record
 
     def _mark(self, part: str) -> None:

@@ -85,7 +85,7 @@ def quantize(values: Values, steps: Steps) -> NDArray[np.int32]:
         if not largest <= MAX_SYMBOL:
             raise UserInputError(
                 f"a value of '{name}' is {largest * getattr(steps, step):.3g}, more than 2^30 quantiser steps: "
-                f"the model has diverged, or codec.{step}_step is too small"
+                f"the model has diverged, or codec.settings.{step}_step is too small"
             )
     return np.concatenate(columns, axis=1).astype(np.int32)
 

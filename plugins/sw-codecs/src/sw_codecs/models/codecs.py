@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from sw_codecs.models import exact, lossless, ply_section, quantized
-from sw_codecs.models.settings import Codec
+from sw_codecs.models.settings import QuantizedSettings
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel, PluginManager
@@ -25,13 +25,15 @@ class Exact:
 
 
 class Quantized:
-    """Octree positions, all else on a lattice and range coded; settings: `Codec` (defaults: rate r5)."""
+    """Octree positions, all else on a lattice and range coded (defaults: rate r5 of 3dgs)."""
+
+    Settings = QuantizedSettings
 
     def __init__(self, plugins: PluginManager, **settings: Any) -> None:
-        self.plugins, self.codec = plugins, Codec(mode="quantized", **settings)
+        self.plugins, self.settings = plugins, QuantizedSettings(**settings)
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
-        quantized.encode(model, writer, self.codec, self.plugins)
+        quantized.encode(model, writer, self.settings, self.plugins)
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
         return quantized.decode(reader, self.plugins)

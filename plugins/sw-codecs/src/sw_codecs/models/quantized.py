@@ -30,7 +30,7 @@ from sw_codecs.models.position_grid import MAX_TOP, PositionGrid
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
-    from sw_codecs.models.settings import Codec
+    from sw_codecs.models.settings import QuantizedSettings
 
 log = logging.getLogger(__name__)
 
@@ -75,10 +75,10 @@ class Layout(Params):
         return Steps(self.dc_step, self.rest_step, self.opacity_step, self.scale_step, self.quat_step)
 
 
-def encode(model: GaussianModel, writer: ContainerWriter, codec: Codec, plugins: PluginManager) -> None:
+def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSettings, plugins: PluginManager) -> None:
     """Sections positions, color, opacity, scales, quats, sh1 .. sh<active degree>."""
     octree = plugins.position_codecs.load("octree")()
-    layout, cells, symbols = lattice(model, codec, octree.sort)
+    layout, cells, symbols = lattice(model, settings, octree.sort)
     writer.raster["sh_degree"] = layout.max_sh_degree
     writer.static.update(layout.model_dump(mode="json"))
     writer.add("positions", octree.encode(cells, layout.position_bits))
@@ -119,7 +119,7 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
 
 
 def lattice(
-    model: GaussianModel, codec: Codec, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
+    model: GaussianModel, settings: QuantizedSettings, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 ) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:
     """Header, grid cells [N,3] in the order of `sort`, and integers of the attributes [N,C] likewise."""
     arrays = {
@@ -134,7 +134,7 @@ def lattice(
     if not keep.all():
         log.info("%d of %d Gaussians can never be drawn and are left out", int((~keep).sum()), len(keep))
     arrays = {name: array[keep] for name, array in arrays.items()}
-    grid = PositionGrid.fit(arrays["means"], codec.position_bits)
+    grid = PositionGrid.fit(arrays["means"], settings.position_bits)
     cells = grid.quantize(arrays["means"])
     order = sort(cells)
     active = (model.active_sh_degree + 1) ** 2 - 1
@@ -149,15 +149,15 @@ def lattice(
         num_gaussians=len(order),
         max_sh_degree=model.max_sh_degree,
         active_sh_degree=model.active_sh_degree,
-        position_bits=codec.position_bits,
+        position_bits=settings.position_bits,
         center=grid.center,
         width=grid.width,
         top=grid.top,
-        dc_step=codec.dc_step,
-        rest_step=codec.rest_step,
-        opacity_step=codec.opacity_step,
-        scale_step=codec.scale_step,
-        quat_step=codec.quat_step,
+        dc_step=settings.dc_step,
+        rest_step=settings.rest_step,
+        opacity_step=settings.opacity_step,
+        scale_step=settings.scale_step,
+        quat_step=settings.quat_step,
         sh_classes=suitable_classes(len(order)),
     )
     return layout, cells[order], quantize(values, layout.steps)

@@ -1,18 +1,13 @@
 """Settings of the quantised file of Gaussians."""
 
-from typing import Literal
-
 from pydantic import Field
 
 from splatwizard_core.api import Params
 
 
-class Codec(Params):
-    """Mode and quantiser steps of the file."""
+class QuantizedSettings(Params):
+    """Grid of the positions, and quantiser steps of all else."""
 
-    mode: Literal["exact", "quantized"] = Field(
-        "exact", description="float32 as trained, or quantised and entropy-coded"
-    )
     position_bits: int = Field(18, ge=8, le=21, description="bits per axis of the position grid")
     dc_step: float = Field(
         0.02, ge=1e-6, le=1e3, description="quantiser step of SH band 0 (SH coefficient; 0.28 of it in colour)"

@@ -123,7 +123,7 @@ class FakeQuantAffine(nn.Module):
         lows, highs = (rows, rows) if self.channels is not None else torch.aminmax(rows, dim=1, keepdim=True)
         if self.blocks == 1:
             return lows.amin(0, keepdim=True), highs.amax(0, keepdim=True)
-        block = _blocks(len(rows), self.blocks, x.device)[:, None].expand_as(lows)
+        block = block_of_rows(len(rows), self.blocks, x.device)[:, None].expand_as(lows)
         low = torch.full_like(self.minimum, torch.inf).scatter_reduce_(0, block, lows, "amin")
         return low, torch.full_like(self.maximum, -torch.inf).scatter_reduce_(0, block, highs, "amax")
 
@@ -157,10 +157,10 @@ def _rows(x: Tensor) -> Tensor:
 
 def _of_rows(values: Tensor, count: int) -> Tensor:
     """values [B, C] of each block for each row, [count, C] or, with one block, [1, C]."""
-    return values if len(values) == 1 else values[_blocks(count, len(values), values.device)]
+    return values if len(values) == 1 else values[block_of_rows(count, len(values), values.device)]
 
 
-def _blocks(count: int, blocks: int, device: torch.device) -> Tensor:
+def block_of_rows(count: int, blocks: int, device: torch.device) -> Tensor:
     """The block of each of `count` rows, [count] int64: contiguous, sizes differ by at most one, larger ones first."""
     size, larger = divmod(count, blocks)
     row = torch.arange(count, device=device)

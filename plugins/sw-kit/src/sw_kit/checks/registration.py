@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 from packaging.requirements import Requirement
 
+from splatwizard_core.tooling import load_plugins
 from sw_kit.checks.fields import check_entry
 from sw_kit.checks.imports import imports_of
 from sw_kit.finding import hold
@@ -25,8 +26,14 @@ FACES = ("splatwizard_core.api", "splatwizard_core.tooling")
 
 
 def check_loads(info: PluginInfo) -> str:
-    """Hold a plugin to be loaded: it imports, and its hooks do not raise."""
+    """Hold a plugin to be loaded: it imports, its hooks do not raise, and none of its entries is refused."""
     hold(info.error is None, f"the plugin is broken: {info.error}", "mend that first; --debug shows a traceback")
+    for entry, why in load_plugins().refused_of(info):
+        hold(
+            False,
+            f"{entry.kind} '{entry.name}' is refused: {why}",
+            "registry.add(...) with a name and fields of its own",
+        )
     return f"{info.distribution} {info.version}, entry point '{info.key}'"
 
 

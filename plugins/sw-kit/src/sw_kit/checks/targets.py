@@ -62,7 +62,8 @@ def check_target(entry: Entry, plugins: PluginManager) -> str:
     made = make(entry, plugins)
     if made is not None:
         _follows(made, contract, whose)
-    return f"is made with its defaults, and has the signatures of {contract.__name__}"
+    settings = _check_settings(entry, plugins, whose) if entry.kind in ("pruner", "coder") else ""
+    return f"is made with its defaults{settings}, and has the signatures of {contract.__name__}"
 
 
 def make(entry: Entry, plugins: PluginManager) -> Any:
@@ -84,6 +85,30 @@ def make(entry: Entry, plugins: PluginManager) -> Any:
         raise BrokenContractError(
             f"{whose} cannot be made with its defaults: {reason}", f"{entry.target}: give every setting a default"
         ) from error
+
+
+def _check_settings(entry: Entry, plugins: PluginManager, whose: str) -> str:
+    """Hold `Settings` of a provider, if it has any, to defaults that it is made with; return how many there are."""
+    target = entry.load()
+    model = getattr(target, "Settings", None)
+    if model is None:
+        return ""
+    mend = f"{entry.target}: Settings is a pydantic model whose fields have defaults, each an argument of the class"
+    try:
+        settings = model().model_dump(mode="json")
+        target(*([plugins] if entry.kind == "coder" else []), **settings)
+    except Exception as error:
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise BrokenContractError(f"{whose} cannot be made with its Settings: {reason}", mend) from error
+    arguments = inspect.signature(target).parameters
+    for name, value in settings.items():
+        default = arguments[name].default if name in arguments else value
+        hold(
+            default in (value, inspect.Parameter.empty),
+            f"{whose}: '{name}' is {default!r} or {value!r} by default",
+            mend,
+        )
+    return f" and its {len(settings)} settings"
 
 
 def _obstacle(entry: Entry) -> None:

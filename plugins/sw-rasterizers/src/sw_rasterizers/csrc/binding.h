@@ -35,6 +35,7 @@ enum Flag : int64_t {  // mirrored in ops.py
   kFlash = 8192,  // CUDA only
   kTensorCores = 16384,
   kBytes = 32768,
+  kForScores = 65536,  // between the ops on CUDA: with kSave, nothing that only the backward pass needs
 };
 
 template <class S>
@@ -46,18 +47,21 @@ const S* data(const OptionalTensor& t) {
   return t.has_value() ? data<S>(*t) : nullptr;
 }
 
-// Pairs of a splat and a tile that a call on the CPU may have, half of them where a backward pass follows: 12 bytes
-// each, 70 with gradients, which a file of a kilobyte can ask for. 2^27 are four times those of the largest real scenes.
+// Pairs of a splat and a tile that a call may have; a file of a kilobyte can ask for any number of them. 2^27 are four
+// times those of the largest real scenes.
 inline int64_t most_pairs() {
   const char* text = std::getenv("SPLATWIZARD_MAX_TILE_PAIRS");
   const int64_t asked = text == nullptr ? 0 : std::atoll(text);
   return std::min<int64_t>(asked > 0 ? asked : int64_t(1) << 27, std::numeric_limits<int32_t>::max());
 }
 
-inline void check_pairs(int64_t count, const sw::Settings& settings) {
-  TORCH_CHECK(count <= settings.most_pairs, "sw_rasterizers: ", count, " splat-tile pairs are more than ",
-              settings.most_pairs, ": draw fewer Gaussians or a smaller image, or set SPLATWIZARD_MAX_TILE_PAIRS (12 "
-              "bytes each, 70 in training, which takes half as many)");
+// `memory`: what a pair takes on the device.
+inline void check_pairs(int64_t count, int64_t most, const char* memory) {
+  TORCH_CHECK(count <= most, "sw_rasterizers: ", count, " splat-tile pairs are more than ", most,
+              ": draw fewer Gaussians or a smaller image, or set SPLATWIZARD_MAX_TILE_PAIRS (", memory, ")");
+}
+inline void check_pairs_on_cpu(int64_t count, const sw::Settings& settings) {
+  check_pairs(count, settings.most_pairs, "12 bytes each, 70 in training, which takes half as many");
 }
 
 struct Inputs {
@@ -152,7 +156,7 @@ struct Inputs {
     s.accumulated_depth = flags & kAccumulatedDepth, s.median_depth = flags & kMedianDepth;
     s.detach_features = flags & kDetachFeatures, s.absgrad = flags & kAbsgrad;
     s.threads = at::get_num_threads();
-    s.most_pairs = most_pairs() / (flags & kSave ? 2 : 1);
+    s.most_pairs = most_pairs() / (means.is_cpu() && (flags & kSave) ? 2 : 1);
     return s;
   }
 

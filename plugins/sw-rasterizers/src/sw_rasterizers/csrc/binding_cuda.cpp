@@ -57,7 +57,7 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
       shade(view, g, settings, splats, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, stream);
     if (general)
       fill_channels(g, channels, splats, work, data<int32_t>(radii), data<uint8_t>(flags), tally.counters, stream);
-    tally.shaded();
+    tally.shaded(settings);
   }
   clock.mark();
 
@@ -83,7 +83,7 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   image.median_splat = data<int32_t>(saved[kMedianSplat]);
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const bool few = !fast && !general && !count_work && tiles < kFewTiles;
-  if (few && save && tally.pairs() > 0) {
+  if (few && save && !(in.flags & kForScores) && tally.pairs() > 0) {
     const int64_t pieces = piece_count(tiles, tally.pairs());
     saved[kBehind] = make({pieces, kTile * kTile, 4}), saved[kWhere] = make_as({pieces, 2}, at::kInt);
     image.pieces = {data<float4>(saved[kBehind]), data<int2>(saved[kWhere]), pieces};

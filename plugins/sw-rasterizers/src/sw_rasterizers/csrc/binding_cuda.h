@@ -117,7 +117,7 @@ struct Tally {
   uint64_t* states;  // of the projection's prefix sums, then of the emission's
   Published* published;
   Counters* after;  // the colours
-  bool used = false;
+  bool used = false, under_way = true;  // under_way: the device may still write into the mailbox
 
   Tally(int64_t gaussians, const at::TensorOptions& options, cudaStream_t stream)
       : stream(stream), blocks(ceil_blocks(gaussians)), mailbox(Mailbox::of(options.device().index())) {
@@ -132,26 +132,32 @@ struct Tally {
     *published = {};
     *after = {};
   }
+  // Where an error ends the call early: the next one, maybe on another stream, finds the mailbox at rest.
+  ~Tally() {
+    if (under_way) C10_CUDA_CHECK_WARN(cudaStreamSynchronize(stream));
+  }
+  Tally(const Tally&) = delete;
+  Tally& operator=(const Tally&) = delete;
 
   void projected() { mailbox.counted.record(stream); }
   // The colours are launched: waits for the counts of the projection, while they are still being computed.
-  void shaded() {
+  void shaded(const Settings& settings) {
     C10_CUDA_CHECK(cudaMemcpyAsync(after, counters, sizeof(Counters), cudaMemcpyDeviceToHost, stream));
     mailbox.colored.record(stream);
     C10_CUDA_KERNEL_LAUNCH_CHECK();
     mailbox.counted.wait();
     used = true;
     // Positions are 32-bit numbers, and the kernels look up to three stages of 256 ahead of the last one.
-    constexpr int64_t most = std::numeric_limits<int32_t>::max() - 1024;
-    TORCH_CHECK(pairs() <= most, "sw_rasterizers: ", pairs(), " splat-tile pairs are more than ", most,
-                "; render fewer Gaussians or a smaller image");
+    constexpr int64_t numbered = std::numeric_limits<int32_t>::max() - 1024;
+    check_pairs(pairs(), std::min(settings.most_pairs, numbered), "12 to 20 bytes each");
   }
   int64_t splats() const { return published->splats; }
   int64_t pairs() const { return published->pairs; }
 
   // Visible, pairs, evaluated, blended, not finite; at the end. `work`: whether work was counted.
-  std::vector<int64_t> counts(bool work) const {
+  std::vector<int64_t> counts(bool work) {
     if (used) mailbox.colored.wait();  // long past by now
+    under_way = false;
     int64_t evaluated = -1, blended = -1;
     if (work) {
       Counters now{};

@@ -34,11 +34,11 @@ void accumulate_as(const Inputs& in, const ScoreInputs& asked, at::ArrayRef<doub
   std::vector<std::vector<int32_t>> tile_lists(static_cast<size_t>(chunks));
   const Slots<S> slots{data<S>(records),    data<int32_t>(index), data<int32_t>(per_chunk), data<PairRun>(runs),
                        tile_lists.data(),   data<S>(slope),       data<uint8_t>(clamped),   data<S>(channel_rows)};
-  int64_t seen[2] = {0, 0};
+  int64_t seen[3] = {0, 0, 0};
   const int64_t used =
       SW_SELECT(project_gaussians<S>)(view, g, settings, channels, slots, data<int32_t>(radii), seen);
   const int64_t count = SW_SELECT(count_pairs<S>)(n, slots);
-  check_pairs(count, settings);
+  check_pairs_on_cpu(seen[2], settings);
   if (count == 0) return;
 
   const Tensor order = make_as({used}, at::kInt);

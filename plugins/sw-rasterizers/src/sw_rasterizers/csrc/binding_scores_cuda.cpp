@@ -50,7 +50,7 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
       c10::Dispatcher::singleton().findSchemaOrThrow("sw_rasterizers::render", "").typed<Render>();
   const Rendered rendered =
       render.call(means, opacities, scales, quats, cov3d, sh, sh_dc, sh_rest, colors, none, visible, background, camera,
-                  width, height, sh_degree, scale_modifier, eps2d, (flags | kSave) & ~int64_t(kCount));
+                  width, height, sh_degree, scale_modifier, eps2d, (flags | kSave | kForScores) & ~int64_t(kCount));
   const std::vector<Tensor>& saved = std::get<4>(rendered);
   TORCH_CHECK(saved.size() == kFlags + 1, "sw_rasterizers: the forward pass kept another state than expected");
   if (saved[kSplat].numel() == 0) return;

@@ -65,7 +65,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int6
                     tally.counters, tally.states, tally.published, stream);
     tally.projected();
     shade(view, g, settings, projected.splats, data<int32_t>(radii), data<uint8_t>(drawn), tally.counters, stream);
-    tally.shaded();
+    tally.shaded(settings);
   }
   clock.mark();
 

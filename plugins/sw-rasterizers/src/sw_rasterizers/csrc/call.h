@@ -37,7 +37,7 @@ struct Settings {
   bool detach_features = false;
   bool absgrad = false;
   int threads = 1;
-  int64_t most_pairs = 0;  // (splat, tile) pairs that a call on the CPU may have; beyond, their lists are not kept
+  int64_t most_pairs = 0;  // (splat, tile) pairs that a call may have; beyond, none are listed
 };
 
 // Channels of the composited image: colours, then inverse depth, accumulated depth, then features.

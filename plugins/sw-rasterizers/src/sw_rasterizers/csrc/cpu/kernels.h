@@ -100,8 +100,9 @@ inline int pair_columns(bool plain, int channels, bool absgrad, bool median) {
 
 // The kernels, once per instruction set (splatwizard/dispatch.h).
 //
-// project_gaussians  returns the number of slots in use; counts [2]: Gaussians with a radius, and those culled
-//                    because a value is not finite
+// project_gaussians  returns the number of slots in use; counts [3]: Gaussians with a radius, those culled because a
+//                    value is not finite, pairs of all that had tiles. More of these than `most_pairs`: the lists have
+//                    gaps, no other kernel may be called
 // count_pairs        (splat, tile) pairs in all
 // depth_order        slots in use, nearest first, equal depths in index order; `order` has room for all of them
 // blend_backward     the last `detached` channels do not influence the geometry; sums [P][pair_columns]

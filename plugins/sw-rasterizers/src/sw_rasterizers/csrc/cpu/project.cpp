@@ -63,12 +63,12 @@ struct ChunkProjection : Projector<V, kCov3d> {
   const Slots<S>& slots;
   int32_t* radii;
 
-  // `keep_tiles`: false once there are more pairs than may be drawn; then they are only counted.
-  void operator()(int64_t chunk, bool keep_tiles, int64_t* invalid) const {
+  // Returns the pairs of the chunk; of them it keeps `room`, that further ones are refused is the caller's business.
+  int64_t operator()(int64_t chunk, int64_t room, int64_t* invalid) const {
     const auto& g = this->g;
     const int64_t begin = chunk * kChunk, end = begin + kChunk < g.count ? begin + kChunk : g.count;
     int64_t slot = begin;
-    TileList tile_list{slots.tile_lists[chunk], keep_tiles};
+    TileList tile_list{slots.tile_lists[chunk], room > 0 ? size_t(room) : 0};
     for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, tile_list, invalid);
     const int64_t used = slot - begin;
     slots.per_chunk[chunk] = int32_t(used);
@@ -77,6 +77,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
     if (slots.channels != nullptr) fill_channels(begin, slot);
     const int total = slots.channels != nullptr ? channels.total() : 0;
     *invalid += shader.drop_broken(begin, slot, total, radii);
+    return tile_list.listed;
   }
 
   int64_t project_pack(int64_t first, int64_t end, int64_t slot, TileList& tile_list, int64_t* invalid) const {
@@ -134,6 +135,7 @@ struct ChunkProjection : Projector<V, kCov3d> {
       const int tiles = list_tiles(view, settings, record, record[kU], record[kV], S(radii[n]), tile_list,
                                    [](int, int) { return true; });
       if (tiles == 0) continue;
+      tile_list.listed += tiles;
       std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       slots.index[slot] = int32_t(n);
       prefetch_sh_rest(g, n);
@@ -166,14 +168,13 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
   std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
   parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
     int64_t bad = 0;
-    project_chunk(chunk, pairs <= settings.most_pairs, &bad);
-    pairs += int64_t(slots.tile_lists[chunk].size());
+    pairs += project_chunk(chunk, settings.most_pairs - pairs, &bad);
     const int32_t* first = radii + chunk * kChunk;
     visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
                              [](int32_t radius) { return radius > 0; });
     invalid += bad;
   });
-  counts[0] = visible, counts[1] = invalid;
+  counts[0] = visible, counts[1] = invalid, counts[2] = pairs;
   int64_t used = 0;
   for (int64_t chunk = 0; chunk < chunks; ++chunk) used += slots.per_chunk[chunk];
   return used;

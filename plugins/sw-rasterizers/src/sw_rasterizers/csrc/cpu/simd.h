@@ -32,6 +32,7 @@ struct PackTraits {
 #if SW_LANES > 1
 typedef float PackF __attribute__((vector_size(4 * SW_LANES)));
 typedef int32_t PackI __attribute__((vector_size(4 * SW_LANES)));
+typedef uint32_t PackU __attribute__((vector_size(4 * SW_LANES)));
 
 template <>
 struct ScalarOf<PackF> {
@@ -188,8 +189,8 @@ SW_HD void lane_sums(V* packs, Scalar<V>* out) {
 
 // 2^x for finite x > -126; relative error below 1e-7. Below that, and for x without meaning, the result is arbitrary
 // (the caller has a mask for those lanes) but no trap. Nearest-integer split by the magic number 1.5 * 2^23, minimax
-// polynomial on [-1/2, 1/2], exponent added as an integer.
-template <class V, class I>
+// polynomial on [-1/2, 1/2], exponent added as an integer; U is unsigned, since it may wrap around.
+template <class V, class U>
 SW_HD V exp2_pack(V x) {
   const V shifted = x + 12582912.0f;
   const V r = x - (shifted - 12582912.0f);
@@ -199,7 +200,7 @@ SW_HD V exp2_pack(V x) {
   p = p * r + constant<V>(2.402211972610481e-1);
   p = p * r + constant<V>(6.93146967043179e-1);
   p = p * r + constant<V>(1.0000000716539854);
-  I bits, n;
+  U bits, n;
   __builtin_memcpy(&bits, &p, sizeof bits);
   __builtin_memcpy(&n, &shifted, sizeof n);
   bits += n << 23;
@@ -229,7 +230,7 @@ SW_HD V log2_pack(V x) {
 
 #if SW_LANES > 1
 SW_HD PackF log_2(PackF x) { return log2_pack<PackF, PackI>(x); }
-SW_HD PackF exp_2(PackF x) { return exp2_pack<PackF, PackI>(x); }
+SW_HD PackF exp_2(PackF x) { return exp2_pack<PackF, PackU>(x); }
 #endif
 SW_HD float exp_2(float x) { return exp2_pack<float, uint32_t>(x); }
 SW_HD double exp_2(double x) { return exp2(x); }

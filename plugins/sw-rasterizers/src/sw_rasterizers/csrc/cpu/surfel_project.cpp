@@ -72,16 +72,18 @@ struct ChunkProjection : SurfelProjector<V> {
   S* planes;
   int32_t* radii_of_all;
 
-  void operator()(int64_t chunk, bool keep_tiles, int64_t* invalid) const {
+  // Returns the pairs of the chunk; keeps `room` of them.
+  int64_t operator()(int64_t chunk, int64_t room, int64_t* invalid) const {
     const auto& g = this->g;
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, g.count);
     int64_t slot = begin;
-    TileList tile_list{slots.tile_lists[chunk], keep_tiles};
+    TileList tile_list{slots.tile_lists[chunk], room > 0 ? size_t(room) : 0};
     for (int64_t first = begin; first < end; first += L) slot = project_pack(first, end, slot, tile_list, invalid);
     slots.per_chunk[chunk] = int32_t(slot - begin);
     const Shader<V> shader{this->view, g, this->settings, slots};
     shader.color(begin, slot);
     *invalid += shader.drop_broken(begin, slot, 0, radii_of_all);
+    return tile_list.listed;
   }
 
   int64_t project_pack(int64_t first, int64_t end, int64_t slot, TileList& tile_list, int64_t* invalid) const {
@@ -147,6 +149,7 @@ struct ChunkProjection : SurfelProjector<V> {
       const int tiles =
           list_tiles(view, this->settings, record, center[0][i], center[1][i], S(radii_of_all[n]), tile_list, accept);
       if (tiles == 0) continue;
+      tile_list.listed += tiles;
       std::copy_n(record, int(kRecord), slots.records + slot * kRecord);
       std::copy_n(plane_of[i], int(kPlane), planes + slot * kPlane);
       slots.index[slot] = int32_t(n);
@@ -166,14 +169,13 @@ int64_t project_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, 
   std::atomic<int64_t> visible{0}, invalid{0}, pairs{0};
   parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) {
     int64_t bad = 0;
-    project_chunk(chunk, pairs <= settings.most_pairs, &bad);
-    pairs += int64_t(slots.tile_lists[chunk].size());
+    pairs += project_chunk(chunk, settings.most_pairs - pairs, &bad);
     const int32_t* first = radii + chunk * kChunk;
     visible += std::count_if(first, first + std::min<int64_t>(kChunk, g.count - chunk * kChunk),
                              [](int32_t radius) { return radius > 0; });
     invalid += bad;
   });
-  counts[0] = visible, counts[1] = invalid;
+  counts[0] = visible, counts[1] = invalid, counts[2] = pairs;
   int64_t used = 0;
   for (int64_t chunk = 0; chunk < chunks; ++chunk) used += slots.per_chunk[chunk];
   return used;

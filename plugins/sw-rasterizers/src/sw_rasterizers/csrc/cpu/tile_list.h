@@ -11,10 +11,11 @@ using namespace sw;
 
 struct TileList {
   std::vector<int32_t>& tiles;
-  bool keep;
+  size_t room;         // further ones are counted, not kept
+  int64_t listed = 0;  // with those
   size_t size() const { return tiles.size(); }
   void put(int tile) {
-    if (keep) tiles.push_back(tile);
+    if (tiles.size() < room) tiles.push_back(tile);
   }
 };
 

@@ -14,7 +14,7 @@ struct Numbering {  // of a block, in shared memory
   alignas(16) unsigned base;  // no neighbour's wide load may touch it while it is written
 };
 
-struct Projected {  // by one thread
+struct Outcome {  // of one thread's Gaussian
   bool visible, drawn, invalid;
   unsigned tiles;
 };
@@ -26,7 +26,7 @@ __device__ __forceinline__ void start_numbering(Numbering& block, Counters* coun
 
 // The number of what this thread drew; adds to the counters.
 __device__ __forceinline__ unsigned take_number(Numbering& block, Counters* counters, uint64_t* states,
-                                                const Projected& own) {
+                                                const Outcome& own) {
   // Sums of the block first: atomics on one address pass one after the other.
   const unsigned warp_tiles = warp_sum(own.tiles);  // a block's fit 32 bits: below 2^24 tiles a splat
   if (lane_index() == 0) atomicAdd(&block.tiles, warp_tiles);

@@ -62,6 +62,11 @@ class Bar:
         left = self.seconds_left
         self._show(f"{duration(left)} left" if left else "")
 
+    def say(self, line: str) -> None:
+        """Print a line for the user, above the bar on a terminal."""
+        with contextlib.suppress(OSError):  # a terminal that has closed must not end the work
+            print(line, file=self._stream, flush=True)
+
     def finish(self) -> None:
         """Show the rate of the whole, and how long it took."""
         self._marks = deque([self._began])
@@ -93,8 +98,7 @@ class Bar:
         else:
             count = f"{self.done:,}" if self.total is None else f"{self.done:,}/{self.total:,}"
             parts = [f"{self.label}: {count}", self.facts(), time_told]
-        with contextlib.suppress(OSError):  # a terminal that has closed must not end the work
-            print(" · ".join(p for p in parts if p), file=self._stream, flush=True)
+        self.say(" · ".join(p for p in parts if p))
         self._lines += 1
 
 

@@ -5,8 +5,8 @@ import time
 
 import pytest
 
-from splatwizard_core import progress
-from splatwizard_core.progress import duration, track
+from splatwizard_native import progress
+from splatwizard_native.progress import duration, track
 
 
 def test_a_blink_of_an_eye_prints_nothing():
@@ -81,8 +81,10 @@ def test_a_terminal_gets_a_bar_with_the_same_facts_and_nested_bars_share_it(monk
         bar.advance(4, loss=0.25, gaussians=1234)
         with track("evaluate", total=2, unit="views", stream=out) as inner:
             inner.advance(1, PSNR=30.5)
+            inner.say("pruned [3] of 5")
         bar.advance(6)
     text = out.getvalue()
+    assert "pruned [3] of 5\x1b" in text or "pruned [3] of 5\n" in text  # a line of its own, above the bars
     for part in ("train [red]", "4/10", "loss 0.25", "1,234 Gaussians", "evaluate", "PSNR 30.5", "10/10"):
         assert part in text
 

@@ -12,9 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from splatwizard_core import files
-from splatwizard_core.errors import DiskFullError
-from splatwizard_core.files import (
+from splatwizard_native import DiskFullError, files
+from splatwizard_native.files import (
     file_sha256,
     remove_folder,
     replacing,
@@ -78,7 +77,7 @@ def test_what_a_killed_process_left_goes_with_the_next_write(tmp_path: Path):
     """Only of that file, and not what a running process is writing."""
     path = tmp_path / "x"
     program = (
-        "import os, signal, sys\nfrom splatwizard_core.files import replacing\n"
+        "import os, signal, sys\nfrom splatwizard_native.files import replacing\n"
         "with replacing(sys.argv[1]) as t:\n    t.write_text('half')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     subprocess.run([sys.executable, "-c", program, str(path)], check=False, timeout=60)
@@ -120,7 +119,7 @@ def test_a_scratch_folder_goes_and_takes_those_of_killed_processes_along(
 ):
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     program = (
-        "import os, signal, sys, tempfile\nfrom splatwizard_core.files import scratch_folder\n"
+        "import os, signal, sys, tempfile\nfrom splatwizard_native.files import scratch_folder\n"
         "tempfile.tempdir = sys.argv[1]\n"
         "with scratch_folder('test') as f:\n    (f / 'x').touch()\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )

@@ -1,0 +1,1 @@
+"""MesonGS: post-training compression of 3D Gaussians by efficient attribute transformation."""

@@ -1,0 +1,143 @@
+"""The training stage: pruning, octree and codebook at the first step, then fine-tuning of what will be decoded."""
+
+from __future__ import annotations
+
+import logging
+from typing import TYPE_CHECKING
+
+import torch
+from sw_finetuning.pruning import scores_of, up_to
+
+from splatwizard_core.api import (
+    CameraIterator,
+    EmptyModel,
+    GaussianModel,
+    LossPack,
+    ParamGroup,
+    Pruner,
+    Rasterizer,
+    Scene,
+    SplatOptimizer,
+    Stage,
+    photometric_loss,
+)
+from sw_codecs.models.raht_gaussians import RahtGaussians
+from sw_mesongs.importance import Importance
+from sw_mesongs.published import Published, published
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from splatwizard_core.api import (
+        OptimizationParams,
+        PipelineParams,
+        RenderResult,
+        Scheduler,
+        SplatModel,
+        StageContext,
+        View,
+    )
+    from sw_mesongs.config import MesonGSConfig
+
+log = logging.getLogger(__name__)
+
+
+class MesonGSStage(Stage):
+    """Prunes a trained 3DGS scene, settles it on an octree, and trains it as the file will hold it.
+
+    pruner  whose scores decide what goes; the own one takes the published beta of the scene where it has none
+    """
+
+    name = "mesongs"
+    starts_from = "3dgs"
+
+    def __init__(self, config: MesonGSConfig, pruner: Pruner) -> None:
+        super().__init__(config)
+        self.config, self.pruner = config, pruner
+        self.values = Published()  # of the scene, once the stage begins
+
+    def begin(self, context: StageContext) -> SplatModel:
+        trained, settings = context.model, self.config.codec.settings
+        if not isinstance(trained, GaussianModel):
+            raise TypeError(f"mesongs compresses a GaussianModel, not a {type(trained).__name__}")
+        self.values = published(context.scene.name, self.config.authors.family, self.config.authors.point)
+        self._rasterizer, self._generator = context.rasterizer, context.generator("method")
+        blocks = self.values.blocks if settings.blocks is None else settings.blocks
+        model = RahtGaussians.of(trained, bits=settings.bits, blocks=blocks)
+        model.active_sh_degree = model.max_sh_degree
+        for frozen in (model.means, model.sh_rest):
+            frozen.requires_grad_(False)
+        return model
+
+    def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
+        groups = [ParamGroup(name, lr) for name, lr in self.rates(0, scene).items()]
+        self._optimizer = SplatOptimizer(model, groups)
+        return self._optimizer
+
+    def rates(self, step: int, scene: Scene) -> dict[str, float]:
+        """Return the step size of each parameter at a step of this run."""
+        factor = self.config.lr.factor
+        share = min(step / (self.config.FULL_ITERATIONS * self.config.schedule_scale or 1), 1.0)
+        return self.config.lr.of_step(share, self.values.lr_factor if factor is None else factor, scene.extent)
+
+    def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        scheduler.register_task(1, self.score_and_prune, name="calculate importance score and prune")
+        scheduler.register_task(1, self.settle, name="create octree")
+        scheduler.register_task(self.when(range(self.config.FULL_ITERATIONS)), self.update_rates, name="update lr")
+
+    def score_and_prune(
+        self,
+        model: RahtGaussians,
+        optimizer: SplatOptimizer,
+        cameras: CameraIterator,
+        rasterizer: Rasterizer,
+        scene: Scene,
+        step: int,
+    ) -> None:
+        """Remove all Gaussians up to the score at the share tau; the others keep their importance.
+
+        The importance weighs the colours in the codebook, whoever decides what goes. Raises EmptyModel.
+        """
+        own = self.pruner if isinstance(self.pruner, Importance) and self.pruner.beta is not None else None
+        importance = own or Importance(beta=self.values.beta)
+        scores = scores_of(importance, model, cameras, rasterizer, scene)
+        model.importance.copy_(scores)
+        if not isinstance(self.pruner, Importance):
+            scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
+        tau = self.config.prune.tau
+        doomed = up_to(scores, self.values.tau if tau is None else tau)
+        before, gone = model.num_rows, int(doomed.sum())
+        if gone == before:
+            raise EmptyModel(step)
+        optimizer.keep_rows(model, ~doomed)
+        log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
+
+    def settle(self, model: RahtGaussians, optimizer: SplatOptimizer) -> None:
+        """Merge the Gaussians of each voxel, and train the codebook of their SH bands 1 to 3."""
+        settings, before = self.config.codec.settings, model.num_rows
+        model.settle(
+            optimizer, settings, generator=self._generator,
+            depth=self.values.depth if settings.depth is None else settings.depth,
+            size=self.values.codebook_size if settings.codebook_size is None else settings.codebook_size,
+        )  # fmt: skip
+        log.info("%d Gaussians in %d voxels, %d codebook entries", before, model.num_rows, len(model.codebook))
+
+    def update_rates(self, optimizer: SplatOptimizer, scene: Scene, step: int) -> None:
+        """Set the step sizes; with lr.final 1, as published, they stay what they are."""
+        for name, lr in self.rates(step, scene).items():
+            optimizer.set_lr(name, lr)
+
+    def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
+        truth = view.image(background, result.image.device)
+        return photometric_loss(result.image, truth, lambda_dssim=self.config.lambda_dssim)
+
+    @torch.no_grad()
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        """Return the model, settled now if there was no step to do it at."""
+        assert isinstance(model, RahtGaussians)
+        if model.grid is None:
+            self.score_and_prune(model, self._optimizer, CameraIterator(scene.train), self._rasterizer, scene, 0)
+            self.settle(model, self._optimizer)
+        if self.config.codec.settings.recalibrate:
+            model.recalibrate()
+        return model

@@ -1,0 +1,22 @@
+"""From the command to the record: a trained scene, an octree, a file that a fresh process decodes."""
+
+import json
+
+import pytest
+
+from splatwizard_core.cli.main import main
+
+SETS = ["iterations=12", "pretrained.iterations=20", "codec.settings.codebook_size=16", "codec.settings.vq_steps=3"]
+
+
+@pytest.mark.pipeline
+def test_a_run_ends_with_a_record_of_a_small_file(tmp_path):
+    # Six views of 64 x 48 pixels; the 3DGS scene that it starts from is trained first.
+    sets = [f"--set={pair}" for pair in SETS]
+    status = main(["run", "--method", "mesongs", "--scene", "demo:tiny", "--rate", "r2", "--out", str(tmp_path), *sets])
+    assert status == 0
+    (path,) = tmp_path.glob("demo-tiny/mesongs/r2/metrics.json")
+    record = json.loads(path.read_text())
+    count = record["counts"]["num_gaussians"]
+    assert 0 < record["file"]["bytes"] < 248 * count / 4
+    assert record["config"]["config"]["authors"]["point"] == "c3"
