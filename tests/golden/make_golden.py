@@ -148,7 +148,7 @@ def masked(n: int, on: int) -> GaussianModel:
 
 SMALL_COMPACT = {
     "grid.levels": 3, "grid.coarsest": 3, "grid.growth": 1.7, "grid.log2_size": 6, "network.hidden": 4, "rvq.size": 6,
-    "rvq.stages": 3, "codec.coder": "huffman",
+    "rvq.stages": 3, "codec.settings.coder": "huffman",
 }  # fmt: skip
 
 
@@ -216,7 +216,7 @@ CASES: dict[str, Case] = {
     "compact3dgs_one_v1": (
         "compact3dgs",
         "r1",
-        {**SMALL_COMPACT, "codec.coder": "range"},
+        {**SMALL_COMPACT, "codec.settings.coder": "range"},
         lambda: compact_gaussians(1, {**SMALL_COMPACT, "grid.halvings": 2}),
     ),
     "chimerags_v1": ("chimerags", "r2", SMALL_VQ, lambda: masked(32, 12)),

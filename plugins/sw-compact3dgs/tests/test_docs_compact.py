@@ -32,7 +32,7 @@ def test_the_readme_names_every_preset_rate_point_and_task():
     for name, values in RATES.items():
         row = next(line for line in lines if line.startswith(f"| `{name}`"))
         assert f"| {values['mask.factor']:g} |" in row
-        assert ("| no" in row) == (values.get("codec.pp") is False)
+        assert ("| no" in row) == (values.get("codec.settings.pp") is False)
     for scheduler in build_schedulers(Compact3DGSStage(Compact3DGSConfig()), PipelineParams()):
         for task in scheduler.registrations:
             assert any(f"| {task.name} |" in line for line in lines)

@@ -23,7 +23,7 @@ from splatwizard_core.runs.decode import decode_model
 from sw_codecs.positions.ordering import spatial_order
 
 RASTERIZER = ReferenceRasterizer()
-FORMS = {"pp": {}, "plain": {"codec__pp": False}}
+FORMS = {"pp": {}, "plain": {"codec__settings__pp": False}}
 PARTS = ("header", "codebooks", "indices")
 SECTIONS = {"positions", "opacities", "grid", "network", *(f"{p}/{n}" for p in ("scales", "rotations") for n in PARTS)}
 
@@ -69,7 +69,7 @@ def test_the_plain_grid_is_float16_and_the_processed_one_has_256_values_and_zero
 
 
 def test_a_coarser_threshold_makes_a_smaller_file():
-    sizes = [len(encoded(make(log2_size=10), codec__grid_threshold=t)) for t in (0.0, 0.5, 1.5)]
+    sizes = [len(encoded(make(log2_size=10), codec__settings__grid_threshold=t)) for t in (0.0, 0.5, 1.5)]
     assert sizes == sorted(sizes, reverse=True)
     assert sizes[2] < 0.9 * sizes[0]
 
@@ -138,7 +138,7 @@ def test_huffman_saves_and_every_entropy_coder_gives_the_same_scene():
         model.log_scales.copy_(torch.where(torch.rand(2000, 1) < 0.7, -3.0, model.log_scales))
     plain, files = (
         encoded(model, **FORMS["plain"]),
-        {c: encoded(model, codec__coder=c) for c in ("huffman", "range", "rans")},
+        {c: encoded(model, codec__settings__coder=c) for c in ("huffman", "range", "rans")},
     )
     assert len(files["huffman"]) < 0.75 * len(plain)
     assert len(files["range"]) < len(files["huffman"])
@@ -199,9 +199,9 @@ def test_what_cannot_be_encoded_is_said():
         with torch.no_grad():
             (model.color.grid.table if where == "table" else model.color.layers[0].weight)[0] = 1e9
         with pytest.raises(SplatwizardError, match="finite"):
-            encoded(model, codec__pp=False)
+            encoded(model, codec__settings__pp=False)
     with pytest.raises(ConfigError, match="entropy coder"):
-        method(codec__coder="octree").stages()
+        method(codec__settings__coder="octree").stages()
     with pytest.raises(TypeError, match="its own Gaussians"):
         method().encode(torch.nn.Module(), None)
 

@@ -22,7 +22,8 @@ SMALL = {
     "densify.start": 20, "densify.stop": 80, "densify.interval": 20, "densify.grad_threshold": 1e-3,
     "densify.reset_interval": 10_000, "mask.lr": 0.1, "mask.interval": 20, "grid.levels": 6, "grid.growth": 1.6,
     "grid.log2_size": 10, "network.hidden": 16, "network.warm_up": 10, "network.lr": 0.02,
-    "network.lr_steps": [120, 140], "rvq.start": 130, "rvq.size": 32, "rvq.stages": 4, "codec.grid_threshold": 0.02,
+    "network.lr_steps": [120, 140], "rvq.start": 130, "rvq.size": 32, "rvq.stages": 4,
+    "codec.settings.grid_threshold": 0.02,
 }  # fmt: skip
 
 

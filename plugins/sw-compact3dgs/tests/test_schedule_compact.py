@@ -75,7 +75,7 @@ def test_the_published_hyper_parameters():
         assert (config.grid.log2_table, config.mask.weight, config.mask.lr, config.network.lr) == expected
         assert config.mask.factor == 1
     assert (real.rvq.size, real.rvq.stages, real.rvq.start, real.rvq.lr) == (64, 6, 29_000, 1e-4)
-    assert (real.mask.threshold, real.mask.init, real.codec.grid_threshold) == (0.01, 1.0, 0.1)
+    assert (real.mask.threshold, real.mask.init, real.codec.settings.grid_threshold) == (0.01, 1.0, 0.1)
     lr = real.lr
     assert (lr.position_init, lr.position_final, lr.opacity, lr.scales, lr.quats) == (1.6e-4, 1.6e-6, 0.05, 5e-3, 1e-3)
 
@@ -84,7 +84,7 @@ def test_rate_points_are_multiples_of_the_presets_weight():
     weights = {}
     for rate in Compact3DGS.RATES:
         c = resolve(Compact3DGS, "paper", rate=rate).config
-        weights[rate] = (c.mask.weight * c.mask.factor, c.grid.log2_table, c.codec.pp)
+        weights[rate] = (c.mask.weight * c.mask.factor, c.grid.log2_table, c.codec.settings.pp)
     assert weights == {
         "r1": (4e-3, 17, True), "r2": (4e-3, 19, True), "r3": (2e-3, 19, True), "r4": (1e-3, 19, True),
         "r5": (5e-4, 19, True), "r6": (2.5e-4, 19, True), "r7": (5e-4, 19, False),

@@ -1,8 +1,9 @@
 """Hyper-parameters of Compact3DGS. Defaults are those of the authors' code for real scenes."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field
+from sw_gaussians.choices import Choosing, OwnCodec
 from sw_gaussians.config import Densify, GaussianTraining, Loss
 from sw_gaussians.config import LearningRates as GaussianRates
 
@@ -68,7 +69,7 @@ class RVQ(Params):
     lr: float = Field(1e-4, ge=0, description="Adam step size of the entries")
 
 
-class Codec(Params):
+class FileSettings(Params):
     """Settings of the file."""
 
     pp: bool = Field(True, description="post-processing: 8-bit opacity and grid, coded indices, packed positions")
@@ -76,7 +77,14 @@ class Codec(Params):
     grid_threshold: float = Field(0.1, ge=0, description="post-processing makes values of the grid up to this zero")
 
 
-class Compact3DGSConfig(OptimizationParams):
+class Codec(OwnCodec):
+    """The file of Compact3DGS, which no other codec can write."""
+
+    name: Literal["compact3dgs"] = Field("compact3dgs", description="the file of Compact3DGS")
+    settings: FileSettings = Field(FileSettings(), description="settings of the file")
+
+
+class Compact3DGSConfig(Choosing, OptimizationParams):
     """Everything that can be set for Compact3DGS."""
 
     lr: LearningRates = Field(LearningRates(), description="step sizes of the Gaussians")
@@ -86,7 +94,7 @@ class Compact3DGSConfig(OptimizationParams):
     grid: Grid = Field(Grid(), description="hash grid")
     network: Network = Field(Network(), description="network behind the grid")
     rvq: RVQ = Field(RVQ(), description="codebooks of scales and rotations")
-    codec: Codec = Field(Codec(), description="what the file holds")
+    codec: Codec = Field(Codec(), description="what writes the file")
 
     @property
     def base(self) -> GaussianTraining:

@@ -30,7 +30,7 @@ from sw_compact3dgs.model import QUANTIZED, SMALLEST_SCALE, CompactGaussians
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
-    from sw_compact3dgs.config import Codec
+    from sw_compact3dgs.config import FileSettings
 
 log = logging.getLogger(__name__)
 
@@ -44,19 +44,19 @@ SHAPES = {"scales": 3, "rotations": 4}
 """Section prefix -> numbers of a vector."""
 
 
-def encode(model: CompactGaussians, writer: ContainerWriter, plugins: PluginManager, codec: Codec) -> None:
+def encode(model: CompactGaussians, writer: ContainerWriter, plugins: PluginManager, settings: FileSettings) -> None:
     """Write all sections; the model stays as it is.
 
     Raises SplatwizardError for values that are not finite and for a model whose masks are all off.
     """
     model = _for_file(model)
     grid = model.color.grid
-    n, form = model.num_rows, FORMS[codec.pp]
+    n, form = model.num_rows, FORMS[settings.pp]
     writer.raster["sh_degree"] = 0
     writer.static.update(
         num_gaussians=n,
         form=form,
-        coder=codec.coder,
+        coder=settings.coder,
         grid_levels=len(grid.levels),
         grid_features=grid.features,
         grid_coarsest=grid.levels[0].resolution,
@@ -66,10 +66,10 @@ def encode(model: CompactGaussians, writer: ContainerWriter, plugins: PluginMana
     )
     means, opacities = model.means.numpy(), model.opacities.numpy()
     table = grid.table.detach()
-    if codec.pp:
+    if settings.pp:
         writer.add("positions", plugins.array_coders.load("byte-planes")().encode(means.astype(np.float16)))
-        writer.add("opacities", _encode_opacities(opacities, plugins, codec.coder))
-        writer.add("grid", _encode_grid(table, _levels(model.color), plugins, codec))
+        writer.add("opacities", _encode_opacities(opacities, plugins, settings.coder))
+        writer.add("grid", _encode_grid(table, _levels(model.color), plugins, settings))
     else:
         writer.add_array("positions", means.astype(np.float16))
         writer.add_array("opacities", opacities.astype(np.float16))
@@ -81,7 +81,7 @@ def encode(model: CompactGaussians, writer: ContainerWriter, plugins: PluginMana
     ):  # fmt: skip
         coder = plugins.vector_coders.load("residual-vq")(
             plugins, size=quantizer.size, stages=quantizer.stages, codebooks=quantizer.codebooks,
-            coder=codec.coder if codec.pp else "packed-bits",
+            coder=settings.coder if settings.pp else "packed-bits",
         )  # fmt: skip
         for part, data in coder.encode(values.numpy(), np.ones(n)).items():
             writer.add(f"{prefix}/{part}", data)
@@ -138,15 +138,15 @@ def _encode_opacities(opacities: NDArray[Any], plugins: PluginManager, coder: st
     return OPACITY.pack(float(side["low"][0]), float(side["step"][0])) + coded
 
 
-def _encode_grid(table: Tensor, levels: NDArray[np.uint8], plugins: PluginManager, codec: Codec) -> bytes:
+def _encode_grid(table: Tensor, levels: NDArray[np.uint8], plugins: PluginManager, settings: FileSettings) -> bytes:
     """Small values become zero, which is a point of the lattice; its ends are those of all values."""
     quantizer: Any = plugins.quantizers.load("fake-quant")(8)
     values = table.reshape(-1)
     if not bool(torch.isfinite(values).all()):
         raise SplatwizardError("the colour grid holds values that are not finite: it cannot be encoded")
     quantizer.observe(values)
-    symbols, side = quantizer.encode(torch.where(values.abs() <= codec.grid_threshold, 0.0, values))
-    model = _bytes_model(plugins, codec.coder)
+    symbols, side = quantizer.encode(torch.where(values.abs() <= settings.grid_threshold, 0.0, values))
+    model = _bytes_model(plugins, settings.coder)
     context = model.Context(256, index=levels, tables=int(levels[-1]) + 1)
     coded: bytes = model.encode(symbols.numpy(), context)
     return GRID.pack(float(side["scale"][0, 0]), int(side["zero"][0, 0])) + coded

@@ -61,15 +61,17 @@ class Compact3DGS(Method):
 
     def stages(self) -> Sequence[Stage]:
         """Raise ConfigError for an entropy coder that is not there: now, and not when all is trained."""
-        coder, known = self.config.codec.coder, self.plugins.entropy_coders.names
+        coder, known = self.config.codec.settings.coder, self.plugins.entropy_coders.names
         if coder not in known:
-            raise ConfigError(f"no entropy coder is called '{coder}'; installed: {', '.join(known)}", key="codec.coder")
+            raise ConfigError(
+                f"no entropy coder is called '{coder}'; installed: {', '.join(known)}", key="codec.settings.coder"
+            )
         return [Compact3DGSStage(self.config)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         if not isinstance(model, CompactGaussians):
             raise TypeError(f"compact3dgs encodes its own Gaussians, not a {type(model).__name__}")
-        file.encode(model, writer, self.plugins, self.config.codec)
+        file.encode(model, writer, self.plugins, self.config.codec.settings)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         self.check_version(reader)

@@ -35,7 +35,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "network.lr_steps": [800, 1200, 1600],
         "rvq.start": 1700,
         "rvq.stages": 4,
-        "codec.grid_threshold": 0.05,
+        "codec.settings.grid_threshold": 0.05,
     },
 }
 
@@ -47,5 +47,5 @@ RATES: Mapping[str, Mapping[str, Any]] = {
     "r4": {"mask.factor": 2.0},
     "r5": {"mask.factor": 1.0},  # published, with post-processing
     "r6": {"mask.factor": 0.5},
-    "r7": {"mask.factor": 1.0, "codec.pp": False},  # published, without post-processing
+    "r7": {"mask.factor": 1.0, "codec.settings.pp": False},  # published, without post-processing
 }

@@ -16,6 +16,7 @@ from splatwizard_core.api import (
     Scheduler,
     SplatModel,
     SplatOptimizer,
+    TaskLog,
     View,
 )
 from sw_compact3dgs.config import Compact3DGSConfig
@@ -40,10 +41,11 @@ class MaskedDensification:
         scene: Scene,
         opt: OptimizationParams,
         step: int,
+        log: TaskLog,
     ) -> None:
-        self.inner(model, optimizer, scene, opt, step)
+        self.inner(model, optimizer, scene, opt, step, log)
         if step < opt.iterations:
-            prune_by_mask(model, optimizer, step=step)
+            log.scalar("masked", prune_by_mask(model, optimizer, step=step))
 
 
 class Compact3DGSStage(ThreeDGSStage):

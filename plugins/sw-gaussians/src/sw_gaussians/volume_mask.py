@@ -5,16 +5,13 @@ Source: Compact 3D Gaussian Representation for Radiance Field (arXiv 2311.13681)
 
 from __future__ import annotations
 
-import logging
 from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor, nn
 
-from splatwizard_core.api import Camera, EmptyModel, GaussianInputs, GaussianModel, Rasterizer, SplatOptimizer
-
-log = logging.getLogger(__name__)
+from splatwizard_core.api import Camera, EmptyModel, GaussianInputs, GaussianModel, Rasterizer, SplatOptimizer, TaskLog
 
 
 class MaskQuantizer(Protocol):
@@ -78,6 +75,6 @@ def prune_by_mask(model: VolumeMaskedGaussians, rows: SplatOptimizer, *, step: i
     return int((~stays).sum())
 
 
-def mask_prune(model: VolumeMaskedGaussians, optimizer: SplatOptimizer, step: int) -> None:
-    """Schedule task: remove the Gaussians whose mask is off."""
-    log.debug("step %d: %d Gaussians were masked", step, prune_by_mask(model, optimizer, step=step))
+def mask_prune(model: VolumeMaskedGaussians, optimizer: SplatOptimizer, step: int, log: TaskLog) -> None:
+    """Schedule task: remove the Gaussians whose mask is off; their number is the curve "masked"."""
+    log.scalar("masked", prune_by_mask(model, optimizer, step=step))

@@ -20,8 +20,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from pydantic import Field
 
-from splatwizard_core.api import BitstreamError
+from splatwizard_core.api import BitstreamError, Params
 from sw_codecs.arrays.packed_bits import PackedBits
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
 from sw_codecs.quantizers.residual_quantizer import ResidualVectorQuantizer
@@ -36,6 +37,16 @@ MAX_SIZE = 1 << 15
 MAX_STAGES = 16
 
 
+class ResidualVQSettings(Params):
+    """Settings of the coder `residual-vq`."""
+
+    size: int = Field(64, ge=1, le=MAX_SIZE, description="entries of a stage")
+    stages: int = Field(6, ge=1, le=MAX_STAGES, description="stages: entries whose sum is a vector")
+    iterations: int = Field(10, ge=0, description="passes of k-means over the vectors for each stage")
+    coder: str = Field("huffman", description="of the indices: packed-bits, or an entropy coder that takes tables")
+    half: bool = Field(False, description="codebooks in float16")
+
+
 class ResidualVQ:
     """Float vectors to three byte strings and back.
 
@@ -47,6 +58,8 @@ class ResidualVQ:
     device      where codebooks are fitted and searched; equal arguments give equal bytes on a CPU
     codebooks   [S, K, d] that were trained elsewhere; None: k-means fits them to the vectors
     """
+
+    Settings = ResidualVQSettings
 
     def __init__(
         self,
