@@ -94,13 +94,13 @@ def column_values(file: Bytes, classes: list[int], scheme: int, p: int, offset: 
     return [unzigzag(value) + offset for value in values]
 
 
-def categorical(data: bytes, size: int, tables: int, numbers: Sequence[int]) -> list[int]:
+def categorical(data: bytes, size: int, tables: int, numbers: Sequence[int], coder: str = "range") -> list[int]:
     file = Bytes(data)
     check(file.one("B") == 1, "version")
     if not numbers:
         return []
     stored = [table if any(table) else [1] * size for table in stored_tables(file, [size] * tables)]
-    return coder_symbols("range", file.rest(), stored, numbers)
+    return coder_symbols(coder, file.rest(), stored, numbers)
 
 
 def bernoulli(data: bytes, n: int) -> list[int]:

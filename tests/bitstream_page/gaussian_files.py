@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from bitstream_page.container import array
-from bitstream_page.entropy_models import columns
+from bitstream_page.entropy_models import categorical, columns
 from bitstream_page.fields import Bytes, check
-from bitstream_page.positions import byte_planes, deflate, float_delta, importance_vq, octree
+from bitstream_page.positions import byte_planes, deflate, float_delta, importance_vq, octree, residual_vq
 
 
 def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
@@ -184,6 +184,50 @@ def chimera_means(
     check(xyz == "uniform16", "positions")
     low, high = array(sections[f"{group}/box"])
     return (low + octree(section) / 65535 * (high - low)).astype("<f4")
+
+
+def compact(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    n, coder, hidden = (static[name] for name in ("num_gaussians", "coder", "hidden"))
+    levels, features, growth = (static[name] for name in ("grid_levels", "grid_features", "grid_growth"))
+    sizes = []
+    for level in range(levels):
+        exponent = level / (levels - 1) if levels > 1 else 0
+        s = static["grid_coarsest"] * (growth ** (levels - 1)) ** exponent - 1
+        vertices = math.ceil(s - 1e-9) + 1
+        sizes.append(-(-min(1 << static["grid_log2"], vertices**3) // 8) * 8)
+    if static["form"] == "plain":
+        means, opacities, table = (array(sections[name]) for name in ("positions", "opacities", "grid"))
+    else:
+        check(static["form"] == "post-processed", "form")
+        means = byte_planes(sections["positions"], "f2", (n, 3), unzstd)
+        file = Bytes(sections["opacities"])
+        low, step = file.unpack("ff")
+        opacities = low + np.array(categorical(file.rest(), 256, 1, [0] * n, coder), np.float64) * step
+        file = Bytes(sections["grid"])
+        scale, zero = file.unpack("fi")
+        level_of = [level for level, size in enumerate(sizes) for _ in range(size * features)]
+        symbols = np.array(categorical(file.rest(), 256, levels, level_of, coder))
+        table = np.float32(scale) * (symbols - zero).astype(np.float32)
+    weights, at = array(sections["network"]).astype("<f4"), 0
+    layers = {}
+    for i, (a, b) in enumerate(((features * levels + 10, hidden), (hidden, hidden), (hidden, 3))):
+        layers[f"color.layers.{i}.weight"] = weights[at : at + a * b].reshape(b, a)
+        at += a * b
+    check(at == len(weights), "weights of the network")
+    scales, quats = (
+        residual_vq(*(sections[f"{name}/{part}"] for part in ("header", "codebooks", "indices")), n, d)
+        for name, d in (("scales", 3), ("rotations", 4))
+    )
+    return {
+        "means": means.astype("<f4"),
+        "opacities": np.clip(opacities.astype("<f4"), 0, 1),
+        "scales": np.maximum(scales, np.float32(1e-8)),
+        "quats": quats,
+        "color.grid.table": table.astype("<f4").reshape(sum(sizes), features),
+        **layers,
+    }
 
 
 def raht(static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]) -> dict[str, np.ndarray]:

@@ -163,3 +163,20 @@ def importance_vq(
     shared, kept = iter(entries), iter(byte_planes(own, "f2", (k, d), unzstd))
     book = byte_planes(codebook, "f2", (size, d), unzstd)
     return np.array([next(kept) if bit else book[next(shared)] for bit in bits], "<f2").reshape(n, d)
+
+
+def residual_vq(header: bytes, codebooks: bytes, indices: bytes, n: int, d: int) -> np.ndarray:
+    file = Bytes(header)
+    version, half, stages, size, stated = file.unpack("BBBHI")
+    coder = file.rest().decode("ascii")
+    check(version == 1 and half in (0, 1) and stated == n, "head of residual-vq")
+    books = np.frombuffer(codebooks, "<f2" if half else "<f4").astype(np.float32).reshape(stages, size, d)
+    if coder == "packed-bits":
+        flat = packed_bits(indices, n * stages, max((size - 1).bit_length(), 1))
+    else:
+        flat = categorical(indices, size, stages, [i % stages for i in range(n * stages)], coder)
+    entries = np.array(flat, np.int64).reshape(n, stages)
+    found = books[0][entries[:, 0]]
+    for stage in range(1, stages):
+        found = found + books[stage][entries[:, stage]]
+    return found

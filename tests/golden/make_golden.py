@@ -170,6 +170,33 @@ def sharing(n: int, colors: int, shapes: int, degree: int) -> GaussianModel:
     )
 
 
+SMALL_COMPACT = {
+    "grid.levels": 3, "grid.coarsest": 3, "grid.growth": 1.7, "grid.log2_size": 6, "network.hidden": 4, "rvq.size": 6,
+    "rvq.stages": 3, "codec.settings.coder": "huffman",
+}  # fmt: skip
+
+
+def compact_gaussians(n: int, settings: Mapping[str, Any]) -> SplatModel:
+    """n Gaussians of Compact3DGS in its last phase with scattered values; one more is masked."""
+    values = Scattered()
+    points = PointCloud(4 * values(n + 1, 3), 0.5 + values(n + 1, 3) / 2)
+    scene = Scene("scattered", [], [], points, Protocol("test"))
+    method = create_method(load_plugins(), "compact3dgs", settings)
+    model = method.create_model(scene, torch.Generator())
+    with torch.no_grad():
+        for _, parameter in sorted(model.named_parameters()):
+            parameter.copy_(values(*parameter.shape))
+        model.means.mul_(4)
+        # The largest and the smallest opacity are exactly 1 and 0 on every machine: they are in the file.
+        model.opacity_logits.mul_(4)
+        model.opacity_logits[:2] = torch.tensor([60.0, -200.0])[: n + 1]
+        model.log_scales.sub_(1)
+        model.mask_logits.fill_(1.0)
+        model.mask_logits[n] = -9.0
+    model.phase = "quantized"
+    return model
+
+
 def settled(n: int, degree: int = 3, anchor: str = "center") -> GaussianModel:
     """Gaussians of MesonGS on an octree of three levels, some voxels shared, in three blocks."""
     from sw_codecs.models.raht_gaussians import settled_copy
@@ -208,6 +235,14 @@ CASES: dict[str, Case] = {
     "hac_half_v1": ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
     "cat_3dgs_refined_v1": ("cat-3dgs", "r1", SMALL_CAT, lambda: cat_anchors(SMALL_CAT)),
     "speedy_splat_v1": ("speedy-splat", "r3", {}, lambda: procedural(16, 2, 1)),
+    "compact3dgs_v1": ("compact3dgs", "r5", SMALL_COMPACT, lambda: compact_gaussians(24, SMALL_COMPACT)),
+    "compact3dgs_plain_v1": ("compact3dgs", "r7", SMALL_COMPACT, lambda: compact_gaussians(12, SMALL_COMPACT)),
+    "compact3dgs_one_v1": (
+        "compact3dgs",
+        "r1",
+        {**SMALL_COMPACT, "codec.settings.coder": "range"},
+        lambda: compact_gaussians(1, {**SMALL_COMPACT, "grid.halvings": 2}),
+    ),
     "chimerags_v1": ("chimerags", "r2", SMALL_VQ, lambda: masked(32, 12)),
     "chimerags_uniform16_v1": ("chimerags", "r1", {**SMALL_VQ, "xyz": "uniform16"}, lambda: masked(20, 0)),
     "chimerags_float16_v1": ("chimerags", "r4", {**SMALL_VQ, "xyz": "float16", "prefer": []}, lambda: masked(5, 5)),

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
         uniform,
         vector_quantizer,
     )
-    from sw_codecs.vectors import sensitivity_vq
+    from sw_codecs.vectors import residual_vq, sensitivity_vq
 
     # mypy holds each class that is registered below to its contract.
     QUANTIZERS: list[Callable[..., api.Quantizer]] = [
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     ARRAY_CODERS: list[Callable[..., api.ArrayCoder]] = [
         byte_planes.BytePlanes, byte_planes.FloatDelta, packed_bits.PackedBits, deflate.Deflate,
     ]  # fmt: skip
-    VECTOR_CODERS: list[Callable[..., api.VectorCoder]] = [sensitivity_vq.SensitivityVQ]
+    VECTOR_CODERS: list[Callable[..., api.VectorCoder]] = [residual_vq.ResidualVQ, sensitivity_vq.SensitivityVQ]
     GAUSSIAN_CODECS: list[Callable[..., api.GaussianCodec]] = [
         codecs.Exact, codecs.Quantized, codecs.Ply, codecs.Lossless, raht_codec.Raht,
     ]  # fmt: skip
@@ -142,6 +142,8 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="float or integer arrays without loss: one DEFLATE stream")  # fmt: skip
     registry.add("sensitivity-vq", "sw_codecs.vectors.sensitivity_vq:SensitivityVQ", codes="vectors",
                  summary="float vectors: a codebook for the least sensitive, own entries for the rest")  # fmt: skip
+    registry.add("residual-vq", "sw_codecs.vectors.residual_vq:ResidualVQ", codes="vectors",
+                 summary="vectors as sums of codebook entries, indices Huffman coded or packed")  # fmt: skip
     registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip
     registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians",

@@ -7,6 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
+from sw_codecs.coders.arithmetic import RansCoder
+from sw_codecs.coders.huffman import HuffmanCoder
 from sw_codecs.entropy.bernoulli import Bernoulli
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
 
@@ -20,6 +22,18 @@ def test_categorical_round_trip(size, tables, data):
     symbols, index = np.array(rows, np.int64).reshape(-1, 2).T
     context = CategoricalContext(size, index=index, tables=tables)
     assert np.array_equal(Categorical().decode(Categorical().encode(symbols, context), context), symbols)
+
+
+@pytest.mark.parametrize("coder", [HuffmanCoder, RansCoder])
+def test_categorical_with_another_coder(coder):
+    symbols = np.minimum(np.random.default_rng(0).geometric(0.3, N) - 1, 63)
+    context = CategoricalContext(64, n=N)
+    data = Categorical(coder()).encode(symbols, context)
+    assert np.array_equal(Categorical(coder()).decode(data, context), symbols)
+    bits = float(Categorical().bits(torch.from_numpy(symbols), context).sum())
+    assert bits < 8 * len(data) < bits + N
+    with pytest.raises(BitstreamError):
+        Categorical().decode(data, context)
 
 
 def test_categorical_estimate_is_the_size():

@@ -65,6 +65,11 @@ def test_the_codebook_loss_is_that_of_each_stage_and_trains_the_codebooks_alone(
     assert float(loss.detach()) == pytest.approx(expected, rel=1e-5)
     loss.backward()
     assert x.grad is None
+    found, same = q.forward_with_loss(x)
+    assert torch.equal(found, q.forward(x))
+    assert torch.equal(same, loss)
+    found.sum().backward()
+    assert (x.grad == 1).all()
     x = x.detach()
     before = float((q.forward(x) - x).square().mean())
     optimizer = torch.optim.Adam(q.parameters(), lr=1e-2)

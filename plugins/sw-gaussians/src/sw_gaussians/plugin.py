@@ -1,4 +1,4 @@
-"""Registers the tasks of 3DGS and of 3DGS-MCMC, a pruner, and the .ply of 3DGS."""
+"""Registers the tasks of 3DGS, of 3DGS-MCMC and of volume masks, a pruner, and the .ply of 3DGS."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -18,6 +18,9 @@ def register_tasks(registry: Registry) -> None:
                  summary="clone, split and prune Gaussians by those statistics", factory=True)  # fmt: skip
     registry.add("reset-opacity", "sw_gaussians.tasks:ResetOpacity",
                  summary="lower every opacity to at most 0.01", factory=True)  # fmt: skip
+    registry.add("mask-prune", "sw_gaussians.volume_mask:mask_prune",
+                 summary="remove Gaussians that a learned volume mask turned off (Compact3DGS)",
+                 factory=False)  # fmt: skip
     registry.add("relocate-dead", "sw_gaussians.mcmc_tasks:Relocate",
                  summary="move faint Gaussians onto opaque ones (3DGS-MCMC)", factory=True)  # fmt: skip
     registry.add("grow-to-cap", "sw_gaussians.mcmc_tasks:Grow",

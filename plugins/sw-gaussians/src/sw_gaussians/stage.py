@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from splatwizard_core.api import (
@@ -116,20 +117,9 @@ class ThreeDGSStage(Stage):
             collect_statistics,
             name="collect gradient statistics",
         )
-        prune_and_densify = tasks.PruneAndDensify(
-            grad_threshold=densify.grad_threshold,
-            percent_dense=densify.percent_dense,
-            min_opacity=densify.min_opacity,
-            world_prune=densify.world_prune,
-            size_rules_after=self.steps(densify.reset_interval),
-            prune_screen_px=densify.prune_screen_px,
-            revised_opacity=densify.revised_opacity,
-            reset_interval=self.steps(densify.reset_interval),
-            pause_after_reset=self.steps(densify.pause_after_reset),
-        )
         scheduler.register_task(
             self.when(range(densify.start, densify.stop, densify.interval)),
-            prune_and_densify,
+            self.densification(),
             name="prune and densify",
         )
         reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
@@ -140,6 +130,21 @@ class ThreeDGSStage(Stage):
             )
         scheduler.register_task(
             self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
+        )
+
+    def densification(self) -> Callable[..., None]:
+        """Return the task that clones, splits and prunes; a stage with rules of its own wraps it."""
+        densify = self.config.densify
+        return tasks.PruneAndDensify(
+            grad_threshold=densify.grad_threshold,
+            percent_dense=densify.percent_dense,
+            min_opacity=densify.min_opacity,
+            world_prune=densify.world_prune,
+            size_rules_after=self.steps(densify.reset_interval),
+            prune_screen_px=densify.prune_screen_px,
+            revised_opacity=densify.revised_opacity,
+            reset_interval=self.steps(densify.reset_interval),
+            pause_after_reset=self.steps(densify.pause_after_reset),
         )
 
     def _register_mcmc(self, scheduler: Scheduler) -> None:

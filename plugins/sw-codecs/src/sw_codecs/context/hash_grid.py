@@ -135,12 +135,11 @@ class HashGrid(nn.Module):
         features: int = 2,
         log2_size: int = 19,
         coarsest: int = 16,
-        finest: int = 2048,
-        generator: torch.Generator,
+        finest: float = 2048,
+        generator: torch.Generator | None,
     ) -> HashGrid:
-        """As in instant-ngp: resolutions from `coarsest` to `finest` in equal ratios."""
-        scales = [coarsest * (finest / coarsest) ** (i / max(levels - 1, 1)) - 1 for i in range(levels)]
-        found = [(scale, math.ceil(scale - 1e-9) + 1) for scale in scales]  # 39.0000000001 is 39
+        """As in instant-ngp: resolutions from `coarsest` to `finest` in equal ratios; generator as above."""
+        found = real_levels(levels, coarsest, finest)
         return cls(dimensions, found, features=features, log2_size=log2_size, binary=False, generator=generator)
 
     @property
@@ -396,6 +395,12 @@ class MixedHashGrid(nn.Module):
 
     def _all(self) -> list[HashGrid]:
         return [grid for grid in self.grids if isinstance(grid, HashGrid)]
+
+
+def real_levels(levels: int, coarsest: float, finest: float) -> list[tuple[float, int]]:
+    """Scale and resolution of each level of `HashGrid.real_grid`."""
+    scales = [coarsest * (finest / coarsest) ** (i / max(levels - 1, 1)) - 1 for i in range(levels)]
+    return [(scale, math.ceil(scale - 1e-9) + 1) for scale in scales]  # 39.0000000001 is 39
 
 
 def table_size(resolution: int, dimensions: int, log2_size: int) -> int:

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import BitstreamError
+from splatwizard_core.api import BitstreamError, EntropyCoder
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.count_tables import pack_tables, rounded_counts, unpack_tables
@@ -50,9 +50,16 @@ class CategoricalContext:
 
 
 class Categorical:
-    """Counts are stored: of the symbols, or from logits that were trained. Its context is a `Categorical.Context`."""
+    """Counts are stored: of the symbols, or from logits that were trained. Its context is a `Categorical.Context`.
+
+    coder   an entropy coder for tables of counts (`huffman`, ...), the same for encoding and decoding: the bytes do not
+            name it. None: `range`, for which `bits` is the size
+    """
 
     Context = CategoricalContext
+
+    def __init__(self, coder: EntropyCoder | None = None) -> None:
+        self.coder: EntropyCoder = RangeCoder() if coder is None else coder
 
     def bits(self, symbols: Tensor, context: CategoricalContext) -> Tensor:
         """Bits per symbol, shape of `symbols`: under the logits, differentiable in them; or else under the counts of
@@ -70,13 +77,13 @@ class Categorical:
         return torch.from_numpy(found.reshape(symbols.shape)).to(symbols.device)
 
     def encode(self, symbols: np.ndarray, context: CategoricalContext) -> bytes:
-        """u8 version, the count tables, chunks of the `range` coder. Raises ValueError for symbols out of range."""
+        """u8 version, the count tables, chunks of the coder. Raises ValueError for symbols out of range."""
         symbols = as_symbols(symbols)
         index, tables = _histograms(symbols, context)
         head = bytes([VERSION])
         if len(symbols) == 0:
             return head
-        return head + pack_tables(list(tables)) + RangeCoder().encode(symbols, _spec(list(tables), index))
+        return head + pack_tables(list(tables)) + self.coder.encode(symbols, _spec(list(tables), index))
 
     def decode(self, data: bytes, context: CategoricalContext) -> np.ndarray:
         """int32 [n]. Raises BitstreamError for damage or another context."""
@@ -91,7 +98,7 @@ class Categorical:
         tables = unpack_tables(reader, [context.size] * context.tables)
         if sum(int(t.sum()) for t in tables) == 0:
             raise BitstreamError("the count tables are empty")
-        return RangeCoder().decode(bytes(reader.take(reader.left)), n, _spec(tables, context.rows(n), stored=True))
+        return self.coder.decode(bytes(reader.take(reader.left)), n, _spec(tables, context.rows(n), stored=True))
 
 
 def _histograms(symbols: np.ndarray, context: CategoricalContext) -> tuple[np.ndarray, np.ndarray]:

@@ -86,14 +86,18 @@ class ResidualVectorQuantizer(nn.Module):
 
     def codebook_loss(self, x: Tensor) -> Tensor:
         """Sum over the stages of the mean squared distance of residuals to entries; it moves the codebooks only."""
+        return self.forward_with_loss(x)[1]
+
+    def forward_with_loss(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """`forward` and `codebook_loss` of x by one search."""
         books = self._fitted()
-        symbols, _ = self._search(x, books.detach())
+        symbols, found = self._search(x, books.detach())
         residual, loss = x.detach().to(books.dtype), books.new_zeros(())
         for stage in range(self.stages):
             entries = books[stage][symbols[:, stage]]
             loss = loss + (residual - entries).square().mean()
             residual = residual - entries.detach()
-        return loss
+        return straight_through(x, found), loss
 
     def encode(self, x: Tensor) -> tuple[Tensor, dict[str, Any]]:
         """Symbols [N, S] int64, and {"codebooks"} [S, K, d] float32 (float16 with `half`) as a numpy array.

@@ -1,1 +1,1 @@
-"""Coders of float vectors that lose more where it matters less."""
+"""Coders of float vectors with loss."""
