@@ -6,6 +6,7 @@ and waits for ever on the lock of a dead process. What is left to know is the tw
 
 from __future__ import annotations
 
+import contextlib
 import os
 import platform
 import re
@@ -146,8 +147,22 @@ class Toolchain:
         if nvcc is not None:
             libraries += ["-ltorch_cuda", "-lc10_cuda", "-L", str(cuda_toolkit.root_of(nvcc) / "lib64"), "-lcudart"]
         extra = ["-fopenmp"] if sys.platform != "darwin" else ["-undefined", "dynamic_lookup"]
-        command = [*self.compiler, "-shared", *map(str, objects), "-o", str(output), *extra, *libraries]
+        first = [*map(str, objects), *runtime_libraries()]
+        command = [*self.compiler, "-shared", *first, "-o", str(output), *extra, *libraries]
         self._pool.submit(_run, command, log).result()
+
+
+def runtime_libraries() -> list[str]:
+    """Paths of the C++ runtime (libstdc++, libgcc_s) that this process, and so torch, runs on; empty but on Linux.
+
+    Linked before the compiler's own. One that brings static ones alone would put a second runtime into the module:
+    numbers in its messages are lost, and an error that passes through it ends the process.
+    """
+    with contextlib.suppress(OSError):
+        mapped = {line.split(maxsplit=5)[-1].strip() for line in Path("/proc/self/maps").read_text().splitlines()}
+        named = (Path(path) for path in sorted(mapped) if path.startswith("/"))
+        return [str(p) for p in named if p.name.startswith(("libgcc_s.so.1", "libstdc++.so.6")) and p.is_file()]
+    return []
 
 
 def _run(command: list[str], log: Path) -> None:
