@@ -12,7 +12,7 @@ import numpy as np
 from bitstream_page.container import array
 from bitstream_page.entropy_models import categorical, columns
 from bitstream_page.fields import Bytes, check
-from bitstream_page.positions import byte_planes, float_delta, importance_vq, octree, residual_vq
+from bitstream_page.positions import byte_planes, deflate, float_delta, importance_vq, octree, residual_vq
 
 
 def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
@@ -123,6 +123,34 @@ def vectree(
         "log_scales": attributes[:, 1:4],
         "quats": attributes[:, 4:],
     }
+
+
+def indexed(
+    static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
+) -> dict[str, np.ndarray]:
+    n, colors, shapes = static["num_gaussians"], static["num_colors"], static["num_shapes"]
+    bands = (static["max_sh_degree"] + 1) ** 2
+    check(static["arrays"] in ("deflate", "byte-planes"), "coder of the arrays")
+
+    def read(name: str, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+        if static["arrays"] == "deflate":
+            return deflate(sections[name], dtype, shape)
+        return byte_planes(sections[name], dtype, shape, unzstd)
+
+    for name, size in (("color_index", colors), ("shape_index", shapes)):
+        index = read(name, "u2" if size <= 2**16 else "u4", (n,))
+        check(set(index.tolist()) == set(range(size)), "every entry is used")
+    steps, zeros = array(sections["steps"]), array(sections["zeros"])
+    sizes = {"opacity": (n,), "factor": (n,), "dc": (colors, 1, 3), "rest": (colors, bands - 1, 3),
+             "shape": (shapes, 3), "quat": (shapes, 4)}  # fmt: skip
+    found = [
+        (read(name, "u1", size).astype(np.int32) - zeros[at]).astype("<f4") * steps[at]
+        for at, (name, size) in enumerate(sizes.items())
+    ]
+    names = ("opacity_values", "log_factors", "color_dc", "color_rest", "shape_scales", "shape_quats")
+    values = dict(zip(names, found, strict=True))
+    values["opacity_values"] = values["opacity_values"].clip(0, 1)
+    return {"means": read("xyz", "f2", (n, 3)).astype("<f4"), **values}
 
 
 def chimera(

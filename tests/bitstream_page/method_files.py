@@ -10,7 +10,7 @@ from bitstream_page.anchor_files import cat, hac
 from bitstream_page.container import container
 from bitstream_page.entropy_models import ExactTables
 from bitstream_page.fields import check
-from bitstream_page.gaussian_files import chimera, compact, exact_mode, packed, ply, quantized, raht, vectree
+from bitstream_page.gaussian_files import chimera, compact, exact_mode, indexed, packed, ply, quantized, raht, vectree
 
 
 def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -> dict[str, np.ndarray]:
@@ -29,7 +29,10 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
         return chimera(static, sections, unzstd)
     if header["method"] == "compact3dgs":
         return compact(static, sections, unzstd)
-    check(header["method"] in ("trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "mesongs"), "method")
+    known = ("trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs")
+    check(header["method"] in known, "method")
+    if static["codec"] == "gaussians-indexed":
+        return indexed(static, sections, unzstd)
     if static["codec"] == "raht":
         return raht(static, sections, unzstd)
     if static["codec"] == "vectree":

@@ -114,11 +114,29 @@ def float_delta(data: bytes, shape: tuple[int, int], unzstd: Callable[[bytes], b
     return found.view("<f4")
 
 
+def deflate(data: bytes, dtype: str, shape: tuple[int, ...]) -> np.ndarray:
+    check(data[0] == 1, "version of the DEFLATE array")
+    return np.frombuffer(zlib.decompress(data[1:]), "<" + dtype).reshape(shape)
+
+
 def packed_bits(data: bytes, n: int, w: int) -> list[int]:
     check(len(data) == -(-n * w // 8), "length of the packed bits")
     digits = "".join(f"{byte:08b}" for byte in data)
     check("1" not in digits[n * w :], "padding")
     return [int(digits[i * w : (i + 1) * w], 2) for i in range(n)]
+
+
+def sensitivity_vq(
+    header: bytes, index: bytes, lattice: bytes, entries: bytes, n: int, d: int, unzstd: Callable[[bytes], bytes]
+) -> np.ndarray:
+    """The vectors, f32 [n,d]."""
+    file = Bytes(header)
+    version, stated, k = file.unpack("BII")
+    file.done()
+    check(version == 1 and stated == n, "version of the vectors")
+    steps, zeros = np.frombuffer(lattice, "<f4", d), np.frombuffer(lattice, "<i4", d, 4 * d)
+    symbols = byte_planes(entries, "u1", (k, d), unzstd).astype(np.int32)
+    return ((symbols - zeros).astype("<f4") * steps)[byte_planes(index, "u2" if k <= 2**16 else "u4", (n,), unzstd)]
 
 
 def importance_vq(

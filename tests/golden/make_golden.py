@@ -146,6 +146,30 @@ def masked(n: int, on: int) -> GaussianModel:
     return model
 
 
+def sharing(n: int, colors: int, shapes: int, degree: int) -> GaussianModel:
+    """Gaussians of C3DGS that share colours and shapes, on lattices whose steps are powers of two."""
+    from sw_c3dgs.coded import CodedGaussians
+    from sw_c3dgs.indexed import IndexedGaussians
+
+    values = Scattered()
+    means = (4 * values(n, 3)).half().numpy()
+    sizes = {
+        "opacity": (n,), "factor": (n,), "dc": (colors, 1, 3), "rest": (colors, (degree + 1) ** 2 - 1, 3),
+        "shape": (shapes, 3), "quat": (shapes, 4),
+    }  # fmt: skip
+    symbols = {name: ((values(*size) + 1) * 127).numpy().astype(np.uint8) for name, size in sizes.items()}
+    return IndexedGaussians(
+        CodedGaussians(
+            means,
+            symbols,
+            np.array([2**-8, 2**-4, 2**-6, 2**-8, 2**-8, 2**-7], np.float32),
+            np.array([0, 190, 128, 127, 0, 128], np.int32),
+            np.arange(n) * 5 % max(colors, 1),
+            np.arange(n) * 3 % max(shapes, 1),
+        )
+    )
+
+
 SMALL_COMPACT = {
     "grid.levels": 3, "grid.coarsest": 3, "grid.growth": 1.7, "grid.log2_size": 6, "network.hidden": 4, "rvq.size": 6,
     "rvq.stages": 3, "codec.settings.coder": "huffman",
@@ -222,6 +246,9 @@ CASES: dict[str, Case] = {
     "chimerags_v1": ("chimerags", "r2", SMALL_VQ, lambda: masked(32, 12)),
     "chimerags_uniform16_v1": ("chimerags", "r1", {**SMALL_VQ, "xyz": "uniform16"}, lambda: masked(20, 0)),
     "chimerags_float16_v1": ("chimerags", "r4", {**SMALL_VQ, "xyz": "float16", "prefer": []}, lambda: masked(5, 5)),
+    "c3dgs_v1": ("c3dgs", "r4", {}, lambda: sharing(40, 7, 5, 2)),
+    "c3dgs_planes_v1": ("c3dgs", "r1", {"codec.settings.arrays": "byte-planes"}, lambda: sharing(12, 12, 12, 3)),
+    "c3dgs_empty_v1": ("c3dgs", "r4", {}, lambda: sharing(0, 0, 0, 0)),
     "chimerags_empty_v1": ("chimerags", "r3", SMALL_VQ, lambda: masked(0, 0)),
     "mesongs_v1": ("mesongs", "r4", {}, lambda: settled(60)),
     "mesongs_corner_v1": ("mesongs", "r1", {}, lambda: settled(20, 0, "corner")),

@@ -182,6 +182,23 @@ def test_a_pruner_that_reads_statistics_is_refused(plugins):
         configured(plugins, prune__pruner="trimming-the-fat").stages()
 
 
+def test_gaussians_that_are_not_finite_are_left_out(plugins, toy, rasterizer):
+    broken = copy.deepcopy(toy.truth)
+    broken.means[3], broken.log_scales[5, 1], broken.opacity_logits[7] = torch.nan, torch.inf, torch.inf
+    method = configured(plugins, iterations=0, prune__tau=0.0, codec__settings__depth=21)
+    model = (
+        TrainingRun(
+            list(method.stages()), lambda: None, toy.scene, PipelineParams(), rasterizer, identity={}, directory=None,
+            trained={"3dgs": broken}.__getitem__,
+        )
+        .train()
+        .model
+    )  # fmt: skip
+    assert 390 < model.num_rows <= 397  # the lowest goes too
+    assert float(model.opacity_logits.detach().max()) == 20
+    assert decoded(plugins, encoded(method, model)).num_rows == model.num_rows
+
+
 def test_nothing_left_is_an_error(train, monkeypatch):
     monkeypatch.setattr(Importance, "score", lambda self, model, *_: torch.ones(model.num_rows))
     with pytest.raises(EmptyModel):
@@ -218,7 +235,7 @@ def test_what_a_gpu_trains_decodes_on_the_cpu_to_what_was_drawn(plugins, toy):
     trained = copy.deepcopy(toy.truth).cuda()
     model = (
         TrainingRun(
-            list(method.stages()), lambda: None, toy.scene, PipelineParams(), gpu, identity={},
+            list(method.stages()), lambda: None, toy.scene, PipelineParams(), gpu, identity={}, directory=None,
             trained={"3dgs": trained}.__getitem__,
         )
         .train()

@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from splatwizard_core import api
-    from sw_codecs.arrays import byte_planes, packed_bits
+    from sw_codecs.arrays import byte_planes, deflate, packed_bits
     from sw_codecs.coders import arithmetic, huffman
     from sw_codecs.context import channel_ar, hash_grid, integer_mlp, spatial_ar, triplane
     from sw_codecs.entropy import (
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
         uniform,
         vector_quantizer,
     )
-    from sw_codecs.vectors import residual_vq
+    from sw_codecs.vectors import residual_vq, sensitivity_vq
 
     # mypy holds each class that is registered below to its contract.
     QUANTIZERS: list[Callable[..., api.Quantizer]] = [
@@ -55,9 +55,9 @@ if TYPE_CHECKING:
         octree.Octree, plain.MortonDelta, plain.RawPositions, draco.Draco,
     ]  # fmt: skip
     ARRAY_CODERS: list[Callable[..., api.ArrayCoder]] = [
-        byte_planes.BytePlanes, byte_planes.FloatDelta, packed_bits.PackedBits,
+        byte_planes.BytePlanes, byte_planes.FloatDelta, packed_bits.PackedBits, deflate.Deflate,
     ]  # fmt: skip
-    VECTOR_CODERS: list[Callable[..., api.VectorCoder]] = [residual_vq.ResidualVQ]
+    VECTOR_CODERS: list[Callable[..., api.VectorCoder]] = [residual_vq.ResidualVQ, sensitivity_vq.SensitivityVQ]
     GAUSSIAN_CODECS: list[Callable[..., api.GaussianCodec]] = [
         codecs.Exact, codecs.Quantized, codecs.Ply, codecs.Lossless, raht_codec.Raht,
     ]  # fmt: skip
@@ -138,6 +138,10 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="float32 positions without loss: steps as byte planes, zstd")  # fmt: skip
     registry.add("packed-bits", "sw_codecs.arrays.packed_bits:PackedBits", codes="arrays",
                  summary="indices of 1 to 16 bits, packed")  # fmt: skip
+    registry.add("deflate", "sw_codecs.arrays.deflate:Deflate", codes="arrays",
+                 summary="float or integer arrays without loss: one DEFLATE stream")  # fmt: skip
+    registry.add("sensitivity-vq", "sw_codecs.vectors.sensitivity_vq:SensitivityVQ", codes="vectors",
+                 summary="float vectors: a codebook for the least sensitive, own entries for the rest")  # fmt: skip
     registry.add("residual-vq", "sw_codecs.vectors.residual_vq:ResidualVQ", codes="vectors",
                  summary="vectors as sums of codebook entries, indices Huffman coded or packed")  # fmt: skip
     registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",

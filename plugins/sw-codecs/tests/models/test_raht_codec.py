@@ -200,11 +200,21 @@ def test_fewer_gaussians_make_a_smaller_file(plugins):
 
 
 def test_what_cannot_be_written_is_told(plugins):
-    model = model_of()
+    settled = settled_copy(model_of(), RahtSettings(**QUICK), seed=0)
+    with torch.no_grad():
+        settled.log_scales[3:5] = torch.inf
+    with pytest.raises(SplatwizardError, match="'log_scales' is not finite in 2 rows"):
+        written(plugins, settled)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_gaussians_that_are_not_finite_are_left_out(plugins, degree):
+    model = model_of(degree=degree)
     with torch.no_grad():
         model.log_scales[3:5] = torch.inf
-    with pytest.raises(SplatwizardError, match="'log_scales' of 2 Gaussians"):
-        written(plugins, model)
+        model.means[8] = torch.nan
+        model.opacity_logits[9], model.opacity_logits[10] = torch.nan, torch.inf
+    assert decoded(plugins, written(plugins, model)).num_rows == 300 - 4
 
 
 def rebuilt(whole, **sections):

@@ -11,6 +11,7 @@ MODULE = NativeModule(
         "csrc/binding.cpp",
         "csrc/binding_surfel.cpp",
         "csrc/binding_scores.cpp",
+        "csrc/binding_shared.cpp",
         "csrc/binding_cuda.cpp",
         "csrc/binding_scores_cuda.cpp",
         "csrc/binding_surfel_cuda.cpp",
@@ -27,6 +28,7 @@ MODULE = NativeModule(
         "csrc/cpu/project_backward.cpp",
         "csrc/cpu/blend.cpp",
         "csrc/cpu/bin.cpp",
+        "csrc/cpu/shared_colors.cpp",
     ),
     headers=("csrc/*.h", "csrc/cpu/*.h", "csrc/cuda/*.h"),
     cuda_sources=(

@@ -62,10 +62,11 @@ class Tables:
         The gradient of a row is the sum over everyone who asked for it, in the same order in every run, on CUDA too,
         where torch's own gradient of indexing adds atomically. Raises ShapeError for an index outside.
         """
-        rows: Tensor = _Lookup.apply(table, self._segments(indices, len(table)))  # type: ignore[no-untyped-call]
+        rows: Tensor = _Lookup.apply(table, self.segments(indices, len(table)))  # type: ignore[no-untyped-call]
         return rows
 
-    def _segments(self, indices: Tensor, rows: int) -> Segments:
+    def segments(self, indices: Tensor, rows: int) -> Segments:
+        """Indices [N] into a table of so many rows, sorted. Raises ShapeError for an index outside."""
         if indices.is_inference():
             return Segments(indices, rows)  # without a version: nobody would notice a change
         found = self._known.get(indices)

@@ -10,6 +10,7 @@ from torch import Tensor
 from splatwizard_core.api import Camera, GaussianInputs, RasterizerInfo, RasterOptions, RenderResult
 from sw_rasterizers import plugin
 from sw_rasterizers.segments import Tables
+from sw_rasterizers.shared_colors import shared_colors
 from sw_rasterizers.standard import StandardRasterizer
 
 
@@ -35,8 +36,9 @@ class DepthRasterizer(StandardRasterizer):
 class IndexedRasterizer(StandardRasterizer):
     """Codebooks of colours and of shapes, with a scale factor for each Gaussian, read in front of the kernels.
 
-    Gradients of codebook rows are sums over their users in a fixed order (`segments`); those of factors and of
-    quaternions are exact. On CUDA the sums of the kernels in front of them are atomic.
+    Shared SH coefficients are never gathered (`shared_colors`): what a Gaussian gets of its own are a colour and, of
+    its shape, seven numbers. Gradients of codebook rows are sums over their users in a fixed order (`segments`); those
+    of factors and of quaternions are exact. On CUDA the sums of the kernels in front of them are atomic.
     Source: C3DGS (arXiv 2401.02436).
     """
 
@@ -49,10 +51,16 @@ class IndexedRasterizer(StandardRasterizer):
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """As `standard`; `RenderResult.inputs` are the inputs as they came. Raises ShapeError for a wrong index too."""
         self.info.check_request(g, opt)
-        return replace(super().render(g.gathered(lookup=self._tables.lookup), cam, opt), inputs=g)
+        drawn = g.gathered(lookup=self._tables.lookup, colors=False)
+        if g.sh is not None and g.sh.codebook is not None and g.sh.indices is not None:
+            segments = self._tables.segments(g.sh.indices, len(g.sh.codebook))
+            center = cam.center.to(g.means)
+            drawn.colors = shared_colors(g.sh, segments, g.means, center, clamp=opt.clamp_color)
+            drawn.sh = None
+        return replace(super().render(drawn, cam, opt), inputs=g)
 
     @torch.no_grad()
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from geometry alone; 0 = culled."""
         self.info.check_geometry(g)
-        return super().visible_filter(g.gathered(lookup=self._tables.lookup), cam)
+        return super().visible_filter(g.gathered(lookup=self._tables.lookup, colors=False), cam)

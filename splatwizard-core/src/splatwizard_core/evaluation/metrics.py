@@ -226,14 +226,13 @@ def metric_identities(registry: TypedRegistry[AnyMetric], setup: MetricSetup) ->
     found: dict[str, str | None] = {}
     for entry in registry:
         found[entry.name] = package = f"{entry.distribution} {entry.version}"
-        if MetricInfo.of(entry).slow:
-            try:
-                target = entry.load()
-                if isinstance(target, MetricFactory):
-                    identity = target.identity(setup)
-                    found[entry.name] = None if identity is None else f"{package}, {identity}"
-            except (Exception, SystemExit):
-                found[entry.name] = None
+        try:
+            target = entry.load()
+            if isinstance(target, MetricFactory):
+                identity = target.identity(setup)
+                found[entry.name] = None if identity is None else f"{package}, {identity}"
+        except (Exception, SystemExit):
+            found[entry.name] = None
     return found
 
 

@@ -18,6 +18,7 @@ The decoder computes in float64 with +, -, *, / and square roots alone: it gives
 from __future__ import annotations
 
 import copy
+import math
 from typing import TYPE_CHECKING, Any, cast, get_args
 
 import numpy as np
@@ -55,10 +56,13 @@ class Raht:
         self.plugins, self.seed, self.settings = plugins, seed, RahtSettings(**settings)
 
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
-        """Write the sections. Raises SplatwizardError for values that are not finite."""
-        model = _checked(model)
+        """Write the sections. Gaussians that are not finite are left out.
+
+        Raises SplatwizardError for a settled model that holds such values.
+        """
         if not isinstance(model, RahtGaussians) or model.grid is None:
             model = settled_copy(model, self.settings, seed=self.seed)
+        _check_finite(model)
         _write(copy.deepcopy(model).cpu(), writer, self.plugins)
 
     def decode(self, reader: ContainerReader) -> GaussianModel:
@@ -66,13 +70,12 @@ class Raht:
         return _read(reader, self.plugins)
 
 
-def _checked(model: GaussianModel) -> GaussianModel:
+def _check_finite(model: RahtGaussians) -> None:
     for name, parameter in model.named_parameters():
-        finite = torch.isfinite(parameter.detach()).flatten(1) if parameter.ndim > 1 else torch.isfinite(parameter)
-        rows = int((~(finite.all(1) if finite.ndim > 1 else finite)).sum())
-        if rows:
-            raise SplatwizardError(f"'{name}' of {rows:,} Gaussians is not finite: they cannot be encoded")
-    return model
+        rows = parameter.detach().reshape(len(parameter), math.prod(parameter.shape[1:]))
+        bad = ~torch.isfinite(rows).all(1)
+        if bool(bad.any()):
+            raise SplatwizardError(f"'{name}' is not finite in {int(bad.sum()):,} rows: they cannot be encoded")
 
 
 @torch.no_grad()

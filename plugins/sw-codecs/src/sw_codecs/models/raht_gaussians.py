@@ -5,6 +5,7 @@ Source: MesonGS (arXiv 2409.09756), sections on attribute transformation, block 
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
@@ -14,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatOptimizer
+from sw_codecs.models.attributes import MAX_LOGIT
 from sw_codecs.models.raht_settings import RahtOptions, RahtSettings
 from sw_codecs.models.voxels import VoxelGrid, one_a_voxel
 from sw_codecs.positions import morton
@@ -25,6 +27,8 @@ from sw_codecs.transforms.raht import RahtPlan
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, Rasterizer
+
+log = logging.getLogger(__name__)
 
 CHANNELS = 7
 """Of the transform: opacity logit, roll, pitch, yaw, SH band 0 of red, green, blue."""
@@ -65,9 +69,16 @@ class RahtGaussians(GaussianModel):
 
     @classmethod
     def of(cls, model: GaussianModel, *, bits: int = 8, blocks: int = 66) -> RahtGaussians:
-        """Return copies of a model's Gaussians, not settled."""
-        tensors = (model.means, model.sh_dc, model.sh_rest, model.opacity_logits, model.log_scales, model.quats)
-        copies = (t.detach().clone() for t in tensors)
+        """Return copies of those of a model's Gaussians that are finite, not settled.
+
+        Opacity logits become at most +-20: beyond it opacities are 0 or 1, and one such number would spoil a block.
+        """
+        finite = finite_rows(model)
+        if not bool(finite.all()):
+            log.info("%d of %d Gaussians are not finite and are left out", int((~finite).sum()), len(finite))
+        logits = model.opacity_logits.clamp(-MAX_LOGIT, MAX_LOGIT)
+        tensors = (model.means, model.sh_dc, model.sh_rest, logits, model.log_scales, model.quats)
+        copies = (t.detach()[finite] for t in tensors)
         return cls(*copies, active_sh_degree=model.active_sh_degree, bits=bits, blocks=blocks)
 
     @property
@@ -167,6 +178,14 @@ class RahtGaussians(GaussianModel):
 
 
 @torch.no_grad()
+def finite_rows(model: GaussianModel) -> Tensor:
+    """Return which Gaussians have finite parameters, [N] bool; an infinite opacity logit is an opacity of 0 or 1."""
+    tensors = (model.means, model.sh_dc, model.sh_rest, model.log_scales, model.quats)
+    finite = [torch.isfinite(tensor).flatten(1).all(1) for tensor in tensors]
+    return torch.stack([*finite, ~torch.isnan(model.opacity_logits)]).all(0)
+
+
+@torch.no_grad()
 def codebook_of(
     rows: Tensor, importance: Tensor, options: RahtOptions, *, size: int, generator: torch.Generator
 ) -> tuple[Tensor, Tensor]:
@@ -198,7 +217,7 @@ def settled_copy(model: GaussianModel, settings: RahtSettings, *, seed: int) -> 
     given = getattr(model, "importance", None)
     if not isinstance(given, Tensor) or given.shape != (model.num_rows,):
         given = model.opacities.detach() * torch.exp(0.1 * model.log_scales.detach().sum(1).clamp(-100, 100))
-    found.importance.copy_(given)
+    found.importance.copy_(given[finite_rows(model)])
     generator = torch.Generator().manual_seed(seed)
     optimizer = SplatOptimizer(found, [])
     found.settle(optimizer, settings, depth=settings.depth, size=settings.codebook_size, generator=generator)

@@ -1,1 +1,1 @@
-"""Coders of float vectors with loss, by codebooks."""
+"""Coders of float vectors with loss."""
