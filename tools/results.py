@@ -31,6 +31,7 @@ BASE = "3dgs"
 TITLES = {
     "3dgs": "3DGS", "trimming-the-fat": "Trimming the Fat", "pup-3dgs": "PUP-3DGS", "speedy-splat": "Speedy-Splat",
     "lightgaussian": "LightGaussian", "chimerags": "ChimeraGS", "hac": "HAC", "cat-3dgs": "CAT-3DGS",
+    "mesongs": "MesonGS", "c3dgs": "C3DGS", "compact3dgs": "Compact3DGS",
 }  # fmt: skip
 NONE = "-"
 
@@ -103,17 +104,15 @@ def cost_table(records: Rows) -> list[list[str]]:
              "FPS, one rasterizer for all", "FPS, its own", "drawn by", "n"]]  # fmt: skip
     for group in points([r for r in records if r.default_rate]):
         first = group[0]
-        alone, quiet = all(r.alone for r in group), all(r.fps_alone for r in group)
+        alone, quiet = [r for r in group if r.alone], [r for r in group if r.fps_alone]
         steps = sorted({r.steps for r in group if r.steps is not None})
         rows.append([
             title(group), rate(group), first.starts_from, ", ".join(first.taught_by) or NONE,
             " / ".join(f"{n:,}" for n in steps) or NONE,
-            spread([r.train_s for r in group], 0) if alone else NONE,
-            spread([r.start_s for r in group], 0) if alone else NONE,
+            spread([r.train_s for r in alone], 0), spread([r.start_s for r in alone], 0),
             spread([None if r.train_bytes is None else r.train_bytes / MIB for r in group], 0),
             spread([r.render_bytes / MIB for r in group], 0),
-            spread([r.default_fps for r in group], 0) if quiet else NONE,
-            spread([r.fps for r in group], 0) if quiet else NONE,
+            spread([r.default_fps for r in quiet], 0), spread([r.fps for r in quiet], 0),
             first.rasterizer or NONE, str(len(group)),
         ])  # fmt: skip
     return rows
