@@ -157,6 +157,12 @@ def test_every_truncation_is_refused():
         ContainerReader(data + b"xyz")
 
 
+def test_an_empty_file_is_called_empty(tmp_path):
+    (tmp_path / "none.swz").touch()
+    with pytest.raises(BitstreamError, match=r"none\.swz: the file is empty$"):
+        ContainerReader.open(tmp_path / "none.swz")
+
+
 def test_truncation_names_the_section_and_both_lengths():
     data = small_file().to_bytes()
     with pytest.raises(
