@@ -160,6 +160,17 @@ def test_a_wrong_setting_is_told_with_its_full_key(config, key, value, told):
     assert error.value.key == key
 
 
+def test_an_unknown_setting_is_told_with_whose_settings_there_are(config):
+    told = r"'codec.settings.power'\?\nThese are the settings of 'ours' \(codec.name\): `--set codec=NAME` chooses"
+    with pytest.raises(ConfigError, match=told):
+        config(codec__settings__pover="1")
+    with pytest.raises(ConfigError, match=r"of 'ours' \(prune.pruner\): `--set prune=NAME`"):
+        config(prune__settings__pover="1")
+    with pytest.raises(ConfigError) as bad_value:
+        config(codec__settings__power="-1")
+    assert "NAME" not in str(bad_value.value)
+
+
 def test_a_provider_without_settings_says_so(config):
     told = r"'prune.settings.power' in --set: 'theirs' \(prune.pruner\) has no settings: leave it out"
     with pytest.raises(ConfigError, match=told):

@@ -35,6 +35,7 @@ def register_metrics(registry: Any) -> None:
         registry.add(name, "nowhere:metric", summary="", direction="lower", label=label, digits=4, position=position)
     registry.add("psnr_unrounded", "nowhere:metric", summary="", direction="higher", label="PSNR, unrounded", unit="dB",
                  digits=2, diagnostic=True)  # fmt: skip
+    registry.add("edge-psnr", "nowhere:metric", summary="", direction="higher", label="Edge PSNR", unit="dB", digits=2)
     registry.add("odd", "nowhere:metric", summary="", direction="lower", digits="many", position="first")
 
 

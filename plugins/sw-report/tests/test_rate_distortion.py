@@ -123,8 +123,8 @@ def test_one_range_inside_the_other_counts_by_the_wider():
 
 def test_falling_quality_is_an_error_for_the_rate_unless_filtered():
     dented = (RATES, [30.1, 32.0, 31.9, 34.2])
-    with pytest.raises(UserInputError, match="test curve a larger file is not better"):
-        bd_rate((RATES, PSNR), dented)
+    with pytest.raises(UserInputError, match="curve of test a larger file is not better in SSIM"):
+        bd_rate((RATES, PSNR), dented, metric="SSIM")
     filtered = bd_rate((RATES, PSNR), dented, pareto=True)
     assert filtered.value == bd_rate((RATES, PSNR), ([RATES[i] for i in (0, 1, 3)], [30.1, 32.0, 34.2])).value
     assert filtered.flags == ("few_points",)
@@ -138,8 +138,8 @@ def test_the_front_holds_what_nothing_smaller_beats():
 @pytest.mark.parametrize(
     ("curve", "complaint"),
     [
-        (([1e6], [30.0]), "at least 2 points, this one has 1"),
-        (([], []), "this one has 0"),
+        (([1e6], [30.0]), "at least 2 points, that of test has 1"),
+        (([], []), "that of test has 0"),
         (([1e6, 2e6], [30.0]), "2 rates and 1 qualities"),
         (([1e6, 0.0], [30.0, 31.0]), "positive"),
         (([1e6, 2e6], [30.0, math.inf]), "finite"),
@@ -150,6 +150,8 @@ def test_what_makes_no_curve_is_refused(curve, complaint):
     for function in (bd_rate, bd_quality):
         with pytest.raises(UserInputError, match=complaint):
             function((RATES, PSNR), curve)
+        with pytest.raises(UserInputError, match=complaint.replace("test", "hac")):
+            function(curve, (RATES, PSNR), names=("hac", "mine"))
 
 
 def test_the_classic_cubic_takes_exactly_four_points():

@@ -160,11 +160,18 @@ def test_a_scene_without_a_curve_leaves_no_mean_unless_partial(make_curve, make_
     runs = collect([tmp_path]).runs
     rows = {r.scene: r for r in bd_tables(runs, "anchor")[0].rows}
     assert rows["b"].rate.value is None
-    assert "at least 2 points, this one has 1" in rows["b"].rate.reason
+    assert rows["b"].rate.reason == "a curve needs at least 2 points, that of better has 1"
     assert rows[None].rate.value is None
     assert rows[None].rate.reason == "1 of 2 scenes have no value"
     rows = {r.scene: r for r in bd_tables(runs, "anchor", partial=True)[0].rows}
     assert rows[None].rate.value == pytest.approx(-50)
+
+
+def test_a_short_curve_of_the_anchor_is_the_one_that_is_named(make_curve, make_run, tmp_path):
+    make_run("r1", method="anchor")
+    make_curve("better", 0.5)
+    (row,) = bd_tables(collect([tmp_path]).runs, "anchor")[0].rows
+    assert row.rate.reason == row.quality.reason == "a curve needs at least 2 points, that of anchor has 1"
 
 
 def test_curves_that_fall_have_no_bd_rate_but_with_pareto(make_curve, make_run, tmp_path):
@@ -174,7 +181,8 @@ def test_curves_that_fall_have_no_bd_rate_but_with_pareto(make_curve, make_run, 
     runs = collect([tmp_path]).runs
     (row,) = bd_tables(runs, "anchor")[0].rows
     assert row.rate.value is None
-    assert "a larger file is not better" in row.rate.reason
+    assert "in the curve of dented a larger file is not better in PSNR" in row.rate.reason
+    assert "--pareto" in row.rate.reason
     (row,) = bd_tables(runs, "anchor", pareto=True)[0].rows
     assert row.rate.value == pytest.approx(-50)
 
@@ -307,6 +315,8 @@ def test_metrics_are_written_as_they_declare():
     assert numbers.score("ssim", None) == "–"
     assert numbers.heading("psnr") == "PSNR dB"
     assert numbers.heading("LPIPS-VGG") == "LPIPS (VGG)"
+    assert numbers.heading("edge-psnr") == numbers.heading("edge_psnr") == "Edge PSNR dB"
+    assert numbers.score("edge-psnr", 15.30941) == "15.31"
 
 
 def test_a_diagnostic_metric_is_shown_by_its_exact_name():

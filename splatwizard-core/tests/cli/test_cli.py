@@ -252,6 +252,17 @@ def test_list_plugins_as_json(capsys: pytest.CaptureFixture[str]):
     assert set(COMMANDS) <= set(listed["commands"])
 
 
+def test_verbose_list_plugins_has_one_line_an_entry(capsys: pytest.CaptureFixture[str]):
+    assert main(["list-plugins", "--json"]) == 0
+    core = json.loads(capsys.readouterr().out)["plugins"][0]
+    assert main(["list-plugins", "--verbose"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == f"splatwizard-core {core['version']}"
+    assert lines[1 : 1 + len(core["provides"])] == [
+        f"  {entry['kind']} {entry['name']}: {entry['summary']}" for entry in core["provides"]
+    ]
+
+
 def test_version(capsys: pytest.CaptureFixture[str]):
     import importlib.metadata
 

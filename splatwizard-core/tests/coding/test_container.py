@@ -16,6 +16,7 @@ from splatwizard_core.coding import container
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import BitstreamError, PluginError, SceneError, SplatwizardError
+from splatwizard_native import DiskFullError
 
 DTYPES = ["bool", "u1", "i1", "u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8"]
 
@@ -155,6 +156,12 @@ def test_every_truncation_is_refused():
             ContainerReader(data[:length])
     with pytest.raises(BitstreamError, match="3 bytes follow"):
         ContainerReader(data + b"xyz")
+
+
+def test_an_empty_file_is_called_empty(tmp_path):
+    (tmp_path / "none.swz").touch()
+    with pytest.raises(BitstreamError, match=r"none\.swz: the file is empty$"):
+        ContainerReader.open(tmp_path / "none.swz")
 
 
 def test_truncation_names_the_section_and_both_lengths():
@@ -336,7 +343,7 @@ def test_a_failed_write_keeps_the_old_file(tmp_path, monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "replace", no_space)
-    with pytest.raises(SplatwizardError, match="disk is full"):
+    with pytest.raises(DiskFullError, match="disk is full"):
         small_file().write(path)
     assert path.read_bytes() == b"old"
     assert os.listdir(tmp_path) == ["scene.swz"]

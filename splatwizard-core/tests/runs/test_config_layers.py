@@ -141,6 +141,21 @@ def test_a_written_file_refuses_another_rate_point_instead_of_ignoring_it(tmp_pa
         resolved(rate="r2", file=file)
 
 
+def test_rate_points_whose_values_are_all_overridden_are_told(monkeypatch: pytest.MonkeyPatch, capsys):
+    from splatwizard_core.cli import setup
+
+    session = SimpleNamespace(device="cpu", scene=lambda each: None)
+    monkeypatch.setattr(setup, "open_session", lambda resolved, plugins: session)
+    monkeypatch.setattr("splatwizard_core.runs.device.device_reason", lambda *arguments: "on the CPU")
+    setup.open_training_session([resolved(rate=r) for r in ("r1", "r2", "r3")], None)
+    assert capsys.readouterr().err == "on the CPU\n"
+    setup.open_training_session(
+        [resolved("codec.mode=exact", "codec.bits.means=4", rate=r) for r in ("r1", "r3")], None
+    )
+    warning, _ = capsys.readouterr().err.splitlines()
+    assert warning.startswith("warning: toy r1, r3: these rate points give the same file")
+
+
 def test_rate_points_that_differ_only_in_the_codec_train_alike():
     hashes = {resolved(rate=r).training_hash() for r in ("r1", "r2", "r3")}
     assert len(hashes) == 1

@@ -107,7 +107,16 @@ class Choice(Named):
                     "leave it out, or name another one",
                     key=first,
                 )
-            checked = _checked(model, f"{path}.{field}", given, sources) if model is not None else {}
+            try:
+                checked = _checked(model, f"{path}.{field}", given, sources) if model is not None else {}
+            except ConfigError as error:
+                wrong = (error.key or "").removeprefix(f"{path}.{field}.").partition(".")[0]
+                if model is None or wrong in model.model_fields:
+                    raise
+                raise ConfigError(
+                    f"{error}\nThese are the settings of '{self.chosen}' ({key}): `--set {path}=NAME` chooses another.",
+                    key=error.key,
+                ) from None
             found[field] = {k: v for k, v in checked.items() if field == "settings" or k in getattr(self, field)}
         return found
 

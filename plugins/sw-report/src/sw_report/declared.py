@@ -55,13 +55,17 @@ class DatasetFacts:
 
 
 def metric_style(name: str) -> MetricStyle:
-    """Spelling of a metric, as its entry declares it; names are compared without case, and with `-` and `_` alike.
+    """Spelling of a metric, as its entry declares it.
 
+    Where no metric has the exact name, as in records of others, case does not count, and `-` and `_` are alike.
     A diagnostic metric, which tells conventions apart, is shown by its exact name.
     """
     metrics = load_plugins().metrics
-    key = metric_key(name)
-    declared: Mapping[str, Any] = metrics.entry(key).declared if key in metrics else {}
+    if name in metrics:
+        entry = metrics.entry(name)
+    else:
+        entry = next((each for each in metrics if metric_key(each.name) == metric_key(name)), None)
+    declared: Mapping[str, Any] = entry.declared if entry is not None else {}
     digits, position = declared.get("digits"), declared.get("position")
     by_name = declared.get("diagnostic", False)
     return MetricStyle(
@@ -73,7 +77,7 @@ def metric_style(name: str) -> MetricStyle:
 
 
 def metric_key(name: str) -> str:
-    """Name of a metric as the registry spells it."""
+    """Name of a metric by which its spellings are compared: lower case, `-` as `_`."""
     return name.lower().replace("-", "_")
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from splatwizard_core.api import UserInputError
 from sw_report.aggregate import comparable, mean
-from sw_report.declared import bd_anchor_rank
+from sw_report.declared import bd_anchor_rank, metric_style
 from sw_report.numbers import is_lpips, main_lpips, ordered_metrics
 from sw_report.rate_distortion import BdResult, bd_quality, bd_rate
 from sw_report.runs import Run, natural
@@ -127,10 +127,15 @@ def _compare(
 ) -> BdRow:
     here = [run for run in runs if run.place == place]
     curves = [curve([run for run in here if run.variant == name], metric) for name in (anchor, variant)]
+    names, label = (anchor, variant), metric_style(metric).label
+    calls = (
+        lambda: bd_rate(*curves, pareto=pareto, names=names, metric=label),
+        lambda: bd_quality(*curves, pareto=pareto, names=names),
+    )
     cells = []
-    for function in (bd_rate, bd_quality):
+    for call in calls:
         try:
-            cells.append(_cell(function(curves[0], curves[1], pareto=pareto)))
+            cells.append(_cell(call()))
         except UserInputError as error:
             cells.append(BdCell(None, (), str(error).partition(": ")[2] or str(error)))
     return BdRow(variant, place[0], *cells)

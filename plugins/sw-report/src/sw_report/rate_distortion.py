@@ -49,23 +49,27 @@ def bd_rate(
     *,
     method: Method = "pchip",
     pareto: bool = False,
+    names: tuple[str, str] = ("anchor", "test"),
+    metric: str = "quality",
 ) -> BdResult:
     """Mean additional rate, in percent, that `test` takes against `anchor` for the same quality.
 
     anchor, test    (bytes, quality) of the points, in any order; quality is higher for better (PSNR, SSIM, -LPIPS)
     method          "pchip": monotone piecewise cubic; "cubic": one polynomial, for exactly 4 points a curve
     pareto          first drop points that a smaller file equals or beats
+    names           what messages call the two curves
+    metric          what messages call the quality
 
     r is interpolated as a function of quality over the qualities that both curves reach; the mean difference d gives
     (10^d - 1) x 100 %. Raises UserInputError for fewer than 2 points, and where a larger file is not better, which
     leaves r without a value (pass `pareto`).
     """
-    (r_a, q_a), (r_t, q_t) = (_points(curve, pareto=pareto) for curve in (anchor, test))
-    for name, quality in (("anchor", q_a), ("test", q_t)):
+    (r_a, q_a), (r_t, q_t) = _both(anchor, test, names, pareto=pareto)
+    for name, quality in zip(names, (q_a, q_t), strict=True):
         if np.any(np.diff(quality) <= 0):
             raise UserInputError(
-                f"BD-rate: in the {name} curve a larger file is not better; drop such points (pareto), "
-                "or compare BD-PSNR"
+                f"BD-rate: in the curve of {name} a larger file is not better in {metric}: drop such points "
+                "(`sw report --pareto`), or go by the BD gain"
             )
     difference = _mean_difference((q_a, r_a), (q_t, r_t), method)
     if difference.value is None:
@@ -83,13 +87,14 @@ def bd_quality(
     *,
     method: Method = "pchip",
     pareto: bool = False,
+    names: tuple[str, str] = ("anchor", "test"),
 ) -> BdResult:
     """Mean gain in quality of `test` over `anchor` at the same rate: BD-PSNR if the quality is PSNR in dB.
 
     Arguments as of `bd_rate`. Quality is interpolated as a function of r over the rates that both curves cover; it may
     fall. Raises UserInputError for fewer than 2 points.
     """
-    a, t = (_points(curve, pareto=pareto) for curve in (anchor, test))
+    a, t = _both(anchor, test, names, pareto=pareto)
     return _mean_difference(a, t, method)
 
 
@@ -102,21 +107,33 @@ def pareto_front(rates: Sequence[float], quality: Sequence[float]) -> tuple[list
     return [rate for rate, _ in kept], [value for _, value in kept]
 
 
-def _points(curve: tuple[Sequence[float], Sequence[float]], *, pareto: bool) -> tuple[Floats, Floats]:
-    """(log10 rate, quality) by rate, checked."""
+def _both(
+    anchor: tuple[Sequence[float], Sequence[float]],
+    test: tuple[Sequence[float], Sequence[float]],
+    names: tuple[str, str],
+    *,
+    pareto: bool,
+) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    return _points(anchor, names[0], pareto=pareto), _points(test, names[1], pareto=pareto)
+
+
+def _points(curve: tuple[Sequence[float], Sequence[float]], name: str, *, pareto: bool) -> tuple[Floats, Floats]:
+    """(log10 rate, quality) by rate, checked; `name` is for messages."""
     rates, quality = (np.asarray(list(values), dtype=np.float64) for values in curve)
     if rates.ndim != 1 or rates.shape != quality.shape:
-        raise UserInputError(f"BD: {rates.size} rates and {quality.size} qualities do not make a curve")
+        raise UserInputError(f"BD: {name}: {rates.size} rates and {quality.size} qualities do not make a curve")
     if not (np.all(np.isfinite(rates)) and np.all(rates > 0) and np.all(np.isfinite(quality))):
-        raise UserInputError("BD: rates must be positive and qualities finite")
+        raise UserInputError(f"BD: in the curve of {name} rates must be positive and qualities finite")
     if pareto:
         rates, quality = (np.asarray(v) for v in pareto_front(rates.tolist(), quality.tolist()))
     if rates.size < 2:
-        raise UserInputError(f"BD: a curve needs at least 2 points, this one has {rates.size}")
+        raise UserInputError(f"BD: a curve needs at least 2 points, that of {name} has {rates.size}")
     order = np.argsort(rates, kind="stable")
     rates, quality = rates[order], quality[order]
     if np.any(np.diff(rates) == 0):
-        raise UserInputError("BD: two points of one curve have the same rate; drop the worse (pareto)")
+        raise UserInputError(
+            f"BD: in the curve of {name} two points have the same rate: drop the worse (`sw report --pareto`)"
+        )
     return np.log10(rates), quality
 
 

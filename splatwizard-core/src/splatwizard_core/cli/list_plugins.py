@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import click
@@ -11,13 +12,16 @@ from splatwizard_core.plugins import load_plugins
 
 
 @click.command("list-plugins", short_help="what is installed, what is broken and why")
-@shared.options(shared.json_option, shared.debug_option)
-def list_plugins(as_json: bool) -> None:
+@shared.options(
+    click.option("--verbose", is_flag=True, help="One line an entry: kind, name, summary."),
+    shared.json_option, shared.debug_option,
+)  # fmt: skip
+def list_plugins(verbose: bool, as_json: bool) -> None:
     """List the installed packages, what each provides, and what is broken and why.
 
     SW_PLUGINS=a,b in the environment restricts what is loaded (empty: the core alone).
     """
-    shared.print_facts(gather(), as_json, _print)
+    shared.print_facts(gather(), as_json, partial(_print, verbose=verbose))
 
 
 def gather() -> dict[str, Any]:
@@ -44,7 +48,7 @@ def gather() -> dict[str, Any]:
     return {"plugins": rows, "clashes": clashes, "commands": [entry.name for entry in command_entries()]}
 
 
-def _print(found: dict[str, Any]) -> None:
+def _print(found: dict[str, Any], *, verbose: bool) -> None:
     from rich.markup import escape
 
     rows = []
@@ -55,13 +59,18 @@ def _print(found: dict[str, Any]) -> None:
             kernels = f" (kernels of {escape(str(entry['kernels']))})" if entry.get("kernels") else ""
             by_kind.setdefault(entry["kind"], []).append(escape(entry["name"]) + default + kernels)
         lines = [f"[bold]{kind}[/bold]: {', '.join(names)}" for kind, names in by_kind.items()]
+        if verbose:
+            lines = [f"[bold]{e['kind']}[/bold] {escape(e['name'])}: {escape(e['summary'])}" for e in row["provides"]]
         if row["error"]:
             lines.append(f"[red]broken: {escape(row['error'])}[/red]")
         for each in row["refused"]:
             lines.append(f"[red]refused: {each['kind']} '{escape(each['name'])}': {escape(each['reason'])}[/red]")
         rows.append([escape(row["distribution"]), row["version"], "\n".join(lines) or "-"])
-    shared.print_table(["distribution", "version", "provides"], rows, title="Installed packages", markup=True)
     out = shared.console()
+    if not verbose:
+        shared.print_table(["distribution", "version", "provides"], rows, title="Installed packages", markup=True)
+    for distribution, version, text in rows if verbose else ():
+        out.print(f"{distribution} {version}\n{text}".replace("\n", "\n  "), soft_wrap=True)
     for clash in found["clashes"]:
         owners = " and ".join(clash["distributions"])
         out.print(

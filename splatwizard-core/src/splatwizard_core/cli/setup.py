@@ -177,11 +177,25 @@ def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginMan
     """
     from splatwizard_core.runs.device import device_reason
 
+    _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
     for each in resolved:
         session.scene(each)
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
     return session
+
+
+def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
+    """Say which rate points of a method have the same values, since --set or --config overrides what differs."""
+    from splatwizard_core.runs.config import content_hash
+
+    equal: dict[str, list[ResolvedConfig]] = {}
+    for each in resolved:
+        told = {k: v for k, v in each.as_dict().items() if k not in ("rate", "provenance")}
+        equal.setdefault(content_hash(told), []).append(each)
+    for same in (found for found in equal.values() if len(found) > 1):
+        rates = ", ".join(each.rate for each in same)
+        say(f"warning: {same[0].method} {rates}: these rate points give the same file, as what differs is overridden")
 
 
 def warn_of_metrics(session: Session, names: Sequence[str] | None, settings: Any, *, quiet: bool = False) -> None:

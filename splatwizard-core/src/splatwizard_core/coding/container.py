@@ -204,7 +204,9 @@ class ContainerReader:
 
     def _prefix(self, data: bytes) -> tuple[int, int]:
         """Container version and header length; a wrong file is refused before it is read whole."""
-        if data[:4] != MAGIC[: len(data[:4])] or not data:
+        if not data:
+            raise BitstreamError(f"{self.name}: the file is empty")
+        if data[:4] != MAGIC[: len(data[:4])]:
             raise BitstreamError(f"{self.name}: not a .swz file (it starts with {data[:4]!r}, not {MAGIC!r})")
         if len(data) < PREFIX.size:
             raise BitstreamError(f"{self.name}: {len(data)} bytes are too few for a .swz file: it is truncated")
