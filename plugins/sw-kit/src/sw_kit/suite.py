@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatwizard_core.api import UserInputError
@@ -54,6 +55,9 @@ def _find(distribution: str, plugins: PluginManager) -> PluginInfo:
     for info in plugins.plugins:
         if wanted in (info.distribution.lower().replace("_", "-"), info.key):
             return info
+    if "/" in distribution or "\\" in distribution or (Path(distribution) / "pyproject.toml").is_file():
+        name = Path(distribution).resolve().name
+        raise UserInputError(f"'{distribution}' is a folder: give the name of the installed distribution (as '{name}')")
     known = ", ".join(sorted(info.distribution for info in plugins.plugins))
     raise UserInputError(f"no plugin called '{distribution}' is installed; there are: {known} (pip install -e FOLDER)")
 
