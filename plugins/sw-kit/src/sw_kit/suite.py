@@ -86,6 +86,11 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
 
         return check_small_run(entry, plugins, settings)
 
+    def rate_points() -> str:
+        from sw_kit.checks.rate_points import check_rate_points
+
+        return check_rate_points(entry, plugins, settings)
+
     is_method = entry.kind == "method"
     found = [PackageCheck(entry.distribution, f"{whose} has the contract's form", signatures)]
     if is_method:
@@ -94,6 +99,7 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
         found.append(PackageCheck(entry.distribution, f"{whose} keeps the contract", behaviour))
     if not quick and is_method:
         found.append(PackageCheck(entry.distribution, f"{whose} runs on a tiny scene", small_run))
+        found.append(PackageCheck(entry.distribution, f"{whose} has its rate points in order", rate_points))
     return found
 
 

@@ -93,10 +93,10 @@ def check_entry(entry: Entry) -> None:
     if known is None:
         return
     wanted = REQUIRED.get(entry.kind)
-    unknown = [name for name in entry.declared if name not in known]
+    unknown = next((f", but '{n}', which its kind does not have" for n in entry.declared if n not in known), "")
     hold(
         wanted is None or wanted in entry.declared,
-        f"{whose} does not declare '{wanted}'" + (f", but '{unknown[0]}', which its kind does not have" if unknown else ""),
+        f"{whose} does not declare '{wanted}'{unknown}",
         f"registry.add(..., {wanted}=...): {known[wanted][1] if wanted else ''}",
     )
     for name, value in entry.declared.items():
