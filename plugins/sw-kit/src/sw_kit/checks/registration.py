@@ -77,8 +77,8 @@ def check_imports(info: PluginInfo) -> str:
     hold(
         not undeclared,
         f"it imports {', '.join(f'{each} ({where})' for each, where in undeclared.items())} without requiring it",
-        f"pyproject.toml: add {', '.join(map(repr, undeclared))} to dependencies (or to an extra, if it is optional); "
-        "that another package brings it today does not count",
+        f"pyproject.toml: add {', '.join(map(repr, undeclared))} to dependencies (to an extra, if it is optional) and "
+        "install again; that another package brings it today does not count",
     )
     return "through the core's faces and declared packages"
 
