@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import sys
 import types
 
@@ -11,7 +10,6 @@ import torch
 from sw_kit.checks import rate_points, registration
 from sw_kit.checks.behaviour import BEHAVIOUR
 from sw_kit.checks.fields import check_entry
-from sw_kit.checks.interruptions import stops_of
 from sw_kit.checks.methods import check_configuration
 from sw_kit.checks.rate_points import check_rate_points
 from sw_kit.checks.small_run import _check_encoding, _lengths
@@ -335,32 +333,6 @@ def test_declarations_of_a_method_that_do_not_fit_it(entry_of, changes, declared
 def test_an_encoder_that_changes_its_model():
     with pytest.raises(BrokenContractError, match="encode changes the model"):
         _check_encoding(BadMethod(PLUGINS, None), some_gaussians())
-
-
-def planned_stage(**plans):
-    """A stage of 40 steps with post tasks, name -> when; all but `foreign` are the stage's own."""
-
-    class Planned(Stage):
-        iterations = 40
-
-        def register_post_task(self, scheduler, ppl, opt):
-            for name, when in plans.items():
-                scheduler.register_task(when, importlib.invalidate_caches if name == "foreign" else self.own, name=name)
-
-        def own(self):
-            pass
-
-    return Planned(OptimizationParams())
-
-
-def test_a_training_is_interrupted_where_its_tasks_could_lose_state():
-    entry = Entry("method", "bad-thing", f"{__name__}:BadMethod", "one line")
-    planned = planned_stage(foreign=range(1, 41), own=[4, 8, 12])
-    assert stops_of([planned], None, entry)[:3] == [3, 6, 20]
-    # The same plan in a second stage, and a task that fires in the last step alone.
-    assert set(stops_of([planned, planned_stage(own=40)], None, entry)) >= {3, 6, 40, 79}
-    assert stops_of([planned_stage(own=range(1, 9))], None, entry) == [4, 20]
-    assert stops_of([Stage(OptimizationParams(iterations=1))], None, entry) == []
 
 
 @pytest.mark.parametrize(("sizes", "broken"), [((500, 400), True), ((400, 500), False), ((410, 400), False)])
