@@ -7,16 +7,18 @@ import types
 
 import pytest
 import torch
-from sw_kit.checks import registration
+from sw_kit.checks import rate_points, registration
 from sw_kit.checks.behaviour import BEHAVIOUR
 from sw_kit.checks.fields import check_entry
 from sw_kit.checks.methods import check_configuration
+from sw_kit.checks.rate_points import check_rate_points
 from sw_kit.checks.small_run import _check_encoding, _lengths
 from sw_kit.checks.targets import check_target
 from sw_kit.finding import BrokenContractError, NotCheckedError, PackageCheck
 from sw_kit.samples import some_gaussians
+from sw_kit.suite import checks_of
 
-from splatwizard_core.api import Method, OptimizationParams, Params, Stage
+from splatwizard_core.api import ConfigError, Method, OptimizationParams, Params, Stage, UserInputError
 from splatwizard_core.tooling import Entry, PluginInfo, load_plugins
 
 PLUGINS = load_plugins()
@@ -84,7 +86,9 @@ def test_requirements_without_versions(installed, requires, said):
 @pytest.mark.parametrize(
     ("source", "said"),
     [("from splatwizard_core.runs.run import run", r"splatwizard_core.runs.run.run \(sw_bad.py\)"),
-     ("def f():\n    import sw_codecs.testing", "sw-codecs without requiring"),
+     ("def f():\n    import sw_codecs.testing", r"sw-codecs \(sw_bad.py\) without requiring"),
+     ("import json\nimport rich", r"imports rich \(sw_bad.py\) without requiring it -> .*add 'rich' to dependencies"),
+     ("from PIL import Image", "imports pillow .*add 'pillow'"),
      ("from splatwizard_core import api, runs", "splatwizard_core.runs")],
 )  # fmt: skip
 def test_imports_of_what_is_not_promised(installed, source, said):
@@ -95,6 +99,11 @@ def test_imports_of_what_is_not_promised(installed, source, said):
 def test_what_only_a_type_checker_reads_may_come_from_anywhere(installed):
     source = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from splatwizard_core.runs.run import run\n"
     registration.check_imports(installed(source + "from splatwizard_core.api import Camera"))
+
+
+def test_what_is_required_by_any_spelling_may_be_imported(installed):
+    source = "import sw_bad, json, no_such_module\nimport numpy.random\nfrom PIL import Image\n"
+    registration.check_imports(installed(source, ("splatwizard-core~=0.2", "numpy>=1", "Pillow>=1 ; extra == 'more'")))
 
 
 def test_a_plugin_that_did_not_load():
@@ -115,9 +124,11 @@ def test_a_plugin_with_an_entry_that_is_refused(monkeypatch):
     [(Entry("method", "a name", "m:C", "one line"), "nobody can type"),
      (Entry("method", "name", "m:C", ""), "summary"),
      (Entry("method", "name", "m:C", "two\nlines"), "summary"),
+     (Entry("method", "name", "m:C", "TODO: one line"), "still has the summary 'TODO: one line'"),
      (Entry("method", "name", "m:C", "line", {"rates": "r1"}), "must be a list of names"),
      (Entry("method", "name", "m:C", "line", {"rate": ["r1"]}), "'rate', which its kind does not have"),
      (Entry("metric", "name", "m:C", "line"), "does not declare 'direction'"),
+     (Entry("metric", "name", "m:C", "line", {"directoin": "higher"}), "'direction', but 'directoin', which"),
      (Entry("metric", "name", "m:C", "line", {"direction": "up"}), "direction='up'"),
      (Entry("coder", "name", "m:C", "line", {"codes": "colours"}), "codes='colours'"),
      (Entry("exporter", "name", "m:C", "line", {"suffix": "ply"}), "suffix='ply'"),
@@ -296,13 +307,22 @@ class BadMethod(Method):
         model.means.data += 1
 
 
+class BadTask(Stage):
+    def register_post_task(self, scheduler, ppl, opt):
+        scheduler.register_task(1, self.prune)
+
+    def prune(self, model):
+        pass
+
+
 @pytest.mark.parametrize(
     ("changes", "declared", "said"),
     [({"name": "other"}, {}, "called 'other'"), ({}, {"rates": ["r1", "r2"]}, "rates are declared"),
      ({"PRESETS": {"paper": {}}}, {"presets": ["paper"]}, "no preset quick"),
      ({"DEFAULT_RATE": "r9"}, {}, "DEFAULT_RATE is 'r9'"), ({"Config": Config}, {}, "no description of strength"),
      ({"RATES": {"r1": {"no_such_key": 1}}}, {}, "no_such_key"),
-     ({"stages": lambda self: []}, {}, "return one or more")],
+     ({"stages": lambda self: []}, {}, "return one or more"),
+     ({"stages": lambda self: [BadTask(self.config)]}, {}, "'model'")],
 )  # fmt: skip
 def test_declarations_of_a_method_that_do_not_fit_it(entry_of, changes, declared, said):
     entry = entry_of("method", type("Changed", (BadMethod,), changes), **declared)
@@ -313,6 +333,25 @@ def test_declarations_of_a_method_that_do_not_fit_it(entry_of, changes, declared
 def test_an_encoder_that_changes_its_model():
     with pytest.raises(BrokenContractError, match="encode changes the model"):
         _check_encoding(BadMethod(PLUGINS, None), some_gaussians())
+
+
+@pytest.mark.parametrize(("sizes", "broken"), [((500, 400), True), ((400, 500), False), ((410, 400), False)])
+def test_a_first_rate_point_with_the_largest_file(entry_of, monkeypatch, sizes, broken):
+    bytes_of = dict(zip(("r1", "r2"), sizes, strict=True))
+    monkeypatch.setattr(rate_points, "_size", lambda entry, plugins, settings, rate: bytes_of[rate])
+    entry = entry_of("method", type("Two", (BadMethod,), {"RATES": {"r1": {}, "r2": {}}}))
+    if broken:
+        with pytest.raises(BrokenContractError, match="of r1 has 500 bytes, that of r2 400"):
+            check_rate_points(entry, PLUGINS)
+    else:
+        assert check_rate_points(entry, PLUGINS).startswith(f"r1 {sizes[0]} bytes")
+    assert "nothing to compare" in check_rate_points(entry_of("method", BadMethod), PLUGINS)
+
+
+@pytest.mark.parametrize("folder", ["./sw-rows", "plugins/sw-rows", "sw-rows/"])
+def test_a_folder_in_place_of_a_name(folder):
+    with pytest.raises(UserInputError, match=r"is a folder: give the name .* \(as 'sw-rows'\)"):
+        checks_of(folder)
 
 
 def test_every_length_of_a_stage_is_found():
@@ -336,6 +375,11 @@ def test_a_finding_tells_reason_and_cure_and_never_raises():
 
     broken = raising(BrokenContractError("why", "do this"))
     assert (broken.state, broken.detail, broken.mend) == ("broken", "why", "do this")
+    # What says itself what to do has no second line; an error of Python's has the way to its traceback.
+    assert raising(ConfigError("'k' is unknown: say 'key'")).mend is None
+    assert raising(AssertionError("cut sections must be refused")).mend is None
+    assert "--debug" in raising(AssertionError()).mend
+    assert "--debug" in raising(KeyError("k")).mend
     assert raising(NotCheckedError("no GPU", "find one")).state == "missing"
     assert raising(SystemExit(3)).detail == "SystemExit: 3"
     assert PackageCheck("sw-bad", "name", lambda: "fine").finding().state == "ok"

@@ -80,3 +80,27 @@ def test_a_method_that_only_encodes_passes_too(written, tmp_path):
     found = check({"only-encodes": package}, ["only-encodes"], tmp_path)
     assert [row for row in found if row["state"] != "ok"] == []
     assert any(row["detail"].startswith("0 steps") for row in found)
+
+
+FORGETS = """
+    fired = 0
+
+    def register_post_task(self, scheduler, ppl, opt):
+        super().register_post_task(scheduler, ppl, opt)
+        scheduler.register_task([4, 8, 12], self.fade, name="fade")
+
+    def fade(self, model: SplatModel) -> None:
+        self.fired += 1
+        model.opacity_logits.data.sub_(0.1 * self.fired)
+"""
+
+
+@pytest.mark.pipeline
+@pytest.mark.slow
+def test_state_on_a_stage_that_ends_before_the_middle_is_found(tmp_path):
+    package = packages.write_package(tmp_path, packages.kinds()["method"], packages.legal_names("forgets"))
+    path = package / "src" / "sw_forgets" / "stage.py"
+    path.write_text(path.read_text() + FORGETS)
+    (row,) = [row for row in check({"": package}, [""], tmp_path) if row["name"].endswith("runs on a tiny scene")]
+    assert row["state"] == "broken"
+    assert "interrupted after step 3, 6," in row["detail"]

@@ -23,6 +23,7 @@ from splatwizard_core.plugins.loading import PluginInfo as PluginInfo
 from splatwizard_core.plugins.manager import load_plugins as load_plugins
 from splatwizard_core.plugins.registry import Entry as Entry
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as NegotiatedRasterizer
+from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import open_model as open_model
 from splatwizard_core.runs.device import choose_device as choose_device
@@ -41,6 +42,7 @@ from splatwizard_core.runs.run import train_in as train_in
 from splatwizard_core.runs.session import Session as Session
 from splatwizard_core.scene.loading import load_scene as load_scene
 from splatwizard_core.scene.locate import DATA_VARIABLE as DATA_VARIABLE
+from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
 from splatwizard_native.files import file_sha256 as file_sha256
 from splatwizard_native.files import new_folder as new_folder
 from splatwizard_native.files import write_atomic as write_atomic

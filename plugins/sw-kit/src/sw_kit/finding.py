@@ -6,6 +6,7 @@ import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from splatwizard_core.api import SplatwizardError
 from splatwizard_core.tooling import Check
 
 log = logging.getLogger(__name__)
@@ -56,7 +57,9 @@ class PackageCheck:
         except (Exception, SystemExit) as error:
             log.debug("%s: %s", self.distribution, self.name, exc_info=True)
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            return Check(self.distribution, self.name, "broken", reason[:600], "--debug shows the traceback")
+            tells = isinstance(error, (SplatwizardError, AssertionError)) and str(error)  # its line says what to do
+            mend = None if tells else "--debug shows the traceback"
+            return Check(self.distribution, self.name, "broken", reason[:600], mend)
 
 
 def hold(condition: object, reason: str, mend: str) -> None:

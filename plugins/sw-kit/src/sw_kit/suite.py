@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from splatwizard_core.api import UserInputError
@@ -54,6 +55,9 @@ def _find(distribution: str, plugins: PluginManager) -> PluginInfo:
     for info in plugins.plugins:
         if wanted in (info.distribution.lower().replace("_", "-"), info.key):
             return info
+    if "/" in distribution or "\\" in distribution or (Path(distribution) / "pyproject.toml").is_file():
+        name = Path(distribution).resolve().name
+        raise UserInputError(f"'{distribution}' is a folder: give the name of the installed distribution (as '{name}')")
     known = ", ".join(sorted(info.distribution for info in plugins.plugins))
     raise UserInputError(f"no plugin called '{distribution}' is installed; there are: {known} (pip install -e FOLDER)")
 
@@ -82,6 +86,11 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
 
         return check_small_run(entry, plugins, settings)
 
+    def rate_points() -> str:
+        from sw_kit.checks.rate_points import check_rate_points
+
+        return check_rate_points(entry, plugins, settings)
+
     is_method = entry.kind == "method"
     found = [PackageCheck(entry.distribution, f"{whose} has the contract's form", signatures)]
     if is_method:
@@ -90,6 +99,7 @@ def _of_entry(entry: Entry, plugins: PluginManager, quick: bool, settings: Seque
         found.append(PackageCheck(entry.distribution, f"{whose} keeps the contract", behaviour))
     if not quick and is_method:
         found.append(PackageCheck(entry.distribution, f"{whose} runs on a tiny scene", small_run))
+        found.append(PackageCheck(entry.distribution, f"{whose} has its rate points in order", rate_points))
     return found
 
 

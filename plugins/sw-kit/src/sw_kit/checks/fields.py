@@ -75,6 +75,11 @@ def check_entry(entry: Entry) -> None:
         f"{whose} has the summary {summary[:40]!r}",
         f"say in one line of at most {LONGEST_SUMMARY} letters what it is",
     )
+    hold(
+        "TODO" not in summary,
+        f"{whose} still has the summary {summary[:60]!r}",
+        "registry.add(..., summary=...): say what it is, `sw list-plugins` prints it",
+    )
     try:
         json.dumps(dict(entry.declared), allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -88,9 +93,10 @@ def check_entry(entry: Entry) -> None:
     if known is None:
         return
     wanted = REQUIRED.get(entry.kind)
+    unknown = next((f", but '{n}', which its kind does not have" for n in entry.declared if n not in known), "")
     hold(
         wanted is None or wanted in entry.declared,
-        f"{whose} does not declare '{wanted}'",
+        f"{whose} does not declare '{wanted}'{unknown}",
         f"registry.add(..., {wanted}=...): {known[wanted][1] if wanted else ''}",
     )
     for name, value in entry.declared.items():

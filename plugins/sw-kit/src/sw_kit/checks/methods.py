@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from splatwizard_core.api import Method, Stage
-from splatwizard_core.tooling import resolve
+from splatwizard_core.tooling import build_schedulers, resolve
 from sw_kit.finding import hold
 from sw_kit.samples import TINY
 
@@ -55,4 +55,6 @@ def check_configuration(entry: Entry, plugins: PluginManager) -> str:
                 f"stages() of preset '{preset}', rate '{rate}' are {stages}",
                 "return one or more objects of Stage",
             )
+            for stage in stages:
+                build_schedulers(stage, resolved.ppl)  # raises for a task whose parameters cannot be supplied
     return f"{len(presets)} presets, {len(rates)} rate points, all of them valid"

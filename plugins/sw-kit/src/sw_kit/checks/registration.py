@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.metadata
 import json
 import subprocess
@@ -55,7 +56,7 @@ def check_requirements(info: PluginInfo) -> str:
 
 
 def check_imports(info: PluginInfo) -> str:
-    """Hold every import of the core to one of its faces, and of a package `sw_...` to one that it requires."""
+    """Hold every import of the core to one of its faces, and every other one to a distribution that it requires."""
     found = imports_of(info.module.partition(".")[0])
     inner = sorted(
         f"{name} ({where})"
@@ -64,13 +65,20 @@ def check_imports(info: PluginInfo) -> str:
     )
     hold(not inner, f"it imports {', '.join(inner[:3])}", f"only {' and '.join(FACES)} are promised: import from there")
     declared = {_normal(Requirement(text).name) for text in importlib.metadata.requires(info.distribution) or []}
-    own = info.module.partition(".")[0]
-    others = {name.partition(".")[0] for name in found if name.startswith("sw_")} - {own}
-    undeclared = sorted(each for each in map(_normal, others) if each not in declared)
+    declared.add(_normal(info.distribution))
+    owners = _owners()
+    undeclared: dict[str, str] = {}  # distribution -> a file that imports it
+    for name, where in found.items():
+        top = name.partition(".")[0]
+        # An editable install tells no modules, so ours go by their names; what is not installed is optional.
+        known = {_normal(top)} if top.startswith(("sw_", "splatwizard_")) else owners.get(top, set())
+        if known and top != info.module.partition(".")[0] and not known & declared:
+            undeclared.setdefault(min(known), where)
     hold(
         not undeclared,
-        f"it imports {', '.join(undeclared)} without requiring it",
-        "pyproject.toml: list it under `dependencies`",
+        f"it imports {', '.join(f'{each} ({where})' for each, where in undeclared.items())} without requiring it",
+        f"pyproject.toml: add {', '.join(map(repr, undeclared))} to dependencies (to an extra, if it is optional) and "
+        "install again; that another package brings it today does not count",
     )
     return "through the core's faces and declared packages"
 
@@ -110,6 +118,13 @@ def _registered_alone(module: str) -> tuple[float, bool, str]:
     *noise, last = done.stdout.splitlines()
     told = json.loads(last)
     return told["cpu_s"], told["torch"], "\n".join([*noise, done.stderr.strip()]).strip()
+
+
+@functools.cache
+def _owners() -> dict[str, set[str]]:
+    """Importable top-level name -> the installed distributions that it is of; nothing of Python's own."""
+    found = importlib.metadata.packages_distributions()
+    return {top: set(map(_normal, of)) for top, of in found.items() if top not in sys.stdlib_module_names}
 
 
 def _normal(name: str) -> str:

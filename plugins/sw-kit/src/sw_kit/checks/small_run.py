@@ -17,13 +17,14 @@ import torch
 
 from splatwizard_core.api import ContainerWriter, Method, Params
 from splatwizard_core.tooling import Choices, RunRequest, Session, directory_lock, open_model, run, train_in
+from sw_kit.checks.interruptions import stops_of
 from sw_kit.checks.targets import make
 from sw_kit.finding import BrokenContractError, hold
 from sw_kit.samples import TINY
 
 if TYPE_CHECKING:
     from splatwizard_core.api import PluginManager
-    from splatwizard_core.tooling import Entry
+    from splatwizard_core.tooling import Entry, ResolvedConfig
 
 log = logging.getLogger(__name__)
 
@@ -39,12 +40,7 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
 
     settings    "KEY=VALUE" besides those that make it short
     """
-    stages = make(entry, plugins).stages()
-    sets = dict.fromkeys(_lengths(entry.load().Config), STEPS) | {"scale_schedule": "true"}
-    if any(stage.starts_from or stage.taught_by for stage in stages):
-        sets["pretrained.iterations"] = STEPS
-    words = [*(f"{key}={value}" for key, value in sets.items()), *settings]
-    resolved = Choices((entry.name,), TINY, preset="paper", sets=tuple(words), device="cpu").resolve_one(plugins)
+    resolved = small_configuration(entry, plugins, settings)
     with tempfile.TemporaryDirectory() as folder:
         whole, halved = (RunRequest(resolved, Path(folder) / name) for name in ("whole", "halved"))
         session = Session(plugins, CPU, log.debug)
@@ -52,10 +48,12 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
         psnr = record.metrics["psnr"].mean
         hold(psnr is not None and math.isfinite(psnr), f"the PSNR is {psnr}", "the decoded scene cannot be drawn")
         model = train_in(session, whole, directory).model
-        steps = sum(stage.iterations for stage in entry.load()(plugins, resolved.config).stages())
-        resumed = "resumes bit-equal" if steps > 1 else "nothing to resume"
-        if steps > 1:
-            _check_resume(model.digest(), halved, plugins, steps // 2)
+        stages = list(entry.load()(plugins, resolved.config).stages())
+        steps, stops = sum(stage.iterations for stage in stages), stops_of(stages, resolved.ppl, entry)
+        resumed = "nothing to resume"
+        if stops:
+            _check_resume(model.digest(), halved, plugins, stops)
+            resumed = f"resumes bit-equal after step {', '.join(map(str, stops))}"
         _check_encoding(entry.load()(plugins, resolved.config), model)
         file = directory / "scene.swz"
         digests = {open_model(file, plugins, CPU)[0].digest() for _ in range(2)}
@@ -68,6 +66,21 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
     return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}; {hostile}"
 
 
+def small_configuration(
+    entry: Entry, plugins: PluginManager, settings: Sequence[str] = (), rate: str | None = None
+) -> ResolvedConfig:
+    """Return the configuration of a short run on `demo:tiny`: every stage has some 40 steps, its plan scaled down.
+
+    rate        rate point; None: the method's default
+    """
+    stages = make(entry, plugins).stages()
+    sets = dict.fromkeys(_lengths(entry.load().Config), STEPS) | {"scale_schedule": "true"}
+    if any(stage.starts_from or stage.taught_by for stage in stages):
+        sets["pretrained.iterations"] = STEPS
+    words = (*(f"{key}={value}" for key, value in sets.items()), *settings)
+    return Choices((entry.name,), TINY, preset="paper", rate=rate, sets=words, device="cpu").resolve_one(plugins)
+
+
 def _lengths(config: type[Params], prefix: str = "") -> Iterator[str]:
     """Dotted keys of a configuration that are numbers of steps of a stage: all called `iterations`, or ending so."""
     for name, field in config.model_fields.items():
@@ -77,16 +90,16 @@ def _lengths(config: type[Params], prefix: str = "") -> Iterator[str]:
             yield from _lengths(field.annotation, f"{prefix}{name}.")
 
 
-def _check_resume(expected: str, request: RunRequest, plugins: PluginManager, stop_after: int) -> None:
-    """Train again, interrupted after some steps and resumed as by another process; hold it to the same model."""
+def _check_resume(expected: str, request: RunRequest, plugins: PluginManager, stops: Sequence[int]) -> None:
+    """Train again, interrupted after each of `stops` and resumed as by another process; hold it to the same model."""
     directory = request.out / "demo-tiny" / request.resolved.method / request.resolved.rate
-    for stop in (stop_after, None):
+    for stop in (*stops, None):
         session = Session(plugins, CPU, log.debug)
         with directory_lock(directory), contextlib.suppress(KeyboardInterrupt):
             found = train_in(session, request, directory, stop_after=stop)
     hold(
         found.model.digest() == expected,
-        f"a training that is interrupted after {stop_after} steps and resumed ends as another model",
+        f"a training that is interrupted after step {', '.join(map(str, stops))} and resumed ends as another model",
         "state lives in parameters, buffers or state_dict_extra; random numbers come from context.generator(name)",
     )
 
@@ -98,7 +111,11 @@ def _check_encoding(method: Method, model: Any) -> None:
         with torch.no_grad():
             method.encode(model, writer)
         files.append(writer.to_bytes())
-    hold(model.digest() == before, "encode changes the model", "work on copies")
+    hold(
+        model.digest() == before,
+        "encode changes the model",
+        "write into clones: encode() gets the model itself, so copy.deepcopy(model) or tensor.detach().clone() first",
+    )
     hold(files[0] == files[1], "encoding twice gives two files", "seed what is random in encode()")
 
 
@@ -123,4 +140,6 @@ def _check_hostile(file: Path) -> str:
         "decode() raises BitstreamError: read values with reader.integer/number/array, code inside reader.decoding(), "
         "and reader.allow(bytes, what) before allocating",
     )
-    return f"{told['refused']} of {HOSTILE} damaged files refused"
+    others = HOSTILE - told["refused"]
+    rest = f", {others} decoded: what was changed there is a legal value or is not used" if others else ""
+    return f"{told['refused']} of {HOSTILE} damaged files refused{rest}"
