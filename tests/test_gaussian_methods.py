@@ -75,5 +75,5 @@ def test_an_unknown_codec_and_another_layout_are_refused(name):
         written(name, model_of(), codec="zip")
     reader = written(name, model_of())
     reader.version = 7
-    with pytest.raises(BitstreamError, match=rf"{name} layout version 7 is unknown, newer than"):
+    with pytest.raises(BitstreamError, match=rf"{name} layout version 7 is unknown, this installation reads"):
         decoded(name, reader)

@@ -92,7 +92,7 @@ def test_a_missing_coder(tmp_path, capsys, only, command):
     only("3dgs")
     path = write(tmp_path, requires=requires(sw_codecs="sw-coders-of-mars=2.0"))
     assert said(capsys, command, path) == (  # a name of ours is ours, whatever the file says
-        f"error: garden.swz needs coder 'octree', which is not installed: sw-codecs {HERE} is there, "
+        f"error: garden.swz needs coder 'gaussians-quantized', which is not installed: sw-codecs {HERE} is there, "
         "but SW_PLUGINS leaves it out"
     )
 
@@ -101,8 +101,8 @@ def test_a_missing_entropy_model(tmp_path, capsys, only):
     only("3dgs")
     row = requires()
     row["sw-codecs"] = ["4.5", "entropy model:columns"]
-    # The octree is asked for first, and the file does not say who provides it.
-    assert "needs coder 'octree'" in said(capsys, "decode", write(tmp_path, requires=row))
+    # The codec of the file is asked for first, and the file does not say who provides it.
+    assert "needs coder 'gaussians-quantized'" in said(capsys, "decode", write(tmp_path, requires=row))
     only("3dgs,codecs")
     del load_plugins().entropy_models._entries["columns"]
     assert said(capsys, "decode", write(tmp_path, requires=row)).endswith(

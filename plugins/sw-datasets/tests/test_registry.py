@@ -199,7 +199,7 @@ def another_package(monkeypatch: pytest.MonkeyPatch):
     def register(content: Callable[[], bytes]) -> None:
         downloads = PluginRegistry("download")
         register_downloads(downloads)
-        downloads._owner = ("another-package", "1.0")
+        downloads._owner = ("another-package", "1.0", True)
         downloads.add("another", "another_package:data", summary="")
         module = types.ModuleType("another_package")
         module.data = content  # type: ignore[attr-defined]

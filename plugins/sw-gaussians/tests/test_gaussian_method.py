@@ -50,7 +50,7 @@ def plugins():
     coders.add("toy-codec", f"{__name__}:ToyCodec", summary="", codes="gaussians")
     coders.add("range", f"{__name__}:NoSuchClass", summary="an entropy coder")
     methods = Registry("method")
-    methods._owner = ("sw-of-toys", "1.0")
+    methods._owner = ("sw-of-toys", "1.0", True)
     methods.add("toy", f"{__name__}:Toy", summary="")
     return SimpleNamespace(coders=coders, gaussian_codecs=Coders(coders, "gaussians"), methods=methods)
 
@@ -93,7 +93,7 @@ def test_a_config_whose_codec_is_a_name_alone_is_the_authors_to_change(plugins):
 def test_another_layout_version_is_refused(plugins, model):
     reader = written(plugins, model)
     reader.version = 7
-    with pytest.raises(BitstreamError, match=r"toy layout version 7 is unknown, newer than"):
+    with pytest.raises(BitstreamError, match=r"toy layout version 7 is unknown, this installation reads"):
         Toy(plugins, None).decode(reader)
 
 

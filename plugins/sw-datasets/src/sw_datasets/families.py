@@ -7,7 +7,6 @@ Source: the data sets' own pages; 3D Gaussian Splatting (arXiv 2308.04079) for `
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -20,7 +19,7 @@ OUTDOOR = ("bicycle", "flowers", "garden", "stump", "treehill")
 INDOOR = ("room", "counter", "kitchen", "bonsai")
 
 
-@dataclass(frozen=True, eq=False, repr=False)  # each method that is generated costs every `sw` command time
+@dataclass(eq=False, repr=False)  # not frozen: each method that is generated costs every `sw` command time
 class Pictures:
     """The picture folder and the size at which a scene is used.
 
@@ -38,7 +37,7 @@ class Pictures:
         return self.by_scene.get(scene, self.folder)
 
 
-@dataclass(frozen=True, eq=False, repr=False)  # each method that is generated costs every `sw` command time
+@dataclass(eq=False, repr=False)  # not frozen: each method that is generated costs every `sw` command time
 class Family:
     """One dataset family and the rules its scenes are read by unless the user says otherwise.
 
@@ -89,6 +88,8 @@ class Family:
 
     def nearest(self, scene: str) -> str | None:
         """The published scene whose name is spelt most like `scene`."""
+        import difflib  # here: every `sw` command loads this module
+
         near = difflib.get_close_matches(scene, self.scenes, n=1)
         return near[0] if near else None
 

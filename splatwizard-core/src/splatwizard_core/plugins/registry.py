@@ -98,8 +98,8 @@ class Registry:
             self.refused.append((dataclasses.replace(entry, name=str(name)), fault))
             return
         rivals = [*self._clashes.get(name, ()), *filter(None, [self._entries.get(name)])]
-        owner = next((e.distribution for e in rivals if not e.foreign), catalogue().get(self.kind, {}).get(name))
-        if foreign and owner is not None:
+        owner = next((e.distribution for e in rivals if not e.foreign), None)
+        if foreign and (owner := owner or catalogue().get(self.kind, {}).get(name)) is not None:
             self.refused.append((entry, TAKEN.format(owner=owner)))
         elif not foreign and any(e.foreign for e in rivals):
             self.refused += [(e, TAKEN.format(owner=distribution)) for e in rivals]
