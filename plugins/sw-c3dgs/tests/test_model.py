@@ -1,4 +1,4 @@
-"""What is drawn in training is what the file holds, and codebooks get the gradients of those who share them."""
+"""Training draws the values that the file holds, and codebooks get the gradients of those who share them."""
 
 import pytest
 import torch

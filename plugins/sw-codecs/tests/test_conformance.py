@@ -15,7 +15,7 @@ KINDS = ("entropy model", "context model", "coder")
 
 
 def ours(names):
-    """Those names of one registry or view that packages of ours provide: a stranger's package has tests of its own."""
+    """Names in one registry or view that packages of ours provide: a stranger's package has tests of its own."""
     entries = {entry.name: entry for kind in KINDS for entry in PLUGINS.registries[kind]}
     return [name for name in names if is_ours(entries[name].distribution)]
 

@@ -16,7 +16,7 @@ OFF = math.log(0.01 / 0.99)  # -4.59512: the sigmoid is the threshold
 
 
 class Mask:
-    """What `ste-mask` of sw-codecs does, which this package can do without."""
+    """The gradient of `ste-mask` of sw-codecs, which this package does not require."""
 
     def forward(self, x):
         soft = torch.sigmoid(x)

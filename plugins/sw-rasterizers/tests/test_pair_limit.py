@@ -121,7 +121,7 @@ def test_a_refused_call_takes_no_memory_for_its_pairs(way, device):
 
 @ON_GPU
 def test_a_call_after_a_refused_one_on_another_stream_reads_its_own_counts(device, monkeypatch):
-    """What the refused call still writes, how many colours were not finite, must not be taken for the next one's."""
+    """A count of colours that are not finite, which the refused call still writes, is not taken for the next one's."""
     many, cam = full_screen(200_000, STANDARD, device), front_camera(320, 320)
     many.sh.dense[:] = float("nan")
     few = full_screen(3, STANDARD, device)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 BITS = 8
 HALF_MAX = 65504.0
 QUANTIZED = ("opacity", "factor", "dc", "rest", "shape", "quat")
-"""What is quantized, each with one lattice: opacities, log factors; SH band 0 and the others; shapes, quaternions."""
+"""Quantized tensors, each with one lattice: opacities, log factors; SH band 0 and the others; shapes, quaternions."""
 PER_GAUSSIAN = ("opacity", "factor")
 PER_COLOR = ("dc", "rest")
 PER_SHAPE = ("shape", "quat")
