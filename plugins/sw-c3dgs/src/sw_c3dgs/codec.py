@@ -24,14 +24,13 @@ from splatwizard_core.api import BitstreamError, GaussianModel, Params, Splatwiz
 from sw_c3dgs.coded import QUANTIZED, CodedGaussians
 from sw_c3dgs.indexed import IndexedGaussians
 from sw_c3dgs.model import SharedGaussians
-from sw_codecs.positions.ordering import spatial_order
+from sw_codecs.positions.ordering import box_cells, spatial_order
 from sw_codecs.vectors.sensitivity_vq import index_dtype
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ArrayCoder, ContainerReader, ContainerWriter, PluginManager
 
 CODERS = ("deflate", "byte-planes")
-CELLS = 21  # bits an axis of the Morton codes
 MAX_ZERO = 1 << 20  # of the quantizer
 MAX_LOG_FACTOR = 80.0  # exp stays within float32
 
@@ -60,7 +59,7 @@ class IndexedCodec:
             raise SplatwizardError(f"the Gaussians cannot be encoded: {error}") from error
         if np.abs(coded.values("factor")).max(initial=0) > MAX_LOG_FACTOR:
             raise SplatwizardError(f"a log scale is beyond +-{MAX_LOG_FACTOR:g}: the Gaussians cannot be encoded")
-        coded = coded.in_order(spatial_order(_cells(coded.means), bits=CELLS))
+        coded = coded.in_order(spatial_order(box_cells(coded.means)))
         n, colors, shapes = len(coded.means), len(coded.symbols["dc"]), len(coded.symbols["shape"])
         bands = 1 + coded.symbols["rest"].shape[1]
         degree = math.isqrt(bands) - 1
@@ -131,17 +130,6 @@ def _index(name: str, size: int, n: int, reader: ContainerReader, coder: ArrayCo
         if len(found) and int(found.max()) >= size:
             raise BitstreamError(f"an index is outside the codebook of {size:,} entries")
     return found
-
-
-def _cells(means: NDArray[np.float16]) -> NDArray[np.int64]:
-    """[N,3] in 0 .. 2^21 - 1, each axis of the bounding box of its own."""
-    if not len(means):
-        return np.zeros((0, 3), np.int64)
-    points = means.astype(np.float64)
-    low = points.min(0)
-    width = np.maximum(points.max(0) - low, 1e-300)
-    cells: NDArray[np.int64] = ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
-    return cells
 
 
 def _decoded_bytes(n: int, colors: int, shapes: int, bands: int) -> int:

@@ -15,6 +15,7 @@ from sw_finetuning.volume import volume_factor
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
+from sw_codecs.positions.ordering import box_cells
 from sw_lightgaussian.importance_vq import HALF_MAX, CodedVectors, ImportanceVQ, PartError, VQSettings
 
 if TYPE_CHECKING:
@@ -25,7 +26,6 @@ log = logging.getLogger(__name__)
 SECTIONS = {"header": "vq", "mask": "mask", "indices": "index", "codebook": "codebook", "own": "sh_keep"}
 """Part of `importance-vq` -> section."""
 
-CELLS = 21  # bits an axis of the grid whose Morton codes order the Gaussians
 ATTRIBUTES = 8  # opacity logit, three log scales, four components of the quaternion
 
 
@@ -119,7 +119,7 @@ class VecTree:
 
     def _order(self, means: NDArray[np.float32]) -> NDArray[np.int64]:
         """Indices [N] that bring the Gaussians into Morton order; no picture depends on it."""
-        found: NDArray[np.int64] = self.plugins.coders.load("float-delta").sort(_cells(means))
+        found: NDArray[np.int64] = self.plugins.coders.load("float-delta").sort(box_cells(means))
         return found
 
     def _write(
@@ -173,17 +173,6 @@ def _colors(dc: NDArray[np.float32], rest: NDArray[np.float32]) -> NDArray[np.fl
     """[N, 3K]: band 0, then the other coefficients of red, of green, of blue."""
     n = len(dc)
     return np.concatenate([dc.reshape(n, 3), rest.transpose(0, 2, 1).reshape(n, 3 * rest.shape[1])], 1)
-
-
-def _cells(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """[N,3] in 0 .. 2^21 - 1, each axis of the bounding box of its own."""
-    if not len(means):
-        return np.zeros((0, 3), np.int64)
-    points = means.astype(np.float64)
-    low = points.min(0)
-    width = np.maximum(points.max(0) - low, 1e-300)
-    cells: NDArray[np.int64] = ((points - low) / width * ((1 << CELLS) - 1)).astype(np.int64)
-    return cells
 
 
 def _finite(array: NDArray[Any]) -> NDArray[Any]:

@@ -37,6 +37,17 @@ def spatial_order(points: Points, *, bits: int = morton.MAX_BITS) -> Points:
     return order if isinstance(points, Tensor) else order.numpy()
 
 
+def box_cells(points: np.ndarray, bits: int = morton.MAX_BITS) -> np.ndarray:
+    """Cells int64 [N, 3] in 0..2^bits - 1 of float `points` [N, 3]: each axis of their box is divided alone."""
+    if not len(points):
+        return np.zeros((0, 3), np.int64)
+    exact = points.astype(np.float64)
+    low = exact.min(0)
+    width = np.maximum(exact.max(0) - low, 1e-300)
+    cells: np.ndarray = ((exact - low) / width * ((1 << bits) - 1)).astype(np.int64)
+    return cells
+
+
 def _cells(points: np.ndarray | Tensor, bits: int) -> Tensor:
     """int64 [N, 3] in 0..2^bits - 1."""
     if isinstance(points, Tensor):
