@@ -113,7 +113,7 @@ def test_a_plugin_that_did_not_load():
 
 def test_a_plugin_with_an_entry_that_is_refused(monkeypatch):
     entry = Entry("metric", "psnr", "m:f", "one line", distribution="sw-bad", version="0.1", foreign=True)
-    monkeypatch.setattr(PLUGINS.metrics, "refused", [(entry, "that is a name of ours")])
+    monkeypatch.setattr(load_plugins().metrics, "refused", [(entry, "that is a name of ours")])
     registration.check_loads(PluginInfo("good", "sw-good", "0.1", "sw_good"))
     with pytest.raises(BrokenContractError, match="metric 'psnr' is refused: that is a name of ours"):
         registration.check_loads(PluginInfo("bad", "sw-bad", "0.1", "sw_bad"))
