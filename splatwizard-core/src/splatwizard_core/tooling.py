@@ -24,6 +24,7 @@ MODULES = {
     "runs.device": "choose_device",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
+    "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
     "coding.container": "decoded_limit",
     "evaluation.evaluate": "png_names",
