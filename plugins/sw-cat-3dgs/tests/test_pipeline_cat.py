@@ -146,7 +146,7 @@ def test_a_heavier_rate_makes_a_smaller_file(method, train, trained, scene, rast
 def test_a_heavy_weight_on_the_planes_shrinks_their_section(method, train):
     sizes = []
     for weight in (0.0, 3000.0):
-        model = train(rate_term__triplane=weight, context__anchors_per_cell=4.0, iterations=120).model
+        model = train(rate_term__triplane=weight, context__anchors_per_cell=16.0, iterations=120).model
         sizes.append(ContainerReader(encoded(model, method), "x").sections["triplane"])
     assert sizes[1] < 0.7 * sizes[0]
 
