@@ -44,7 +44,7 @@ def accuracy(model, scene, rasterizer) -> tuple[float, float, float]:
 
 @pytest.mark.slow
 def test_quick_finds_the_surface():
-    """Measured with 20 % and 1 dB of slack; 3dgs quick has 34.24 dB and depths that are off by 0.99 %."""
+    """Measured: 0.0041, 4.9 degrees, 34.2 dB, with 20 % and 1 dB of slack; 3dgs quick: 0.0099 and 34.24 dB."""
     plugins = load_plugins()
     scene, rasterizer = load_scene("demo", SceneOptions(), plugins), NegotiatedRasterizer(plugins, device="cpu")
     resolved = resolve(plugins.methods.load("2dgs"), "quick", plugins=plugins)
@@ -55,5 +55,5 @@ def test_quick_finds_the_surface():
     ).train().model  # fmt: skip
     depth, angle, psnr = accuracy(model, scene, rasterizer)
     assert depth < 0.005
-    assert angle < 8
+    assert angle < 6
     assert psnr > 33.2
