@@ -127,6 +127,7 @@ def measure(
         "speed": None,
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
+        "raster": quality.raster_header(rasterizer.decided(options)),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
         "contended": contended,
         "flags": _flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
