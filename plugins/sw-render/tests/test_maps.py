@@ -136,7 +136,7 @@ def test_only_what_is_asked_for_is_drawn():
 def test_kinds_that_only_surfels_have_are_refused_for_others():
     assert MapRequest(normals=AUTO).suited(surfels=True, what="x").normals == RENDERED
     assert MapRequest(normals=AUTO).suited(surfels=False, what="x").normals == SURFACE
-    assert MapRequest(DEPTHS, RENDERED).suited(surfels=True, what="x") == MapRequest(DEPTHS, RENDERED)
+    assert MapRequest(tuple(DEPTHS), RENDERED).suited(surfels=True, what="x") == MapRequest(tuple(DEPTHS), RENDERED)
     for request in (MapRequest(normals=RENDERED), MapRequest((SURFACE,)), MapRequest((SURFACE,), AUTO)):
         with pytest.raises(UserInputError, match="x holds no surfels"):
             request.suited(surfels=False, what="x")

@@ -16,7 +16,7 @@ from splatwizard_core.tooling import write_json
 from sw_render.colors import depth_colors, normal_colors
 from sw_render.exr import write_exr
 from sw_render.maps import MapRequest, Maps
-from sw_render.modes import DRAWN, RENDERED, SURFACE
+from sw_render.modes import DEPTHS, NORMALS, RENDERED, SURFACE
 
 LARGEST = 65_535
 """Of a 16-bit PNG."""
@@ -40,10 +40,13 @@ class MapFiles:
     exr: bool = False
     scale: float | None = None
     written: dict[str, list[str]] = field(default_factory=dict, init=False)
-    _largest: dict[str, tuple[float, str]] = field(default_factory=dict, init=False)
+    _largest: dict[str, float] = field(default_factory=dict, init=False)
 
     def add(self, name: str, maps: Maps) -> None:
-        """Write the maps of a view under a name without suffix."""
+        """Write the maps of a view under a name without suffix.
+
+        Raises UserInputError for a `scale` that a depth would not fit into 16 bits with.
+        """
         alpha = _array(maps.alpha)
         for mode, tensor in maps.depths.items():
             self._add_depth(f"depth_{mode}", name, _array(tensor), alpha, maps.camera)
@@ -63,27 +66,22 @@ class MapFiles:
         if self.exr:
             write_exr(self._path(kind, f"{name}.exr"), depth)
         largest = float(depth.max(initial=0))
-        if largest >= self._largest.get(kind, (0.0, ""))[0]:
-            self._largest[kind] = largest, name
+        if self.scale is not None and round(largest * self.scale) > LARGEST:
+            raise UserInputError(
+                f"--depth-scale {self.scale:g}: a depth of {largest:.4g} ({kind} of {name}) does not fit into 16 bits: "
+                f"give at most {LARGEST / largest:.6g}, or leave it out"
+            )
+        self._largest[kind] = max(largest, self._largest.get(kind, 0.0))
 
     def finish(self) -> None:
-        """Write what depends on all views: the 16-bit PNGs, whose scale is one for the set, and the sidecars.
-
-        Raises UserInputError for a `scale` that depths would not fit into 16 bits with.
-        """
+        """Write what depends on all views: the 16-bit PNGs, whose scale is one for the set, and the sidecars."""
         if self.png:
-            for kind, (largest, name) in self._largest.items():
-                self._write_pngs(kind, largest, name)
+            for kind, largest in self._largest.items():
+                self._write_pngs(kind, self.scale or (LARGEST / largest if largest > 0 else 1.0))
         if "normals" in self.written:
             write_json(self.folder / "normals" / "normals.json", self._normals_facts())
 
-    def _write_pngs(self, kind: str, largest: float, name: str) -> None:
-        scale = self.scale or (LARGEST / largest if largest > 0 else 1.0)
-        if round(largest * scale) > LARGEST:
-            raise UserInputError(
-                f"--depth-scale {scale:g}: a depth of {largest:.4g} ({kind} of {name}) does not fit into 16 bits: "
-                f"give at most {LARGEST / largest:.6g}, or leave it out"
-            )
+    def _write_pngs(self, kind: str, scale: float) -> None:
         folder = self.folder / kind
         for path in [folder / each for each in self.written[kind] if each.endswith(".npz")]:
             with np.load(path) as stored:  # kept there, not in memory, until the scale was known
@@ -94,7 +92,7 @@ class MapFiles:
         mode = kind.removeprefix("depth_")
         facts = {
             "mode": mode,
-            "meaning": DRAWN.get(mode, "depth of the surface, (1 - depth_ratio) expected + depth_ratio median"),
+            "meaning": DEPTHS[mode],
             "encoding": "16-bit grey, value = round(depth * scale); 0: no surface",
             "scale": scale,
             "unit": "1 / scene unit" if mode == "inverse" else "scene unit",
@@ -105,11 +103,10 @@ class MapFiles:
 
     def _normals_facts(self) -> dict[str, Any]:
         source = self.request.normals
+        assert source is not None
         return {
             "source": source,
-            "meaning": "normals of the surfels, blended"
-            if source == RENDERED
-            else "of the surface that depth describes",
+            "meaning": NORMALS[source],
             **({} if source == RENDERED else {"depth_ratio": self.request.depth_ratio}),
             "npz": "float32 [3,H,W], world frame, unit length; 0: none",
             "png": "8-bit, round(255 (n + 1) / 2), camera frame with x right, y up, z towards the viewer; black: none, "

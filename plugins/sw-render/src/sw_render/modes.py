@@ -13,11 +13,14 @@ DRAWN: Mapping[str, str] = {
 """Depth modes that rasterizers draw -> meaning."""
 
 RENDERED, SURFACE = "rendered", "surface"
-DEPTHS = (*DRAWN, SURFACE)
-"""All depth modes; "surface" is (1 - r) expected + r median of surfels, with the r of their training."""
+DEPTHS: Mapping[str, str] = {**DRAWN, SURFACE: "(1 - depth_ratio) expected + depth_ratio median, of surfels"}
+"""All depth modes -> meaning; the ratio is that of the training."""
 
-NORMALS = (RENDERED, SURFACE)
-"""Normals of the surfels, blended; or those of the surface that the depth describes."""
+NORMALS: Mapping[str, str] = {
+    RENDERED: "normals of the surfels, blended",
+    SURFACE: "normals of the surface that the depth describes",
+}
+"""Kinds of normals -> meaning."""
 
 AUTO = "auto"
 """The first of NORMALS that a model has."""
