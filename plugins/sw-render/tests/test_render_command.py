@@ -221,7 +221,7 @@ def test_nothing_in_sight_is_no_surface(tmp_path: Path, capsys, camera: Camera):
         (["--depth", "expected", "--depth-scale", "0"], "--depth-scale"),
         (["--depth", "expected", "--depth-ratio", "2"], "--depth-ratio"),
         (["--depth", "expected", "--depth-scale", "1e9"], "does not fit into 16 bits: give at most"),
-        (["--set", "raster.profile=dgr"], "no rasterizer knows the profile 'dgr': raster.profile is one of 3dgs ("),
+        (["--set", "raster.profile=dgr"], "no rasterizer knows the profile 'dgr': raster.profile is one of 3dgs, dgr"),
         (["--set", "raster.profil=3dgs"], "did you mean 'raster.profile'?"),
         (["--set", "raster.antialias=maybe"], "raster.antialias"),
         (["--set", "raster.eps2d=-1"], "low-pass"),

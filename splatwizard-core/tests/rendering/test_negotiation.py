@@ -576,7 +576,11 @@ def test_a_profile_that_nobody_knows_is_told_with_those_that_there_are(plugins):
     with pytest.raises(ConfigError) as caught:
         NegotiatedRasterizer(plugins, device="cpu", options={"profile": "dgr"})
     assert str(caught.value) == (
-        "no rasterizer knows the profile 'dgr': raster.profile is one of 3dgs (quirky reference), dgr-exact "
-        "(reference), old-tiles (quirky)"
+        "no rasterizer knows the profile 'dgr': raster.profile is one of 3dgs, dgr-exact, old-tiles"
     )
     assert caught.value.key == "raster.profile"
+
+
+def test_features_that_nobody_offers_together_are_told(plugins):
+    with pytest.raises(CapabilityError, match=r"reference \(cpu/cuda\) has no ANTIALIAS with SURFEL"):
+        NegotiatedRasterizer(plugins, device="cpu").select({"ANTIALIAS", "SURFEL"})

@@ -188,12 +188,9 @@ class NegotiatedRasterizer:
 
     def _check_profile(self, name: str | None) -> None:
         known = {profile for info in self._readable for profile in info.profiles}
-        if name and known and name not in known:
+        if name and known and name not in known:  # with none installed, what to install is told at the first request
             raise ConfigError(
-                f"no rasterizer knows the profile '{name}': raster.profile is one of "
-                + ", ".join(
-                    f"{p} ({' '.join(i.name for i in self._readable if p in i.profiles)})" for p in sorted(known)
-                ),
+                f"no rasterizer knows the profile '{name}': raster.profile is one of {', '.join(sorted(known))}",
                 key="raster.profile",
             )
 
@@ -249,6 +246,7 @@ class NegotiatedRasterizer:
                 + (f" lacks {', '.join(sorted(lacks))}" if lacks else "")
                 + (f" draws nothing without {', '.join(sorted(needs))}" if needs else "")
                 + (" serves only where raster.prefer names it" if self._is_uninvited(info) else "")
+                + "".join(f" has no {' with '.join(sorted(c))}" for c in info.combos_forbidden if c <= wanted)
                 + (" is forbidden" if info.name in self._forbid else "")
                 + ("" if self._accepts(info) else f" is {info.exactness}")
             )
