@@ -540,6 +540,17 @@ def test_load_built_says_why_a_build_does_not_load(package):
         package.module().load_built()
 
 
+def test_a_module_loads_once_native_code_is_switched_on_again(package, monkeypatch):
+    module = package.module()
+    monkeypatch.setenv("SPLATWIZARD_NATIVE", "0")
+    with pytest.raises(NativeBuildError, match="SPLATWIZARD_NATIVE=0"):
+        module.load()
+    assert not module.has_cuda()
+    monkeypatch.setenv("SPLATWIZARD_NATIVE", "1")
+    assert module.available() is None
+    module.load()
+
+
 def test_load_built_says_that_native_code_is_switched_off(package, monkeypatch):
     monkeypatch.setenv("SPLATWIZARD_NATIVE", "0")
     with pytest.raises(NativeBuildError, match="SPLATWIZARD_NATIVE=0"):
