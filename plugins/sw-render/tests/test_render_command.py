@@ -232,6 +232,11 @@ def test_what_makes_no_sense_is_told_in_a_line(tmp_path: Path, capsys, folder: P
     assert told in " ".join(said.split())
 
 
+def test_a_file_that_an_option_swallows_is_told_where_to_stand(capsys, folder: Path):
+    said = refused(capsys, "--depth", folder / "walls.ply")
+    assert "one or more of expected, median, inverse, accumulated, surface (FILE goes before it)" in said
+
+
 def test_rasterizers_without_the_maps_are_answered_with_one_that_has_them(tmp_path: Path, capsys, folder: Path):
     able = [e.name for e in load_plugins().rasterizers if "DEPTH_MEDIAN" in e.declared.get("features", ())]
     arguments = [folder / "walls.ply", "--scene", "demo:tiny", "--out", tmp_path, "--depth", "median"]

@@ -33,7 +33,8 @@ def _modes(_context: click.Context, _parameter: click.Parameter, value: str | No
     words = [word.strip() for word in value.split(",")] if value is not None else []
     for word in words:
         if word not in DEPTHS:
-            raise click.UsageError(f"--depth has no mode '{word}': one or more of {', '.join(DEPTHS)}")
+            swallowed = " (FILE goes before it)" if Path(word).exists() and word else ""
+            raise click.UsageError(f"--depth has no mode '{word}': one or more of {', '.join(DEPTHS)}{swallowed}")
     return tuple(dict.fromkeys(words))
 
 
