@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Literal
 
 import torch
 from pydantic import Field
+from sw_gaussians.surfels import SurfelModel
 
-from splatwizard_core.api import GaussianModel, Params, RasterOptions, ScoreSpec
+from splatwizard_core.api import ConfigError, GaussianModel, Params, RasterOptions, ScoreSpec
+from sw_trimgs.surfel_contribution import blended, footprint
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -45,8 +47,9 @@ class Contribution:
     count   tested: pixels where alpha is at least 1/255, that which saturates the pixel included; blended: without it
     top     shift: all slots start with the first view, and a value enters only if it beats the highest
 
-    The authors' kernels count every pixel of the tiles that a splat touches, up to 256 a tile, which makes the values of
-    small splats smaller; here the footprint counts, whatever the tiles are.
+    The authors' kernels count every pixel of the tiles that a splat touches, up to 256 a tile, which makes the values
+    of small splats smaller; here the footprint counts, whatever the tiles are. That of surfels is taken from their
+    outline (surfel_contribution.py), for gamma 0.5 alone.
     """
 
     Settings = ContributionSettings
@@ -71,7 +74,14 @@ class Contribution:
     def of_view(
         self, model: GaussianModel, camera: Camera, rasterizer: Rasterizer, background: Tensor | None
     ) -> Tensor:
-        """[N] float32, the mean over the pixels of one view; 0 for what it does not show."""
+        """[N] float32, the mean over the pixels of one view; 0 for what it does not show.
+
+        Raises ConfigError for surfels and another gamma than 0.5.
+        """
+        if model.NUM_SCALES == SurfelModel.NUM_SCALES:
+            if self.gamma != 0.5:
+                raise ConfigError(f"gamma of the pruner 'trimgs' is {self.gamma}; for surfels it can only be 0.5")
+            return blended(model, camera, rasterizer) / (footprint(model, camera) + EPSILON)
         specs = (
             ScoreSpec("sum", "gamma", rule=self.count, gamma=self.gamma),
             ScoreSpec("pixels", "hits", rule=self.count),

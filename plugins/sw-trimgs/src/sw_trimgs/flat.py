@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import torch
 from sw_gaussians.density import rotate
+from sw_gaussians.surfels import THICKNESS, as_ellipsoids
 
 from splatwizard_core.api import GaussianInputs, GaussianModel
 
@@ -18,14 +19,14 @@ if TYPE_CHECKING:
 
     from splatwizard_core.api import Camera, Rasterizer
 
-THICKNESS = 1e-8
-"""Standard deviation along the normal, world units."""
 NORMAL_AXIS = 0
 """Column of the rotation that is the normal; surfels of 2DGS have theirs in column 2."""
 
 
 class FlatGaussians(GaussianModel):
-    """Gaussians whose first scale is THICKNESS and gets no gradient; the first column of the rotation is the normal.
+    """Gaussians whose first scale is 1e-8 world units; the first column of the rotation is the normal.
+
+    That scale has no gradient.
 
     neighbors       [N,k] int32 buffer, rows of the nearest Gaussians; empty where nobody has looked for them
     draws_surface   depth and normal of each Gaussian are composited beside the colours
@@ -41,7 +42,7 @@ class FlatGaussians(GaussianModel):
 
     @property
     def scales(self) -> Tensor:
-        """[N,3] standard deviations, world units; the first is THICKNESS, whatever splits have made of its logarithm."""
+        """[N,3] standard deviations, world units; the first is THICKNESS, whatever splits made of its logarithm."""
         free = self.log_scales[:, 1:].exp()
         return torch.cat([free.new_full((len(free), 1), THICKNESS), free], dim=1)
 
@@ -82,9 +83,8 @@ def flattened(model: GaussianModel) -> FlatGaussians:
     """
     if isinstance(model, FlatGaussians):
         return model
+    model = as_ellipsoids(model)
     log_scales, quats = model.log_scales.detach(), model.quats.detach()
-    if log_scales.shape[1] == 2:
-        log_scales = torch.cat([log_scales, log_scales.new_full((len(log_scales), 1), math.log(THICKNESS))], dim=1)
     smallest = log_scales.argmin(dim=1)  # [N]
     order = (smallest[:, None] + torch.arange(3, device=smallest.device)) % 3
     tensors = (model.means, model.sh_dc, model.sh_rest, model.opacity_logits, log_scales.gather(1, order))
