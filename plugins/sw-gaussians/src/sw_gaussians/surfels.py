@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel
+from splatwizard_core.api import GaussianModel, UserInputError
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter
@@ -73,6 +73,15 @@ def gaussians_of(
     """Make a SurfelModel of raw tensors with log_scales [N,2], else a GaussianModel (shapes: that class)."""
     kind = SurfelModel if log_scales.shape[-1] == SurfelModel.NUM_SCALES else GaussianModel
     return kind(means, sh_dc, sh_rest, opacity_logits, log_scales, quats, active_sh_degree=active_sh_degree)
+
+
+def refuse_surfels(model: GaussianModel, who: str) -> None:
+    """Raise UserInputError if `model` holds surfels, for whoever knows Gaussians with three scales only."""
+    if model.NUM_SCALES == SurfelModel.NUM_SCALES:
+        raise UserInputError(
+            f"{who} takes Gaussians with three scales each, and these are surfels with two (2DGS); "
+            "`sw export --format ply-as-3dgs` makes flat ellipsoids of them"
+        )
 
 
 def as_ellipsoids(model: GaussianModel) -> GaussianModel:
