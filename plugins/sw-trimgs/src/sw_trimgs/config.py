@@ -1,4 +1,4 @@
-"""Hyper-parameters of TrimGS on ellipsoids: the fine-tuning, its trims, its densification, its normals."""
+"""Hyper-parameters of TrimGS: the fine-tuning, its trims and densification; on ellipsoids also its normals."""
 
 from __future__ import annotations
 
@@ -77,18 +77,23 @@ class Normals(Params):
     refresh: int = Field(500, ge=1, description="steps between two searches for them, beside that after each change")
 
 
-class Trim3DGSConfig(Choosing):
-    """Everything that can be set for TrimGS on flat Gaussians."""
+class TuneConfig(Choosing):
+    """Settings of the fine-tuning, whatever it trains."""
 
     FULL_ITERATIONS: ClassVar[int] = 7_000
 
     iterations: int = Field(7_000, ge=1, description="steps after the trained scene")
-    start: Literal["flat-3dgs", "3dgs"] = Field(
-        "flat-3dgs", description="whose trained scene; that of 3dgs, like any .ply, is flattened first"
-    )
     lr: Rates = Field(Rates(), description="step sizes")
     densify: Densify = Field(Densify(), description="density control")
     trim: Trimming = Field(Trimming(), description="removal of what contributes least")
-    normals: Normals = Field(Normals(), description="regularisation by normals")
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM in the loss; the rest is that of L1")
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+
+class Trim3DGSConfig(TuneConfig):
+    """Everything that can be set for TrimGS on flat Gaussians."""
+
+    start: Literal["flat-3dgs", "3dgs"] = Field(
+        "flat-3dgs", description="whose trained scene; that of 3dgs, like any .ply, is flattened first"
+    )
+    normals: Normals = Field(Normals(), description="regularisation by normals")

@@ -14,6 +14,12 @@ def register_methods(registry: Registry) -> None:
                  summary="flat Gaussians, trimmed by contribution and split by scale (Fan et al. 2024)",
                  presets=["paper", "dtu", "mipnerf360-outdoor", "mipnerf360-indoor", "quick"],
                  rates=RATES)  # fmt: skip
+    registry.add("trim-2dgs", "sw_trimgs.surfel_method:Trim2DGS",
+                 summary="surfels of a 2DGS scene, trimmed by contribution and split by scale (Fan et al. 2024)",
+                 presets=["paper", "dtu", "mipnerf360", "tnt", "tnt-large", "quick"], rates=RATES)  # fmt: skip
+    registry.add("trim-2dgs-scratch", "sw_trimgs.surfel_method:Trim2DGSScratch",
+                 summary="2DGS that is trimmed and split by scale while it trains (Fan et al. 2024)",
+                 presets=["paper", "dtu", "quick"], rates=RATES)  # fmt: skip
 
 
 @hookimpl

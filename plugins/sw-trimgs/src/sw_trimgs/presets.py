@@ -56,6 +56,52 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "quick": {"iterations": 700, "scale_schedule": True, "densify.reset_interval": 0, **QUICK_RATES},
 }
 
+SURFEL_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    # The authors' scripts, by data set; scan63 of DTU starts the means at 1.6e-6.
+    "dtu": {
+        "densify.mode": "mix",
+        "trim.interval": 100,
+        "surface.lambda_dist": 1000.0,
+        "surface.depth_ratio": 1.0,
+        "drop_masked": True,
+    },
+    "mipnerf360": {"densify.size_px": 100},
+    "tnt": {
+        "lr.position_init": 1.6e-6,
+        "densify.reset_interval": 0,
+        "trim.interval": 300,
+        "surface.edge_threshold": 0.0,
+        "surface.depth_ratio": 1.0,
+    },
+    "tnt-large": {
+        "lr.position_init": 1.6e-6,
+        "densify.reset_interval": 0,
+        "trim.interval": 300,
+        "surface.edge_threshold": 0.0,
+        "surface.depth_ratio": 1.0,
+        "surface.lambda_dist": 10.0,
+    },
+    "quick": {"iterations": 700, "scale_schedule": True, "densify.reset_interval": 0, **QUICK_RATES},
+}
+
+SCRATCH_PRESETS: Mapping[str, Mapping[str, Any]] = {
+    "paper": {},
+    "dtu": {"trim.interval": 100, "surface.lambda_dist": 1000.0},
+    # The quick plan of 2dgs, which ends its densification at step 1,200 of 2,000.
+    "quick": {
+        "base.preset": "quick",
+        "iterations": 2000,
+        "densify.interval": 100,
+        "densify.start": 200,
+        "densify.stop": 1200,
+        "trim.after": 200,
+        "trim.interval": 100,
+        "trim.stop": 1200,
+        "surface.normal_after": 500,
+    },
+}
+
 
 def _quantized(bits: int, dc: float, rest: float, opacity: float, scale: float, quat: float) -> dict[str, Any]:
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from sw_finetuning.fine_tuning import FineTuningRates, FineTuningStage
+from sw_finetuning.fine_tuning import FineTuningStage
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
         View,
         When,
     )
-    from sw_trimgs.config import Densify, Normals, Trim3DGSConfig, Trimming
+    from sw_trimgs.config import Normals, Trim3DGSConfig, TuneConfig
 
 LAST = 1
 """Priority of what comes after everything else that a step does to the rows."""
@@ -52,27 +52,19 @@ class FlatStage(ThreeDGSStage):
 class TrimStage(FineTuningStage):
     """Goes on from a trained scene with densification by scale, and trims what contributes least.
 
-    rates       step sizes
-    densify, trim   see config.py
+    config      its plan, see config.py
+
+    Raises ConfigError for a pruner that is not installed.
     """
 
     name = "tune"
     statistics = True
     rates_plan = range(7_000)
 
-    def __init__(
-        self,
-        opt: OptimizationParams,
-        rates: FineTuningRates,
-        densify: Densify,
-        trim: Trimming,
-        plugins: PluginManager,
-        *,
-        lambda_dssim: float,
-    ) -> None:
-        super().__init__(opt, rates, lambda_dssim=lambda_dssim)
-        self.densify, self.trim = densify, trim
-        self.pruner = trim.load(plugins, "trim.pruner")
+    def __init__(self, config: TuneConfig, plugins: PluginManager) -> None:
+        super().__init__(config, config.lr, lambda_dssim=config.lambda_dssim)
+        self.densify, self.trim = config.densify, config.trim
+        self.pruner = config.trim.load(plugins, "trim.pruner")
 
     def begin(self, context: StageContext) -> SplatModel:
         model = super().begin(context)
@@ -138,7 +130,7 @@ class TrimFlatStage(TrimStage):
     """The fine-tuning of flat Gaussians, whose normals follow the depth map and their neighbours."""
 
     def __init__(self, config: Trim3DGSConfig, plugins: PluginManager) -> None:
-        super().__init__(config, config.lr, config.densify, config.trim, plugins, lambda_dssim=config.lambda_dssim)
+        super().__init__(config, plugins)
         self.start, self.normals = config.start, config.normals
 
     @property
