@@ -160,7 +160,7 @@ def test_each_mode_densifies_in_its_way(train, mode, curves):
 def test_both_terms_are_in_the_loss_from_their_step_on_and_fall(train):
     parts = []
     train(
-        iterations=60, normals__after=3, normals__edge_threshold=0, normals__weight=5, densify__stop=0,
+        iterations=40, normals__after=3, normals__edge_threshold=0, normals__weight=5, densify__stop=0,
         on_step=lambda _, record: parts.append(record.parts),
     )  # fmt: skip
     assert [("normal" in each, "rough" in each) for each in parts[:5]] == [(False, False)] * 3 + [(True, True)] * 2
@@ -215,7 +215,7 @@ def test_a_fresh_decoder_draws_what_was_trained(plugins, whole, toy, rasterizer,
 
 def test_files_shrink_with_the_rate_point(plugins, whole):
     sizes = []
-    for rate in ("r1", "r2", "r3", "r4", "r5", "r6"):
+    for rate in ("r1", "r3", "r6"):
         method = Trim3DGS(plugins, resolve(Trim3DGS, "paper", rate=rate, plugins=plugins).config)
         sizes.append(len(encoded(method, whole[1])))
     assert sizes == sorted(set(sizes))

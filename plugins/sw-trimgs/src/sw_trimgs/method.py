@@ -49,7 +49,7 @@ class Flat3DGS(GaussianMethod):
 
 
 class Trim3DGS(GaussianMethod):
-    """Fan, Yang, Li, Zhang, Zhang: Trim 3D Gaussian Splatting for Accurate Geometry Representation, 2024.
+    """Fan, Yang, Li, Li, Zhang: Trim 3D Gaussian Splatting for Accurate Geometry Representation, 2024.
 
     1. START    flat Gaussians, trained as in 3DGS
     2. TUNE     7,000 steps: split what is large, trim what contributes least, let normals follow the depth

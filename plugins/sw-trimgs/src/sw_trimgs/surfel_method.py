@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from sw_gaussians.method import GaussianMethod
 
-from splatwizard_core.api import Method, create_method
+from splatwizard_core.api import ConfigError, Method, create_method
 from sw_trimgs.presets import RATES, SCRATCH_PRESETS, SURFEL_PRESETS
 from sw_trimgs.surfel_config import ScratchConfig, Trim2DGSConfig
 from sw_trimgs.surfel_stage import ScratchStage, TrimSurfelStage
@@ -22,7 +22,7 @@ NO_SIZE_RULE = 1e9
 
 
 class Trim2DGS(GaussianMethod):
-    """Fan, Yang, Li, Zhang, Zhang: Trim 3D Gaussian Splatting (arXiv 2406.07499), on the surfels of a 2DGS scene."""
+    """Fan, Yang, Li, Li, Zhang: Trim 3D Gaussian Splatting (arXiv 2406.07499), on the surfels of a 2DGS scene."""
 
     name: ClassVar[str] = "trim-2dgs"
     version: ClassVar[int] = 1
@@ -46,7 +46,7 @@ class Trim2DGSScratch(GaussianMethod):
     DEFAULT_RATE: ClassVar[str] = "r6"
 
     def _base(self) -> Method:
-        """Return the configured 2dgs: its start and its stage."""
+        """Return the configured 2dgs: its start and its stage. Raises ConfigError for values that are ours to set."""
         config: ScratchConfig = self.config
         values = dict(config.base)
         preset = str(values.pop("preset", "paper"))
@@ -59,6 +59,13 @@ class Trim2DGSScratch(GaussianMethod):
         }
         if config.surface.depth_ratio is not None:
             own["surface.depth_ratio"] = config.surface.depth_ratio
+        taken = next((key for key in own if _holds(values, key)), None)
+        if taken is not None:
+            raise ConfigError(
+                f"'base.{taken}' is set by trim-2dgs-scratch itself: leave it out ('surface', 'iterations' and "
+                "'scale_schedule' of its own are what can be set)",
+                key="base",
+            )
         return create_method(self.plugins, "2dgs", {**own, **values}, preset=preset)
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
@@ -66,3 +73,11 @@ class Trim2DGSScratch(GaussianMethod):
 
     def stages(self) -> Sequence[Stage]:
         return [ScratchStage(self.config, self._base(), self.plugins)]
+
+
+def _holds(values: Mapping[str, Any], key: str) -> bool:
+    """Whether nested blocks of values, or dotted keys, say something of the dotted `key`."""
+    if key in values:
+        return True
+    block, _, rest = key.partition(".")
+    return bool(rest) and isinstance(values.get(block), Mapping) and _holds(values[block], rest)
