@@ -1,7 +1,6 @@
 """Small meshes that tests of several files need."""
 
 import numpy as np
-
 from sw_geometry.mesh import Mesh
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 from small_meshes import sphere
-
-from splatwizard_core.api import Camera, Protocol, Scene, View
 from sw_geometry.chamfer import Truth, compare, compare_points, seen_by
 from sw_geometry.mesh import Floats, Mesh
+
+from splatwizard_core.api import Camera, Protocol, Scene, View
 
 
 def unit_points(count: int, seed: int = 0) -> Floats:

@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.io import savemat
-
-from splatwizard_core.api import CapabilityError, UserInputError
 from sw_geometry import dtu
 from sw_geometry.culling import in_view, kept_vertices, widened
 from sw_geometry.mesh import Floats, Mesh
 from sw_geometry.ply import write_mesh
+
+from splatwizard_core.api import CapabilityError, UserInputError
 
 
 def bump(count: int, size: float, shift: float = 0.0) -> Mesh:

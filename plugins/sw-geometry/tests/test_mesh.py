@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from small_meshes import sphere
-
-from splatwizard_core.api import UserInputError
 from sw_geometry.clusters import cluster_of_triangles, largest_clusters
 from sw_geometry.mesh import Mesh, canonical, without_degenerate
 from sw_geometry.ply import read_mesh, read_points, write_mesh
+
+from splatwizard_core.api import UserInputError
 
 
 def joined(*meshes: Mesh) -> Mesh:

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-
 from sw_geometry.mesh import Mesh
 from sw_geometry.nearest import nearest_points, point_triangle, to_triangles
 from sw_geometry.sampling import grid_samples, grid_thinned, thinned, uniform_samples

@@ -67,7 +67,7 @@ def read_mesh(path: Path) -> Mesh:
         rows = None if table is None else table["rows"].astype(np.int64)
     if sides is None or rows is None or (sides != 3).any():
         raise UserInputError(f"{path}: it is truncated, or has faces that are no triangles")
-    if rows.size and not (0 <= rows.min() and rows.max() < len(vertices)):
+    if rows.size and not (rows.min() >= 0 and rows.max() < len(vertices)):
         raise UserInputError(f"{path}: a triangle names a vertex that is not there")
     names = vertices.dtype.names or ()
     return Mesh(
