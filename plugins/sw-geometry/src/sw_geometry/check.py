@@ -19,9 +19,9 @@ def check_open3d() -> list[Check]:
         told = str(error)
         if "library of the system" in told:
             return [Check(GROUP, NAME, "broken", told.partition(": ")[2], f"apt install {SYSTEM_PACKAGES}")]
-        state = "missing" if told.startswith("package-missing") else "broken"
-        mend = f"pip install '{EXTRA}'" if state == "missing" else f"pip install --force-reinstall '{EXTRA}'"
-        return [Check(GROUP, NAME, state, told.removeprefix("package-missing: "), mend)]
+        if told.startswith("package-missing"):
+            return [Check(GROUP, NAME, "missing", told.partition(": ")[2], f"pip install '{EXTRA}'")]
+        return [Check(GROUP, NAME, "broken", told, f"pip install --force-reinstall '{EXTRA}'")]
     from sw_geometry.fusion import Fusion
 
     fusion = Fusion(voxel_size=0.05, truncation=4.0, depth_trunc=10.0, max_bytes=1 << 30)

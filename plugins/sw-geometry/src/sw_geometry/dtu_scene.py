@@ -65,6 +65,6 @@ def _views(scene: Scene) -> Iterator[tuple[Floats, Mask]]:
         for name, projection in zip(names, projections, strict=True):
             with Image.open(folder / name) as picture:
                 pixels = np.asarray(picture)
-            mask = pixels > 0 if pixels.ndim == 2 else (pixels > 0).any(axis=2)
-            yield projection, widened(mask, RADIUS * mask.shape[1] / 1600)
+            mask = np.asarray(pixels > 0 if pixels.ndim == 2 else (pixels > 0).any(axis=2))
+            yield projection, widened(mask, RADIUS)
             bar.advance()

@@ -84,7 +84,9 @@ def mesh_of(subject: Subject) -> Built:
 def build_from_model(subject: Subject, parameters: Parameters, max_memory: float | None) -> Built:
     """Draw the depth of the model from the cameras of its scene and fuse it."""
     if parameters.unbounded:
-        from sw_geometry.unbounded import build_unbounded as make
+        from sw_geometry.unbounded import build_unbounded
+
+        make = build_unbounded
     else:
         make = build
     scene = subject.scene

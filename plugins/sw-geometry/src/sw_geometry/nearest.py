@@ -19,7 +19,7 @@ def nearest_points(queries: Floats, points: Floats) -> tuple[Floats, Indices]:
     if not len(points):
         return np.full(len(queries), np.inf), np.zeros(len(queries), dtype=np.int64)
     distance, row = cKDTree(points).query(queries)
-    return distance, row
+    return np.asarray(distance), np.asarray(row)
 
 
 def to_triangles(queries: Floats, mesh: Mesh) -> tuple[Floats, Indices]:
@@ -71,7 +71,7 @@ def point_triangle(points: Floats, corners: Floats) -> Floats:
     for p, q in ((a, b), (b, c), (c, a)):  # on the inner side of every edge: the foot lies in the triangle
         inside &= (np.cross(q - p, points - p) * normal).sum(axis=1) >= 0
     height = np.abs(((points - a) * normal).sum(axis=1)) / np.sqrt(np.where(squared > 0, squared, 1.0))
-    return np.where(inside, height, edges.min(axis=0))
+    return np.asarray(np.where(inside, height, edges.min(axis=0)))
 
 
 def _to_segment(points: Floats, p: Floats, q: Floats) -> Floats:

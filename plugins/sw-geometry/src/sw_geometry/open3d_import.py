@@ -11,7 +11,7 @@ from splatwizard_core.api import CapabilityError
 
 EXTRA = "sw-geometry[mesh]"
 SYSTEM_PACKAGES = "libgl1 libegl1 libx11-6 libgomp1 libusb-1.0-0"
-"""Debian's and Ubuntu's packages with the libraries that its wheels do not bring; 0.19 needs the first, third, fourth."""
+"""Debian's and Ubuntu's packages with the libraries that its wheels do not bring."""
 
 
 @cache

@@ -42,7 +42,7 @@ def draw(mesh: Mesh, camera: Camera, *, colored: bool = False) -> NDArray[np.uin
     base = np.where((facing < 0)[:, None], base * (0.8, 0.45, 0.45), base)
     picture = np.ones((*hit.shape, 3))
     picture[hit] = base
-    return np.rint(np.clip(picture, 0, 1) * 255).astype(np.uint8)
+    return np.asarray(np.rint(np.clip(picture, 0, 1) * 255), dtype=np.uint8)
 
 
 def _rays(camera: Camera) -> NDArray[np.float32]:

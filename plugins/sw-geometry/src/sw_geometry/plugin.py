@@ -12,13 +12,13 @@ def register_commands(registry: Registry) -> None:
 @hookimpl
 def register_metrics(registry: Registry) -> None:
     for name, target, label, unit, digits, direction, position, summary in (
-        ("chamfer_dtu", "DTU_CHAMFER", "Chamfer", "mm", 2, "lower", 20, "mesh against the scanner's points, DTU's protocol, mm"),
+        ("chamfer_dtu", "DTU_CHAMFER", "Chamfer", "mm", 2, "lower", 20, "mesh against the scanner, DTU's protocol, mm"),
         ("chamfer", "CHAMFER", "Chamfer", "", 4, "lower", 21, "mesh against the truth of the scene, its units"),
         ("mesh_f1", "F_SCORE", "mesh F1", "", 3, "higher", 22, "share of mesh and truth within tau of each other"),
         ("chamfer_points", "POINTS", "Chamfer, points", "", 4, "lower", 23,
          "centres of the Gaussians against the truth, with metrics.mesh.points=true"),
         ("depth_error", "DEPTH", "depth error", "", 4, "lower", 24, "mean relative error of the depth, test views"),
-        ("normal_error", "NORMALS", "normals", "deg", 1, "lower", 25, "mean angle between true and drawn normals, degrees"),
+        ("normal_error", "NORMALS", "normals", "deg", 1, "lower", 25, "mean angle to the true normals, degrees"),
     ):  # fmt: skip
         registry.add(name, f"sw_geometry.metrics:{target}", summary=summary, label=label, unit=unit, digits=digits,
                      direction=direction, position=position, over="model", slow=True, group="mesh",

@@ -51,10 +51,10 @@ def read_mesh(path: Path) -> Mesh:
         raise UserInputError(f"{path}: not a mesh: its elements are {', '.join(e[0] for e in elements) or 'none'}")
     vertices, rest = _table(path, elements[0], body, is_text)
     count = elements[1][1]
-    lists = [kind for kind in elements[1][2] if isinstance(kind[1], tuple)]
+    lists = [kind for _, kind in elements[1][2] if isinstance(kind, tuple)]
     if len(elements[1][2]) != 1 or len(lists) != 1:
         raise UserInputError(f"{path}: its faces must have one property, the list of vertex indices")
-    length, index = lists[0][1]
+    length, index = lists[0]
     if is_text:
         faces = _whole_numbers(rest, 4 * count)
         sides = None if faces is None else faces.reshape(-1, 4)[:, 0]
