@@ -18,9 +18,9 @@ def check_open3d() -> list[Check]:
     except CapabilityError as error:
         told = str(error)
         if "library of the system" in told:
-            return [Check(GROUP, NAME, "broken", told.partition(": ")[2], f"apt install {SYSTEM_PACKAGES}")]
-        if told.startswith("package-missing"):
-            return [Check(GROUP, NAME, "missing", told.partition(": ")[2], f"pip install '{EXTRA}'")]
+            return [Check(GROUP, NAME, "broken", told, f"apt install {SYSTEM_PACKAGES}")]
+        if told.startswith("meshes need"):
+            return [Check(GROUP, NAME, "missing", "Open3D is not installed", f"pip install '{EXTRA}'")]
         return [Check(GROUP, NAME, "broken", told, f"pip install --force-reinstall '{EXTRA}'")]
     from sw_geometry.fusion import Fusion
 

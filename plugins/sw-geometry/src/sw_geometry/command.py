@@ -75,7 +75,7 @@ def mesh(
     pieces, mesh.json says how it was made. --set takes scene keys, keys of the run (raster.prefer, ...), and
     metrics.mesh.KEY, which options win over.
     """
-    from splatwizard_core.api import Subject
+    from splatwizard_core.api import SplatwizardError, Subject
     from splatwizard_core.tooling import (
         Session,
         choose_device,
@@ -88,7 +88,7 @@ def mesh(
     )
     from sw_geometry.files import write_files
     from sw_geometry.metrics import build_from_model
-    from sw_geometry.open3d_import import import_open3d
+    from sw_geometry.open3d_import import Open3DMissing, import_open3d
     from sw_geometry.parameters import resolve
 
     run = Path(file) if (Path(file) / "config.toml").is_file() else None
@@ -97,7 +97,10 @@ def mesh(
     target = out or (run / "mesh" if run is not None else Path("mesh"))
     chosen = Choices(scene=scene, config_file=config, sets=sets, device=device).resolve_without_method()
     settings, setup = _settings(chosen.metrics, given, no_mask)
-    import_open3d()  # before the work, not after it
+    try:
+        import_open3d()  # before the work, not after it
+    except Open3DMissing as error:
+        raise SplatwizardError(str(error)) from error  # nothing is wrong with what was asked: status 1
 
     plugins = load_plugins()
     session = Session(plugins, choose_device(chosen.ppl.device, plugins), say)

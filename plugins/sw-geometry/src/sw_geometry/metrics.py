@@ -18,7 +18,7 @@ from sw_geometry.depth import depth_views
 from sw_geometry.files import write_files
 from sw_geometry.maps import depth_and_normal_error
 from sw_geometry.mesh import Mesh
-from sw_geometry.open3d_import import import_open3d
+from sw_geometry.open3d_import import Open3DMissing, import_open3d
 from sw_geometry.parameters import Parameters, resolve
 from sw_geometry.settings import MeshSettings
 
@@ -37,6 +37,8 @@ class GeometryMetric:
         """Measure; whatever is wrong becomes the reason of a null and spoils no other metric."""
         try:
             return self.measure(subject)
+        except Open3DMissing as error:
+            raise CapabilityError(f"package-missing: {error}") from error
         except (CapabilityError, MemoryError):
             raise
         except (SplatwizardError, ValueError, OSError) as error:
@@ -53,7 +55,7 @@ class GeometryMetric:
         if self.needs_mesh:
             try:
                 import_open3d()
-            except CapabilityError as error:
+            except Open3DMissing as error:
                 return f"{error}; until then there is no Chamfer distance"
         return None
 
