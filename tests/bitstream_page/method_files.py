@@ -29,7 +29,7 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
         return chimera(static, sections, unzstd)
     if header["method"] == "compact3dgs":
         return compact(static, sections, unzstd)
-    known = ("trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs")
+    known = ("trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs", "2dgs")
     check(header["method"] in known, "method")
     if static["codec"] == "gaussians-indexed":
         return indexed(static, sections, unzstd)

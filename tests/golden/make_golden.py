@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sw_gaussians.surfels import Surface, SurfelModel
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.gaussians.model import GaussianModel
@@ -56,6 +57,16 @@ def procedural(n: int, degree: int = 3, active: int | None = None) -> GaussianMo
         4 * values(n, 3), values(n, 1, 3), values(n, coefficients - 1, 3) / 4, 4 * values(n) + 1, values(n, 3) - 4,
         values(n, 4), active_sh_degree=active,
     )  # fmt: skip
+
+
+def surfels(n: int, degree: int = 3, active: int | None = None) -> SurfelModel:
+    """Surfels of scattered values."""
+    model = procedural(n, degree, active)
+    tensors = {name: each.detach() for name, each in model.named_parameters()}
+    tensors["log_scales"] = tensors["log_scales"][:, :2].contiguous()
+    flat = SurfelModel(**tensors, active_sh_degree=active)
+    flat.surface = Surface(1.0, 100.0, 0.05)
+    return flat
 
 
 def coincident() -> GaussianModel:
@@ -250,6 +261,11 @@ CASES: dict[str, Case] = {
     "c3dgs_planes_v1": ("c3dgs", "r1", {"codec.settings.arrays": "byte-planes"}, lambda: sharing(12, 12, 12, 3)),
     "c3dgs_empty_v1": ("c3dgs", "r4", {}, lambda: sharing(0, 0, 0, 0)),
     "chimerags_empty_v1": ("chimerags", "r3", SMALL_VQ, lambda: masked(0, 0)),
+    "2dgs_exact_v1": ("2dgs", "r6", {}, lambda: surfels(16)),
+    "2dgs_r3_v1": ("2dgs", "r3", {}, lambda: surfels(60, 2, 1)),
+    "2dgs_zstd_v1": ("2dgs", "r6", {"codec.name": "gaussians-zstd"}, lambda: surfels(20, 1)),
+    "2dgs_ply_v1": ("2dgs", "r6", {"codec.name": "gaussians-ply"}, lambda: surfels(8, 1, 0)),
+    "2dgs_empty_v1": ("2dgs", "r1", {}, lambda: surfels(0)),
     "mesongs_v1": ("mesongs", "r4", {}, lambda: settled(60)),
     "mesongs_corner_v1": ("mesongs", "r1", {}, lambda: settled(20, 0, "corner")),
     "mesongs_one_v1": ("mesongs", "r2", {}, lambda: settled(1, 1)),
