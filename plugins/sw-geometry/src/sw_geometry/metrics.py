@@ -1,4 +1,4 @@
-"""What evaluations measure of a model's geometry: `sw eval --geometry`, `sw run --geometry`.
+"""Metrics of a model's geometry: `sw eval --geometry`, `sw run --geometry`.
 
 One mesh serves all of them. A scene without a truth of a kind has no such value; where a truth is there and something
 else is missing, the reason stands in the record.
