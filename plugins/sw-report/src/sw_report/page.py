@@ -112,7 +112,7 @@ def _lede(runs: Sequence[Run]) -> str:
     if len(runs) > 1:
         methods, scenes = _unique([r.variant for r in runs]), _unique([r.facts.scene for r in runs])
         protocols = _unique([r.facts.protocol.id for r in runs])
-        sizes = sorted(r.facts.file.bytes for r in runs)
+        sizes = sorted(r.size for r in runs)
         return (
             f"{len(runs)} runs: {_plural(len(methods), 'method')} on {_plural(len(scenes), 'scene')}, under "
             f"{_plural(len(protocols), 'protocol')}. Files of {numbers.megabytes(sizes[0])} to "

@@ -38,13 +38,13 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
         style = metric_style(metric)
         lines = []
         for variant in variants:
-            own = sorted((r for r in runs if r.variant == variant), key=lambda r: r.facts.file.bytes)
+            own = sorted((r for r in runs if r.variant == variant), key=lambda r: r.size)
             points = [
                 Point(
-                    run.facts.file.bytes / 1e6,
+                    run.size / 1e6,
                     value,
                     f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} "
-                    f"at {numbers.megabytes(run.facts.file.bytes)} MB",
+                    f"at {numbers.megabytes(run.size)} MB",
                     run.facts.rate or "" if len(variants) <= 2 else "",
                 )
                 for run in own
