@@ -200,16 +200,17 @@ def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
         say(f"warning: {same[0].method} {rates}: these rate points give the same file, as what differs is overridden")
 
 
-def warn_of_metrics(session: Session, names: Sequence[str] | None, settings: Any, *, quiet: bool = False) -> None:
+def warn_of_metrics(
+    session: Session, names: Sequence[str] | None, settings: Any, *, geometry: bool = False, quiet: bool = False
+) -> None:
     """Say before the work, once, what keeps metrics from being computed here.
 
-    names   None: all that are installed
+    names   None: all over images that are installed; with `geometry` those over models too
     Raises UserInputError for settings that name something which is not there.
     """
-    from splatwizard_core.evaluation.metrics import MetricSetup, unavailable
+    from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, unavailable
 
-    metrics = session.plugins.metrics
-    entries = [metrics.entry(name) for name in (metrics.names if names is None else names)]
+    entries = chosen_metrics(session.plugins.metrics, names, geometry=geometry)
     for line in unavailable(entries, MetricSetup(session.device, settings)):
         if not quiet:
             say(f"warning: {line}")

@@ -67,7 +67,7 @@ class ProtocolBlock(Part):
 
 
 class MetricBlock(Part):
-    """One image metric over the test views."""
+    """One image metric over the test views, or one of the model itself: without `per_view`, details in `geometry`."""
 
     mean: float | None
     per_view: list[float | None] = Field(description="in the order of `views`; null: not finite, as `unknown` says")
@@ -224,7 +224,7 @@ class Record(Part):
     speed: SpeedBlock
     memory: MemoryBlock
     train: TrainBlock
-    geometry: Annotated[dict[str, float] | None, WhyNull("not asked for")] = None
+    geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
     raster_options: dict[str, dict[str, Any]] = Field(
