@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -67,6 +68,13 @@ def surfels(n: int, degree: int = 3, active: int | None = None) -> SurfelModel:
     flat = SurfelModel(**tensors, active_sh_degree=active)
     flat.surface = Surface(1.0, 100.0, 0.05)
     return flat
+
+
+def flat(n: int, degree: int = 3) -> GaussianModel:
+    """Gaussians of scattered values, thin along their first axis."""
+    model = procedural(n, degree)
+    model.log_scales.data[:, 0] = math.log(1e-8)
+    return model
 
 
 def coincident() -> GaussianModel:
@@ -231,6 +239,10 @@ CASES: dict[str, Case] = {
     "3dgs_classes_v1": ("3dgs", "r1", {"codec.position_bits": 8}, orderly),
     "trimming_the_fat_ply_v1": ("trimming-the-fat", "r3", {"codec": "gaussians-ply"}, lambda: procedural(5, 1)),
     "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),
+    "flat_3dgs_v1": ("flat-3dgs", "r6", {}, lambda: flat(6, 1)),
+    "trim_3dgs_v1": ("trim-3dgs", "r3", {}, lambda: flat(40, 1)),
+    "trim_2dgs_v1": ("trim-2dgs", "r4", {}, lambda: surfels(30, 1)),
+    "trim_2dgs_scratch_v1": ("trim-2dgs-scratch", "r6", {}, lambda: surfels(5, 1)),
     "pup_3dgs_exact_v1": ("pup-3dgs", "r3", {}, lambda: procedural(5, 1)),
     "pup_3dgs_quantized_v1": ("pup-3dgs", "r6", {"codec": "gaussians-quantized"}, lambda: procedural(12, 1)),
     "lightgaussian_v1": ("lightgaussian", "r3", SMALL_CODEBOOK, lambda: procedural(40, 2)),

@@ -52,13 +52,16 @@ def test_every_view_shows_something_and_no_two_are_alike(tiny):
     assert min((a - b).abs().mean() for i, a in enumerate(pictures) for b in pictures[:i]) > 3
 
 
-def test_equal_seeds_give_equal_bits_in_another_process_with_other_threads():
+def test_equal_seeds_give_equal_bits_in_another_process_with_other_threads(tmp_path, monkeypatch):
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); from test_synthetic import digest\n"
         "from sw_datasets.demo.synthetic import SIZES, make_scene\n"
         "print(digest(make_scene(SIZES['tiny'])))"
     )
-    env = {**os.environ, "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    # Each with a cache of its own: neither reads what the other drew.
+    monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "here"))
+    there = str(tmp_path / "there")
+    env = {**os.environ, "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "SPLATWIZARD_CACHE": there}
     command = [sys.executable, "-c", code, os.path.dirname(__file__)]
     other = subprocess.run(command, capture_output=True, text=True, env=env, check=True).stdout.strip()
     assert digest(make_scene(SIZES["tiny"])) == other

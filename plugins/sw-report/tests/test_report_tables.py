@@ -3,7 +3,7 @@
 import pytest
 from sw_report import numbers
 from sw_report.aggregate import dataset_tables, mean
-from sw_report.distortion import bd_tables, choose_anchor, drawn_metrics
+from sw_report.distortion import bd_metrics, bd_tables, choose_anchor, drawn_metrics, with_values
 from sw_report.results_tables import (
     bd_table,
     cost_table,
@@ -382,3 +382,48 @@ def test_times_of_an_idle_machine_carry_no_mark(make_run, tmp_path):
     table = runs_table(collect([tmp_path]).runs)
     assert not any(numbers.SHARED in text for row in texts(table) for text in row)
     assert numbers.SHARED_NOTE not in table.notes
+
+
+def test_values_of_different_machines_are_marked_one_by_one(make_run, tmp_path):
+    make_run("r1")
+    make_run("r2", size=2000, change=lambda c: c["environment"].update(threads=1))
+    table = runs_table(collect([tmp_path]).runs)
+    cells = [dict(zip((column.name for column in table.columns), row, strict=True)) for row in texts(table)]
+    assert [row["FPS"] for row in cells] == ["12.5ᵃ", "12.5ᵇ"]
+    assert [row["PSNR dB"][-1].isdigit() for row in cells] == [True, True]
+    (note,) = (note for note in table.notes if "different machines" in note)
+    assert note.endswith("ᵃ cpu, A Processor, 2 threads; ᵇ cpu, A Processor, 1 thread.")
+
+
+def test_diagnostic_metrics_stand_in_no_table_even_of_records_that_do_not_say_so(make_run, tmp_path):
+    def with_diagnostic(content):
+        content["metrics"]["psnr_unrounded"] = {"mean": 30.0, "per_view": [], "direction": "higher"}
+        content["metrics"]["their_check"] = {"mean": 1.0, "per_view": [], "direction": "higher", "diagnostic": True}
+
+    for scene in ("a", "b"):
+        make_run(scene=scene, change=with_diagnostic)
+    runs = collect([tmp_path]).runs
+    (means,) = dataset_tables(runs)
+    heads = [column.name for table in (runs_table(runs), means_table(means)) for column in table.columns]
+    assert not {"psnr_unrounded", "their_check"} & set(heads)
+    assert bd_metrics(runs) == ["psnr", "ssim"]
+
+
+def test_the_anchor_is_one_whose_curve_overlaps_and_it_is_said(make_curve, tmp_path):
+    make_curve("3dgs")
+    make_curve("toy", 0.5)
+    make_curve("hac", change=lambda c: c["metrics"]["psnr"].update(mean=c["metrics"]["psnr"]["mean"] - 30))
+    runs = collect([tmp_path]).runs
+    assert choose_anchor(runs, None) == "3dgs"
+    (table,) = (t for t in bd_tables(runs, "3dgs") if t.metric == "psnr")
+    assert table.chosen == "The anchor is 3dgs; hac shares a range of PSNR with 0 other curves."
+    assert bd_table(table).caption.startswith(table.chosen)
+    assert bd_tables(runs, "hac")[0].chosen == "The anchor is hac."
+
+
+def test_tables_without_a_bd_value_are_left_out_with_their_reasons(make_run, tmp_path):
+    make_run("r1", method="3dgs")
+    make_run("r1", method="toy")
+    kept, reasons = with_values(bd_tables(collect([tmp_path]).runs, "3dgs"))
+    assert kept == []
+    assert reasons == ["No BD values by PSNR, SSIM: a curve needs at least 2 points, that of 3dgs has 1."]

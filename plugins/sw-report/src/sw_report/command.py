@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     click.option("--jsonl", "form", flag_value="jsonl", help="Print one JSON object a run."),
     click.option("--anchor", metavar="METHOD", type=name_of("method"),
                  help="What BD-rates compare against.  [default: the most usual "
-                 "of the methods, or the first]"),
+                 "of the methods whose curve overlaps with others]"),
     click.option("--pareto", is_flag=True, help="BD-rates after dropping points that a smaller file equals or beats."),
     click.option("--partial", is_flag=True, help="Means over the scenes that are there, the missing ones named; "
                  "without it, one missing scene leaves no mean."),

@@ -16,6 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import SCHEMA
 from sw_report import numbers
+from sw_report.declared import metric_style
 
 LONGEST_TEXT = 300
 LARGEST_RECORD = 64_000_000  # bytes; ten thousand views with ten metrics take a tenth of it
@@ -176,6 +177,15 @@ class RunFacts(Facts):
     flags: list[Text] = []
     unknown: dict[Text, Text] = {}
     date: Text | None = None
+
+    def is_diagnostic(self, metric: str) -> bool:
+        """Whether a metric only tells conventions apart, and stands in no table; older records do not say it."""
+        return self.metrics[metric].diagnostic or metric_style(metric).diagnostic
+
+    def mean(self, metric: str) -> float | None:
+        """Mean of a metric over the test views, if it is known."""
+        found = self.metrics.get(metric)
+        return None if found is None else found.mean
 
 
 OTHER_SCHEMA = f"record of schema {{}}, this release writes {SCHEMA}: a dash may stand for what only one has"

@@ -20,6 +20,7 @@ from sw_report.aggregate import dataset_tables
 from sw_report.blocks import Part, Section, Table
 from sw_report.declared import metric_style
 from sw_report.distortion import bd_tables, choose_anchor
+from sw_report.looks import looks_of
 from sw_report.pictures import (
     GAIN,
     LONGEST_SIDE,
@@ -112,7 +113,7 @@ def _lede(runs: Sequence[Run]) -> str:
     if len(runs) > 1:
         methods, scenes = _unique([r.variant for r in runs]), _unique([r.facts.scene for r in runs])
         protocols = _unique([r.facts.protocol.id for r in runs])
-        sizes = sorted(r.facts.file.bytes for r in runs)
+        sizes = sorted(r.size for r in runs)
         return (
             f"{len(runs)} runs: {_plural(len(methods), 'method')} on {_plural(len(scenes), 'scene')}, under "
             f"{_plural(len(protocols), 'protocol')}. Files of {numbers.megabytes(sizes[0])} to "
@@ -149,7 +150,7 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     if options.pictures:
         gallery = single_gallery(run, Truth([run], options.opener), PictureBudget())
         sections.append(Section("pictures", PICTURES, [Part(gallery=gallery)], short=SHORT[PICTURES]))
-    views = plots.view_charts([run])
+    views = plots.view_charts([run], looks_of([run]))
     parts = [Part(charts=views)] if views is not None else [Part(text="The record holds no scores of single views.")]
     table = plots.views_table([run])
     parts += [Part(table=table, folded="All scores")] if table is not None else []
@@ -170,7 +171,7 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
 
 def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
     anchor = choose_anchor(runs, options.anchor)
-    style_of = {variant: i for i, variant in enumerate(plots.variants_of(runs))}
+    style_of = looks_of(runs)
     sections = []
     means = dataset_tables(runs, partial=options.partial)
     if means:
@@ -234,9 +235,9 @@ def _place_parts(
     if bars is not None:
         parts.append(Part(BYTES, charts=bars))
         parts.append(Part(table=plots.sections_table(runs), folded="Bytes as a table"))
-    curves, missing = plots.training_charts(runs)
+    curves, missing = plots.training_charts(runs, style_of)
     parts.append(Part("Training", charts=curves, text=_sentence(missing)))
-    by_view = plots.view_charts(runs)
+    by_view = plots.view_charts(runs, style_of)
     if by_view is not None:
         parts.append(Part(VIEWS, charts=by_view))
         parts.append(Part(table=plots.views_table(runs), folded="All scores"))
@@ -244,7 +245,8 @@ def _place_parts(
 
 
 def _training(anchor: str, title: str, runs: Sequence[Run], breakdown: Table | None) -> Section:
-    curves, missing = plots.training_charts(runs)
+    style_of = looks_of(runs)
+    curves, missing = plots.training_charts(runs, style_of)
     parts = [Part(charts=curves, text=_sentence(missing))]
     if breakdown is not None:
         parts.append(Part("Where the time went", table=breakdown))

@@ -9,7 +9,8 @@ from importlib import resources
 from markupsafe import Markup
 
 from sw_report.charts import HEIGHT, STYLES, WIDTH
-from sw_report.plots import distortion_charts, variants_of
+from sw_report.looks import looks_of
+from sw_report.plots import distortion_charts
 from sw_report.runs import Run
 
 FILE_NAME = "rd.svg"
@@ -35,7 +36,7 @@ def rd_svg(runs: Sequence[Run], title: str) -> str | None:
 
     runs    of one scene under one protocol
     """
-    charts = distortion_charts(runs, {variant: i for i, variant in enumerate(variants_of(runs))})
+    charts = distortion_charts(runs, looks_of(runs))
     if charts is None:
         return None
     width = 2 * MARGIN + len(charts.figures) * (WIDTH + GAP) - GAP

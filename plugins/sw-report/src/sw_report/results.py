@@ -200,7 +200,7 @@ def print_plot(directories: Sequence[Path], out: Console) -> None:
     for run in collect(directories).runs:
         value = run.mean("psnr")
         if value is not None:
-            curves.setdefault(run.variant, []).append((run.facts.file.bytes / 1e6, value))
+            curves.setdefault(run.variant, []).append((run.size / 1e6, value))
     if not curves:
         return
     unicode = (getattr(sys.stdout, "encoding", None) or "").lower().startswith("utf")
@@ -217,17 +217,20 @@ def print_plot(directories: Sequence[Path], out: Console) -> None:
 
 def bd_lines(directories: Sequence[Path]) -> list[str]:
     """BD-rates of the methods against the usual anchor, by PSNR; nothing for a single method."""
-    from sw_report.distortion import bd_tables, choose_anchor
+    from sw_report.distortion import bd_tables, choose_anchor, why_anchor, with_values
     from sw_report.numbers import percent
     from sw_report.runs import collect
 
     runs = collect(directories).runs
     anchor = choose_anchor(runs, None)
+    if anchor is None:
+        return []
+    tables, missing = with_values(table for table in bd_tables(runs, anchor) if table.metric == "psnr")
+    if not tables:
+        return missing
     found: list[str] = []
     marks: dict[str, None] = {}
-    for table in bd_tables(runs, anchor):
-        if table.metric != "psnr":
-            continue
+    for table in tables:
         told = []
         for row in table.rows:
             value, why = row.rate.value, row.rate.reason
@@ -238,7 +241,8 @@ def bd_lines(directories: Sequence[Path]) -> list[str]:
             if mark:
                 marks[why] = None
         found.append(f"BD-rate against {anchor} by PSNR (negative saves): {', '.join(told)}")
-    return [*found, *(f"* {why}" for why in marks)]
+    chosen = why_anchor(runs, anchor)
+    return [*found, *([chosen] if ";" in chosen else []), *(f"* {why}" for why in marks)]
 
 
 def _number(metric: str, value: float | None) -> str:

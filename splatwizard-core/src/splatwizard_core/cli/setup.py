@@ -159,15 +159,17 @@ def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) 
 
 
 def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
-    """Threads and device as asked. Raises PluginError for rasterizers that are not installed, CapabilityError."""
+    """Threads and device as asked. Raises PluginError or ConfigError for a choice of rasterizers that is none here,
+    CapabilityError for the device."""
     from splatwizard_core.runs.device import choose_device, set_threads
     from splatwizard_core.runs.session import Session
 
     ppl = resolved.ppl
-    for name in (*ppl.raster.prefer, *ppl.raster.forbid):
-        plugins.rasterizers.entry(name)
     set_threads(ppl.threads)
-    return Session(plugins, choose_device(ppl.device, plugins), say)
+    session = Session(plugins, choose_device(ppl.device, plugins), say)
+    if ppl.raster != type(ppl.raster)():
+        session.rasterizer(resolved, ())  # what is wrong with the choice is told before the work
+    return session
 
 
 def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> Session:

@@ -110,7 +110,7 @@ def render_options(raster: Mapping[str, Any], background: Tensor | None) -> Rast
     for key in RASTER_KEYS.keys() & raster.keys():
         value, kind = raster[key], RASTER_KEYS[key]
         is_size = kind is float and type(value) in (int, float) and 0 <= value < math.inf
-        if not is_size and (kind is float or type(value) is not kind):
+        if not is_size and (kind is float or type(value) is not kind or len(str(value)) > 64):
             raise BitstreamError(f"the file asks for rasterizer option {key} = {value!r:.80}, which makes no sense")
         asked[key] = kind(value)
     return RasterOptions(background=background, **asked)

@@ -23,8 +23,8 @@ from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, p
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.scene.scene import Scene, View
-from splatwizard_native import CoreTime, MemoryMeter, synchronize, track
+from splatwizard_core.scene.scene import Scene
+from splatwizard_native import CoreTime, MemoryMeter, synchronize
 
 FEWEST_SPEED_VIEWS = 8
 
@@ -135,6 +135,7 @@ def measure(
         "speed": None,
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
+        "raster": quality.raster_header(rasterizer.decided(options)),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
         "contended": contended,
         "flags": _flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
@@ -191,21 +192,3 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
     if path.suffix != ".ply":
         import_method(path, session.plugins)  # code is not memory of the model
     return open_file
-
-
-def render_views(
-    session: Session, resolved: ResolvedConfig, opened: Opened, views: Sequence[View], folder: Path
-) -> list[str]:
-    """Draw views as PNG into `folder`; returns the file names."""
-    options = quality.render_options(opened.raster, session.scene(resolved).background.to(session.device))
-    rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(opened.raster))
-    folder.mkdir(parents=True, exist_ok=True)
-    names = quality.png_names([view.name for view in views])
-    opened.model.check_finite()
-    opened.model.prepare()
-    with track("render", total=len(views), unit="views") as bar:
-        for view, name in zip(views, names, strict=True):
-            image = quality.render_view(opened.model, view.camera.to(session.device), rasterizer, options).image
-            quality.save_png(image.cpu(), folder / name)
-            bar.advance()
-    return names

@@ -227,6 +227,9 @@ class Record(Part):
     geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
+    raster_options: dict[str, dict[str, Any]] = Field(
+        {}, description="phase -> options of drawing that are not the defaults: profile, antialias, eps2d, clamp_color"
+    )
     phases: list[PhaseBlock] = Field(description="who served each phase, with distribution and version")
     environment: dict[str, Any]
     contended: dict[str, float] = Field(

@@ -171,6 +171,7 @@ def _record(
         "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
         "train": schema.picked(schema.TrainBlock, training, {"with_pretraining_s": total_seconds(training)}),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
+        "raster_options": {"train": training["raster"], "render": measured.get("raster", {})},
         "contended": contended,
         "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
         "phases": phases_of_run(session.plugins, training, encoding, measured),

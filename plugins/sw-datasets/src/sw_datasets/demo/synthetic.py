@@ -9,10 +9,12 @@ from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, stream
 from sw_datasets.assemble import assemble_scene
+from sw_datasets.demo.kept import kept_or_drawn, picture_key
 from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of, normal_map
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks
@@ -205,6 +207,13 @@ def start_points(world: World, cameras: list[Camera], count: int, generator: tor
     )
 
 
+def _picture(world: World, seed: int, camera: Camera, samples: int, background: float) -> NDArray[np.uint8]:
+    """Draw a camera's picture of `build_world(seed)`, or read it, if it was drawn before."""
+    key = picture_key(stream(seed, "world").get_state().numpy().tobytes(), camera, samples, background)
+    shape = (camera.height, camera.width, 3)
+    return kept_or_drawn(key, shape, partial(draw, world, camera, samples=samples, background=background))
+
+
 def make_scene(
     size: DemoSize | None = None,
     *,
@@ -216,7 +225,7 @@ def make_scene(
     source_size: tuple[int, int] | None = None,
     resolution: int = -1,
 ) -> Scene:
-    """The demo scene, of the size asked for. Pictures are drawn on first use; equal arguments give equal bits.
+    """The demo scene, of the size asked for. Pictures are drawn or read on first use; equal arguments give equal bits.
 
     seed            layout and textures; init_seed: start points and surface samples
     background      "black" or "white", behind the stage
@@ -228,7 +237,7 @@ def make_scene(
     cameras = orbit(size.views, size.width, size.height)
     grey = 1.0 if background == "white" else 0.0
     views = [
-        View(camera, f"view_{i:03d}.png", partial(draw, world, camera, samples=size.samples, background=grey))
+        View(camera, f"view_{i:03d}.png", partial(_picture, world, seed, camera, size.samples, grey))
         for i, camera in enumerate(cameras)
     ]
     width, height = source_size or (size.width, size.height)
