@@ -61,6 +61,7 @@ def test_a_bounded_scene_decides_by_its_cameras(scene):
     assert found.depth_trunc == pytest.approx(6)
     assert found.voxel_size == pytest.approx(6 / 1024)
     assert found.sdf_trunc == pytest.approx(5 * found.voxel_size)
+    assert resolve(MeshSettings(unbounded=True), scene, {}).mesh_res == 256
     assert (found.clusters, found.depth_ratio, found.cull, found.min_views) == (50, 0.0, "none", 1)
 
 
