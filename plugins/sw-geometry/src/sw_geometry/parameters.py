@@ -59,7 +59,9 @@ def resolve(settings: MeshSettings, scene: Scene, static: Mapping[str, Any]) -> 
     bounded: Mapping[str, Any] = DTU if is_dtu else {"depth_trunc": 2 * radius, "clusters": AUTO_CLUSTERS}
     depth_trunc = settings.depth_trunc or bounded["depth_trunc"]
     mesh_res = settings.mesh_res or (UNBOUNDED_RES if settings.unbounded else MESH_RES)
-    voxel = settings.voxel_size or bounded.get("voxel_size") or depth_trunc / mesh_res
+    # Published code knows no such limit; below a pixel, depth that is looked up at the nearest one has no detail.
+    footprint = 0.0 if settings.mesh_res else radius / max(view.camera.fx for view in scene.train)
+    voxel = settings.voxel_size or bounded.get("voxel_size") or max(depth_trunc / mesh_res, footprint)
     truncation = DTU["sdf_trunc"] / DTU["voxel_size"] if is_dtu else AUTO_TRUNCATION
     return Parameters(
         voxel_size=voxel,
