@@ -489,3 +489,20 @@ def test_small_sections_are_told_by_name(make_run, tmp_path):
     legend = [name for _, name in section_bars(collect([tmp_path]).runs).legend]
     assert legend[0] == "part-0"
     assert legend[-1] == "smaller: part-15, part-16, part-17, part-18, part-19"
+
+
+def test_files_that_are_not_compressed_are_marked(make_run, tmp_path):
+    def stored_by(*coders):
+        def change(content):
+            parts = [{"kind": "coder", "name": name, "distribution": "sw-codecs", "version": "1"} for name in coders]
+            content["phases"] = [{"phase": "encode", "provided_by": parts}]
+
+        return change
+
+    make_run("r1", change=stored_by("range"), size=1000)
+    make_run("r2", change=stored_by("plain"), size=2000)
+    make_run("r3", change=stored_by("plain", "range"), size=3000)  # something is compressed
+    make_run("r4", change=stored_by("not-installed"), size=4000)
+    table = runs_table(collect([tmp_path]).runs)
+    assert [row[1] for row in texts(table)] == ["r1", "r2, float32", "r3", "r4"]
+    assert "float32: the parameters as they were trained, not compressed." in table.notes

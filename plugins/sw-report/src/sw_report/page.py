@@ -124,7 +124,8 @@ def _lede(runs: Sequence[Run]) -> str:
     views = facts.test_views or len(facts.views)
     psnr = runs[0].mean("psnr")
     reached = f" that reach {psnr:.2f} dB on {_plural(views, 'test view')}" if psnr is not None else ""
-    return f"{numbers.megabytes(facts.file.bytes)} MB hold {stored}{reached}; every score is of the decoded file."
+    form = f" in {facts.uncompressed()}, not compressed," if facts.uncompressed() else ""
+    return f"{numbers.megabytes(facts.file.bytes)} MB hold {stored}{form}{reached}; every score is of the decoded file."
 
 
 def _plural(n: int, word: str) -> str:

@@ -45,8 +45,8 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
                 Point(
                     run.size / 1e6,
                     value,
-                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} "
-                    f"at {numbers.megabytes(run.size)} MB",
+                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} at "
+                    f"{' '.join((numbers.megabytes(run.size), 'MB', run.facts.uncompressed())).strip()}",
                     run.facts.rate or "" if len(runs) <= MOST_LABELLED else "",
                 )
                 for run in own

@@ -48,7 +48,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
     rows: list[Row] = []
     for run in runs:
         facts = run.facts
-        cells: list[str | Cell] = [run.variant, facts.rate or numbers.MISSING]
+        cells: list[str | Cell] = [run.variant, facts.rate_label() or numbers.MISSING]
         cells += [str(len(run.seeds))] if several else []
         cells += [_scored(run, name) for name in names]
         cells += [
@@ -70,6 +70,7 @@ def runs_table(runs: Sequence[Run]) -> Table:
     notes = missing_metrics(runs)
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
+    notes += uncompressed_notes(run.facts for run in runs)
     if several:
         notes.append(numbers.SEEDS_NOTE)
     if any(facts.contended for run in runs for facts in run.seeds):
@@ -80,6 +81,13 @@ def runs_table(runs: Sequence[Run]) -> Table:
     if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
         notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
     return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes, sortable=True)
+
+
+def uncompressed_notes(runs: Iterable[RunFacts]) -> list[str]:
+    """One line for each number format of files that are not compressed."""
+    return [
+        numbers.UNCOMPRESSED_NOTE.format(name) for name in dict.fromkeys(run.uncompressed() for run in runs) if name
+    ]
 
 
 MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[float | None], str]], ...] = (
