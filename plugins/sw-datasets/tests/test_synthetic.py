@@ -52,13 +52,16 @@ def test_every_view_shows_something_and_no_two_are_alike(tiny):
     assert min((a - b).abs().mean() for i, a in enumerate(pictures) for b in pictures[:i]) > 3
 
 
-def test_equal_seeds_give_equal_bits_in_another_process_with_other_threads():
+def test_equal_seeds_give_equal_bits_in_another_process_with_other_threads(tmp_path, monkeypatch):
     code = (
         "import sys; sys.path.insert(0, sys.argv[1]); from test_synthetic import digest\n"
         "from sw_datasets.demo.synthetic import SIZES, make_scene\n"
         "print(digest(make_scene(SIZES['tiny'])))"
     )
-    env = {**os.environ, "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2"}
+    # Each with a cache of its own: neither reads what the other drew.
+    monkeypatch.setenv("SPLATWIZARD_CACHE", str(tmp_path / "here"))
+    there = str(tmp_path / "there")
+    env = {**os.environ, "OMP_NUM_THREADS": "2", "OPENBLAS_NUM_THREADS": "2", "SPLATWIZARD_CACHE": there}
     command = [sys.executable, "-c", code, os.path.dirname(__file__)]
     other = subprocess.run(command, capture_output=True, text=True, env=env, check=True).stdout.strip()
     assert digest(make_scene(SIZES["tiny"])) == other
@@ -104,6 +107,28 @@ def test_surface_samples_are_on_visible_surfaces_with_outward_normals(tiny):
         assert not solid.shape.contains(solid.shape.to_local(p + 1e-5 * n)).any()
         inner |= solid.shape.contains(solid.shape.to_local(p - 1e-5 * n))
     assert inner.mean() > 0.995  # all but points within 10 micrometres of an edge
+
+
+def test_the_distance_to_the_scene_is_zero_on_its_samples_and_grows_along_their_normals(tiny):
+    points, normals = (tiny.ground_truth[name].double().numpy() for name in ("points", "normals"))
+    distance = tiny.ground_truth["distance"]
+    assert np.abs(distance(points)).max() < 1e-6
+    out = distance(points + 0.01 * normals)
+    assert np.median(out) == pytest.approx(0.01)
+    assert out.max() < 0.01 + 1e-6  # less where another solid is nearer
+    assert distance(np.array([[0.0, 0.0, 9.0]])) == pytest.approx(9 - 0.52 * 2, abs=0.05)  # above the large sphere
+
+
+def test_normal_maps_belong_to_the_depth_maps(tiny):
+    from sw_gaussians.surface import depth_normals
+
+    angles = []
+    for view in tiny.test:
+        depth, normals = (tiny.ground_truth[kind][view.name] for kind in ("depth", "normal_maps"))
+        assert torch.equal(depth[0] > 0, normals.norm(dim=0) > 0.5)
+        cosine = (depth_normals(depth, view.camera) * normals).sum(dim=0)[depth[0] > 0]
+        angles.append(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))))
+    assert torch.cat(angles).median() < 0.6  # of 64 x 48 pixels; spheres are coarse there
 
 
 def test_start_points_lie_near_the_surfaces_with_the_colours_of_the_pictures(tiny):

@@ -5,6 +5,7 @@ import json
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from sw_report.looks import looks_of
 from sw_report.plots import training_charts
 from sw_report.runs import collect
 from sw_report.training_log import log_path, read_training, thin
@@ -79,7 +80,8 @@ def test_the_page_draws_what_tasks_recorded(make_run):
         for step in (301, 302):
             file.write(json.dumps({"stage": 0, "step": step, "scalars": {"dead <codes>": step}}) + "\n")
         file.write(json.dumps({"stage": 0, "step": 303, "scalars": {"only once": 1}}) + "\n")
-    charts, missing = training_charts(collect([directory]).runs)
+    runs = collect([directory]).runs
+    charts, missing = training_charts(runs, looks_of(runs))
     assert not missing
     assert [figure.caption for figure in charts.figures][2:] == ["dead <codes>"]
     assert "dead &lt;codes&gt; over steps" in str(charts.figures[2].svg)

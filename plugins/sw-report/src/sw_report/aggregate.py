@@ -5,9 +5,11 @@ Source: evaluation protocol, aggregation. A mean over what happens to exist woul
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from sw_report.configurations import seed_of
 from sw_report.declared import dataset_facts
 from sw_report.numbers import ordered_metrics
 from sw_report.runs import Run, natural
@@ -22,6 +24,8 @@ class MeanRow:
     metrics     by name; None: a scene is missing (or its value unknown), and partial means were not asked for
     size        mean bytes, or None likewise
     counts      mean primitives by unit, or None likewise
+    seeds       of each scene; 1 where the scenes have different ones
+    deviations  standard deviation (n - 1) of a metric's mean over the scenes, over the seeds; empty for one seed
     """
 
     variant: str
@@ -31,6 +35,8 @@ class MeanRow:
     metrics: dict[str, float | None]
     size: float | None
     counts: dict[str, float] | None
+    seeds: int = 1
+    deviations: dict[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,7 @@ class DatasetTable:
 
     published   whether `scenes` are the published ones (else: all that the runs are of)
     protocols   ids; several only where they differ in nothing but the picture folder
+    directions  metric -> "higher" or "lower", what is better
     """
 
     dataset: str
@@ -47,6 +54,7 @@ class DatasetTable:
     published: bool
     protocols: tuple[str, ...]
     rows: list[MeanRow]
+    directions: dict[str, str] = field(default_factory=dict)
 
 
 def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[DatasetTable]:
@@ -99,7 +107,7 @@ def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
     for run, scene in scene_of.items():
         if scene in scenes:
             rows.setdefault((run.variant, run.facts.rate), {})[scene] = run
-    names = ordered_metrics(name for run in runs for name in run.facts.metrics)
+    names = ordered_metrics(name for run in runs for name in run.facts.metrics if not run.facts.is_diagnostic(name))
     return DatasetTable(
         runs[0].facts.dataset,
         dataset.title,
@@ -110,6 +118,7 @@ def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
             (_row(variant, rate, by_scene, scenes, names, partial) for (variant, rate), by_scene in rows.items()),
             key=lambda row: (natural(row.variant), natural(row.rate or "")),
         ),
+        {name: metric.direction for run in runs for name, metric in run.facts.metrics.items()},
     )
 
 
@@ -120,16 +129,26 @@ def _row(
     present = [runs[scene] for scene in scenes if scene in runs]
     whole = not missing or partial
     counts = None
-    if whole and present and all(run.facts.counts.keys() == present[0].facts.counts.keys() for run in present):
-        counts = {unit: mean([run.facts.counts[unit] for run in present]) or 0.0 for unit in present[0].facts.counts}
+    if whole and present and all(run.counts.keys() == present[0].counts.keys() for run in present):
+        counts = {unit: mean([run.counts[unit] for run in present]) or 0.0 for unit in present[0].counts}
+    seeds, deviations = 1, dict[str, float]()
+    if whole and len({tuple(map(seed_of, run.seeds)) for run in present}) == 1:
+        seeds = len(present[0].seeds)
+        for name in metrics if seeds > 1 else ():
+            by_seed = [mean([run.seeds[i].mean(name) for run in present], partial=partial) for i in range(seeds)]
+            known = [value for value in by_seed if value is not None]
+            if len(known) == seeds:
+                deviations[name] = statistics.stdev(known)
     return MeanRow(
         variant,
         rate,
         tuple(scene for scene in scenes if scene in runs),
         missing,
         {name: mean([run.mean(name) for run in present], partial=partial) if whole else None for name in metrics},
-        mean([run.facts.file.bytes for run in present]) if whole else None,
+        mean([run.size for run in present]) if whole else None,
         counts,
+        seeds,
+        deviations,
     )
 
 

@@ -16,6 +16,7 @@ from sw_report.axes import Axis, fitted_axis, tick_labels
 WIDTH, HEIGHT = 420, 260
 LEFT, RIGHT, TOP, BOTTOM = 50, 16, 12, 40
 STYLES = 8  # colours in the style sheet: classes s0 .. s7
+DASHES = 4  # patterns of lines in the style sheet: solid, classes dash1 .. dash3
 
 MARKERS = (
     "M-4,0a4,4 0 1,0 8,0a4,4 0 1,0 -8,0Z",  # circle
@@ -45,6 +46,7 @@ class Series:
 
     style   colour and marker, any number
     dashed  the line is dashed
+    dash    pattern of the line, any number: 0 is solid; for lines of one colour
     marks   points are marked; False: the line alone
     joined  points are joined by a line
     """
@@ -55,6 +57,7 @@ class Series:
     dashed: bool = False
     marks: bool = True
     joined: bool = True
+    dash: int = 0
 
 
 @dataclass(frozen=True)
@@ -136,7 +139,7 @@ def _series(series: Series, x: Axis, y: Axis) -> Markup:
         line = "M" + "L".join(f"{px:.1f},{py:.1f}" for px, py in at)
         name = Markup("") if series.marks else Markup("<title>{}</title>").format(series.name)
         parts.append(
-            Markup('<path class="line{}" d="{}">{}</path>').format(" dashed" if series.dashed else "", line, name)
+            Markup('<path class="line{}" d="{}">{}</path>').format(_pattern(series.dashed, series.dash), line, name)
         )
     if series.marks:
         shape = _marker(series.style)
@@ -157,18 +160,23 @@ def _series(series: Series, x: Axis, y: Axis) -> Markup:
     return Markup('<g class="s{}">{}</g>').format(series.style % STYLES, Markup("").join(parts))
 
 
+def _pattern(dashed: bool, dash: int) -> str:
+    """Classes of a line's pattern."""
+    return " dashed" if dashed else f" dash{dash % DASHES}" if dash % DASHES else ""
+
+
 def _marker(style: int) -> str:
     """Shape of a series: colours repeat after STYLES series, then each has another shape than before."""
     return MARKERS[(style + style // STYLES) % len(MARKERS)]
 
 
-def swatch(style: int, *, dashed: bool = False, marks: bool = True) -> Markup:
+def swatch(style: int, *, dashed: bool = False, marks: bool = True, dash: int = 0) -> Markup:
     """Key of a series in a legend."""
     marker = Markup('<g class="point" transform="translate(14,7)"><path d="{}"/></g>').format(_marker(style))
     return Markup(
         '<svg class="swatch s{}" viewBox="0 0 28 14" width="28" height="14" aria-hidden="true">'
         '<path class="line{}" d="M1,7H27"/>{}</svg>'
-    ).format(style % STYLES, " dashed" if dashed else "", marker if marks else Markup(""))
+    ).format(style % STYLES, _pattern(dashed, dash), marker if marks else Markup(""))
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,11 @@ nothing more is known of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatwizard_core.tooling import load_plugins
+from splatwizard_core.tooling import load_plugins, resolve
 
 
 @dataclass(frozen=True)
@@ -22,12 +22,14 @@ class MetricStyle:
     unit        "dB", or nothing
     digits      decimals in tables
     position    place in tables, smaller first; infinite if nothing is declared
+    diagnostic  whether it only tells conventions apart, and stands in no table
     """
 
     label: str
     unit: str = ""
     digits: int = 4
     position: float = math.inf
+    diagnostic: bool = False
 
     @property
     def heading(self) -> str:
@@ -73,6 +75,7 @@ def metric_style(name: str) -> MetricStyle:
         "" if by_name else str(declared.get("unit", "")),
         digits if isinstance(digits, int) and 0 <= digits < 16 else MetricStyle.digits,
         position if isinstance(position, (int, float)) else math.inf,
+        bool(by_name),
     )
 
 
@@ -95,3 +98,23 @@ def bd_anchor_rank(method: str) -> float:
     declared: Mapping[str, Any] = methods.entry(method).declared if method in methods else {}
     rank = declared.get("bd_anchor")
     return rank if isinstance(rank, (int, float)) else math.inf
+
+
+def uncompressed(encoders: Iterable[tuple[str, str]]) -> str:
+    """Number format of the parameters in a file that holds them as they are; empty if anything compressed them.
+
+    encoders    (kind, name) of the parts that served the encoding
+    """
+    coders = load_plugins().coders
+    names = [name for kind, name in encoders if kind == "coder"]
+    return str(coders.entry(names[0]).declared.get("stores", "")) if len(names) == 1 and names[0] in coders else ""
+
+
+def rate_settings(method: str, preset: str | None, rate: str | None) -> tuple[set[str], dict[str, Any]]:
+    """Keys that a rate point of an installed method sets, and its whole configuration; empty if that cannot be told."""
+    try:
+        found = resolve(load_plugins().methods.entry(method).load(), preset, rate)
+    except Exception:  # not installed, another release, or a stranger's fault: the record alone has to do
+        return set(), {}
+    keys = {key for key, who in found.provenance.items() if who.startswith("rate ")}
+    return keys, found.config.model_dump(mode="json")

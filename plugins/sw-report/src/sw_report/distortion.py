@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from splatwizard_core.api import UserInputError
@@ -41,19 +41,21 @@ class BdRow:
 
 @dataclass(frozen=True)
 class BdTable:
-    """BD values of all methods against one anchor, by one metric, in one protocol group."""
+    """BD values of all methods against one anchor, by one metric, in one protocol group; `chosen` says why that."""
 
     metric: str
     anchor: str
     protocol: str
     rows: list[BdRow]
+    chosen: str = ""
 
 
 def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
     """Choose the variant that others are compared against; None if there is only one.
 
-    wanted  a variant or a method; None: the method that declares the smallest `bd_anchor`, else the alphabetically
-            first variant
+    wanted  a variant or a method; None: of those whose curve shares a range with at least half of the other curves,
+            the one whose method declares the smallest `bd_anchor`, else the alphabetically first; if there is none,
+            the one that shares a range with most
 
     Raises UserInputError for a name that no run is of, or that several variants share.
     """
@@ -67,8 +69,47 @@ def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
         return matches[0]
     if len(variants) < 2:
         return None
+    ranked = _ranked(runs)
+    shared = {variant: len(overlapping(runs, variant)) for variant in ranked}
+    curves = sum(count > 0 for count in shared.values())
+    enough = [variant for variant in ranked if shared[variant] and 2 * shared[variant] >= curves - 1]
+    return enough[0] if enough else max(ranked, key=lambda variant: shared[variant])
+
+
+def why_anchor(runs: Sequence[Run], anchor: str) -> str:
+    """Say in a sentence what the anchor is, and why it is not the usual one, if that is so."""
+    usual = _ranked(runs)[0]
+    if usual == anchor:
+        return f"The anchor is {anchor}."
+    return f"The anchor is {anchor}; {usual} shares a range of PSNR with {len(overlapping(runs, usual))} other curves."
+
+
+def _ranked(runs: Sequence[Run]) -> list[str]:
+    """Variants, the most usual anchors first."""
     methods = {run.variant: run.facts.method for run in runs}
-    return min(variants, key=lambda variant: (bd_anchor_rank(methods[variant]), natural(variant)))
+    return sorted(methods, key=lambda variant: (bd_anchor_rank(methods[variant]), natural(variant)))
+
+
+def overlapping(runs: Sequence[Run], variant: str) -> list[str]:
+    """Other variants whose curve of PSNR (else of the first metric) shares a range with this one's, on any scene."""
+    known = bd_metrics(runs)[:1]
+    places = dict.fromkeys(run.place for run in runs if run.variant == variant)
+    others = [other for other in dict.fromkeys(run.variant for run in runs) if other != variant]
+    return [
+        other for other in others
+        if any(_shares_a_range(runs, place, variant, other, metric) for metric in known for place in places)
+    ]  # fmt: skip
+
+
+def _shares_a_range(runs: Sequence[Run], place: tuple[str, str], first: str, second: str, metric: str) -> bool:
+    """Whether two curves of one scene, of two points or more, reach a common range of quality."""
+    reached = []
+    for variant in (first, second):
+        _, quality = curve([run for run in runs if run.place == place and run.variant == variant], metric)
+        if len(quality) < 2:
+            return False
+        reached.append((min(quality), max(quality)))
+    return max(low for low, _ in reached) < min(high for _, high in reached)
 
 
 def bd_metrics(runs: Sequence[Run]) -> list[str]:
@@ -77,7 +118,7 @@ def bd_metrics(runs: Sequence[Run]) -> list[str]:
         name
         for run in runs
         for name, metric in run.facts.metrics.items()
-        if metric.mean is not None and metric.direction in DIRECTIONS and not metric.diagnostic
+        if metric.mean is not None and metric.direction in DIRECTIONS and not run.facts.is_diagnostic(name)
     )
 
 
@@ -95,7 +136,7 @@ def bd_tables(runs: Sequence[Run], anchor: str | None, *, pareto: bool = False, 
     """
     if anchor is None:
         return []
-    tables = []
+    tables, chosen = [], why_anchor(runs, anchor)
     for group in comparable(runs):
         places = dict.fromkeys(run.place for run in group if run.variant == anchor)
         others = [v for v in dict.fromkeys(run.variant for run in group) if v != anchor]
@@ -109,16 +150,29 @@ def bd_tables(runs: Sequence[Run], anchor: str | None, *, pareto: bool = False, 
                 rows += cells
                 if len(cells) > 1:
                     rows.append(_mean_row(variant, cells, partial))
-            tables.append(BdTable(metric, anchor, ids, rows))
+            tables.append(BdTable(metric, anchor, ids, rows, chosen))
     return tables
+
+
+def with_values(tables: Iterable[BdTable]) -> tuple[list[BdTable], list[str]]:
+    """Tables that hold a value, and for those that hold none one line for each reason."""
+    kept, reasons = [], dict[str, dict[str, None]]()
+    for table in tables:
+        cells = [cell for row in table.rows for cell in (row.rate, row.quality)]
+        if any(cell.value is not None for cell in cells):
+            kept.append(table)
+            continue
+        for cell in cells:
+            reasons.setdefault(cell.reason, {})[metric_style(table.metric).label] = None
+    return kept, [f"No BD values by {', '.join(labels)}: {why}." for why, labels in reasons.items() if why]
 
 
 def curve(runs: Sequence[Run], metric: str) -> tuple[list[float], list[float]]:
     """(bytes, quality), quality turned so that higher is better."""
-    known = [(float(run.facts.file.bytes), run.facts.metrics[metric]) for run in runs if run.mean(metric) is not None]
+    known = [(run, value) for run in runs if (value := run.mean(metric)) is not None]
     return (
-        [size for size, _ in known],
-        [(m.mean or 0.0) * (-1 if m.direction == "lower" else 1) for _, m in known],
+        [run.size for run, _ in known],
+        [value * (-1 if run.facts.metrics[metric].direction == "lower" else 1) for run, value in known],
     )
 
 

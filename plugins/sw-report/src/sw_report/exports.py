@@ -1,4 +1,4 @@
-"""Results for other programs and for papers: CSV, JSON, JSON lines, Markdown, LaTeX."""
+"""Results for other programs: CSV, JSON, JSON lines, Markdown."""
 
 from __future__ import annotations
 
@@ -14,10 +14,11 @@ from typing import Any
 from splatwizard_core.tooling import write_atomic
 from sw_report import numbers
 from sw_report.aggregate import dataset_tables
-from sw_report.blocks import Table
-from sw_report.distortion import bd_tables
+from sw_report.blocks import Cell, Table
+from sw_report.configurations import seed_of
+from sw_report.distortion import bd_tables, with_values
 from sw_report.results_tables import bd_table, means_table, metric_names, runs_table
-from sw_report.runs import Collection, Run
+from sw_report.runs import Collection, Run, machine
 
 # What the survey of 3DGS compression asks of a table of one method on one scene.
 SURVEY_COLUMNS = ("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians")
@@ -33,23 +34,26 @@ def survey_row(run: Run, lpips: str | None = numbers.FIELD_LPIPS) -> list[str]:
         mean = run.mean(name) if name is not None else None
         return "" if mean is None else f"{mean:.{digits}f}"
 
-    primitives = run.facts.counts.get("num_gaussians")
+    primitives = run.counts.get("num_gaussians")
     return [
         _cell(run.facts.rate or run.facts.preset or ""), value("psnr", 4), value("ssim", 5), value(lpips, 5),
-        str(run.facts.file.bytes), "" if primitives is None else str(primitives),
+        str(round(run.size)), "" if primitives is None else str(round(primitives)),
     ]  # fmt: skip
 
 
 def to_csv(runs: Sequence[Run]) -> str:
-    """One table of all runs: what tells them apart, then the survey's columns."""
+    """One table of all runs: what tells them apart, the survey's columns, the number of seeds and their deviations."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["Dataset", "Scene", "Protocol", "Method", *SURVEY_COLUMNS, "LPIPS variant"])
+    deviations = [f"{name} deviation" for name in SURVEY_COLUMNS[1:4]]
+    writer.writerow(["Dataset", "Scene", "Protocol", "Method", *SURVEY_COLUMNS, "LPIPS variant", "Seeds", *deviations])
     for run in runs:
         facts = run.facts
         where = [facts.dataset, facts.scene, facts.protocol.id, run.variant]
         lpips = numbers.main_lpips(name for name in facts.metrics if run.mean(name) is not None)
-        writer.writerow([*map(_cell, where), *survey_row(run, lpips), lpips or ""])
+        spread = [None if name is None else run.deviation(name) for name in ("psnr", "ssim", lpips)]
+        told = ["" if value is None else f"{value:.5f}" for value in spread]
+        writer.writerow([*map(_cell, where), *survey_row(run, lpips), lpips or "", str(len(run.seeds)), *told])
     return text.getvalue()
 
 
@@ -86,8 +90,9 @@ def to_dict(collection: Collection, *, anchor: str | None, partial: bool, pareto
 
 
 def run_dict(run: Run) -> dict[str, Any]:
-    """One run as plain values."""
-    facts = run.facts
+    """One run, or the mean over its seeds, as plain values."""
+    facts, names = run.facts, metric_names([run], diagnostic=True)
+    deviations = {name: found for name in names if (found := run.deviation(name)) is not None}
     return {
         "directory": str(run.directory),
         "method": run.variant,
@@ -96,17 +101,20 @@ def run_dict(run: Run) -> dict[str, Any]:
         "dataset": facts.dataset,
         "scene": facts.scene,
         "protocol": facts.protocol.id,
-        "metrics": {name: run.mean(name) for name in metric_names([run], diagnostic=True)},
-        "bytes": facts.file.bytes,
+        "metrics": {name: run.mean(name) for name in names},
+        "deviations": deviations,
+        "seeds": [seed_of(each) for each in run.seeds],
+        "bytes": round(run.size),
         "sections": facts.file.sections,
-        "counts": facts.counts,
+        "counts": {unit: round(n) for unit, n in run.counts.items()},
         "steps": facts.train.steps,
-        "train_s": facts.train.train_s,
-        "with_pretraining_s": facts.train.with_pretraining_s,
-        "encode_s": facts.codec.encode_s,
-        "decode_s": facts.codec.decode_s,
-        "fps": facts.speed.fps,
-        "contended": facts.contended,
+        "train_s": run.over_seeds(lambda each: each.train.train_s)[0],
+        "with_pretraining_s": run.over_seeds(lambda each: each.train.with_pretraining_s)[0],
+        "encode_s": run.over_seeds(lambda each: each.codec.encode_s)[0],
+        "decode_s": run.over_seeds(lambda each: each.codec.decode_s)[0],
+        "fps": run.over_seeds(lambda each: each.speed.fps)[0],
+        "machines": list(dict.fromkeys(map(machine, run.seeds))),
+        "contended": {phase: share for each in run.seeds for phase, share in each.contended.items()},
         "flags": facts.flags,
         "unknown": facts.unknown,
         "date": facts.date,
@@ -114,8 +122,9 @@ def run_dict(run: Run) -> dict[str, Any]:
 
 
 def to_json_lines(runs: Sequence[Run]) -> str:
-    """One JSON object a run and line."""
-    return "".join(json.dumps(run_dict(run), allow_nan=False) + "\n" for run in runs)
+    """One JSON object a run and line, every seed by itself."""
+    each = [single for run in runs for single in run.repeats or (run,)]
+    return "".join(json.dumps(run_dict(run), allow_nan=False) + "\n" for run in each)
 
 
 def tables_of(collection: Collection, *, anchor: str | None, partial: bool, pareto: bool) -> list[tuple[str, Table]]:
@@ -126,7 +135,7 @@ def tables_of(collection: Collection, *, anchor: str | None, partial: bool, pare
         found.append((f"{place[0]}, protocol {place[1]}", runs_table([run for run in runs if run.place == place])))
     for means in dataset_tables(runs, partial=partial):
         found.append((f"{means.title}, protocol {', '.join(means.protocols)}", means_table(means)))
-    for bd in bd_tables(runs, anchor, pareto=pareto, partial=partial):
+    for bd in with_values(bd_tables(runs, anchor, pareto=pareto, partial=partial))[0]:
         found.append((f"{numbers.heading(bd.metric)} against {bd.anchor}, protocol {bd.protocol}", bd_table(bd)))
     return found
 
@@ -137,31 +146,11 @@ def to_markdown(tables: Sequence[tuple[str, Table]], notes: Sequence[str]) -> st
     for title, table in tables:
         lines = [f"**{_markdown(title)}**", "", "| " + " | ".join(_markdown(c.name) for c in table.columns) + " |"]
         lines.append("|" + "|".join("---" if c.text or not i else "---:" for i, c in enumerate(table.columns)) + "|")
-        lines += ["| " + " | ".join(_markdown(cell.text) for cell in row.cells) + " |" for row in table.rows]
+        lines += ["| " + " | ".join(map(_marked, row.cells)) + " |" for row in table.rows]
         lines += ["", *(f"{_markdown(note)}  " for note in [table.caption, *table.notes] if note)]
         blocks.append("\n".join(lines).rstrip() + "\n")
     if notes:
         blocks.append("\n".join(f"- {_markdown(note)}" for note in notes) + "\n")
-    return "\n".join(blocks)
-
-
-def to_latex(tables: Sequence[tuple[str, Table]], notes: Sequence[str]) -> str:
-    """Tables for booktabs (\\usepackage{booktabs}); what must be known stands in comments and under the table."""
-    blocks = [f"% {_comment(note)}\n" for note in notes]
-    for title, table in tables:
-        align = "".join("l" if c.text or not i else "r" for i, c in enumerate(table.columns))
-        lines = [
-            r"\begin{table}", r"  \centering", f"  \\caption{{{_latex(title)}. {_latex(table.caption)}}}",
-            f"  \\begin{{tabular}}{{{align}}}", r"    \toprule",
-            "    " + " & ".join(_latex(c.name) for c in table.columns) + r" \\", r"    \midrule",
-        ]  # fmt: skip
-        for row in table.rows:
-            if row.emphasis:
-                lines.append(r"    \midrule")
-            lines.append("    " + " & ".join(_latex(cell.text) for cell in row.cells) + r" \\")
-        lines += [r"    \bottomrule", r"  \end{tabular}"]
-        lines += [f"  \\par\\smallskip\\footnotesize {_latex(note)}" for note in table.notes]
-        blocks.append("\n".join([*lines, r"\end{table}"]) + "\n")
     return "\n".join(blocks)
 
 
@@ -175,20 +164,9 @@ def _name(text: str) -> str:
     return re.sub(r"[^\w.+@()\[\]-]+", "_", text).strip(".") or "_"
 
 
+def _marked(cell: Cell) -> str:
+    return f"**{_markdown(cell.text)}**" if cell.best else _markdown(cell.text)
+
+
 def _markdown(text: str) -> str:
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text.replace("\n", " "))
-
-
-def _comment(text: str) -> str:
-    return " ".join(text.split())
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "–": "--", "−": "$-$", "×": r"$\times$", "·": r"$\cdot$", "†": r"\dag{}",
-}  # fmt: skip
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text)

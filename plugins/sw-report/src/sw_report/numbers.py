@@ -8,6 +8,10 @@ from collections.abc import Iterable
 from sw_report.declared import metric_key, metric_style
 
 MISSING = "–"
+MACHINES = "ᵃᵇᶜᵈᵉᶠᵍʰ"
+"""Marks of values that come from different machines; later ones share the last."""
+SEEDS_NOTE = "± standard deviation over the seeds (of the sample, n - 1); the value is their mean."
+UNCOMPRESSED_NOTE = "{}: the parameters as they were trained, not compressed."
 SHARED = "†"
 SHARED_NOTE = f"{SHARED} Other processes wanted the cores meanwhile: on an idle machine it is faster."
 FIELD_LPIPS = "lpips_vgg_3dgs"  # the form that the field's tables, the survey's among them, print
@@ -44,6 +48,11 @@ def score(metric: str, value: float | None, *, digits: int | None = None) -> str
     if value is None:
         return MISSING
     return f"{value:.{metric_style(metric).digits if digits is None else digits}f}"
+
+
+def with_deviation(text: str, deviation: str | None) -> str:
+    """A mean over seeds and its standard deviation: `27.20 ± 0.05`; the value alone where there is none."""
+    return text if deviation is None else f"{text} ± {deviation}"
 
 
 def megabytes(size: float | None) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from sw_report import numbers
 from sw_report.blocks import Cell, Charts, Figure, Table, columns, row
@@ -16,6 +17,7 @@ from sw_report.training_log import TrainingCurves, log_path, read_training
 
 MOST_SECTIONS = 2 * STYLES - 1  # with a colour of their own; smaller ones are joined
 MOST_LINES = 8
+MOST_LABELLED = 16  # points of a chart with their rate points beside them
 MOST_VIEWS_IN_TABLE = 300
 MOST_BARS = 24
 
@@ -38,14 +40,14 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
         style = metric_style(metric)
         lines = []
         for variant in variants:
-            own = sorted((r for r in runs if r.variant == variant), key=lambda r: r.facts.file.bytes)
+            own = sorted((r for r in runs if r.variant == variant), key=lambda r: r.size)
             points = [
                 Point(
-                    run.facts.file.bytes / 1e6,
+                    run.size / 1e6,
                     value,
-                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} "
-                    f"at {numbers.megabytes(run.facts.file.bytes)} MB",
-                    run.facts.rate or "" if len(variants) <= 2 else "",
+                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} at "
+                    f"{' '.join((numbers.megabytes(run.size), 'MB', run.facts.uncompressed())).strip()}",
+                    run.facts.rate or "" if len(runs) <= MOST_LABELLED else "",
                 )
                 for run in own
                 if (value := run.mean(metric)) is not None
@@ -92,7 +94,8 @@ def section_bars(runs: Sequence[Run]) -> Charts | None:
         bars.append(Bar(run.label, f"{numbers.megabytes(size)} MB", parts))
     legend = [(square(style), name) for name, style in styles.items() if style < MOST_SECTIONS]
     if len(styles) > MOST_SECTIONS:
-        legend.append((square(MOST_SECTIONS), f"{len(styles) - MOST_SECTIONS} smaller sections"))
+        smaller = [name for name, style in styles.items() if style == MOST_SECTIONS]
+        legend.append((square(MOST_SECTIONS), f"smaller: {', '.join(smaller)}"))
     svg = stacked_bars(f"Bytes by section for {len(shown)} runs", bars)
     notes = [f"{len(shown)} of {len(with_sections)} runs, spread evenly."] if len(shown) < len(with_sections) else []
     if len(with_sections) < len(runs):
@@ -135,12 +138,25 @@ def single_sections_table(run: Run) -> Table | None:
     return Table("Bytes by section", columns(["section", "bytes", "share", ""]), rows, notes=notes, wide=True)
 
 
-def training_charts(runs: Sequence[Run]) -> tuple[Charts | None, list[str]]:
-    """Loss, counts and curves of tasks over the steps, one line for each different training; and what is missing."""
+@dataclass(frozen=True)
+class Drawn:
+    """One training as the charts draw it; `style` and `dash` as of `charts.Series`."""
+
+    name: str
+    curves: TrainingCurves
+    style: int
+    dash: int
+
+
+def training_charts(runs: Sequence[Run], style_of: dict[str, int]) -> tuple[Charts | None, list[str]]:
+    """Loss, counts and curves of tasks over the steps, one line for each different training; and what is missing.
+
+    Trainings of one method have its colour and patterns of their own.
+    """
     trainings: dict[object, list[Run]] = {}
     for run in runs:
         trainings.setdefault(log_path(run), []).append(run)
-    curves: list[tuple[str, TrainingCurves]] = []
+    curves: list[Drawn] = []
     missing: dict[str, list[str]] = {}
     for path, group in trainings.items():
         found = read_training(path)  # type: ignore[arg-type]
@@ -149,7 +165,8 @@ def training_charts(runs: Sequence[Run]) -> tuple[Charts | None, list[str]]:
             continue
         rates = [run.facts.rate for run in group if run.facts.rate]
         name = group[0].variant + (f" ({', '.join(rates)})" if rates and len(runs) > 1 else "")
-        curves.append((name, found))
+        variant = group[0].variant
+        curves.append(Drawn(name, found, style_of[variant], sum(style_of[variant] == c.style for c in curves)))
     notes = [f"{', '.join(names)}: {why}" for why, names in missing.items()]
     if len(curves) > MOST_LINES:
         notes.append(f"{MOST_LINES} of {len(curves)} trainings are drawn")
@@ -157,57 +174,54 @@ def training_charts(runs: Sequence[Run]) -> tuple[Charts | None, list[str]]:
     if not curves:
         return None, notes
     figures = _training_figures(curves)
-    damaged = sum(c.damaged for _, c in curves)
+    damaged = sum(c.curves.damaged for c in curves)
     if damaged:
         notes.append(f"{damaged} damaged lines of logs were passed over")
-    legend = [(swatch(i, marks=False), name) for i, (name, _) in enumerate(curves)] if len(curves) > 1 else []
+    legend = [(swatch(c.style, marks=False, dash=c.dash), c.name) for c in curves] if len(curves) > 1 else []
     return Charts(figures, legend), notes
 
 
-def _training_figures(curves: Sequence[tuple[str, TrainingCurves]]) -> list[Figure]:
-    stages = curves[0][1].stages if len(curves) == 1 else []
+def _training_figures(drawn: Sequence[Drawn]) -> list[Figure]:
+    stages = drawn[0].curves.stages if len(drawn) == 1 else []
     borders = [(float(step), f"stage {index + 1}") for step, index in stages[1:]]
     figures = []
-    losses = [
-        Series(name, [Point(x, y) for x, y in c.loss if y > 0], i, marks=False) for i, (name, c) in enumerate(curves)
-    ]
-    if any(len(s.points) > 1 for s in losses):
-        chart = Chart("Training loss over steps", losses, "step", y_log=True, borders=borders)
-        figures.append(Figure("Training loss (logarithmic, means of neighbouring steps)", chart.draw()))
-    units = {key for _, c in curves for key in c.counts}
-    for key in sorted(units, key=lambda key: (key != "num_gaussians", key)):
+
+    def add(caption: str, title: str, pick: Callable[[TrainingCurves], Sequence[tuple[float, float]]],
+            *, log: bool = False) -> None:  # fmt: skip
         lines = [
-            Series(name, [Point(x, y) for x, y in c.counts.get(key, [])], i, marks=False)
-            for i, (name, c) in enumerate(curves)
-        ]
+            Series(d.name, [Point(x, y) for x, y in pick(d.curves) if y > 0 or not log], d.style, marks=False,
+                   dash=d.dash)
+            for d in drawn
+        ]  # fmt: skip
         if any(len(s.points) > 1 for s in lines):
-            unit = numbers.unit(key)
-            chart = Chart(f"Number of {unit} over steps", lines, "step", borders=borders)
-            figures.append(Figure(f"Number of {unit}", chart.draw()))
-    for name in dict.fromkeys(name for _, c in curves for name in c.scalars):
-        lines = [
-            Series(label, [Point(x, y) for x, y in c.scalars.get(name, [])], i, marks=False)
-            for i, (label, c) in enumerate(curves)
-        ]
-        if any(len(s.points) > 1 for s in lines):
-            figures.append(Figure(name, Chart(f"{name} over steps", lines, "step", borders=borders).draw()))
+            figures.append(Figure(caption, Chart(title, lines, "step", y_log=log, borders=borders).draw()))
+
+    add("Training loss (logarithmic, means of neighbouring steps)", "Training loss over steps", lambda c: c.loss,
+        log=True)  # fmt: skip
+    counted = {key for d in drawn for key in d.curves.counts}
+    for key in sorted(counted, key=lambda key: (key != "num_gaussians", key)):
+        caption = f"Number of {numbers.unit(key)}"
+        add(caption, f"{caption} over steps", lambda c, key=key: c.counts.get(key, []))  # type: ignore[misc]
+    for name in dict.fromkeys(name for d in drawn for name in d.curves.scalars):
+        add(name, f"{name} over steps", lambda c, name=name: c.scalars.get(name, []))  # type: ignore[misc]
     return figures
 
 
-def view_charts(runs: Sequence[Run]) -> Charts | None:
+def view_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
     """First two metrics (PSNR and SSIM) of every test view; views in the order of the record."""
     shown = pick_evenly(runs, MOST_LINES)
+    looks = [(style_of[r.variant], sum(r.variant == other.variant for other in shown[:i])) for i, r in enumerate(shown)]
     figures = []
     for metric in drawn_metrics(shown)[:2]:
         lines = []
-        for i, run in enumerate(shown):
+        for run, (look, dash) in zip(shown, looks, strict=True):
             scores = run.facts.metrics[metric].per_view if metric in run.facts.metrics else []
             points = [
                 Point(float(j + 1), value, f"{run.label}, {name}: {numbers.score(metric, value, digits=3)}")
                 for j, (name, value) in enumerate(zip(run.facts.views, scores, strict=False))
                 if value is not None
             ]
-            lines.append(Series(run.label, points, i, joined=len(shown) > 1))
+            lines.append(Series(run.label, points, look, joined=len(shown) > 1, dash=dash))
         if not any(line.points for line in lines):
             continue
         average = shown[0].mean(metric) if len(shown) == 1 else None
@@ -217,7 +231,8 @@ def view_charts(runs: Sequence[Run]) -> Charts | None:
         figures.append(Figure(_caption(style), chart.draw()))
     if not figures:
         return None
-    legend = [(swatch(i), run.label) for i, run in enumerate(shown)] if len(shown) > 1 else []
+    keys = [swatch(look, dash=dash) for look, dash in looks]
+    legend = [(key, run.label) for key, run in zip(keys, shown, strict=True)] if len(shown) > 1 else []
     notes = [f"{len(shown)} of {len(runs)} runs, spread evenly."] if len(shown) < len(runs) else []
     return Charts(figures, legend, notes)
 

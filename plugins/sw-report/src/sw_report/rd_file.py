@@ -9,7 +9,8 @@ from importlib import resources
 from markupsafe import Markup
 
 from sw_report.charts import HEIGHT, STYLES, WIDTH
-from sw_report.plots import distortion_charts, variants_of
+from sw_report.looks import looks_of
+from sw_report.plots import distortion_charts
 from sw_report.runs import Run
 
 FILE_NAME = "rd.svg"
@@ -35,7 +36,7 @@ def rd_svg(runs: Sequence[Run], title: str) -> str | None:
 
     runs    of one scene under one protocol
     """
-    charts = distortion_charts(runs, {variant: i for i, variant in enumerate(variants_of(runs))})
+    charts = distortion_charts(runs, looks_of(runs))
     if charts is None:
         return None
     width = 2 * MARGIN + len(charts.figures) * (WIDTH + GAP) - GAP
@@ -72,11 +73,17 @@ def rd_svg(runs: Sequence[Run], title: str) -> str | None:
     return str(drawn)
 
 
-def _style() -> str:
-    """Style rules with the colours of the page, in both themes; no variables, which few drawing programs know."""
+def themes() -> tuple[dict[str, str], dict[str, str]]:
+    """Colours of the page by the names of their variables (`--s0`), in the light and in the dark theme."""
     sheet = resources.files("sw_report").joinpath("templates/style.css").read_text("utf-8")
     blocks = re.findall(r"\{\s*color-scheme: (?:light|dark);([^}]*)\}", sheet)
-    light, dark = (_coloured(dict(re.findall(r"(--\w+): (#\w+);", block))) for block in blocks[:2])
+    light, dark = (dict(re.findall(r"(--\w+): (#\w+);", block)) for block in blocks[:2])
+    return light, dark
+
+
+def _style() -> str:
+    """Style rules with the colours of the page, in both themes; no variables, which few drawing programs know."""
+    light, dark = map(_coloured, themes())
     return f"{light} @media (prefers-color-scheme: dark) {{ {dark} }}"
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 from sw_report import numbers
-from sw_report.aggregate import DatasetTable
+from sw_report.aggregate import DatasetTable, MeanRow
 from sw_report.blocks import Cell, Row, Table, columns, row
 from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
 from sw_report.facts import RunFacts, clean
+from sw_report.marks import marked
 from sw_report.runs import Run, machine
 
 
@@ -20,7 +21,7 @@ def metric_names(runs: Iterable[Run], *, diagnostic: bool = False) -> list[str]:
         name
         for run in runs
         for name, metric in run.facts.metrics.items()
-        if (diagnostic or not metric.diagnostic) and (metric.mean is not None or metric.per_view)
+        if (diagnostic or not run.facts.is_diagnostic(name)) and (metric.mean is not None or metric.per_view)
     )
 
 
@@ -29,57 +30,114 @@ def missing_metrics(runs: Iterable[Run]) -> list[str]:
     reasons: dict[str, dict[str, None]] = {}
     for run in runs:
         for name in numbers.ordered_metrics(run.facts.metrics):
-            if run.mean(name) is None:
+            if run.mean(name) is None and not run.facts.is_diagnostic(name):
                 why = run.facts.unknown.get(f"metrics.{name}.mean", "the record gives no reason")
                 reasons.setdefault(why, {})[numbers.heading(name)] = None
     return [f"{', '.join(names)}: {why}" for why, names in reasons.items()]
 
 
 def runs_table(runs: Sequence[Run]) -> Table:
-    """One row a run: quality, size, times."""
+    """One row a configuration and rate point: quality, size, times; of several seeds, mean ± standard deviation."""
     names = metric_names(runs)
+    several = any(len(run.seeds) > 1 for run in runs)
     heads = [
-        "method", "rate", *map(numbers.heading, names), "MB", "primitives", "steps", "train s", "encode s", "decode s",
-        "FPS",
+        "method", "rate", *(["seeds"] if several else []), *map(numbers.heading, names), "MB", "primitives", "steps",
+        *(head for head, _, _, _ in MEASURED),
     ]  # fmt: skip
-    rows = []
+    marks = machine_marks(runs)
+    rows: list[Row] = []
     for run in runs:
         facts = run.facts
-        cells: list[str | Cell] = [run.variant, facts.rate or numbers.MISSING]
-        for name in names:
-            value = run.mean(name)
-            why = facts.unknown.get(f"metrics.{name}.mean", "") if value is None else f"{value:.6f}"
-            cells.append(Cell(numbers.score(name, value), why))
-        train = facts.train
+        cells: list[str | Cell] = [run.variant, facts.rate_label() or numbers.MISSING]
+        cells += [str(len(run.seeds))] if several else []
+        cells += [_scored(run, name) for name in names]
         cells += [
-            Cell(numbers.megabytes(facts.file.bytes), f"{facts.file.bytes:,} bytes"),
-            numbers.counts(facts.counts),
-            numbers.count(train.steps),
-            Cell(
-                numbers.shared(numbers.seconds(train.with_pretraining_s), "train" in facts.contended),
-                "with the training of scenes that it starts from",
-            ),
-            numbers.shared(numbers.seconds(facts.codec.encode_s), "encode" in facts.contended),
-            numbers.shared(numbers.seconds(facts.codec.decode_s), "decode" in facts.contended),
-            numbers.shared(numbers.rate(facts.speed.fps), "render" in facts.contended),
+            Cell(numbers.megabytes(run.size), f"{run.size:,.0f} bytes"),
+            numbers.counts({unit: round(n) for unit, n in run.counts.items()}),
+            numbers.count(facts.train.steps),
+            *(_measured(run, column, marks) for column in MEASURED),
         ]
         rows.append(row(cells))
+    if len({run.variant for run in runs}) > 1:
+        first = 2 + several
+        compared = {first + i: ([run.mean(n) for run in runs], _direction(runs, n)) for i, n in enumerate(names)}
+        compared[first + len(names)] = ([run.size for run in runs], "lower")
+        if not marks and not any(run.contended("render") for run in runs):
+            compared[len(heads) - 1] = ([run.over_seeds(lambda facts: facts.speed.fps)[0] for run in runs], "higher")
+        rows = marked(rows, compared)
     views = {run.facts.test_views or len(run.facts.views) for run in runs}
     caption = f"Means over {', '.join(map(str, sorted(views)))} test views."
     notes = missing_metrics(runs)
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
-    if any(run.facts.contended for run in runs):
+    notes += uncompressed_notes(run.facts for run in runs)
+    if several:
+        notes.append(numbers.SEEDS_NOTE)
+    if any(facts.contended for run in runs for facts in run.seeds):
         notes.append(numbers.SHARED_NOTE)
+    if marks:
+        told = "; ".join(f"{mark} {name}" for name, mark in marks.items())
+        notes.append(f"Times and FPS come from different machines, and are not comparable: {told}.")
     if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
         notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
-    return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes)
+    return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes, sortable=True)
+
+
+def uncompressed_notes(runs: Iterable[RunFacts]) -> list[str]:
+    """One line for each number format of files that are not compressed."""
+    return [
+        numbers.UNCOMPRESSED_NOTE.format(name) for name in dict.fromkeys(run.uncompressed() for run in runs) if name
+    ]
+
+
+MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[float | None], str]], ...] = (
+    ("train s", "train", lambda facts: facts.train.with_pretraining_s, numbers.seconds),
+    ("encode s", "encode", lambda facts: facts.codec.encode_s, numbers.seconds),
+    ("decode s", "decode", lambda facts: facts.codec.decode_s, numbers.seconds),
+    ("FPS", "render", lambda facts: facts.speed.fps, numbers.rate),
+)
+"""Values that depend on the machine: head of the column, phase, value, spelling. Training includes the base scene's."""
+
+
+def _direction(runs: Sequence[Run], metric: str) -> str:
+    return next((run.facts.metrics[metric].direction for run in runs if metric in run.facts.metrics), "higher")
+
+
+def machine_marks(runs: Sequence[Run]) -> dict[str, str]:
+    """Mark of each machine that the runs were measured on; none if it is one."""
+    machines = list(dict.fromkeys(machine(facts) for run in runs for facts in run.seeds))
+    last = len(numbers.MACHINES) - 1
+    return {name: numbers.MACHINES[min(i, last)] for i, name in enumerate(machines)} if len(machines) > 1 else {}
+
+
+def _scored(run: Run, name: str) -> Cell:
+    value, deviation = run.mean(name), run.deviation(name)
+    why = run.facts.unknown.get(f"metrics.{name}.mean", "") if value is None else f"{value:.6f}"
+    text = numbers.score(name, value)
+    return Cell(numbers.with_deviation(text, None if deviation is None else numbers.score(name, deviation)), why)
+
+
+def _measured(
+    run: Run,
+    column: tuple[str, str, Callable[[RunFacts], float | None], Callable[[float | None], str]],
+    marks: dict[str, str],
+) -> Cell:
+    """A time or a rate, marked where other processes had a part in it, and with its machine if there are several."""
+    _, phase, value, spelt = column
+    found, deviation = run.over_seeds(value)
+    text = numbers.with_deviation(spelt(found), None if deviation is None else spelt(deviation))
+    own = "".join(sorted({marks[name] for facts in run.seeds if (name := machine(facts)) in marks}))
+    title = "with the training of scenes that it starts from" if phase == "train" else ""
+    return Cell(numbers.shared(text, found is not None and run.contended(phase)) + (own if found is not None else ""),
+                title)  # fmt: skip
 
 
 def means_table(table: DatasetTable) -> Table:
     """Plain means over the scenes of a data set."""
     names = list(dict.fromkeys(name for r in table.rows for name in r.metrics))
-    heads = ["method", "rate", "scenes", *map(numbers.heading, names), "MB", "primitives"]
+    several = any(r.seeds > 1 for r in table.rows)
+    heads = ["method", "rate", "scenes", *(["seeds"] if several else []), *map(numbers.heading, names), "MB",
+             "primitives"]  # fmt: skip
     rows = []
     for r in table.rows:
         of = f"{len(r.scenes)} of {len(table.scenes)}"
@@ -88,15 +146,26 @@ def means_table(table: DatasetTable) -> Table:
             row(
                 [
                     r.variant, r.rate or numbers.MISSING, Cell(of, where),
-                    *(numbers.score(name, r.metrics[name]) for name in names),
+                    *([str(r.seeds)] if several else []), *(_mean_score(r, name) for name in names),
                     numbers.megabytes(r.size), numbers.counts({k: round(v) for k, v in (r.counts or {}).items()}),
                 ]
             )
         )  # fmt: skip
+    if len({r.variant for r in table.rows}) > 1:
+        first = 3 + several
+        compared = {first + i: ([r.metrics[n] for r in table.rows], table.directions[n]) for i, n in enumerate(names)}
+        compared[first + len(names)] = ([r.size for r in table.rows], "lower")
+        rows = marked(rows, compared)
     return Table(
         f"Means over {table.title}", columns(heads, text=("method", "rate")), rows,
-        f"Plain means over {', '.join(table.scenes)}.", means_notes(table),
+        f"Plain means over {', '.join(table.scenes)}.", means_notes(table), sortable=True,
     )  # fmt: skip
+
+
+def _mean_score(found: MeanRow, name: str) -> str:
+    deviation = found.deviations.get(name)
+    told = None if deviation is None else numbers.score(name, deviation)
+    return numbers.with_deviation(numbers.score(name, found.metrics[name]), told)
 
 
 def means_notes(table: DatasetTable) -> list[str]:
@@ -110,6 +179,8 @@ def means_notes(table: DatasetTable) -> list[str]:
         kind = "no mean" if unknown else "mean of what is there"
         name = f"{variant} {', '.join(filter(None, rates))}".strip()
         notes.append(f"{name}: {kind}, {_some(missing)} missing.")
+    if any(r.seeds > 1 for r in table.rows):
+        notes.append(f"{numbers.SEEDS_NOTE} Each seed's value is its mean over the scenes.")
     if len(table.protocols) > 1:
         notes.append(f"The scenes use different picture folders: {'; '.join(table.protocols)}.")
     return notes
@@ -138,7 +209,7 @@ def bd_table(table: BdTable) -> Table:
     )  # fmt: skip
     return Table(
         f"Against {table.anchor} by {style.heading}", columns(heads, text=("method", "scene")), rows,
-        f"Against {table.anchor}: rate at equal quality (negative saves), quality at equal rate (positive is better).",
+        f"{table.chosen} Rate at equal quality (negative saves), quality at equal rate (positive is better).",
         list(marks),
     )  # fmt: skip
 

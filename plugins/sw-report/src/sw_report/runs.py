@@ -3,29 +3,34 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import statistics
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import FILE_NAME
+from sw_report.configurations import PRESET, configurations, described, differing, seed_of
 from sw_report.facts import RunFacts, clean, read_facts
 
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One run directory.
+    """One run directory, or several that differ in the seed alone.
 
     directory   where its record lies
-    facts       what the record says
-    variant     the method as this report names it: told apart by preset or folder where the name is not enough
+    facts       what the record says; of several seeds, the smallest one's
+    variant     the method as this report names it: told apart by preset, by what differs in its configuration or by
+                folder where the name is not enough
     root        the argument under which it was found
+    repeats     the runs of all seeds, each alone, this one first; empty: one run
     """
 
     directory: Path
     facts: RunFacts
     variant: str
     root: Path
+    repeats: tuple[Run, ...] = ()
 
     @property
     def label(self) -> str:
@@ -37,10 +42,41 @@ class Run:
         """Scene and protocol id: results of one place may be compared."""
         return self.facts.scene, self.facts.protocol.id
 
+    @property
+    def seeds(self) -> tuple[RunFacts, ...]:
+        """Records of every seed."""
+        return tuple(run.facts for run in self.repeats) or (self.facts,)
+
+    @property
+    def size(self) -> float:
+        """Bytes of the file, mean over the seeds."""
+        return statistics.fmean(facts.file.bytes for facts in self.seeds)
+
+    @property
+    def counts(self) -> dict[str, float]:
+        """Primitives by unit, mean over the seeds."""
+        units = [unit for unit in self.facts.counts if all(unit in facts.counts for facts in self.seeds)]
+        return {unit: statistics.fmean(facts.counts[unit] for facts in self.seeds) for unit in units}
+
     def mean(self, metric: str) -> float | None:
-        """Mean of a metric over the test views, if it is known."""
-        found = self.facts.metrics.get(metric)
-        return None if found is None else found.mean
+        """Mean of a metric over the test views and the seeds, if it is known."""
+        return self.over_seeds(lambda facts: facts.mean(metric))[0]
+
+    def deviation(self, metric: str) -> float | None:
+        """Standard deviation of a metric's mean over the seeds (of the sample, n - 1); None for one seed."""
+        return self.over_seeds(lambda facts: facts.mean(metric))[1]
+
+    def over_seeds(self, value: Callable[[RunFacts], float | None]) -> tuple[float | None, float | None]:
+        """Mean and standard deviation (n - 1) of a value over the seeds; None where one is unknown, or it is one."""
+        values = [value(facts) for facts in self.seeds]
+        known = [each for each in values if each is not None]
+        if len(known) < len(values):
+            return None, None
+        return statistics.fmean(known), statistics.stdev(known) if len(known) > 1 else None
+
+    def contended(self, phase: str) -> bool:
+        """Whether other processes wanted the cores in this phase, with any seed."""
+        return any(phase in facts.contended for facts in self.seeds)
 
 
 @dataclass(frozen=True)
@@ -85,8 +121,10 @@ def collect(paths: Sequence[Path]) -> Collection:
         for remark, folders in remarked.items()
     ]
     notes += [f"left out: {clean(str(problem))}" for problem in problems]
+    runs, by_configuration = _tell_configurations_apart(runs)
     runs, told_apart = _tell_apart(runs)
-    return Collection(sorted(runs, key=_order), notes + told_apart + _protocol_notes(runs))
+    notes += by_configuration + told_apart + _protocol_notes(runs)
+    return Collection(sorted(_seeds_joined(runs), key=_order), notes)
 
 
 def record_paths(root: Path) -> list[Path]:
@@ -104,19 +142,51 @@ def natural(text: str) -> tuple[tuple[int, int | str], ...]:
 
 def _order(run: Run) -> tuple[object, ...]:
     facts = run.facts
-    return natural(facts.scene), facts.protocol.id, natural(run.variant), facts.file.bytes, facts.rate or ""
+    return natural(facts.scene), facts.protocol.id, natural(run.variant), run.size, facts.rate or ""
+
+
+MOST_KEYS = 3  # in the name of a configuration
+MOST_TOLD = 8  # in a note about them
+
+
+def _tell_configurations_apart(runs: list[Run]) -> tuple[list[Run], list[str]]:
+    """Give every configuration of a method a name of its own, and say what differs: no two may share a curve or mean.
+
+    By the preset where that is enough, else by what differs if it is little, else by a number.
+    """
+    by_method: dict[str, list[int]] = {}
+    for i, run in enumerate(runs):
+        by_method.setdefault(run.facts.method, []).append(i)
+    named, notes = list(runs), []
+    for method, group in by_method.items():
+        found = configurations([runs[i].facts for i in group])
+        distinct = list({tuple(sorted(each.items())): each for each in found}.values())
+        if len(distinct) < 2:
+            continue
+        keys = [key for key in differing(distinct) if key != PRESET]
+        presets = [runs[i].facts.preset for i in group]
+        if len({each.get(PRESET) for each in distinct}) == len(distinct):
+            names = [preset or "no preset" for preset in presets]
+        elif len(keys) <= MOST_KEYS:
+            several = len(set(presets)) > 1
+            names = [", ".join(filter(None, (preset if several else "", described(each, keys))))
+                     for preset, each in zip(presets, found, strict=True)]  # fmt: skip
+        else:
+            names = [f"configuration {distinct.index(each) + 1}" for each in found]
+        for i, name in zip(group, names, strict=True):
+            named[i] = replace(runs[i], variant=f"{method} ({name})")
+        if keys:
+            told = ", ".join(keys[:MOST_TOLD]) + (f" and {len(keys) - MOST_TOLD} more" if len(keys) > MOST_TOLD else "")
+            notes.append(clean(f"runs of {method} differ in more than the rate, and stand apart: {told}"))
+    return named, notes
 
 
 def _tell_apart(runs: list[Run]) -> tuple[list[Run], list[str]]:
-    """Name what one name would mix: presets of a method, then folders; of what still is equal, the newest stays."""
-    for distinguish in (_by_preset, _by_root):
-        clashing = {
-            runs[i].facts.method
-            for group in _clashes(runs)
-            if len({distinguish(runs[j]) for j in group}) > 1
-            for i in group
-        }
-        runs = [replace(run, variant=distinguish(run)) if run.facts.method in clashing else run for run in runs]
+    """Name apart by their folders what one name would mix; of what still is equal, the newest stays."""
+    clashing = {
+        runs[i].variant for group in _clashes(runs) if len({_by_root(runs[j]) for j in group}) > 1 for i in group
+    }
+    runs = [replace(run, variant=_by_root(run)) if run.variant in clashing else run for run in runs]
     dropped: set[int] = set()
     notes = []
     for group in _clashes(runs):
@@ -130,15 +200,23 @@ def _tell_apart(runs: list[Run]) -> tuple[list[Run], list[str]]:
     return [run for i, run in enumerate(runs) if i not in dropped], notes
 
 
+def _seeds_joined(runs: list[Run]) -> list[Run]:
+    """One run for all seeds of a configuration at a rate point; what is not a number is the smallest seed's."""
+    groups: dict[tuple[object, ...], list[Run]] = {}
+    for run in runs:
+        groups.setdefault((run.place, run.variant, run.facts.rate), []).append(run)
+    joined = []
+    for group in groups.values():
+        group.sort(key=lambda run: -1 if (seed := seed_of(run.facts)) is None else seed)
+        joined.append(replace(group[0], repeats=tuple(group)) if len(group) > 1 else group[0])
+    return joined
+
+
 def _clashes(runs: list[Run]) -> list[list[int]]:
     groups: dict[tuple[object, ...], list[int]] = {}
     for i, run in enumerate(runs):
-        groups.setdefault((run.place, run.variant, run.facts.rate), []).append(i)
+        groups.setdefault((run.place, run.variant, run.facts.rate, seed_of(run.facts)), []).append(i)
     return [group for group in groups.values() if len(group) > 1]
-
-
-def _by_preset(run: Run) -> str:
-    return f"{run.variant} ({run.facts.preset})" if run.facts.preset else run.variant
 
 
 def _by_root(run: Run) -> str:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, stream
 from sw_datasets.assemble import assemble_scene
-from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of
+from sw_datasets.demo.kept import kept_or_drawn, picture_key
+from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of, normal_map
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks
 
@@ -130,15 +132,18 @@ def orbit(count: int, width: int, height: int) -> list[Camera]:
     return cameras
 
 
-class DepthMaps(Mapping[str, Tensor]):
-    """View name -> exact depth [1,H,W] float32 (z in the camera frame, 0 = nothing), computed when asked for."""
+class ExactMaps(Mapping[str, Tensor]):
+    """View name -> an exact map of the world, computed when asked for.
 
-    def __init__(self, world: World, views: list[View]) -> None:
-        self._world = world
+    draw    depth_map ([1,H,W] float32, z in the camera frame, 0 = nothing) or normal_map ([3,H,W], world frame)
+    """
+
+    def __init__(self, world: World, views: list[View], draw: Callable[[World, Camera], Tensor]) -> None:
+        self._world, self._draw = world, draw
         self._cameras = {view.name: view.camera for view in views}
 
     def __getitem__(self, name: str) -> Tensor:
-        return depth_map(self._world, self._cameras[name])
+        return self._draw(self._world, self._cameras[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._cameras)
@@ -202,6 +207,13 @@ def start_points(world: World, cameras: list[Camera], count: int, generator: tor
     )
 
 
+def _picture(world: World, seed: int, camera: Camera, samples: int, background: float) -> NDArray[np.uint8]:
+    """Draw a camera's picture of `build_world(seed)`, or read it, if it was drawn before."""
+    key = picture_key(stream(seed, "world").get_state().numpy().tobytes(), camera, samples, background)
+    shape = (camera.height, camera.width, 3)
+    return kept_or_drawn(key, shape, partial(draw, world, camera, samples=samples, background=background))
+
+
 def make_scene(
     size: DemoSize | None = None,
     *,
@@ -213,7 +225,7 @@ def make_scene(
     source_size: tuple[int, int] | None = None,
     resolution: int = -1,
 ) -> Scene:
-    """The demo scene, of the size asked for. Pictures are drawn on first use; equal arguments give equal bits.
+    """The demo scene, of the size asked for. Pictures are drawn or read on first use; equal arguments give equal bits.
 
     seed            layout and textures; init_seed: start points and surface samples
     background      "black" or "white", behind the stage
@@ -225,7 +237,7 @@ def make_scene(
     cameras = orbit(size.views, size.width, size.height)
     grey = 1.0 if background == "white" else 0.0
     views = [
-        View(camera, f"view_{i:03d}.png", partial(draw, world, camera, samples=size.samples, background=grey))
+        View(camera, f"view_{i:03d}.png", partial(_picture, world, seed, camera, size.samples, grey))
         for i, camera in enumerate(cameras)
     ]
     width, height = source_size or (size.width, size.height)
@@ -245,6 +257,8 @@ def make_scene(
         ground_truth={
             "points": torch.from_numpy(xyz.T.astype(np.float32)),
             "normals": torch.from_numpy(normals.T.astype(np.float32)),
-            "depth": DepthMaps(world, views),
+            "distance": world.distance,
+            "depth": ExactMaps(world, views, depth_map),
+            "normal_maps": ExactMaps(world, views, normal_map),
         },
     )
