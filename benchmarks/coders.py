@@ -9,7 +9,6 @@ Processor seconds of one thread; the runs of both take turns, and the median of 
 """
 
 import argparse
-import resource
 import statistics
 import time
 import zlib
@@ -29,21 +28,15 @@ ROWS = 1_000_000  # per-symbol tables that the library is handed at once: 128 MB
 ZSTD_SAMPLE = 1_000_000  # symbols: level 19 takes a second for each
 
 
-def cpu_seconds():
-    """Of this process and of those it started (Draco's decoder)."""
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return time.process_time() + children.ru_utime + children.ru_stime
-
-
 def in_turns(*functions, repeats):
     """Median of the seconds that each takes, one after another and again, and what each returned last."""
     seconds, results = [[] for _ in functions], [None] * len(functions)
     for _ in range(repeats):
         for i, function in enumerate(functions):
             results[i] = None  # freed here, not in the time of the next
-            start = cpu_seconds()
+            start = time.process_time()
             results[i] = function()
-            seconds[i].append(cpu_seconds() - start)
+            seconds[i].append(time.process_time() - start)
     return [statistics.median(each) for each in seconds], results
 
 
@@ -200,31 +193,19 @@ def bench_models(plugins, n, repeats):
     print(f"\nentropy models, {n:,} symbols\n{'':<34}{'enc MS/s':>10}{'dec MS/s':>10}{'bits/sym':>10}   size")
     r, load = np.random.default_rng(1), lambda name: plugins.entropy_models.load(name)
     mean, scale = r.normal(0, 20, n), np.exp(r.uniform(np.log(0.2), np.log(20), n))
-    floats = {name: torch.from_numpy(value) for name, value in (("mean", mean), ("scale", scale))}
-    for family, draw in (("gaussian", r.normal), ("laplace", r.laplace)):
-        symbols = np.rint(draw(mean, scale)).astype(np.int64)
-        model, exact = load(family)(), load(f"{family}-exact")()
-        context = model.Context(**floats)
-        ideal = float(model.bits(torch.from_numpy(symbols.astype(float)), context).sum()) / 8
-        integers = exact.IntegerContext(np.rint(4096 * mean).astype(np.int64), np.rint(4096 * scale).astype(np.int64))
-        for coder, given in ((exact, integers), (model, context)):
-            name = family if coder is model else f"{family}-exact"
-            report(name, n, lambda c=coder, g=given, s=symbols: c.encode(s, g),
-                   lambda d, c=coder, g=given: c.decode(d, g), symbols, ideal, "its estimate", repeats)  # fmt: skip
-    symbols = np.rint(np.where(r.random(n) < 0.4, r.normal(-20, 2, n), r.normal(9, 5, n))).astype(np.int64)
+    symbols = np.rint(r.normal(mean, scale)).astype(np.int64)
+    exact = load("gaussian-exact")()
+    context = exact.FloatContext(torch.from_numpy(mean), torch.from_numpy(scale))
+    ideal = float(exact.bits(torch.from_numpy(symbols.astype(float)), context).sum()) / 8
+    integers = exact.IntegerContext(np.rint(4096 * mean).astype(np.int64), np.rint(4096 * scale).astype(np.int64))
+    report("gaussian-exact", n, lambda: exact.encode(symbols, integers), lambda d: exact.decode(d, integers), symbols,
+           ideal, "its estimate", repeats)  # fmt: skip
+    modes = np.rint(np.where(r.random(n) < 0.4, r.normal(-20, 2, n), r.normal(9, 5, n))).astype(np.int64)
     mixture = load("mixture")()
-    context = mixture.Context(torch.tensor([0.4, 0.6]).log(), torch.tensor([-20.0, 9.0]), torch.tensor([2.0, 5.0]))
-    factorised = load("factorised")(init_scale=30)
-    optimizer = torch.optim.Adam(factorised.parameters(), lr=0.03)
-    for _ in range(300):
-        batch = torch.from_numpy(symbols[r.integers(0, n, 2048)]).float()
-        optimizer.zero_grad()
-        factorised.bits(batch + torch.rand(2048) - 0.5).mean().backward()
-        optimizer.step()
-    for name, model, given in (("mixture", mixture, context), ("factorised", factorised, None)):
-        ideal = float(model.bits(torch.from_numpy(symbols).float(), given).detach().double().sum()) / 8
-        report(name, n, lambda m=model, g=given: m.encode(symbols, g), lambda d, m=model: m.decode(d, (n,)), symbols,
-               ideal, "its estimate", repeats)  # fmt: skip
+    two = mixture.Context(torch.tensor([0.4, 0.6]).log(), torch.tensor([-20.0, 9.0]), torch.tensor([2.0, 5.0]))
+    ideal = float(mixture.bits(torch.from_numpy(modes).float(), two).double().sum()) / 8
+    report("mixture", n, lambda: mixture.encode(modes, two), lambda d: mixture.decode(d, (n,)), modes, ideal,
+           "its estimate", repeats)  # fmt: skip
     categorical, small = load("categorical")(), np.minimum(r.geometric(0.2, n) - 1, 63)
     for name, model, given, coded in (
         ("categorical", categorical, categorical.Context(64, n=n), small),
@@ -252,15 +233,11 @@ def bench_positions(plugins, n, repeats):
         [(2 + np.cos(u[:, 1])) * np.cos(u[:, 0]), (2 + np.cos(u[:, 1])) * np.sin(u[:, 0]), np.sin(u[:, 1])], 1
     )
     points = ((torus + 3) / 6 * 65535).astype(np.int64)
-    points = points[plugins.coders.load("octree").sort(points)]
+    octree = plugins.coders.load("octree")()
+    points = points[octree.sort(points)]
     yardstick = len(level_19.compress(points.T.astype(np.uint16).tobytes()))
-    for name in ("octree", "morton-delta", "draco"):
-        codec = plugins.coders.load(name)()
-        try:
-            report(f"{name} (torus, 16 bit)", n, lambda c=codec: c.encode(points, 16), codec.decode, points, yardstick,
-                   "zstd-19, sorted", repeats)  # fmt: skip
-        except Exception as error:
-            print(f"{name:<34}{error}")
+    report("octree (torus, 16 bit)", n, lambda: octree.encode(points, 16), octree.decode, points, yardstick,
+           "zstd-19, sorted", repeats)  # fmt: skip
     byte_planes, float_delta = (plugins.array_coders.load(name)() for name in ("byte-planes", "float-delta"))
     packed = plugins.array_coders.load("packed-bits")(8192)
     floats, halves = torus.astype(np.float32), (0.3 * r.normal(size=(n, 3))).astype(np.float16)

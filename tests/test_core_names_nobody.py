@@ -19,12 +19,10 @@ PLAIN_WORDS = {
     "depth": "a field of RenderResult",
     "mixture": "a word",
     "range": "a form of a plan",
-    "raw": "a word",
     "columns": "a word of tables",
     "opacity": "a property of a .ply",
     "standard": "a word",
     "uniform": "a word",
-    "gaussian": "a word of this field",
 }
 """Names that are plain words as well: alone they say nothing, so only whole sentences could give them away."""
 

@@ -146,7 +146,7 @@ def escape(bits: Iterator[str]) -> tuple[bool, int]:
 
 
 def density_tables(data: bytes, rows: int, width: int) -> list[list[int]]:
-    """`factorised` and `mixture`: the columns of the matrix."""
+    """`mixture`: the columns of the matrix."""
     file = Bytes(data)
     check(file.unpack("BIH") == (1, rows, width), "head of density tables")
     crc = file.one("I")
@@ -189,9 +189,9 @@ def coded_values(
 
 
 def exact(
-    data: bytes, family: str, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
+    data: bytes, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
 ) -> list[int]:
-    """`gaussian-exact` and `laplace-exact`."""
+    """`gaussian-exact`."""
     file = Bytes(data)
     check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
     centres, numbers = [], []
@@ -207,7 +207,7 @@ def exact(
         start = len(found)
         chunk = Bytes(file.take(length))
         words = RangeWords(chunk.take(chunk.varint()))
-        coded = coded_values(words, chunk.bits(), tables, family, numbers[start : start + count])
+        coded = coded_values(words, chunk.bits(), tables, "gaussian", numbers[start : start + count])
         values = [value + centre for value, centre in zip(coded, centres[start : start + count], strict=True)]
         check(crc_i32(values) == crc, "CRC of a chunk")
         found += values
@@ -231,6 +231,6 @@ def conditional(
         present = there[part]
         spread = np.broadcast_to(steps[part], mean[part].shape)
         parameters = [each[present].tolist() for each in (mean[part], scale[part], spread)]
-        found[part][present] = exact(file.take(file.varint()), "gaussian", tables, *parameters)
+        found[part][present] = exact(file.take(file.varint()), tables, *parameters)
     file.done()
     return found

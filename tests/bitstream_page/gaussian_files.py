@@ -15,6 +15,11 @@ from bitstream_page.fields import Bytes, check
 from bitstream_page.positions import byte_planes, deflate, float_delta, importance_vq, octree, residual_vq
 
 
+def scales_of(static: dict[str, Any]) -> int:
+    check(static.get("primitive", "surfel") == "surfel", "primitive")
+    return 2 if "primitive" in static else 3
+
+
 def exact_mode(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, np.ndarray]:
     return {name: array(section) for name, section in sections.items()}
 
@@ -23,8 +28,9 @@ def quantized(static: dict[str, Any], sections: dict[str, bytes]) -> dict[str, n
     n, active = static["num_gaussians"], static["active_sh_degree"]
     points = octree(sections["positions"])
     check(len(points) == n, "number of points")
+    scales = scales_of(static)
     base = {name: np.array(columns(sections[name], n, width), np.float64).reshape(width, n)
-            for name, width in (("color", 3), ("opacity", 1), ("scales", 3), ("quats", 3))}  # fmt: skip
+            for name, width in (("color", 3), ("opacity", 1), ("scales", scales), ("quats", 3))}  # fmt: skip
     rest = np.zeros((n, (static["max_sh_degree"] + 1) ** 2 - 1, 3), np.float32)
     activity = [0] * n
     for band in range(1, active + 1):
@@ -80,9 +86,9 @@ def band_columns(section: bytes, n: int, band: int, classes: int, activity: list
 
 
 def ply(static: dict[str, Any], section: bytes) -> dict[str, np.ndarray]:
-    n, r = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1
+    n, r, scales = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1, scales_of(static)
     names = ["x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2", *(f"f_rest_{i}" for i in range(3 * r)),
-             "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
+             "opacity", *(f"scale_{i}" for i in range(scales)), "rot_0", "rot_1", "rot_2", "rot_3"]  # fmt: skip
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
     lines += [f"property float {name}" for name in names] + ["end_header"]
     file = Bytes(section)
@@ -94,16 +100,16 @@ def ply(static: dict[str, Any], section: bytes) -> dict[str, np.ndarray]:
         "sh_dc": table[:, None, 6:9],
         "sh_rest": table[:, 9 : 9 + 3 * r].reshape(n, 3, r).transpose(0, 2, 1),
         "opacity_logits": table[:, 9 + 3 * r],
-        "log_scales": table[:, 10 + 3 * r : 13 + 3 * r],
-        "quats": table[:, 13 + 3 * r :],
+        "log_scales": table[:, 10 + 3 * r : 10 + scales + 3 * r],
+        "quats": table[:, 10 + scales + 3 * r :],
     }
 
 
 def packed(
     static: dict[str, Any], sections: dict[str, bytes], unzstd: Callable[[bytes], bytes]
 ) -> dict[str, np.ndarray]:
-    n, r = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1
-    tails = {"sh_dc": (1, 3), "sh_rest": (r, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
+    n, r, scales = static["num_gaussians"], (static["max_sh_degree"] + 1) ** 2 - 1, scales_of(static)
+    tails = {"sh_dc": (1, 3), "sh_rest": (r, 3), "opacity_logits": (), "log_scales": (scales,), "quats": (4,)}
     planes = {name: byte_planes(sections[name], "f4", (n, *tail), unzstd) for name, tail in tails.items()}
     return {"means": float_delta(sections["means"], (n, 3), unzstd), **planes}
 

@@ -29,7 +29,10 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
         return chimera(static, sections, unzstd)
     if header["method"] == "compact3dgs":
         return compact(static, sections, unzstd)
-    known = ("trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs")
+    known = (
+        "trimming-the-fat", "pup-3dgs", "speedy-splat", "lightgaussian", "c3dgs", "mesongs", "2dgs",
+        "flat-3dgs", "trim-3dgs", "trim-2dgs", "trim-2dgs-scratch",
+    )  # fmt: skip
     check(header["method"] in known, "method")
     if static["codec"] == "gaussians-indexed":
         return indexed(static, sections, unzstd)

@@ -66,25 +66,6 @@ def octree_leaves(file: Bytes, b: int, distinct: int) -> list[int]:
     return [(node << low) + bits for node, bits in zip(nodes, raw_bits(file, distinct, low), strict=True)]
 
 
-def plain_positions(data: bytes, *, unzstd: Callable[[bytes], bytes] | None = None) -> np.ndarray:
-    """`morton-delta`, or with a decompressor `raw`."""
-    file = Bytes(data)
-    version, b = file.unpack("BB")
-    crc, n = file.one("I"), file.varint()
-    check(version == 1, "version of the positions")
-    if unzstd is None:
-        code, codes = 0, []
-        for high, low in zip(*columns(file.rest(), n, 2), strict=True):
-            code += (high << 48) + low
-            codes.append(code)
-        points = points_of(codes)
-    else:
-        points = np.frombuffer(unzstd(file.rest()), "<u2" if b <= 16 else "<u4").reshape(3, n).T.astype(np.int64)
-        codes = [sum((int(p[a]) >> i & 1) << 3 * i + a for i in range(21) for a in range(3)) for p in points]
-    check(crc_i64(codes) == crc, "CRC of the points")
-    return points
-
-
 def byte_planes(data: bytes, dtype: str, shape: tuple[int, ...], unzstd: Callable[[bytes], bytes]) -> np.ndarray:
     file = Bytes(data)
     version, form = file.unpack("BB")

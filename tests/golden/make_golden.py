@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
 import tempfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from sw_gaussians.surfels import Surface, SurfelModel
 
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.gaussians.model import GaussianModel
@@ -56,6 +58,23 @@ def procedural(n: int, degree: int = 3, active: int | None = None) -> GaussianMo
         4 * values(n, 3), values(n, 1, 3), values(n, coefficients - 1, 3) / 4, 4 * values(n) + 1, values(n, 3) - 4,
         values(n, 4), active_sh_degree=active,
     )  # fmt: skip
+
+
+def surfels(n: int, degree: int = 3, active: int | None = None) -> SurfelModel:
+    """Surfels of scattered values."""
+    model = procedural(n, degree, active)
+    tensors = {name: each.detach() for name, each in model.named_parameters()}
+    tensors["log_scales"] = tensors["log_scales"][:, :2].contiguous()
+    flat = SurfelModel(**tensors, active_sh_degree=active)
+    flat.surface = Surface(1.0, 100.0, 0.05)
+    return flat
+
+
+def flat(n: int, degree: int = 3) -> GaussianModel:
+    """Gaussians of scattered values, thin along their first axis."""
+    model = procedural(n, degree)
+    model.log_scales.data[:, 0] = math.log(1e-8)
+    return model
 
 
 def coincident() -> GaussianModel:
@@ -220,6 +239,10 @@ CASES: dict[str, Case] = {
     "3dgs_classes_v1": ("3dgs", "r1", {"codec.position_bits": 8}, orderly),
     "trimming_the_fat_ply_v1": ("trimming-the-fat", "r3", {"codec": "gaussians-ply"}, lambda: procedural(5, 1)),
     "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),
+    "flat_3dgs_v1": ("flat-3dgs", "r6", {}, lambda: flat(6, 1)),
+    "trim_3dgs_median_v1": ("trim-3dgs", "r3", {}, lambda: flat(40, 1)),
+    "trim_2dgs_v1": ("trim-2dgs", "r4", {}, lambda: surfels(30, 1)),
+    "trim_2dgs_scratch_v1": ("trim-2dgs-scratch", "r6", {}, lambda: surfels(5, 1)),
     "pup_3dgs_exact_v1": ("pup-3dgs", "r3", {}, lambda: procedural(5, 1)),
     "pup_3dgs_quantized_v1": ("pup-3dgs", "r6", {"codec": "gaussians-quantized"}, lambda: procedural(12, 1)),
     "lightgaussian_v1": ("lightgaussian", "r3", SMALL_CODEBOOK, lambda: procedural(40, 2)),
@@ -250,6 +273,11 @@ CASES: dict[str, Case] = {
     "c3dgs_planes_v1": ("c3dgs", "r1", {"codec.settings.arrays": "byte-planes"}, lambda: sharing(12, 12, 12, 3)),
     "c3dgs_empty_v1": ("c3dgs", "r4", {}, lambda: sharing(0, 0, 0, 0)),
     "chimerags_empty_v1": ("chimerags", "r3", SMALL_VQ, lambda: masked(0, 0)),
+    "2dgs_exact_v1": ("2dgs", "r6", {}, lambda: surfels(16)),
+    "2dgs_r3_v1": ("2dgs", "r3", {}, lambda: surfels(60, 2, 1)),
+    "2dgs_zstd_v1": ("2dgs", "r6", {"codec.name": "gaussians-zstd"}, lambda: surfels(20, 1)),
+    "2dgs_ply_v1": ("2dgs", "r6", {"codec.name": "gaussians-ply"}, lambda: surfels(8, 1, 0)),
+    "2dgs_empty_v1": ("2dgs", "r1", {}, lambda: surfels(0)),
     "mesongs_v1": ("mesongs", "r4", {}, lambda: settled(60)),
     "mesongs_corner_v1": ("mesongs", "r1", {}, lambda: settled(20, 0, "corner")),
     "mesongs_one_v1": ("mesongs", "r2", {}, lambda: settled(1, 1)),

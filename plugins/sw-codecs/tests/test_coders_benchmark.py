@@ -18,5 +18,5 @@ def test_the_benchmark_runs_small():
         timeout=300,
     )
     assert found.returncode == 0, found.stderr
-    for name in ("range", "rans", "huffman", "factorised", "gaussian-exact", "columns", "octree", "float-delta"):
+    for name in ("range", "rans", "huffman", "mixture", "gaussian-exact", "columns", "octree", "float-delta"):
         assert f"\n{name}" in found.stdout

@@ -17,12 +17,10 @@ from sw_codecs.coders.model_spec import Tables
 from sw_codecs.entropy.bernoulli import Bernoulli
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
 from sw_codecs.entropy.columns import Columns
-from sw_codecs.entropy.factorised import Factorised
-from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext, LaplaceExact
+from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
 from sw_codecs.entropy.mixture import Mixture, MixtureContext
 from sw_codecs.positions import morton
 from sw_codecs.positions.octree import Octree
-from sw_codecs.positions.plain import MortonDelta, RawPositions
 
 GOLDEN = Path(__file__).parent / "golden"
 
@@ -69,25 +67,13 @@ CASES = {
         lambda d: Mixture().decode(d, modes.shape),
         modes,
     ),
-    "factorised_v1": (
-        lambda: Factorised().encode(residuals),
-        lambda d: Factorised().decode(d, residuals.shape),
-        residuals,
-    ),
     "bernoulli_v1": (lambda: Bernoulli().encode(mixed < 900), lambda d: Bernoulli().decode(d, 300), mixed < 900),
     "gaussian_exact_v1": (
         lambda: GaussianExact().encode(residuals, context),
         lambda d: GaussianExact().decode(d, context),
         residuals,
     ),
-    "laplace_exact_v1": (
-        lambda: LaplaceExact().encode(residuals, context),
-        lambda d: LaplaceExact().decode(d, context),
-        residuals,
-    ),
     "octree_v1": (lambda: Octree().encode(points, 16), Octree().decode, points),
-    "morton_delta_v1": (lambda: MortonDelta().encode(points, 16), MortonDelta().decode, points),
-    "raw_v1": (lambda: RawPositions().encode(points, 16), RawPositions().decode, points),
     "byte_planes_v1": (
         lambda: BytePlanes().encode(halves),
         lambda d: BytePlanes().decode(d, halves.dtype, halves.shape),

@@ -210,3 +210,22 @@ def test_the_background_shows_where_nothing_is():
     camera = orbit(1, 16, 12)[0]
     assert draw(world, camera, samples=1, background=1.0)[0, 0].tolist() == [255, 255, 255]
     assert draw(world, camera, samples=2, background=0.0)[0, 0].tolist() == [0, 0, 0]
+
+
+def test_the_distance_is_that_to_the_nearest_point_of_the_surface(shape):
+    from scipy.spatial import cKDTree
+
+    p = np.array(shape.position)[:, None] + 0.7 * np.random.default_rng(4).normal(size=(3, 400))
+    local = shape.to_local(p)
+    distance = shape.distance(local)
+    dense = shape.sample(40_000, torch.Generator().manual_seed(1))
+    sampled, _ = cKDTree(dense.T).query(local.T)
+    np.testing.assert_array_equal(distance < 0, shape.contains(local))
+    assert (sampled - np.abs(distance)).min() > -1e-9
+    assert (sampled - np.abs(distance)).max() < 0.06  # samples of it lie some 0.01 apart
+
+
+def test_a_step_along_the_normal_is_as_far_as_it_is_long(shape):
+    p = shape.sample(500, torch.Generator().manual_seed(5))
+    np.testing.assert_allclose(shape.distance(p), 0, atol=1e-9)
+    np.testing.assert_allclose(shape.distance(p + 0.03 * shape.normal(p)), 0.03, atol=1e-9)

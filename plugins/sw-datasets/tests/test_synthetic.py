@@ -109,6 +109,28 @@ def test_surface_samples_are_on_visible_surfaces_with_outward_normals(tiny):
     assert inner.mean() > 0.995  # all but points within 10 micrometres of an edge
 
 
+def test_the_distance_to_the_scene_is_zero_on_its_samples_and_grows_along_their_normals(tiny):
+    points, normals = (tiny.ground_truth[name].double().numpy() for name in ("points", "normals"))
+    distance = tiny.ground_truth["distance"]
+    assert np.abs(distance(points)).max() < 1e-6
+    out = distance(points + 0.01 * normals)
+    assert np.median(out) == pytest.approx(0.01)
+    assert out.max() < 0.01 + 1e-6  # less where another solid is nearer
+    assert distance(np.array([[0.0, 0.0, 9.0]])) == pytest.approx(9 - 0.52 * 2, abs=0.05)  # above the large sphere
+
+
+def test_normal_maps_belong_to_the_depth_maps(tiny):
+    from sw_gaussians.surface import depth_normals
+
+    angles = []
+    for view in tiny.test:
+        depth, normals = (tiny.ground_truth[kind][view.name] for kind in ("depth", "normal_maps"))
+        assert torch.equal(depth[0] > 0, normals.norm(dim=0) > 0.5)
+        cosine = (depth_normals(depth, view.camera) * normals).sum(dim=0)[depth[0] > 0]
+        angles.append(torch.rad2deg(torch.acos(cosine.clamp(-1, 1))))
+    assert torch.cat(angles).median() < 0.6  # of 64 x 48 pixels; spheres are coarse there
+
+
 def test_start_points_lie_near_the_surfaces_with_the_colours_of_the_pictures(tiny):
     surface = cKDTree(make_scene(SIZES["tiny"]).ground_truth["points"].numpy())
     away, _ = surface.query(tiny.points.xyz.numpy())

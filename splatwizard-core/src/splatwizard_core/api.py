@@ -40,6 +40,7 @@ MODULES = {
         "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
     ),
     "evaluation.image": "ssim_map",
+    "evaluation.evaluate": "MetricResult Subject",
     "evaluation.metrics": "MetricSetup PreparedMetric",
 }
 """Module of the core -> the names that it lends. `api.pyi` repeats them for type checkers."""

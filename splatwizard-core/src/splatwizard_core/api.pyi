@@ -17,6 +17,8 @@ from splatwizard_core.errors import SceneError as SceneError
 from splatwizard_core.errors import ShapeError as ShapeError
 from splatwizard_core.errors import SplatwizardError as SplatwizardError
 from splatwizard_core.errors import UserInputError as UserInputError
+from splatwizard_core.evaluation.evaluate import MetricResult as MetricResult
+from splatwizard_core.evaluation.evaluate import Subject as Subject
 from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric

@@ -22,18 +22,23 @@ MODULES = {
     "runs.decode": "open_model",
     "runs.session": "Session",
     "runs.device": "choose_device",
+    "runs.measure": "opener",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
+    "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
     "coding.container": "decoded_limit",
-    "evaluation.evaluate": "png_names",
+    "evaluation.evaluate": "png_names render_options render_view save_png suggested_rasterizers",
     "evaluation.metrics": "MetricInfo short_reason",
     "errors": "RunLockedError",
     "rendering.negotiation": "NegotiatedRasterizer",
-    "cli.options": "console debug_option json_option options print_json print_table say set_option",
+    "cli.options": (
+        "config_option console debug_option device_option images_option json_option options print_facts print_json "
+        "print_table say scene_option set_option"
+    ),
     "cli.complete": "name_of",
-    "cli.paths": "OUTPUT_FILE OUTPUT_FOLDER existing_file",
-    "cli.setup": "Choices",
+    "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
+    "cli.setup": "Choices open_session takes_choices",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
 BASE = {"files": "file_sha256 new_folder write_atomic write_json", "progress": "Bar"}

@@ -19,8 +19,7 @@ from splatwizard_core.cli.main import cli, main
 from splatwizard_core.plugins import catalogue, load_plugins
 
 COMMANDS = (
-    "run", "train", "encode", "decode", "eval", "render", "export", "info", "list-plugins", "schedule",
-    "completion",
+    "run", "train", "encode", "decode", "eval", "export", "info", "list-plugins", "schedule", "completion",
 )  # fmt: skip
 """Of the core."""
 
@@ -149,7 +148,6 @@ def test_a_run_that_no_package_reports_ends_in_a_line(tmp_path: Path, monkeypatc
         (["run", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
         (["train", "--scene", "demo:tiny", "--out", "{text}"], "cannot write into {text}: it is a file"),
         (["decode", "{folder}"], "{folder} is a folder, and this command takes a file"),
-        (["render", "{folder}"], "{folder} is a folder, and this command takes a file"),
         (["export", "{folder}", "x.ply"], "{folder} is a folder, and this command takes a file"),
         (["export", "{text}", "{folder}/none/x.ply"], "there is no folder {folder}/none"),
         (["decode", "{text}", "--out", "{folder}"], "{folder} is a folder: give the name of a file in it"),
@@ -322,15 +320,13 @@ def test_ply_files_are_measured_drawn_and_exported(tmp_path: Path, capsys: pytes
     assert "no installed exporter writes '.mars' files" in capsys.readouterr().err
 
     force = ["--set", "raster.prefer=reference"]
+    measure = ["eval", str(ply), "--scene", "demo:tiny", "--no-speed", "--metrics", "psnr,l1"]
     folder = str(tmp_path / "views")
-    assert main(["render", str(ply), "--scene", "demo:tiny", "--out", folder, *force, "--json"]) == 0
-    drawn = json.loads(capsys.readouterr().out)["files"]
-    assert sorted(os.listdir(folder)) == sorted(drawn) == ["view_000.png", "view_004.png"]
-
-    assert main(["eval", str(ply), "--scene", "demo:tiny", "--no-speed", "--metrics", "psnr,l1", *force, "--json"]) == 0
+    assert main([*measure, "--renders", folder, *force, "--json"]) == 0
     facts = json.loads(capsys.readouterr().out)
     assert set(facts["metrics"]) == {"psnr", "l1"}
     assert facts["speed"] is None
+    assert sorted(os.listdir(folder)) == sorted(facts["renders"]) == ["view_000.png", "view_004.png"]
     from PIL import Image
 
     assert Image.open(tmp_path / "views" / "view_000.png").size == (64, 48)

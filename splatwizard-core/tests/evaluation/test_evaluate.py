@@ -187,7 +187,15 @@ def test_what_changes_the_picture_goes_into_the_file_and_comes_back():
 
 @pytest.mark.parametrize(
     "raster",
-    [{"antialias": 1}, {"antialias": "yes"}, {"eps2d": -1}, {"eps2d": math.inf}, {"eps2d": True}, {"profile": None}],
+    [
+        {"antialias": 1},
+        {"antialias": "yes"},
+        {"eps2d": -1},
+        {"eps2d": math.inf},
+        {"eps2d": True},
+        {"profile": None},
+        {"profile": "x" * 65},
+    ],
 )
 def test_a_file_that_asks_for_nonsense_is_refused(raster: dict[str, object]):
     with pytest.raises(BitstreamError, match="which makes no sense"):

@@ -542,3 +542,45 @@ def test_counts_are_whole_numbers_unless_they_are_weighted():
     mask, weight = torch.ones(2, 2, dtype=torch.bool), torch.ones(2, 2)
     assert ScoreSpec("n", "hits").dtype == ScoreSpec("n", "hits", mask).dtype == torch.int32
     assert ScoreSpec("n", "hits", weight).dtype == ScoreSpec("n", "blend").dtype == torch.float32
+
+
+def test_a_profile_is_served_by_one_that_knows_it(plugins, scene):
+    plain, quirky = plugins.install("plain", speed=9), plugins.install("quirky", speed=2, profiles=["old-tiles"])
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu")
+    rasterizer.render(*scene, RasterOptions())
+    rasterizer.render(*scene, RasterOptions(profile="old-tiles"))
+    assert plain.calls == quirky.calls == 1
+    assert rasterizer.choices == {"plain": "plain", "profile old-tiles": "quirky"}
+    with pytest.raises(CapabilityError, match=r"no rasterizer offers profile newer on cpu; nearest: .* lacks profile"):
+        rasterizer.render(*scene, RasterOptions(profile="newer"))
+
+
+def test_the_users_options_hold_in_place_of_those_of_a_request(plugins, scene):
+    reference = ReferenceRasterizer()
+    decided = {"antialias": True, "profile": "dgr-exact", "eps2d": 0.5}
+    rasterizer = NegotiatedRasterizer(plugins, device="cpu", options=decided)
+    asked = RasterOptions(profile="3dgs", alpha=True)
+    expected = reference.render(*scene, replace(asked, **decided))
+    assert torch.equal(rasterizer.render(*scene, asked).image, expected.image)
+    assert not torch.equal(reference.render(*scene, asked).image, expected.image)
+    assert rasterizer.choices == {"ALPHA_MAP+ANTIALIAS+profile dgr-exact": "reference"}
+    scores = replace(asked, scores=(ScoreSpec("hits", "hits"),))
+    summed = rasterizer.accumulate(scene[0], [scene[1]], scores).scores["hits"]
+    wanted = reference.render(*scene, replace(scores, **decided)).scores["hits"]
+    assert torch.equal(summed, wanted)
+    assert rasterizer.decided(asked).alpha
+
+
+def test_a_profile_that_nobody_knows_is_told_with_those_that_there_are(plugins):
+    plugins.install("quirky", profiles=["old-tiles", "3dgs"])
+    with pytest.raises(ConfigError) as caught:
+        NegotiatedRasterizer(plugins, device="cpu", options={"profile": "dgr"})
+    assert str(caught.value) == (
+        "no rasterizer knows the profile 'dgr': raster.profile is one of 3dgs, dgr-exact, old-tiles"
+    )
+    assert caught.value.key == "raster.profile"
+
+
+def test_features_that_nobody_offers_together_are_told(plugins):
+    with pytest.raises(CapabilityError, match=r"reference \(cpu/cuda\) has no ANTIALIAS with SURFEL"):
+        NegotiatedRasterizer(plugins, device="cpu").select({"ANTIALIAS", "SURFEL"})

@@ -90,6 +90,20 @@ def test_keys_go_to_method_run_and_scene_options():
     assert (found.scene.resolution, found.scene.test_every, found.scene.split) == (4, 5, "all")
 
 
+def test_options_of_rasterizers_that_nobody_decides_leave_the_hashes_of_older_runs():
+    plain, decided = resolved(scene="x"), resolved("raster.antialias=true", "raster.eps2d=0.1", scene="x")
+    assert plain.as_dict()["pipeline"]["raster"] == {"prefer": [], "forbid": []}
+    assert plain.training_content()["pipeline"]["raster"] == {"prefer": [], "forbid": []}
+    assert plain.ppl.raster.options == {}
+    assert decided.ppl.raster.options == {"antialias": True, "eps2d": 0.1}
+    assert decided.training_hash() != plain.training_hash()
+    assert resolved("raster.antialias=none", "raster.profile=none", scene="x").config_hash() == plain.config_hash()
+    assert resolved("raster.antialias=false", scene="x").ppl.raster.options == {"antialias": False}
+    for wrong in ("raster.eps2d=-1", "raster.eps2d=nan", "raster.antialias=2"):
+        with pytest.raises(ConfigError, match="raster"):
+            resolved(wrong, scene="x")
+
+
 def test_the_written_file_makes_the_same_configuration(tmp_path: Path):
     first = resolved(
         "densify.screen_px=none", "steps=3,4,5", "background=white", rate="r1", preset="quick", scene="demo:tiny"

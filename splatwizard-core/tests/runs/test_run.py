@@ -8,13 +8,16 @@ import pytest
 import torch
 
 from splatwizard_core.cli.main import main
+from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import CheckpointError, RunLockedError, SplatwizardError, UserInputError
 from splatwizard_core.plugins import PluginManager
 from splatwizard_core.runs.config import ResolvedConfig, parse_set, resolve
 from splatwizard_core.runs.decode import open_model, save_decoded, timed_decode
 from splatwizard_core.runs.directory import RunRequest, run_directory
+from splatwizard_core.runs.encode import encode_directory
 from splatwizard_core.runs.fresh import FreshProcessError, decode_fresh, run_fresh
 from splatwizard_core.runs.lock import directory_lock
+from splatwizard_core.runs.measure import measure, opener
 from splatwizard_core.runs.record import Record, read_record
 from splatwizard_core.runs.run import run, train_in, train_only
 from splatwizard_core.runs.session import Session
@@ -70,11 +73,32 @@ def test_the_record_holds_what_the_protocol_asks_for(done):
     assert "rss" in record.flags
     assert record.rasterizers["render"] == {"SPLIT_SH": "reference"}
     assert set(record.rasterizers["train"]) == {"BACKWARD+SPLIT_SH"}
+    assert record.raster_options == {"train": {}, "render": {}}
     assert record.environment["packages"]["sw-toy"] == "0.1"
     assert record.plan[0]["iterations"] == 6
     for name in ("config.toml", "log.jsonl", "renders/view_000.png", "renders/view_004.png"):
         home = directory if name != "log.jsonl" else directory.parent / "r1"  # where it was trained
         assert (home / name).is_file()
+
+
+def test_options_of_rasterizers_reach_training_the_file_and_what_measures_it(toy_plugins, tmp_path: Path):
+    invocation, decided = Run(toy_plugins, tmp_path), ("raster.antialias=true", "raster.profile=dgr-exact")
+    request = invocation.request(*decided, "iterations=1")
+    trained, directory = train_only(invocation.session, request)
+    assert trained.facts["rasterizers"] == {"ANTIALIAS+BACKWARD+SPLIT_SH+profile dgr-exact": "reference"}
+    encode_directory(invocation.session, request.resolved, directory, tmp_path / "x.swz")
+    asked = {"antialias": True, "profile": "dgr-exact"}
+    assert trained.facts["raster"] == ContainerReader.open(tmp_path / "x.swz").raster == asked
+
+    def measured(*sets: str) -> dict[str, Any]:
+        file = opener(tmp_path / "x.swz", invocation.session)
+        return measure(invocation.session, config(toy_plugins, *sets), file, metrics=["psnr"], speed=False)
+
+    as_file_asks, as_user_decides = measured(), measured("raster.antialias=false")
+    assert as_file_asks["raster"] == asked
+    assert as_file_asks["rasterizers"] == {"ANTIALIAS+SPLIT_SH+profile dgr-exact": "reference"}
+    assert as_user_decides["raster"] == {"profile": "dgr-exact"}
+    assert as_user_decides["metrics"]["psnr"]["mean"] != as_file_asks["metrics"]["psnr"]["mean"]
 
 
 def test_metrics_come_from_the_registry_and_a_missing_one_says_why(done):

@@ -89,7 +89,8 @@ class NativeModule:
         try:
             self._load(say)
         except NativeBuildError as error:
-            session.error = error
+            if not switched_off():  # the environment is asked anew each time
+                session.error = error
             raise
 
     def try_load(self) -> bool:
@@ -107,6 +108,8 @@ class NativeModule:
         """Load, and say whether there are CUDA kernels; if not, warn once. For code that has a torch fallback."""
         session = self._session
         if session.cuda is None:
+            if session.loaded is None and switched_off():
+                return False
             session.cuda = self.try_load() and bool(architectures_of(session.loaded))
             if not session.cuda and session.loaded is not None:
                 log.warning("kernels '%s' have no CUDA part: %s; %s", self.name, self._without_cuda(), self.without)

@@ -9,6 +9,7 @@ from sw_gaussians.method import HEADER_KEY, GaussianMethod
 from sw_gaussians.ply import load_ply
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
+from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import SceneError
 from sw_3dgs.config import MODES, ThreeDGSConfig
@@ -37,7 +38,9 @@ class ThreeDGS(GaussianMethod):
         """Gaussians of the .ply that `init` names, else one for each start point of the scene."""
         config: ThreeDGSConfig = self.config
         if config.init:
-            return load_ply(config.init)
+            model = load_ply(config.init)
+            refuse_surfels(model, f"init: {config.init}: method {self.name}")
+            return model
         if scene.points is None or len(scene.points) == 0:
             raise SceneError(
                 f"scene '{scene.name}' has no start points: 3DGS needs SfM points, random ones, or --set init=FILE.ply",

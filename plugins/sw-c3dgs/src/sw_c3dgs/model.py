@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatModel
@@ -66,7 +67,8 @@ class SharedGaussians(SplatModel):
 
     @classmethod
     def of(cls, model: GaussianModel) -> SharedGaussians:
-        """Copies of a model's Gaussians, each with a colour and a shape of its own."""
+        """Copies of a model's Gaussians, each with its own colour and shape. Raises UserInputError for surfels."""
+        refuse_surfels(model, "codec gaussians-indexed (method c3dgs)")
         log_factors, shapes = split_scales(model.log_scales.detach())
         own = torch.arange(model.num_rows, device=model.device)
         # Row after row, whatever the layout of the originals: Adam rounds by layout, and a resumed model keeps these.

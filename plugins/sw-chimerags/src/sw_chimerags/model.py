@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import torch
 from sw_finetuning.importance import ScoredGaussians
+from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel
@@ -49,7 +50,8 @@ class MaskedGaussians(ScoredGaussians):
 
     @classmethod
     def of(cls, model: GaussianModel, *, quantizer: MaskQuantizer, init: float) -> MaskedGaussians:
-        """Copies of a model's Gaussians; SH bands that it lacks are zero."""
+        """Copies of a model's Gaussians; SH bands that it lacks are zero. Raises UserInputError for surfels."""
+        refuse_surfels(model, "method chimerags")
         tensors = [getattr(model, name).detach().clone() for name in TENSORS]
         rest = model.sh_rest.new_zeros(model.num_rows, (DEGREE + 1) ** 2 - 1, 3)
         rest[:, : model.sh_rest.shape[1]] = model.sh_rest.detach()

@@ -13,18 +13,9 @@ if TYPE_CHECKING:
     from sw_codecs.arrays import byte_planes, deflate, packed_bits
     from sw_codecs.coders import arithmetic, huffman
     from sw_codecs.context import channel_ar, hash_grid, integer_mlp, spatial_ar, triplane
-    from sw_codecs.entropy import (
-        bernoulli,
-        categorical,
-        columns,
-        conditional,
-        factorised,
-        float_models,
-        gaussian_exact,
-        mixture,
-    )
+    from sw_codecs.entropy import bernoulli, categorical, columns, conditional, gaussian_exact, mixture
     from sw_codecs.models import codecs, raht_codec
-    from sw_codecs.positions import draco, octree, plain
+    from sw_codecs.positions import octree
     from sw_codecs.quantizers import (
         binary,
         fake_quant,
@@ -37,13 +28,12 @@ if TYPE_CHECKING:
 
     # mypy holds each class that is registered below to its contract.
     QUANTIZERS: list[Callable[..., api.Quantizer]] = [
-        uniform.Uniform, rounding.SteRound, rounding.UniformNoise, binary.SteBinary, binary.SteMask,
+        uniform.Uniform, rounding.SteRound, binary.SteBinary, binary.SteMask,
         fake_quant.FakeQuantAffine, vector_quantizer.VectorQuantizer, residual_quantizer.ResidualVectorQuantizer,
     ]  # fmt: skip
     ENTROPY_MODELS: list[Callable[..., api.EntropyModel]] = [
         columns.Columns, categorical.Categorical, bernoulli.Bernoulli, gaussian_exact.GaussianExact,
-        gaussian_exact.LaplaceExact, float_models.GaussianFloat, float_models.LaplaceFloat, mixture.Mixture,
-        factorised.Factorised, conditional.ConditionalGaussian,
+        mixture.Mixture, conditional.ConditionalGaussian,
     ]  # fmt: skip
     CONTEXT_MODELS: list[Callable[..., api.ContextModel]] = [
         integer_mlp.IntegerMlp, triplane.Triplane, spatial_ar.SpatialAr, channel_ar.ChannelAr, hash_grid.MixedHashGrid,
@@ -51,9 +41,7 @@ if TYPE_CHECKING:
     ENTROPY_CODERS: list[Callable[..., api.EntropyCoder]] = [
         arithmetic.RangeCoder, arithmetic.RansCoder, huffman.HuffmanCoder,
     ]  # fmt: skip
-    POSITION_CODECS: list[Callable[..., api.PositionCodec]] = [
-        octree.Octree, plain.MortonDelta, plain.RawPositions, draco.Draco,
-    ]  # fmt: skip
+    POSITION_CODECS: list[Callable[..., api.PositionCodec]] = [octree.Octree]
     ARRAY_CODERS: list[Callable[..., api.ArrayCoder]] = [
         byte_planes.BytePlanes, byte_planes.FloatDelta, packed_bits.PackedBits, deflate.Deflate,
     ]  # fmt: skip
@@ -69,7 +57,6 @@ def register_quantizers(registry: Registry[Any]) -> None:
                  summary="affine, bits and range per channel; rounding or noise")  # fmt: skip
     registry.add("ste-round", "sw_codecs.quantizers.rounding:SteRound",
                  summary="multiples of a step, straight-through gradient")  # fmt: skip
-    registry.add("uniform-noise", "sw_codecs.quantizers.rounding:UniformNoise", summary="noise of one step in training")
     registry.add("ste-binary", "sw_codecs.quantizers.binary:SteBinary", summary="the sign, +1 or -1")
     registry.add("ste-mask", "sw_codecs.quantizers.binary:SteMask", summary="a learned mask with a threshold")
     registry.add("fake-quant", "sw_codecs.quantizers.fake_quant:FakeQuantAffine",
@@ -89,15 +76,8 @@ def register_entropy_models(registry: Registry[Any]) -> None:
     registry.add("bernoulli", "sw_codecs.entropy.bernoulli:Bernoulli", summary="masks, stored share of ones")
     registry.add("gaussian-exact", "sw_codecs.entropy.gaussian_exact:GaussianExact",
                  summary="mean and scale per symbol, integers only: decodes on any machine")  # fmt: skip
-    registry.add("laplace-exact", "sw_codecs.entropy.gaussian_exact:LaplaceExact",
-                 summary="as gaussian-exact, Laplacian")  # fmt: skip
-    registry.add("gaussian", "sw_codecs.entropy.float_models:GaussianFloat",
-                 summary="float mean and scale per symbol: for training and comparison, same machine kind")  # fmt: skip
-    registry.add("laplace", "sw_codecs.entropy.float_models:LaplaceFloat", summary="as gaussian, Laplacian")
     registry.add("mixture", "sw_codecs.entropy.mixture:Mixture",
                  summary="weighted Gaussians or Laplacians, counts in the file")  # fmt: skip
-    registry.add("factorised", "sw_codecs.entropy.factorised:Factorised",
-                 summary="trained density per channel, counts in the file")  # fmt: skip
     registry.add("conditional-gaussian", "sw_codecs.entropy.conditional:ConditionalGaussian",
                  summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
 
@@ -125,13 +105,6 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="Huffman codes from count tables")  # fmt: skip
     registry.add("octree", "sw_codecs.positions.octree:Octree", codes="positions",
                  summary="point positions as octree occupancy")  # fmt: skip
-    registry.add("morton-delta", "sw_codecs.positions.plain:MortonDelta", codes="positions",
-                 summary="point positions as Morton steps")  # fmt: skip
-    registry.add("raw", "sw_codecs.positions.plain:RawPositions", codes="positions",
-                 summary="point positions as they are, zstd")  # fmt: skip
-    registry.add("draco", "sw_codecs.positions.draco:Draco", codes="positions",
-                 available="sw_codecs.positions.draco:unavailable",
-                 summary="point positions by Draco (pip install 'sw-codecs[draco]')")  # fmt: skip
     registry.add("byte-planes", "sw_codecs.arrays.byte_planes:BytePlanes", codes="arrays",
                  summary="float or integer arrays without loss: byte planes, zstd")  # fmt: skip
     registry.add("float-delta", "sw_codecs.arrays.byte_planes:FloatDelta", codes="arrays",

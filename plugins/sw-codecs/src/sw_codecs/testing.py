@@ -105,16 +105,13 @@ def stored_side(side: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def check_entropy_model(
-    factory: Callable[..., EntropyModel], case: Callable[[int], EntropyCase], *, trained: EntropyModel | None = None
-) -> None:
+def check_entropy_model(factory: Callable[..., EntropyModel], case: Callable[[int], EntropyCase]) -> None:
     """Hold an entropy model to `EntropyModel`: round trips, truncation, and its estimate against the real size.
 
-    factory     makes one, without arguments: the decoder
+    factory     makes one, without arguments: the encoder or the decoder
     case        makes something of about n symbols to code; it is asked for 0, a few, and 100,000
-    trained     the encoder; None: as the decoder
     """
-    model: EntropyModel = _made(trained or factory(), EntropyModel)
+    model: EntropyModel = _made(factory(), EntropyModel)
     for n in (0, 30, MANY):
         each = case(n)
         given = each.symbols.copy()

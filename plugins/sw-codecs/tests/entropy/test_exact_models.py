@@ -1,4 +1,4 @@
-"""gaussian-exact, laplace-exact and the integer network: exact on any thread count and batch size, and not larger."""
+"""gaussian-exact and the integer network: exact on any thread count and batch size, and not larger."""
 
 import numpy as np
 import pytest
@@ -10,25 +10,21 @@ from torch import nn
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.context.integer_mlp import IntegerMlp, to_fixed
 from sw_codecs.entropy import gaussian_exact
-from sw_codecs.entropy.gaussian_exact import FloatContext, GaussianExact, IntegerContext, LaplaceExact, step_multipliers
-
-MODELS = {"gaussian": GaussianExact, "laplace": LaplaceExact}
+from sw_codecs.entropy.gaussian_exact import FloatContext, GaussianExact, IntegerContext, step_multipliers
 
 
-def drawn(name, n, seed=0, low=0.2, high=20.0):
+def drawn(n, seed=0, low=0.2, high=20.0):
     """Mean, scale and rounded samples in steps."""
     r = np.random.default_rng(seed)
     mean, scale = r.normal(0, 20, n), np.exp(r.uniform(np.log(low), np.log(high), n))
-    draw = r.normal if name == "gaussian" else r.laplace
-    return mean, scale, np.rint(draw(mean, scale)).astype(np.int64)
+    return mean, scale, np.rint(r.normal(mean, scale)).astype(np.int64)
 
 
-@pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize("n", [0, 1, 2, 5000])
-def test_round_trip(name, n):
-    mean, scale, symbols = drawn(name, n)
+def test_round_trip(n):
+    mean, scale, symbols = drawn(n)
     context = IntegerContext(to_fixed(mean), to_fixed(scale))
-    found = MODELS[name]().decode(MODELS[name]().encode(symbols, context), context)
+    found = GaussianExact().decode(GaussianExact().encode(symbols, context), context)
     assert found.dtype == np.int32
     assert np.array_equal(found, symbols)
 
@@ -54,13 +50,13 @@ symbols_and_parameters = st.lists(
 
 
 @settings(max_examples=150, deadline=None)
-@given(st.sampled_from(sorted(MODELS)), symbols_and_parameters)
-def test_any_symbols_under_any_parameters(name, rows):
+@given(symbols_and_parameters)
+def test_any_symbols_under_any_parameters(rows):
     symbols, mean, scale, multiplier = np.array(rows, np.int64).reshape(-1, 4).T
     keep = np.abs(mean // multiplier) < 2**29
     context = IntegerContext(mean[keep], scale[keep], multiplier[keep])
-    data = MODELS[name]().encode(symbols[keep], context)
-    assert np.array_equal(MODELS[name]().decode(data, context), symbols[keep])
+    data = GaussianExact().encode(symbols[keep], context)
+    assert np.array_equal(GaussianExact().decode(data, context), symbols[keep])
 
 
 def test_escapes_at_both_ends():
@@ -69,7 +65,6 @@ def test_escapes_at_both_ends():
     assert np.array_equal(GaussianExact().decode(GaussianExact().encode(symbols, context), context), symbols)
 
 
-@pytest.mark.parametrize("name", MODELS)
 @pytest.mark.parametrize(
     ("low", "high", "within"),
     [
@@ -81,20 +76,19 @@ def test_escapes_at_both_ends():
         (0.2, 0.3, 0.02),
     ],
 )
-def test_real_size_agrees_with_the_training_estimate(name, low, high, within):
-    mean, scale, symbols = drawn(name, 100_000, low=low, high=high)
-    size = 8 * len(MODELS[name]().encode(symbols, IntegerContext(to_fixed(mean), to_fixed(scale))))
+def test_real_size_agrees_with_the_training_estimate(low, high, within):
+    mean, scale, symbols = drawn(100_000, low=low, high=high)
+    size = 8 * len(GaussianExact().encode(symbols, IntegerContext(to_fixed(mean), to_fixed(scale))))
     values = torch.from_numpy(symbols.astype(float))
-    estimate = MODELS[name]().bits(values, FloatContext(torch.from_numpy(mean), torch.from_numpy(scale))).sum()
+    estimate = GaussianExact().bits(values, FloatContext(torch.from_numpy(mean), torch.from_numpy(scale))).sum()
     assert size == pytest.approx(float(estimate), rel=within)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_real_size_agrees_with_the_tables(name):
-    mean, scale, symbols = drawn(name, 100_000)
+def test_real_size_agrees_with_the_tables():
+    mean, scale, symbols = drawn(100_000)
     context = IntegerContext(to_fixed(mean), to_fixed(scale))
-    size = 8 * len(MODELS[name]().encode(symbols, context))
-    assert size == pytest.approx(MODELS[name]().table_bits(symbols, context).sum(), rel=0.002)
+    size = 8 * len(GaussianExact().encode(symbols, context))
+    assert size == pytest.approx(GaussianExact().table_bits(symbols, context).sum(), rel=0.002)
 
 
 def test_the_step_changes_the_unit_of_the_parameters():
@@ -119,13 +113,13 @@ def test_step_multipliers_take_no_floats():
 
 def test_many_chunks(monkeypatch):
     monkeypatch.setattr(gaussian_exact, "CHUNK", 1000)
-    mean, scale, symbols = drawn("gaussian", 3500)
+    mean, scale, symbols = drawn(3500)
     context = IntegerContext(to_fixed(mean), to_fixed(scale))
     assert np.array_equal(GaussianExact().decode(GaussianExact().encode(symbols, context), context), symbols)
 
 
 def test_damage_is_found(assert_survives_damage):
-    mean, scale, symbols = drawn("gaussian", 40)
+    mean, scale, symbols = drawn(40)
     symbols[3] += 300  # an escape
     context = IntegerContext(to_fixed(mean), to_fixed(scale))
     data = GaussianExact().encode(symbols, context)
@@ -133,7 +127,7 @@ def test_damage_is_found(assert_survives_damage):
 
 
 def test_another_context_is_found():
-    mean, scale, symbols = drawn("gaussian", 500)
+    mean, scale, symbols = drawn(500)
     data = GaussianExact().encode(symbols, IntegerContext(to_fixed(mean), to_fixed(scale)))
     mean[7] += 1
     with pytest.raises(BitstreamError):

@@ -66,3 +66,15 @@ def test_hamilton_product_on_units():
     assert multiply(i, j).tolist() == k.tolist()
     assert multiply(j, i).tolist() == (-k).tolist()
     assert multiply(i, i).tolist() == (-one).tolist()
+
+
+def test_surfels_keep_the_line_of_their_normal(gaussians):
+    scales, quats = gaussians
+    flat, turned = canonical(scales[:, :2], quats)
+    assert flat.shape == (500, 2)
+    assert (np.diff(flat, axis=1) <= 0).all()
+    assert (turned[:, 0] >= 0.5 - 1e-12).all()
+    thin = np.full((500, 1), -40.0)  # a covariance whose third axis is nothing
+    before = covariances(np.concatenate([scales[:, :2], thin], 1), quats)
+    after = covariances(np.concatenate([flat, thin], 1), turned)
+    np.testing.assert_allclose(after, before, rtol=1e-9, atol=1e-12)

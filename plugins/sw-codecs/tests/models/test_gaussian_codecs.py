@@ -8,9 +8,10 @@ import torch
 from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.method import GaussianMethod
 from sw_gaussians.ply import export_ply
+from sw_gaussians.surfels import Surface, SurfelModel
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, ConfigError
+from splatwizard_core.errors import BitstreamError, ConfigError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import is_ours
@@ -29,6 +30,10 @@ def model():
         torch.randn(n, 3, generator=g), torch.randn(n, 1, 3, generator=g), 0.1 * torch.randn(n, 15, 3, generator=g),
         torch.randn(n, generator=g), torch.randn(n, 3, generator=g) - 3, torch.randn(n, 4, generator=g),
     )  # fmt: skip
+
+
+QUICK = {"vectree": {"iterations": 5, "batch": 100}, "raht": {"vq_steps": 5}}
+"""Settings with which a codec that trains a codebook takes no seconds."""
 
 
 class SomeMethod(GaussianMethod):
@@ -54,7 +59,7 @@ def decoded_from(plugins, reader):
 def test_each_codec_that_says_it_codes_gaussians_decodes_what_it_encodes(plugins, model):
     assert {"gaussians-exact", "gaussians-quantized"} <= set(plugins.gaussian_codecs.names)
     for name in (n for n in plugins.gaussian_codecs.names if is_ours(plugins.coders.entry(n).distribution)):
-        reader = ContainerReader(written(plugins, name, model).to_bytes(), "file.swz")
+        reader = ContainerReader(written(plugins, name, model, **QUICK.get(name, {})).to_bytes(), "file.swz")
         decoded = decoded_from(plugins, reader)
         assert isinstance(decoded, GaussianModel)
         assert 0 < decoded.num_rows <= model.num_rows
@@ -183,3 +188,67 @@ def test_a_ply_with_another_header_is_refused(plugins, model):
 
     with pytest.raises(BitstreamError, match=r"section 'ply': is no \.ply of 500 Gaussians"):
         decoded_from(plugins, rewritten(written(plugins, "gaussians-ply", model).to_bytes(), swap))
+
+
+SURFEL_CODECS = ("gaussians-exact", "gaussians-ply", "gaussians-quantized", "gaussians-zstd")
+
+
+@pytest.fixture(scope="module")
+def surfels(model):
+    tensors = [each.detach() for each in model.parameters()]
+    found = SurfelModel(*tensors[:4], tensors[4][:, :2].contiguous(), tensors[5])
+    found.surface = Surface(1.0, 100.0, 0.05)
+    return found
+
+
+def normals(model):
+    w, x, y, z = torch.nn.functional.normalize(model.quats.detach().double(), dim=1).T
+    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)], dim=1)
+
+
+@pytest.mark.parametrize("name", SURFEL_CODECS)
+def test_surfels_come_back_as_surfels(plugins, surfels, name):
+    writer = written(plugins, name, surfels)
+    assert writer.static["primitive"] == "surfel"
+    assert writer.static["depth_ratio"] == 1.0
+    decoded = decoded_from(plugins, ContainerReader(writer.to_bytes(), "file.swz"))
+    assert type(decoded) is SurfelModel
+    assert decoded.surface == surfels.surface
+    if name in ("gaussians-exact", "gaussians-ply"):
+        for key, parameter in surfels.named_parameters():
+            assert torch.equal(getattr(decoded, key), parameter), key
+    if name == "gaussians-zstd":
+        assert torch.equal(decoded.log_scales.sort(dim=0).values, surfels.log_scales.sort(dim=0).values)
+
+
+def test_quantised_surfels_keep_their_planes(plugins, surfels):
+    with torch.no_grad():
+        surfels.opacity_logits.clamp_(min=-4)  # all are drawn: rows can be told apart by their position
+    fine = {"position_bits": 21, "quat_step": 1e-4, "scale_step": 1e-4}
+    data = written(plugins, "gaussians-quantized", surfels, **fine).to_bytes()
+    decoded = decoded_from(plugins, ContainerReader(data, "file.swz"))
+    nearest = torch.cdist(surfels.means.double(), decoded.means.double()).argmin(dim=1)
+    assert len(nearest.unique()) == decoded.num_rows == surfels.num_rows
+    ordered = decoded.log_scales[nearest].detach()
+    torch.testing.assert_close(ordered, surfels.log_scales.sort(dim=1, descending=True).values, atol=1e-4, rtol=0)
+    cosine = (normals(decoded)[nearest] * normals(surfels)).sum(dim=1).abs()  # either side is the same surfel
+    assert torch.rad2deg(torch.acos(cosine.clamp(max=1))).max() < 0.05
+    assert len(data) < len(written(plugins, "gaussians-exact", surfels).to_bytes()) / 3
+
+
+@pytest.mark.parametrize("name", ["gaussians-indexed", "raht", "vectree"])
+def test_codecs_that_know_no_surfels_say_so(plugins, surfels, name):
+    with pytest.raises(UserInputError, match="three scales each, and these are surfels"):
+        written(plugins, name, surfels)
+
+
+@pytest.mark.parametrize("name", SURFEL_CODECS)
+@pytest.mark.parametrize(("key", "value"), [("primitive", None), ("primitive", "blob"), ("depth_ratio", -1)])
+def test_a_wrong_primitive_or_surface_is_damage(plugins, surfels, name, key, value):
+    writer = written(plugins, name, surfels)
+    if value is None:
+        del writer.static[key]
+    else:
+        writer.static[key] = value
+    with pytest.raises(BitstreamError):
+        decoded_from(plugins, ContainerReader(writer.to_bytes(), "file.swz"))

@@ -21,7 +21,7 @@ def test_morton_order_is_that_of_the_position_codecs(bits):
     assert np.array_equal(spatial_order(cells, bits=bits), morton.sort(cells))
 
 
-@pytest.mark.parametrize("name", ["octree", "morton-delta", "raw", "draco", "byte-planes", "float-delta"])
+@pytest.mark.parametrize("name", ["octree", "byte-planes", "float-delta"])
 def test_a_method_asks_a_codec_for_the_order(name):
     cells = np.random.default_rng(3).integers(0, 1 << 10, (500, 3))
     sort = load_plugins().coders.load(name).sort

@@ -15,7 +15,6 @@ QUANTIZERS = load_plugins().quantizers
 NAMES = [entry.name for entry in QUANTIZERS if is_ours(entry.distribution)]
 FITTED = {"vq", "residual-vq"}
 NOT_IDEMPOTENT = {"residual-vq"}  # greedy: a decoded row may be encoded otherwise, see its docstring
-NOISY = {"uniform-noise"}
 
 
 def made(name, x):
@@ -41,13 +40,20 @@ def test_symbols_and_side_information_are_all_a_decoder_needs(name, n, seed, spr
     if hasattr(quantizer, "observing"):
         quantizer.forward(x)
         quantizer.observing = False
-    decoded, symbols, side = check_quantizer(QUANTIZERS.load(name), x, trained=quantizer, is_noisy=name in NOISY)
+    decoded, symbols, side = check_quantizer(QUANTIZERS.load(name), x, trained=quantizer)
     if name not in NOT_IDEMPOTENT:
         again, _ = quantizer.encode(decoded if name != "ste-mask" else torch.where(decoded > 0, 1.0, -100.0))
         if name == "uniform":  # measures its range; it has to be told to keep it
             top = side["low"] + side["step"].astype(float) * (2.0 ** side["bits"] - 1)
             again, _ = QUANTIZERS.load(name)(low=side["low"], high=top).encode(decoded)
         assert torch.equal(again, symbols)
+
+
+def test_a_quantizer_that_adds_noise_is_held_to_the_rest_of_the_contract():
+    noisy = QUANTIZERS.load("uniform")(6, noise=True)
+    check_quantizer(QUANTIZERS.load("uniform"), rows(20, 0, 1.0), trained=noisy, is_noisy=True)
+    with pytest.raises(AssertionError, match="not those of forward"):
+        check_quantizer(QUANTIZERS.load("uniform"), rows(20, 0, 1.0), trained=noisy)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -74,7 +80,7 @@ def test_a_training_step_leaves_no_tensor_behind_and_waits_for_none(name):
     assert out.shape == x.shape
     out.sum().backward()
     assert leaf.grad.device.type == "meta"
-    if name in {"ste-round", "uniform-noise"}:
+    if name == "ste-round":
         step = torch.ones(3, device="meta", requires_grad=True)
         quantizer.step_gradient = True
         quantizer.forward(leaf, step).sum().backward()

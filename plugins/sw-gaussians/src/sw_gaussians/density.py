@@ -106,7 +106,10 @@ def _split(model: GaussianModel, parents: Tensor, revised_opacity: bool) -> dict
     }
     scales = rows["log_scales"].exp()
     noise = torch.randn(scales.shape, generator=model.next_split_generator(), dtype=torch.float32)
-    rows["means"] = rows["means"] + rotate(rows["quats"], noise.to(scales) * scales)
+    offsets = noise.to(scales) * scales
+    if offsets.shape[1] == 2:
+        offsets = torch.nn.functional.pad(offsets, (0, 1))  # children of a surfel stay in its plane
+    rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
     rows["log_scales"] = (scales / SPLIT_SHRINK).log()
     if revised_opacity:
         opacity = torch.sigmoid(rows["opacity_logits"])

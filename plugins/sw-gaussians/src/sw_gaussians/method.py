@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from splatwizard_core.api import GaussianModel, Method, PluginError, SceneError
 from sw_gaussians.choices import CodecChoice
+from sw_gaussians.surfels import SurfelModel, state_surface, stated_surface
 
 if TYPE_CHECKING:
     import torch
@@ -57,12 +58,16 @@ class GaussianMethod(Method):
         if not isinstance(model, GaussianModel):
             raise TypeError(f"{self.name} encodes a GaussianModel, not a {type(model).__name__}")
         writer.static[HEADER_KEY] = self.config.codec.name
+        state_surface(model, writer)
         self.config.codec.load(self.plugins).encode(model, writer)
 
     def decode(self, reader: ContainerReader) -> SplatModel:
         """Return the model, by whichever codec has written it. Raises BitstreamError."""
         self.check_version(reader)
-        return self.plugins.gaussian_codecs.load(self.codec_of(reader))(self.plugins).decode(reader)
+        model = self.plugins.gaussian_codecs.load(self.codec_of(reader))(self.plugins).decode(reader)
+        if isinstance(model, SurfelModel):
+            model.surface = stated_surface(reader)
+        return model
 
     def codec_of(self, reader: ContainerReader) -> str:
         """Return the name of the codec that the header of a file states. Raises BitstreamError."""

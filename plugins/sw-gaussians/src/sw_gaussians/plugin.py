@@ -38,9 +38,11 @@ def register_pruners(registry: Registry) -> None:
 def register_exporters(registry: Registry) -> None:
     registry.add("ply", "sw_gaussians.ply:export_ply",
                  summary="3DGS .ply, float32, as the original viewers read it", suffix=".ply")  # fmt: skip
+    registry.add("ply-as-3dgs", "sw_gaussians.ply:export_ply_as_3dgs",
+                 summary="the same, of surfels too: they get a third scale of 1e-8", suffix="")  # fmt: skip
 
 
 @hookimpl
 def register_importers(registry: Registry) -> None:
     registry.add("ply", "sw_gaussians.ply:load_ply",
-                 summary="3DGS .ply, float32, as the original code writes it", suffix=".ply")  # fmt: skip
+                 summary=".ply of 3DGS and 2DGS, float32, as the original codes write it", suffix=".ply")  # fmt: skip

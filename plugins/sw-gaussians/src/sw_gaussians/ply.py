@@ -1,4 +1,7 @@
-"""The .ply of 3DGS: 62 float32 a Gaussian at SH degree 3, raw values, as the authors' code and all viewers read it."""
+"""The .ply of 3DGS: 62 float32 a Gaussian at SH degree 3, raw values, as the authors' code and all viewers read it.
+
+That of 2DGS differs in one thing: a surfel has no `scale_2`. Which of the two a file is, that property says.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ from plyfile import PlyData
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SceneError, SplatModel, replacing
+from sw_gaussians.surfels import SurfelModel, as_ellipsoids, gaussians_of
 
 MAX_HEADER = 1 << 16
 _SIZES = {
@@ -22,20 +26,26 @@ _SIZES = {
 }  # fmt: skip
 
 
-def property_names(sh_rest: int) -> list[str]:
-    """The vertex properties in the order of the file, for `sh_rest` = K - 1 higher SH coefficients a channel."""
+def property_names(sh_rest: int, scales: int = 3) -> list[str]:
+    """The vertex properties in the order of the file.
+
+    sh_rest     K - 1, higher SH coefficients a channel
+    scales      of a Gaussian: 3, of a surfel 2
+    """
     return [
         "x", "y", "z", "nx", "ny", "nz",
         *(f"f_dc_{i}" for i in range(3)),
         *(f"f_rest_{i}" for i in range(3 * sh_rest)),
         "opacity",
-        *(f"scale_{i}" for i in range(3)),
+        *(f"scale_{i}" for i in range(scales)),
         *(f"rot_{i}" for i in range(4)),
     ]  # fmt: skip
 
 
 def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     """Read a model with exactly the values of the file, active SH degree = the degree that is stored (0 .. 3).
+
+    A file with scale_0 and scale_1 and no scale_2 holds surfels: a SurfelModel.
 
     Any order of properties, float or double, binary or ASCII, is read; normals and unknown properties are ignored.
     Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
@@ -70,7 +80,9 @@ def from_ply(data: bytes, path: str) -> GaussianModel:
     degree = math.isqrt(rest // 3 + 1) - 1
     if rest % 3 or (degree + 1) ** 2 != rest // 3 + 1 or degree > 3:
         raise SceneError(f"{name}: {rest} f_rest properties; 0, 9, 24 or 45 (SH degree 0 to 3) are possible", path=path)
-    needed = [each for each in property_names(rest // 3) if each not in ("nx", "ny", "nz")]
+    flat = "scale_1" in names and "scale_2" not in names
+    scales = SurfelModel.NUM_SCALES if flat else GaussianModel.NUM_SCALES
+    needed = [each for each in property_names(rest // 3, scales) if each not in ("nx", "ny", "nz")]
     missing = [each for each in needed if each not in names]
     if missing:
         raise SceneError(
@@ -85,12 +97,12 @@ def from_ply(data: bytes, path: str) -> GaussianModel:
 
     # f_rest is channel-major: all K-1 coefficients of red, then green, then blue.
     sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, rest // 3)
-    return GaussianModel(
+    return gaussians_of(
         columns("x", "y", "z"),
         columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
         sh_rest.transpose(1, 2).contiguous(),
         columns("opacity")[:, 0],
-        columns("scale_0", "scale_1", "scale_2"),
+        columns(*(f"scale_{i}" for i in range(scales))),
         columns("rot_0", "rot_1", "rot_2", "rot_3"),
     )
 
@@ -109,14 +121,23 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
         file.writelines(_file_parts(model))
 
 
+def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
+    """Do what `export_ply` does, with a third scale of 1e-8 for surfels, so that viewers of 3DGS show them.
+
+    What these show is not what a rasterizer of surfels draws: they widen every Gaussian by their low-pass filter.
+    """
+    export_ply(as_ellipsoids(model) if isinstance(model, GaussianModel) else model, path)
+
+
 def to_ply(model: GaussianModel) -> bytes:
     """The bytes that `export_ply` writes of a model."""
     return b"".join(_file_parts(model))
 
 
 def _file_parts(model: GaussianModel) -> tuple[bytes, memoryview]:
-    """The header, and the rows [N, 17 + 3 (K - 1)] little-endian, columns as `property_names`."""
-    properties = "".join(f"property float {name}\n" for name in property_names(model.sh_rest.shape[1]))
+    """The header, and the rows [N, 17 + 3 (K - 1)] (surfels: one less) little-endian, columns as `property_names`."""
+    names = property_names(model.sh_rest.shape[1], model.NUM_SCALES)
+    properties = "".join(f"property float {name}\n" for name in names)
     header = f"ply\nformat binary_little_endian 1.0\nelement vertex {model.num_rows}\n{properties}end_header\n"
     columns = (
         model.means,

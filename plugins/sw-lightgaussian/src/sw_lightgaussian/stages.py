@@ -11,6 +11,7 @@ from sw_finetuning.importance import KeepImportance, ScoredGaussians
 from sw_finetuning.pruning import PruneByScore
 from sw_gaussians.moments import restore_moments
 from sw_gaussians.statistics import collect_statistics
+from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import ConfigError, GaussianModel, Pruner
 from sw_lightgaussian.config import LightGaussianConfig
@@ -104,7 +105,8 @@ class DistillStage(DistillationStage):
 
 
 def truncated(model: GaussianModel, degree: int) -> ScoredGaussians:
-    """The Gaussians without the SH bands above `degree`; copies."""
+    """The Gaussians without the SH bands above `degree`; copies. Raises UserInputError for surfels."""
+    refuse_surfels(model, "method lightgaussian")
     degree = min(degree, model.max_sh_degree)
     rest = model.sh_rest[:, : (degree + 1) ** 2 - 1]
     tensors = (model.means, model.sh_dc, rest, model.opacity_logits, model.log_scales, model.quats)

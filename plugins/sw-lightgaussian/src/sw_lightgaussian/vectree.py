@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from sw_finetuning.volume import volume_factor
+from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
@@ -158,6 +159,7 @@ def importance_of(model: GaussianModel) -> NDArray[np.float64]:
 
 def _arrays(model: GaussianModel) -> dict[str, NDArray[np.float32]]:
     """The six tensors on the host. Raises SplatwizardError for what cannot be written."""
+    refuse_surfels(model, "codec vectree")
     arrays = {}
     for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats"):
         arrays[name] = array = getattr(model, name).detach().float().cpu().numpy()

@@ -169,7 +169,7 @@ class RunFacts(Facts):
     speed: SpeedFacts = SpeedFacts()
     memory: MemoryFacts = MemoryFacts()
     train: TrainFacts = TrainFacts()
-    geometry: dict[Text, float] | None = None
+    geometry: dict[Text, dict[Text, Any]] | None = None
     rasterizers: dict[Text, dict[Text, Text]] = {}
     phases: list[PhaseFacts] = []
     environment: dict[Text, Any] = {}

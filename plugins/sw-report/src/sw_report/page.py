@@ -21,6 +21,7 @@ from sw_report.blocks import Part, Section, Table
 from sw_report.commands import commands_table
 from sw_report.declared import metric_style
 from sw_report.distortion import bd_tables, choose_anchor, with_values
+from sw_report.geometry import geometry_parts
 from sw_report.looks import looks_of
 from sw_report.pictures import (
     GAIN,
@@ -164,9 +165,8 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
     sections.append(_training("training", "Training", [run], tables.breakdown_table(facts)))
     sections.append(Section("cost", "Time and memory", [Part(table=tables.cost_table(facts))]))
-    if facts.geometry:
-        values = "; ".join(f"{name} {tables.plain(value)}" for name, value in facts.geometry.items())
-        sections.append(Section("geometry", "Geometry", [Part(text=f"{values}.")]))
+    if parts := geometry_parts(run, pictures=options.pictures):
+        sections.append(Section("geometry", "Geometry", parts))
     sections.append(_provenance([run]))
     return sections
 

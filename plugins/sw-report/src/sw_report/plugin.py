@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    registry.add("report", "sw_report.command:report", position=5.5, summary="tables, curves, BD-rates, one HTML page")
+    registry.add("report", "sw_report.command:report", position=4.7, summary="tables, curves, BD-rates, one HTML page")
 
 
 @hookimpl

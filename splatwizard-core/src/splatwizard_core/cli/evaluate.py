@@ -24,18 +24,18 @@ from splatwizard_native import scratch_folder
     shared.scene_option, shared.images_option, shared.config_option, shared.set_option,
     click.option(
         "--metrics", metavar="NAME[,NAME]", type=name_of("metric"),
-        help="Which metrics.  [default: every one that is installed]",
+        help="Which metrics.  [default: every one over images that is installed]",
     ),
     click.option(
         "--renders", metavar="DIR", type=OUTPUT_FOLDER,
-        help="Keep the rendered test views there as PNG.  [default: they are not kept]",
+        help="Keep the rendered test views there as PNG, and what shows the geometry.  [default: they are not kept]",
     ),
     click.option(
         "--roundtrip", is_flag=True,
         help="Of a run directory: encode it, decode the file in a fresh process, measure that.",
     ),
     click.option("--no-speed", is_flag=True, help="Leave out rendering speed and memory."),
-    shared.repeats_option,
+    shared.repeats_option, shared.geometry_option,
     click.option("--quiet", is_flag=True, help="Do not warn of metrics that cannot be computed."),
     shared.device_option, shared.seed_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
@@ -47,6 +47,7 @@ def evaluate(
     roundtrip: bool,
     no_speed: bool,
     repeats: int,
+    geometry: bool,
     quiet: bool,
     as_json: bool,
     chosen: Choices,
@@ -75,7 +76,7 @@ def evaluate(
     else:
         resolved = chosen.resolve_without_method()
     session = open_session(resolved, plugins)
-    warn_of_metrics(session, names, resolved.metrics, quiet=quiet)
+    warn_of_metrics(session, names, resolved.metrics, geometry=geometry, quiet=quiet)
 
     def open_trained() -> Opened:
         with finished_training(session, resolved, file) as trained:
@@ -92,6 +93,7 @@ def evaluate(
             resolved,
             open_trained if measured.is_dir() else opener(measured, session),
             metrics=names,
+            geometry=geometry,
             speed=not no_speed,
             repeats=repeats,
             renders=renders,
@@ -109,7 +111,8 @@ def _print(facts: dict[str, Any]) -> None:
     for name, metric in sorted(facts["metrics"].items(), key=lambda item: item[1]["diagnostic"]):
         shown = "-" if metric["mean"] is None else f"{metric['mean']:.4f}"
         kind = "diagnostic" if metric["diagnostic"] else f"{metric['direction']} is better"
-        rows.append([name, f"{shown}  ({kind}, {len(facts['views'])} views)"])
+        over = f", {len(facts['views'])} views" if name not in (facts["geometry"] or {}) else ""
+        rows.append([name, f"{shown}  ({kind}{over})"])
     if facts["file"]["bytes"] is not None:
         rows.append(["bytes", f"{facts['file']['bytes']:,}"])
     rows += [[name.removeprefix("num_"), f"{count:,}"] for name, count in facts["counts"].items()]

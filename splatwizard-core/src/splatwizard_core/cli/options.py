@@ -87,6 +87,7 @@ repeats_option = click.option(
     "--repeats", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
     help="Measure rendering speed N times; the spread goes into the record.",
 )  # fmt: skip
+geometry_option = click.option("--geometry", is_flag=True, help="Measure geometry too, on scenes that know theirs.")
 resume_option = click.option(
     "--resume/--fresh", default=True, show_default=True,
     help="Go on from the last checkpoint and skip finished steps, or discard what --out holds and start over.",

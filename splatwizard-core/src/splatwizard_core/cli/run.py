@@ -21,11 +21,13 @@ if TYPE_CHECKING:
 @shared.options(
     shared.methods_option, shared.scene_option, shared.images_option, shared.rates_option, shared.preset_option,
     shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
-    shared.seed_option, shared.repeats_option, shared.resume_option, shared.changed_plan_option, shared.json_option,
-    shared.debug_option,
+    shared.seed_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
+    shared.changed_plan_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
-def run(out: Path, repeats: int, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices) -> None:
+def run(
+    out: Path, repeats: int, geometry: bool, resume: bool, allow_changed_plan: bool, as_json: bool, chosen: Choices
+) -> None:
     """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
 
     Finished steps are not done again; an interrupted run goes on from its last checkpoint. Installed packages make
@@ -38,14 +40,14 @@ def run(out: Path, repeats: int, resume: bool, allow_changed_plan: bool, as_json
     plugins = load_plugins()
     resolved = chosen.resolve(plugins)
     session = open_training_session(resolved, plugins)
-    warn_of_metrics(session, None, resolved[0].metrics)
+    warn_of_metrics(session, None, resolved[0].metrics, geometry=geometry)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
         shared.say("preset quick: the plan scaled down for a procedural scene (--preset paper runs it in full)")
     finished: list[FinishedRun] = []
     written: list[Path] = []
     console = None if as_json else shared.console()
     for each in resolved:
-        request = RunRequest(each, out, resume, allow_changed_plan, repeats)
+        request = RunRequest(each, out, resume, allow_changed_plan, repeats, geometry)
         record, directory = run_one(session, request)
         finished.append(FinishedRun(directory, record, partial(session.scene, each)))
         plugins.hook.run_finished(runs=FinishedRuns(finished[-1:], False, console, shared.say, written))

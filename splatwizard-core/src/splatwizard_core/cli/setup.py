@@ -159,15 +159,17 @@ def _without_unused_starts(plugins: PluginManager, found: list[ResolvedConfig]) 
 
 
 def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
-    """Threads and device as asked. Raises PluginError for rasterizers that are not installed, CapabilityError."""
+    """Threads and device as asked. Raises PluginError or ConfigError for a choice of rasterizers that is none here,
+    CapabilityError for the device."""
     from splatwizard_core.runs.device import choose_device, set_threads
     from splatwizard_core.runs.session import Session
 
     ppl = resolved.ppl
-    for name in (*ppl.raster.prefer, *ppl.raster.forbid):
-        plugins.rasterizers.entry(name)
     set_threads(ppl.threads)
-    return Session(plugins, choose_device(ppl.device, plugins), say)
+    session = Session(plugins, choose_device(ppl.device, plugins), say)
+    if ppl.raster != type(ppl.raster)():
+        session.rasterizer(resolved, ())  # what is wrong with the choice is told before the work
+    return session
 
 
 def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> Session:
@@ -198,16 +200,17 @@ def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:
         say(f"warning: {same[0].method} {rates}: these rate points give the same file, as what differs is overridden")
 
 
-def warn_of_metrics(session: Session, names: Sequence[str] | None, settings: Any, *, quiet: bool = False) -> None:
+def warn_of_metrics(
+    session: Session, names: Sequence[str] | None, settings: Any, *, geometry: bool = False, quiet: bool = False
+) -> None:
     """Say before the work, once, what keeps metrics from being computed here.
 
-    names   None: all that are installed
+    names   None: all over images that are installed; with `geometry` those over models too
     Raises UserInputError for settings that name something which is not there.
     """
-    from splatwizard_core.evaluation.metrics import MetricSetup, unavailable
+    from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, unavailable
 
-    metrics = session.plugins.metrics
-    entries = [metrics.entry(name) for name in (metrics.names if names is None else names)]
+    entries = chosen_metrics(session.plugins.metrics, names, geometry=geometry)
     for line in unavailable(entries, MetricSetup(session.device, settings)):
         if not quiet:
             say(f"warning: {line}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import json
 import math
 import os
 from collections import Counter
@@ -22,6 +23,7 @@ from splatwizard_core.evaluation.metrics import (
     MetricSettings,
     MetricSetup,
     PreparedMetric,
+    chosen_metrics,
     measured,
     noting_failure,
     prepare_metric,
@@ -31,7 +33,7 @@ from splatwizard_core.plugins import PluginManager
 from splatwizard_core.plugins.registry import Entry
 from splatwizard_core.rendering.rasterizer import Rasterizer, RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.scene import View
+from splatwizard_core.scene.scene import Scene, View
 from splatwizard_native import out_of_memory, replacing, track
 
 # What a file may ask of a rasterizer, and the type of the value; whatever else its `raster` holds is for the method.
@@ -43,7 +45,7 @@ NOT_A_NUMBER = "not a number in at least one view (the render holds values that 
 
 @dataclass(frozen=True)
 class MetricResult:
-    """One metric over the views.
+    """One metric over the views, or of the model itself: then without `per_view`.
 
     mean        over the views; None if unknown, or infinite
     per_view    in the order of the views; None where the value is not finite
@@ -52,6 +54,7 @@ class MetricResult:
     diagnostic  computed to tell conventions apart, not for tables
     made_with   what else the values depend on: versions, weights and their checksums
     verified    False: `made_with` names something that is not the published one
+    details     of a metric over models its protocol, and what its value consists of: JSON data
     """
 
     mean: float | None
@@ -61,6 +64,24 @@ class MetricResult:
     diagnostic: bool = False
     made_with: Mapping[str, str] = field(default_factory=dict)
     verified: bool = True
+    details: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A decoded model, and all that a metric over models is given besides: `rasterizer` and `options` draw it.
+
+    static      values of its file's header
+    keep        folder for files that show what was measured, made by whoever writes them; None: they are not kept
+    """
+
+    model: SplatModel
+    scene: Scene
+    rasterizer: Rasterizer
+    options: RasterOptions
+    setup: MetricSetup
+    static: Mapping[str, Any]
+    keep: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -89,7 +110,7 @@ def render_options(raster: Mapping[str, Any], background: Tensor | None) -> Rast
     for key in RASTER_KEYS.keys() & raster.keys():
         value, kind = raster[key], RASTER_KEYS[key]
         is_size = kind is float and type(value) in (int, float) and 0 <= value < math.inf
-        if not is_size and (kind is float or type(value) is not kind):
+        if not is_size and (kind is float or type(value) is not kind or len(str(value)) > 64):
             raise BitstreamError(f"the file asks for rasterizer option {key} = {value!r:.80}, which makes no sense")
         asked[key] = kind(value)
     return RasterOptions(background=background, **asked)
@@ -151,7 +172,7 @@ def evaluate(
     """
     if not views:
         raise SceneError("there is no view to evaluate on")
-    wanted = [plugins.metrics.entry(name) for name in (plugins.metrics.names if metrics is None else metrics)]
+    wanted = [e for e in chosen_metrics(plugins.metrics, metrics, geometry=False) if MetricInfo.of(e).over == "image"]
     setup = MetricSetup(device, metric_settings or {})
     ready: dict[str, PreparedMetric] = {}
     missing: dict[str, str] = {}
@@ -189,6 +210,21 @@ def evaluate(
         drawn_gaussians=drawn / len(views),
         renders=names if save_to is not None else [],
     )
+
+
+def evaluate_model(subject: Subject, entries: Sequence[Entry]) -> dict[str, MetricResult]:
+    """Measure by those over models that apply to the scene; one that breaks or lacks something only has a reason."""
+    found = {}
+    for entry in (e for e in entries if MetricInfo.of(e).over == "model"):
+        missing: dict[str, str] = {}
+        info = MetricInfo.of(entry)
+        with noting_failure(entry, missing):
+            if (result := entry.load()(subject)) is not None:
+                told = json.loads(json.dumps([result.mean, dict(result.details)], allow_nan=False))
+                found[entry.name] = MetricResult(told[0], [], info.direction, result.reason, details=told[1])
+        if missing:
+            found[entry.name] = MetricResult(None, [], info.direction, missing[entry.name])
+    return found
 
 
 def _summary(entry: Entry, values: list[float], ready: PreparedMetric | None, missing: str | None) -> MetricResult:

@@ -49,6 +49,7 @@ class MetricInfo:
     slow        left out of evaluations during a training
     unrounded   gets the render as it is, not rounded to 8 bit
     settings    "module:Model", the pydantic model of its settings; empty: it has none
+    over        "image", or "model": (evaluate.Subject) -> evaluate.MetricResult, or None where it does not apply
     """
 
     label: str
@@ -60,6 +61,7 @@ class MetricInfo:
     slow: bool = False
     unrounded: bool = False
     settings: str = ""
+    over: str = "image"
 
     @classmethod
     def of(cls, entry: Entry) -> MetricInfo:
@@ -135,14 +137,21 @@ class MetricFactory(Protocol):
         ...
 
 
-AnyMetric = Metric | MetricFactory
-"""The target of a metric's entry."""
+AnyMetric = Metric | MetricFactory | Callable[[Any], Any]
+"""The target of a metric's entry; of one over models, the last."""
 
 
 def quick_metrics(registry: TypedRegistry[AnyMetric]) -> list[str]:
     """Names of the metrics that are computed during training: the quick ones whose value the log is read for."""
     infos = {entry.name: MetricInfo.of(entry) for entry in registry}
-    return [name for name, info in infos.items() if not (info.diagnostic or info.slow)]
+    return [name for name, info in infos.items() if not (info.diagnostic or info.slow or info.over == "model")]
+
+
+def chosen_metrics(registry: TypedRegistry[Any], names: Iterable[str] | None, *, geometry: bool) -> list[Entry]:
+    """The metrics of an evaluation: those named (None: all over images), with `geometry` all over models besides."""
+    wanted = [e.name for e in registry if MetricInfo.of(e).over == "image"] if names is None else [*names]
+    wanted += [e.name for e in registry if geometry and MetricInfo.of(e).over == "model"]
+    return [registry.entry(name) for name in dict.fromkeys(wanted)]
 
 
 def check_settings(registry: TypedRegistry[AnyMetric], settings: MetricSettings) -> dict[str, dict[str, Any]]:
@@ -190,7 +199,7 @@ def unavailable(entries: Iterable[Entry], setup: MetricSetup) -> list[str]:
 
 def prepare_metric(entry: Entry, setup: MetricSetup) -> PreparedMetric:
     """The metric of an entry, ready. Raises what its import or its `prepare` raises."""
-    target: AnyMetric = entry.load()
+    target = entry.load()
     return target.prepare(setup) if isinstance(target, MetricFactory) else PreparedMetric(target)
 
 
@@ -221,14 +230,14 @@ def noting_failure(entry: Entry, reasons: dict[str, str]) -> Iterator[None]:
         reasons[entry.name] = f"{entry.whose} failed: {one_line(error)}"
 
 
-def metric_identities(registry: TypedRegistry[AnyMetric], setup: MetricSetup) -> dict[str, str | None]:
+def metric_identities(entries: Iterable[Entry], setup: MetricSetup) -> dict[str, str | None]:
     """name -> what its values would depend on now, cheaply told; None: it cannot be computed now."""
     found: dict[str, str | None] = {}
-    for entry in registry:
+    for entry in entries:
         found[entry.name] = package = f"{entry.distribution} {entry.version}"
         try:
             target = entry.load()
-            if isinstance(target, MetricFactory):
+            if hasattr(target, "identity"):
                 identity = target.identity(setup)
                 found[entry.name] = None if identity is None else f"{package}, {identity}"
         except (Exception, SystemExit):

@@ -33,6 +33,8 @@ class GaussianModel(SplatModel):
     active_sh_degree    bands above it are neither drawn nor trained
     """
 
+    NUM_SCALES: int = 3
+    """Columns of `log_scales`; a subclass of flat Gaussians (surfels) has 2."""
     ROWS: tuple[str, ...] = (
         "means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats",
         "grad_accum", "denom", "max_radii2d",
@@ -66,7 +68,7 @@ class GaussianModel(SplatModel):
             "sh_dc": (sh_dc, (1, 3)),
             "sh_rest": (sh_rest, ("K-1", 3)),
             "opacity_logits": (opacity_logits, ()),
-            "log_scales": (log_scales, (3,)),
+            "log_scales": (log_scales, (self.NUM_SCALES,)),
             "quats": (quats, (4,)),
         }
         for name, (tensor, tail) in tails.items():
@@ -114,7 +116,7 @@ class GaussianModel(SplatModel):
 
     @property
     def scales(self) -> Tensor:
-        """[N,3] standard deviations, world units."""
+        """[N,3] (surfels: [N,2]) standard deviations, world units."""
         return torch.exp(self.log_scales)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:

@@ -71,7 +71,7 @@ def register_datasets(registry: Registry) -> None:
 
 @hookspec
 def register_metrics(registry: Registry) -> None:
-    """Add image metrics: callables (render [3,H,W], truth [3,H,W]) -> float, or factories of them, with a direction."""
+    """Add metrics: callables (render [3,H,W], truth [3,H,W]) -> float or factories of them; or `over` models."""
 
 
 @hookspec

@@ -5,14 +5,15 @@ from __future__ import annotations
 import functools
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
-from typing import TypeVar
+from types import MappingProxyType
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 
-from splatwizard_core.errors import CapabilityError, PluginError
+from splatwizard_core.errors import CapabilityError, ConfigError, PluginError
 from splatwizard_core.gaussians.inputs import GaussianInputs
 from splatwizard_core.plugins.catalogue import catalogue, package_of
 from splatwizard_core.plugins.guards import one_line
@@ -27,6 +28,7 @@ from splatwizard_native import ForeseenError, NativeBuildError
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+_PROFILE = "profile "  # before the name of a profile that is asked for like a feature
 
 
 class NegotiatedRasterizer:
@@ -38,13 +40,14 @@ class NegotiatedRasterizer:
     forbid      names never to take
     exactness   which kinds of result are acceptable from one that nobody prefers by name
     suggested   further names to prefer, after `prefer`, ignored where not installed (a method's or a file's own choice)
+    options     values of RasterOptions that hold in place of each request's own (the user's choice)
 
     Order: preferred ones; then fast ones that serve directly; then fast ones behind an adapter; then those of speed
     0, the oracles. Within each, the higher speed. A rasterizer whose native module cannot be built is left out with
     one warning, and so is one whose entry cannot be read (it may know features of a newer core), unless it was asked
     for by name. One that is none of ours is taken only where it is preferred. SW_RASTERIZER=name (for debugging) takes
     that one or fails.
-    Raises PluginError for a name that is not installed.
+    Raises PluginError for a name that is not installed, ConfigError for a profile that none of them knows.
     """
 
     def __init__(
@@ -56,6 +59,7 @@ class NegotiatedRasterizer:
         forbid: Iterable[str] = (),
         exactness: Iterable[str] = ("exact", "tight"),
         suggested: Iterable[str] = (),
+        options: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         self.device = torch.device(device)
         self.choices: dict[str, str] = {}
@@ -74,11 +78,14 @@ class NegotiatedRasterizer:
         self._failed: dict[str, str] = {}
         self._readable = [info for entry in self._registry if (info := self._read(entry)) is not None]
         self._usable = [info for info in self._readable if self._may_serve(info)]
+        self._options = dict(options)
+        self._check_profile(self._options.get("profile"))
         self.info = RasterizerInfo(
             name="negotiated",
             devices=frozenset({self.device.type}),
             dtypes=frozenset().union(*(i.dtypes for i in self._usable)),
-            features=frozenset().union(*(i.features for i in self._usable)),
+            features=frozenset().union(*(i.features for i in self._usable)) & Feature.__members__.keys(),
+            profiles=tuple(sorted({profile for i in self._usable for profile in i.profiles})),
         )
 
     @property
@@ -86,9 +93,14 @@ class NegotiatedRasterizer:
         """Names in `served` -> the rasterizer whose kernels each one draws with."""
         return {name: self._registry.entry(name).declared.get("kernels") or name for name in sorted(self.served)}
 
+    def decided(self, opt: RasterOptions) -> RasterOptions:
+        """The options that are drawn with where `opt` is asked for: the user's values in place of its own."""
+        return replace(opt, **self._options) if self._options else opt
+
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view with the rasterizer that serves it best. Raises CapabilityError if none does."""
-        return self._delegate(Feature.asked_by(opt, g), lambda r: r.render(g, cam, opt))
+        opt = self.decided(opt)
+        return self._delegate(Feature.asked_by(opt, g), lambda r: r.render(g, cam, opt), opt.profile)
 
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from geometry alone; 0 = culled."""
@@ -99,12 +111,12 @@ class NegotiatedRasterizer:
 
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
         """Sum the scores that `opt` asks for over several views; no gradient."""
-        cams = list(cams)  # a second attempt after a failed build must see them again
+        cams, opt = list(cams), self.decided(opt)  # a second attempt after a failed build must see the cameras again
         with torch.no_grad():
-            return self._delegate(Feature.asked_by(opt, g), lambda r: r.accumulate(g, cams, opt))
+            return self._delegate(Feature.asked_by(opt, g), lambda r: r.accumulate(g, cams, opt), opt.profile)
 
     def select(self, required: Iterable[str]) -> Rasterizer:
-        """The rasterizer for these features, loaded.
+        """The rasterizer for these features ("profile NAME" is one), loaded.
 
         Raises CapabilityError that names what is missing and who comes near.
         """
@@ -129,9 +141,10 @@ class NegotiatedRasterizer:
         self._chosen[wanted] = rasterizer
         return rasterizer
 
-    def _delegate(self, asked: Feature, call: Callable[[Rasterizer], T]) -> T:
+    def _delegate(self, asked: Feature, call: Callable[[Rasterizer], T], profile: str = "") -> T:
+        wanted = asked.names | {_PROFILE + profile} if profile else asked.names
         while True:
-            rasterizer = self.select(asked.names)
+            rasterizer = self.select(wanted)
             try:
                 result = call(rasterizer)
             except NativeBuildError as error:  # kernels may be built by the first call
@@ -163,14 +176,23 @@ class NegotiatedRasterizer:
         self._chosen = {k: r for k, r in self._chosen.items() if r.info.name not in failed}
 
     def _read(self, entry: Entry) -> RasterizerInfo | None:
-        """The declaration for this device; None, with a warning, if it makes no sense."""
+        """The declaration for this device, profiles among its features; None, with a warning, if it makes no sense."""
         try:
-            return RasterizerInfo.from_entry(entry).on(self.device.type)
+            info = RasterizerInfo.from_entry(entry).on(self.device.type)
+            return replace(info, features=info.features | {_PROFILE + name for name in info.profiles})
         except PluginError as error:
             if entry.name in (self._forced, *self._prefer):
                 raise
             _warn_once(f"{error}: it is not used")
             return None
+
+    def _check_profile(self, name: str | None) -> None:
+        known = {profile for info in self._readable for profile in info.profiles}
+        if name and known and name not in known:  # with none installed, what to install is told at the first request
+            raise ConfigError(
+                f"no rasterizer knows the profile '{name}': raster.profile is one of {', '.join(sorted(known))}",
+                key="raster.profile",
+            )
 
     def _accepts(self, info: RasterizerInfo) -> bool:
         return info.exactness in self._exactness or info.name in self._prefer
@@ -224,6 +246,7 @@ class NegotiatedRasterizer:
                 + (f" lacks {', '.join(sorted(lacks))}" if lacks else "")
                 + (f" draws nothing without {', '.join(sorted(needs))}" if needs else "")
                 + (" serves only where raster.prefer names it" if self._is_uninvited(info) else "")
+                + "".join(f" has no {' with '.join(sorted(c))}" for c in info.combos_forbidden if c <= wanted)
                 + (" is forbidden" if info.name in self._forbid else "")
                 + ("" if self._accepts(info) else f" is {info.exactness}")
             )

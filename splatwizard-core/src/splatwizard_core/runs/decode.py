@@ -167,7 +167,7 @@ def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: st
     if name is None:
         ours_last = sorted(plugins.exporters, key=lambda e: not e.foreign)  # a suffix of ours stays ours
         suffixes = {e.declared.get("suffix", ""): e.name for e in ours_last}
-        name = suffixes.get(path.suffix)
+        name = suffixes.get(path.suffix) if path.suffix else None  # one without a suffix is for who names it
         if name is None:
             known = ", ".join(f"{suffix} ({exporter})" for suffix, exporter in sorted(suffixes.items()) if suffix)
             raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")

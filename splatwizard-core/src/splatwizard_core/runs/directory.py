@@ -36,6 +36,7 @@ class RunRequest:
     resume      use the finished steps and checkpoints that are there; False: discard them
     allow_changed_plan  resume although the plan or configuration differs from the checkpoint's
     repeats     how often rendering speed is measured; decoding is timed as often, and at least three times
+    geometry    measure the model's geometry too
     """
 
     resolved: ResolvedConfig
@@ -43,6 +44,7 @@ class RunRequest:
     resume: bool = True
     allow_changed_plan: bool = False
     repeats: int = 1
+    geometry: bool = False
 
 
 class StepLog:

@@ -6,6 +6,7 @@ import contextlib
 import importlib.metadata
 import time
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     model = session.plugins.importers.load("ply")(path).to(session.device).eval().requires_grad_(False)
     method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
-    raster = raster_header(last.raster_options(last.iterations, torch.zeros(3)))
+    raster = raster_header(replace(last.raster_options(last.iterations, torch.zeros(3)), **resolved.ppl.raster.options))
     try:
         return encode(method, model, raster, target)
     except (TypeError, AttributeError) as error:

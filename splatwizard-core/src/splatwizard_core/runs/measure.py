@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import torch
 
 from splatwizard_core.evaluation import evaluate as quality
+from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics
 from splatwizard_core.evaluation.speed import SpeedReport, measure_speed
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -22,8 +23,8 @@ from splatwizard_core.runs.record import MemoryBlock, MetricBlock, SpeedBlock, p
 from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.scene.scene import Scene, View
-from splatwizard_native import CoreTime, MemoryMeter, synchronize, track
+from splatwizard_core.scene.scene import Scene
+from splatwizard_native import CoreTime, MemoryMeter, synchronize
 
 FEWEST_SPEED_VIEWS = 8
 
@@ -33,11 +34,13 @@ class Opened(NamedTuple):
 
     raster          options that it asks of a rasterizer
     device_bound    its file decodes only on the machine that made it
+    static          values of its file's header
     """
 
     model: SplatModel
     raster: dict[str, Any]
     device_bound: bool = False
+    static: dict[str, Any] = {}
 
 
 def measure(
@@ -46,6 +49,7 @@ def measure(
     open_model: Callable[[], Opened],
     *,
     metrics: Sequence[str] | None = None,
+    geometry: bool = False,
     speed: bool = True,
     repeats: int = 1,
     renders: Path | None = None,
@@ -54,10 +58,10 @@ def measure(
 
     resolved    with the scene, the settings of metrics, and the choice of rasterizers
     open_model  () -> the model on the session's device; called first, before any picture is read
-    metrics     names; None: all that are installed
+    metrics     names; None: all over images that are installed; with `geometry` all over models besides
     speed       also measure speed and memory
     repeats     how often speed is measured
-    renders     folder for the test views as PNG; None: not kept
+    renders     folder for the test views as PNG, and in `geometry` what metrics over models show; None: not kept
     """
     plugins, device = session.plugins, session.device
     began = time.perf_counter()
@@ -67,7 +71,7 @@ def measure(
     meter = MemoryMeter(device)
     meter.start()
     began = time.perf_counter()
-    model, raster, device_bound = open_model()
+    model, raster, device_bound, static = open_model()
     synchronize(device)
     open_s = time.perf_counter() - began
     decoded_bytes, peak_load = meter.current_bytes(), meter.peak_bytes()
@@ -112,7 +116,10 @@ def measure(
         metric_settings=resolved.metrics, save_to=renders,
         label=f"evaluate on {scene.name}",
     )  # fmt: skip
-    results = result.metrics.items()
+    setup = MetricSetup(device, resolved.metrics)
+    subject = quality.Subject(model, scene, rasterizer, options, setup, static, renders and renders / "geometry")
+    of_model = quality.evaluate_model(subject, chosen_metrics(plugins.metrics, metrics, geometry=geometry))
+    results = {**result.metrics, **of_model}.items()
     found = {
         "dataset": scene.protocol.dataset,
         "scene": scene.name,
@@ -121,12 +128,14 @@ def measure(
         "test_views": len(views),
         **vars(result),
         "metrics": {name: picked(MetricBlock, asdict(metric)) for name, metric in results},
+        "geometry": {name: dict(m.details) for name, m in of_model.items()} or None,
         "unknown": {f"metrics.{name}.mean": m.reason for name, m in results if m.reason is not None},
         "digest": model.digest(),
         "counts": model.counts(),
         "speed": None,
         "memory": None,
         "rasterizers": dict(rasterizer.choices),
+        "raster": quality.raster_header(rasterizer.decided(options)),
         "environment": describe_environment(plugins, device, resolved.ppl.seed),
         "contended": contended,
         "flags": _flags(scene, result, meter, device_bound=device_bound, bad_rows=bad_rows, contended=bool(contended)),
@@ -178,26 +187,8 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
             gaussians = session.plugins.importers.load("ply")(path)
             return Opened(gaussians.to(session.device).eval().requires_grad_(False), {})
         model, reader = open_model(path, session.plugins, session.device)
-        return Opened(model, reader.raster, reader.made_on is not None)
+        return Opened(model, reader.raster, reader.made_on is not None, reader.static)
 
     if path.suffix != ".ply":
         import_method(path, session.plugins)  # code is not memory of the model
     return open_file
-
-
-def render_views(
-    session: Session, resolved: ResolvedConfig, opened: Opened, views: Sequence[View], folder: Path
-) -> list[str]:
-    """Draw views as PNG into `folder`; returns the file names."""
-    options = quality.render_options(opened.raster, session.scene(resolved).background.to(session.device))
-    rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(opened.raster))
-    folder.mkdir(parents=True, exist_ok=True)
-    names = quality.png_names([view.name for view in views])
-    opened.model.check_finite()
-    opened.model.prepare()
-    with track("render", total=len(views), unit="views") as bar:
-        for view, name in zip(views, names, strict=True):
-            image = quality.render_view(opened.model, view.camera.to(session.device), rasterizer, options).image
-            quality.save_png(image.cpu(), folder / name)
-            bar.advance()
-    return names

@@ -107,11 +107,12 @@ def phases_of_run(
     measured: Mapping[str, Any],
 ) -> list[dict[str, Any]]:
     """Return all phases of a run from the facts of its steps."""
+    computed = (n for n, m in measured["metrics"].items() if m["per_view"] or m["mean"] is not None)
     return [
         *training["phases"],
         _phase(ENCODE, encoding["parts"]),
         _phase(RENDER, named_parts(plugins, "rasterizer", measured["rasterizers"].values())),
-        _phase(EVALUATE, named_parts(plugins, "metric", (n for n, m in measured["metrics"].items() if m["per_view"]))),
+        _phase(EVALUATE, named_parts(plugins, "metric", computed)),
     ]
 
 

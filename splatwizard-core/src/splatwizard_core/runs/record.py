@@ -67,7 +67,7 @@ class ProtocolBlock(Part):
 
 
 class MetricBlock(Part):
-    """One image metric over the test views."""
+    """One image metric over the test views, or one of the model itself: without `per_view`, details in `geometry`."""
 
     mean: float | None
     per_view: list[float | None] = Field(description="in the order of `views`; null: not finite, as `unknown` says")
@@ -224,9 +224,12 @@ class Record(Part):
     speed: SpeedBlock
     memory: MemoryBlock
     train: TrainBlock
-    geometry: Annotated[dict[str, float] | None, WhyNull("not asked for")] = None
+    geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = None
     plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
+    raster_options: dict[str, dict[str, Any]] = Field(
+        {}, description="phase -> options of drawing that are not the defaults: profile, antialias, eps2d, clamp_color"
+    )
     phases: list[PhaseBlock] = Field(description="who served each phase, with distribution and version")
     environment: dict[str, Any]
     contended: dict[str, float] = Field(

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_core.evaluation.metrics import MetricSetup, metric_identities
+from splatwizard_core.evaluation.metrics import MetricSetup, chosen_metrics, metric_identities
 from splatwizard_core.runs import record as schema
 from splatwizard_core.runs.config import ResolvedConfig, content_hash
 from splatwizard_core.runs.contention import CONTENDED, contended_phases
@@ -57,6 +57,7 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         def evaluate_it() -> dict[str, Any]:
             arguments = ["eval", str(encoded), "--config", str(directory / CONFIG), "--device", str(session.device)]
             arguments += ["--renders", str(directory / RENDERS), "--repeats", str(request.repeats), "--quiet", "--json"]
+            arguments += ["--geometry"] * request.geometry
             return {**run_fresh(arguments), "asked": asked}
 
         encoding = steps.once(
@@ -66,7 +67,8 @@ def run(session: Session, request: RunRequest) -> tuple[schema.Record, Path]:
         keys = step_keys(session, resolved, encoding)
         # The extent of the measurement, with the packages and weights that are there now.
         setup = MetricSetup(session.device, resolved.metrics)
-        asked = {"repeats": request.repeats, "metrics": metric_identities(session.plugins.metrics, setup)}
+        wanted = chosen_metrics(session.plugins.metrics, None, geometry=request.geometry)
+        asked = {"repeats": request.repeats, "metrics": metric_identities(wanted, setup)}
         finished = steps.done("record", keys["record"])
         if finished is not None and measures(finished.get("asked"), asked):
             with contextlib.suppress(UserInputError):  # a damaged record is written again
@@ -169,6 +171,7 @@ def _record(
         "codec": schema.picked(schema.CodecBlock, {"peak_decode_bytes": decoded["peak_bytes"]}, steps),
         "train": schema.picked(schema.TrainBlock, training, {"with_pretraining_s": total_seconds(training)}),
         "rasterizers": {"train": training["rasterizers"], "render": measured["rasterizers"]},
+        "raster_options": {"train": training["raster"], "render": measured.get("raster", {})},
         "contended": contended,
         "flags": [*(flag for flag in measured["flags"] if flag != CONTENDED), *([CONTENDED] if contended else [])],
         "phases": phases_of_run(session.plugins, training, encoding, measured),

@@ -84,11 +84,12 @@ class Session:
         self.once(line, lambda: self.say(line))
 
     def rasterizer(self, resolved: ResolvedConfig, suggested: Iterable[str]) -> NegotiatedRasterizer:
-        """Return what draws for a run: the user's choice first, then `suggested` names."""
+        """Return what draws for a run: the user's choice first, then `suggested` names; with the user's options."""
         chosen = resolved.ppl.raster
         return NegotiatedRasterizer(
-            self.plugins, device=self.device, prefer=chosen.prefer, forbid=chosen.forbid, suggested=suggested
-        )
+            self.plugins, device=self.device, prefer=chosen.prefer, forbid=chosen.forbid, suggested=suggested,
+            options=chosen.options,
+        )  # fmt: skip
 
     def load_kernels(self) -> None:
         """Load (or compile) every installed native module now, so that no clock of a step runs while a compiler does.

@@ -175,8 +175,8 @@ def _train_stages(
     scene, ppl = session.scene(resolved), resolved.ppl
     method = pretrained.make_method(plugins, resolved)
     stages = list(method.stages())
-    options = stages[-1].raster_options(stages[-1].iterations, scene.background)
     rasterizer = session.rasterizer(resolved, [name for stage in stages for name in stage.prefer])
+    options = rasterizer.decided(stages[-1].raster_options(stages[-1].iterations, scene.background))
     parts = StageParts(plugins, stages, ppl, loaded, rasterizer)
     before: dict[str, dict[str, Any]] = {}
 

@@ -132,9 +132,10 @@ class Scene:
     train, test views, disjoint unless the split is "all"
     points      start points (SfM, or random for Blender scenes); None if there are none
     protocol    how pictures were chosen, resized and split
-    ground_truth    geometry that the scene brings, by name: "points" [P,3], "normals" [P,3], "depth": view name ->
-                    [1,H,W]; "world_mats" and "scale_mats" [n,4,4] float64, n views by name (their product projects the
-                    scene's units to pixels, scale_mats[0] takes them to millimetres); often empty
+    ground_truth    geometry that the scene brings, by name: "points" [P,3], "normals" [P,3]; "distance": points [n,3]
+                    -> [n] to the surface; "depth", "normal_maps": view name -> [1,H,W], [3,H,W] (world); "world_mats"
+                    and "scale_mats" [n,4,4] float64, n views by name (their product projects the scene's units to
+                    pixels, scale_mats[0] takes them to millimetres); often empty
     warnings    one-line facts the user should see (dropped points, off-centre principal point)
     """
 

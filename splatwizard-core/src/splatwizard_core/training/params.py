@@ -5,7 +5,7 @@ import typing
 from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, create_model
+from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, create_model, model_serializer
 
 from splatwizard_core.scene.dataset import SceneOptions
 
@@ -25,10 +25,29 @@ class Params(BaseModel):
 
 
 class RasterParams(Params):
-    """Choice among the installed rasterizers."""
+    """Choice among the installed rasterizers, and options that hold in place of those of the method or of a file."""
 
     prefer: list[str] = Field([], description="rasterizers to take first if they can, by name")
     forbid: list[str] = Field([], description="rasterizers never to take, by name")
+    profile: str | None = Field(
+        None, description="set of constants and quirks that rasterizers know by this name; none: as method or file asks"
+    )
+    antialias: bool | None = Field(
+        None, description="compensate opacities for the low-pass (Mip-Splatting); none: as method or file asks"
+    )
+    eps2d: float | None = Field(
+        None, ge=0, le=100, description="low-pass of the projected Gaussians, px^2; none: as method or file asks (0.3)"
+    )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Values of `RasterOptions` that the user has decided."""
+        return self.model_dump(exclude={"prefer", "forbid"})
+
+    @model_serializer(mode="wrap")
+    def _given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        # None is left out: a configuration that decides nothing keeps the hash that it had before there were options.
+        return {name: value for name, value in handler(self).items() if value is not None}
 
 
 class PipelineParams(Params):

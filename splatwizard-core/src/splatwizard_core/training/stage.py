@@ -146,7 +146,7 @@ class Stage:
         """Register what runs between backward and the optimizer step, at the steps of `self.when(...)`."""
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        """Return how this step is rendered. Must not ask for different features at different steps."""
+        """Return how this step is rendered. The last step asks for every feature that any step asks for."""
         return RasterOptions(background=background)
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:

@@ -1,6 +1,6 @@
 """Columns of integers under densities of their own: the encoder turns each density into counts, and stores these.
 
-What `factorised` and `mixture` have in common. A decoder that evaluated the density itself would need exp and tanh,
+Used by `mixture`. A decoder that evaluated the density itself would need exp and tanh,
 whose last bits differ between machines, and one wrong count garbles all that follows. The counts of a column cover the
 integers in which the density has its mass; what lies outside is escape coded.
 

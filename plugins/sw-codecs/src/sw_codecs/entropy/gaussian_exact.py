@@ -1,4 +1,4 @@
-"""Entropy models `gaussian-exact` and `laplace-exact`: integer parameters, shipped count tables, any machine.
+"""Entropy model `gaussian-exact`: integer parameters, shipped count tables, any machine.
 
 Mean and scale reach the coder as integers with 12 fractional bits (from an integer network, see `integer_mlp`), are
 put on a lattice with integer arithmetic alone, and select one of 512 shipped tables. Symbols are coded table by table,
@@ -9,7 +9,7 @@ rules 3 to 6.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from torch import Tensor
@@ -21,7 +21,7 @@ from sw_codecs.coders.arithmetic import CHUNK, HEADER
 from sw_codecs.coders.model_spec import as_symbols
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter
 from sw_codecs.entropy.exact_tables import FRACTIONS, Family, exact_tables
-from sw_codecs.entropy.rates import CODER_FLOOR, gaussian_bits, laplace_bits
+from sw_codecs.entropy.rates import CODER_FLOOR, gaussian_bits
 
 UNIT = 4096  # 12 fractional bits
 SYMBOL_LIMIT = 1 << 30
@@ -77,25 +77,24 @@ Floats = FloatContext
 Integers = IntegerContext
 
 
-class ExactModel:
-    """Codes integer symbols [n], |k| < 2^30, in units of the step; see the two subclasses.
+class GaussianExact:
+    """Codes integer symbols [n], |k| < 2^30, in units of the step: a Gaussian with mean and standard deviation each.
 
     What a caller builds is reached through the class, so that whoever got it from the registry needs no import:
     `model.FloatContext(...)`, `model.IntegerContext(...)`, `model.step_multipliers(outputs)`.
     """
 
-    family: ClassVar[str]
     FloatContext = Floats
     IntegerContext = Integers
     step_multipliers = staticmethod(step_multipliers)
 
     def bits(self, symbols: Tensor, context: Floats) -> Tensor:
         """Bits of each value (its unit is the context's; rounded or with noise added); differentiable."""
-        raise NotImplementedError
+        return gaussian_bits(symbols, context.mean, context.scale, context.step, **context.bound)
 
     def table_bits(self, symbols: np.ndarray, context: Integers) -> np.ndarray:
         """Bits that `encode` spends on each symbol, float64 [n], from the very tables it uses; no gradient."""
-        tables, _ = self._family()
+        tables = exact_tables().gaussian
         symbols = _check_symbols(symbols)
         centre, number = _lattice(context, len(symbols))
         found = np.empty(len(symbols))
@@ -114,8 +113,9 @@ class ExactModel:
         """
         symbols = _check_symbols(symbols)
         centre, number = _lattice(context, len(symbols))
-        family, head = self._family()
-        parts = [head]
+        tables = exact_tables()
+        family = tables.gaussian
+        parts = [tables.version.to_bytes(2, "little") + tables.crc.to_bytes(4, "little")]
         for start in range(0, len(symbols), CHUNK):
             part = slice(start, start + CHUNK)
             chunk = np.ascontiguousarray(symbols[part], "<i4")
@@ -132,44 +132,20 @@ class ExactModel:
             centre, number = _lattice(context, len(np.asarray(context.mean)))
         except ValueError as error:
             raise BitstreamError(str(error)) from error
-        family, _ = self._family()
-        reader = ByteReader(data)
-        exact_tables().check(reader.integer(2), reader.integer(4))
+        tables, reader = exact_tables(), ByteReader(data)
+        tables.check(reader.integer(2), reader.integer(4))
         found = np.empty(len(centre), np.int32)
         for start in range(0, len(found), CHUNK):
             part = slice(start, start + CHUNK)
             count, kmin, kmax, length, crc = HEADER.unpack(reader.take(HEADER.size))
             if count != len(found[part]):
                 raise BitstreamError(f"a chunk has {count:,} symbols, expected {len(found[part]):,}")
-            chunk = _decode_chunk(reader.take(length), number[part], family) + centre[part]
+            chunk = _decode_chunk(reader.take(length), number[part], tables.gaussian) + centre[part]
             if chunk.min() != kmin or chunk.max() != kmax or checksum.crc32(chunk.astype("<i4")) != crc:
                 raise BitstreamError("the decoded symbols do not match their CRC-32: damaged data or a wrong context")
             found[part] = chunk
         reader.finish()
         return found
-
-    def _family(self) -> tuple[Family, bytes]:
-        tables = exact_tables()
-        family: Family = getattr(tables, self.family)
-        return family, tables.version.to_bytes(2, "little") + tables.crc.to_bytes(4, "little")
-
-
-class GaussianExact(ExactModel):
-    """Gaussian with mean and standard deviation per symbol."""
-
-    family = "gaussian"
-
-    def bits(self, symbols: Tensor, context: Floats) -> Tensor:
-        return gaussian_bits(symbols, context.mean, context.scale, context.step, **context.bound)
-
-
-class LaplaceExact(ExactModel):
-    """Laplacian with mean and scale b (density exp(-|x - mean| / b) / 2b) per symbol."""
-
-    family = "laplace"
-
-    def bits(self, symbols: Tensor, context: Floats) -> Tensor:
-        return laplace_bits(symbols, context.mean, context.scale, context.step, **context.bound)
 
 
 def _check_symbols(symbols: Any) -> np.ndarray:

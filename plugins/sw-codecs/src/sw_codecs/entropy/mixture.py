@@ -30,7 +30,7 @@ class MixtureContext:
     scale   [..., K] > 0: standard deviation, or b of a Laplacian
     step    the width of a bin, a number or one per channel [C]
     family  "gaussian" or "laplace"
-    smallest_probability, grad_below_bound     as in `FloatContext` of `gaussian`
+    smallest_probability, grad_below_bound     as in `FloatContext` of `gaussian-exact`
     """
 
     logits: Tensor

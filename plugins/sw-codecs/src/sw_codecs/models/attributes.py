@@ -1,8 +1,8 @@
 """Gaussians as a matrix of integers and back: the lattice of the file in mode `quantized`.
 
-Columns: colour band 0 (luma, two chroma), opacity logit, three log scales in descending order, x, y, z of the unit
-quaternion, then three columns for each higher SH coefficient. Dequantising uses +, *, / and square roots of doubles
-in a fixed order, so that a file decodes to the same floats on every machine.
+Columns: colour band 0 (luma, two chroma), opacity logit, three log scales (of surfels two) in descending order, x, y, z
+of the unit quaternion, then three columns for each higher SH coefficient. Dequantising uses +, *, / and square roots of
+doubles in a fixed order, so that a file decodes to the same floats on every machine.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from splatwizard_core.api import UserInputError
 from sw_codecs.models import gauge
 
-BASE_COLUMNS = 10
+SCALES_FROM = 4
+"""First column of the log scales."""
 MAX_LOGIT = 20.0
 MAX_SYMBOL = 1 << 30
 
@@ -63,8 +64,13 @@ class Values:
     quats: NDArray[Any]
 
 
+def base_columns(scales: int) -> int:
+    """Return how many columns stand before those of higher SH coefficients, for Gaussians with so many scales."""
+    return SCALES_FROM + scales + 3
+
+
 def quantize(values: Values, steps: Steps) -> NDArray[np.int32]:
-    """Integers [N, 10 + 3R], each the nearest one. Raises UserInputError if one is beyond 2^30.
+    """Integers [N, 10 + 3R] (of surfels 9 + 3R), each the nearest one. Raises UserInputError if one is beyond 2^30.
 
     A dead zone around zero, as in video codecs, does not pay: it shrinks the coefficients of all the Gaussians behind a
     pixel in one direction, so their errors add up (a tenth of a step cost 0.05 dB on the demo scene, and saved less
@@ -90,17 +96,17 @@ def quantize(values: Values, steps: Steps) -> NDArray[np.int32]:
     return np.concatenate(columns, axis=1).astype(np.int32)
 
 
-def dequantize(symbols: NDArray[Any], steps: Steps) -> Values:
-    """Inverse of `quantize`, float32."""
-    n = len(symbols)
-    base = symbols[:, :BASE_COLUMNS].astype(np.float64)
-    rest = symbols[:, BASE_COLUMNS:].astype(np.float64).reshape(n, -1, 3)
+def dequantize(symbols: NDArray[Any], steps: Steps, scales: int = 3) -> Values:
+    """Inverse of `quantize`, float32, for Gaussians with so many `scales`."""
+    n, quats, columns = len(symbols), SCALES_FROM + scales, base_columns(scales)
+    base = symbols[:, :columns].astype(np.float64)
+    rest = symbols[:, columns:].astype(np.float64).reshape(n, -1, 3)
     return Values(
         dc=_to_rgb(base[:, :3] * steps.dc).astype(np.float32),
         rest=_to_rgb(rest * steps.rest).astype(np.float32),
         opacity_logits=(base[:, 3] * steps.opacity).astype(np.float32),
-        log_scales=(base[:, 4:7] * steps.scale).astype(np.float32),
-        quats=gauge.complete(base[:, 7:10] * steps.quat).astype(np.float32),
+        log_scales=(base[:, SCALES_FROM:quats] * steps.scale).astype(np.float32),
+        quats=gauge.complete(base[:, quats:columns] * steps.quat).astype(np.float32),
     )
 
 

@@ -2,6 +2,9 @@
 
 Sorting the axes by size makes the three scale columns narrow; of the four sign choices that are left, the one with
 the largest |w| makes w >= 1/2, so that it need not be stored: w = sqrt(1 - x^2 - y^2 - z^2).
+
+A surfel is the case of a third scale of 0: its normal stays the third axis, and 8 choices are left, of which a
+renderer, which turns normals to the camera, sees none.
 """
 
 from __future__ import annotations
@@ -41,11 +44,16 @@ def multiply(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float
 
 
 def canonical(log_scales: NDArray[Any], quats: NDArray[Any]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Log scales [N,3] in descending order and unit quaternions [N,4] with w >= 1/2 of the same covariances.
+    """Log scales in descending order and unit quaternions [N,4] with w >= 1/2 of the same covariances.
+
+    log_scales  [N,3], of surfels [N,2]
+    quats       [N,4] (w,x,y,z), any norm
 
     A quaternion of norm 0 becomes the identity.
     """
-    scales = np.asarray(log_scales, dtype=np.float64)
+    width = log_scales.shape[1]
+    scales = np.full((len(log_scales), 3), -np.inf)
+    scales[:, :width] = log_scales
     q = np.asarray(quats, dtype=np.float64)
     norm = np.linalg.norm(q, axis=1, keepdims=True)
     q = np.where(norm > 1e-12, q / np.maximum(norm, 1e-12), np.array([1.0, 0.0, 0.0, 0.0]))
@@ -58,7 +66,7 @@ def canonical(log_scales: NDArray[Any], quats: NDArray[Any]) -> tuple[NDArray[np
     best = np.abs(candidates[:, :, 0]).argmax(axis=0)
     q = candidates[best, np.arange(len(q))]
     q = np.where(q[:, :1] < 0, -q, q)
-    return np.take_along_axis(scales, order, axis=1), q
+    return np.take_along_axis(scales, order, axis=1)[:, :width], q
 
 
 def complete(xyz: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.surfels import gaussians_of, state_surfels, stated_scales
 
-from splatwizard_core.api import GaussianModel
 from sw_codecs.positions.ordering import spatial_order
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+    from splatwizard_core.api import ContainerReader, ContainerWriter, GaussianModel, PluginManager
 
-TAILS = {"sh_dc": (1, 3), "opacity_logits": (), "log_scales": (3,), "quats": (4,)}
-"""Shape of one row of what is stored as byte planes, but for sh_rest [K-1,3]; means [3] are stored as steps."""
+PLANES = ("sh_dc", "opacity_logits", "log_scales", "quats", "sh_rest")
+"""Parameters that are stored as byte planes; means are stored as steps."""
 
 
 def encode(model: GaussianModel, writer: ContainerWriter, plugins: PluginManager) -> None:
@@ -29,13 +29,16 @@ def encode(model: GaussianModel, writer: ContainerWriter, plugins: PluginManager
     writer.static["num_gaussians"] = model.num_rows
     writer.static["max_sh_degree"] = model.max_sh_degree
     writer.static["active_sh_degree"] = model.active_sh_degree
+    state_surfels(model, writer)
     steps, planes = plugins.array_coders.load("float-delta")(), plugins.array_coders.load("byte-planes")()
     means = _float32(model, "means")
     order = spatial_order(np.nan_to_num(means, nan=0.0, posinf=0.0, neginf=0.0))  # for the order alone
     writer.add("means", steps.encode(means[order]))
-    for name in (*TAILS, "sh_rest"):
+    for name in PLANES:
         writer.add(name, planes.encode(_float32(model, name)[order]))
-    writer.allow(_bytes(model.num_rows, model.sh_rest.shape[1]), f"a model of {model.num_rows:,} Gaussians")
+    writer.allow(
+        _bytes(model.num_rows, model.sh_rest.shape[1], model.NUM_SCALES), f"a model of {model.num_rows:,} Gaussians"
+    )
 
 
 def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
@@ -43,15 +46,18 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     n = reader.integer("num_gaussians", low=0, high=2**32 - 1)
     degree = reader.integer("max_sh_degree", low=0, high=3)
     active = reader.integer("active_sh_degree", low=0, high=degree)
-    rest = (degree + 1) ** 2 - 1
-    reader.allow(_bytes(n, rest), f"a model of {n:,} Gaussians")
+    rest, scales = (degree + 1) ** 2 - 1, stated_scales(reader)
+    reader.allow(_bytes(n, rest, scales), f"a model of {n:,} Gaussians")
     steps, planes = plugins.array_coders.load("float-delta")(), plugins.array_coders.load("byte-planes")()
     with reader.decoding("means") as data:
         tensors = {"means": torch.from_numpy(steps.decode(data, np.float32, (n, 3)))}
-    for name, tail in {**TAILS, "sh_rest": (rest, 3)}.items():
+    tails: dict[str, tuple[int, ...]] = {
+        "sh_dc": (1, 3), "opacity_logits": (), "log_scales": (scales,), "quats": (4,), "sh_rest": (rest, 3),
+    }  # fmt: skip
+    for name in PLANES:
         with reader.decoding(name) as data:
-            tensors[name] = torch.from_numpy(planes.decode(data, np.float32, (n, *tail)))
-    return GaussianModel(**tensors, active_sh_degree=active)
+            tensors[name] = torch.from_numpy(planes.decode(data, np.float32, (n, *tails[name])))
+    return gaussians_of(**tensors, active_sh_degree=active)
 
 
 def _float32(model: GaussianModel, name: str) -> NDArray[Any]:
@@ -59,5 +65,5 @@ def _float32(model: GaussianModel, name: str) -> NDArray[Any]:
     return array
 
 
-def _bytes(n: int, rest: int) -> int:
-    return 4 * n * (14 + 3 * rest)
+def _bytes(n: int, rest: int, scales: int) -> int:
+    return 4 * n * (11 + scales + 3 * rest)

@@ -9,15 +9,16 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from pydantic import Field, ValidationError
+from sw_gaussians.surfels import SurfelModel, gaussians_of
 
 from splatwizard_core.api import BitstreamError, GaussianModel, Params
-from sw_codecs.models.attributes import BASE_COLUMNS, Steps, Values, dequantize, quantize
+from sw_codecs.models.attributes import SCALES_FROM, Steps, Values, base_columns, dequantize, quantize
 from sw_codecs.models.band_context import (
     MAX_CLASSES,
     activity_classes,
@@ -37,8 +38,8 @@ log = logging.getLogger(__name__)
 FAINTEST = math.log(1 / 255 / (1 - 1 / 255))
 """Rasterizers skip a splat whose alpha is below 1/255, and alpha never exceeds the opacity."""
 
-SECTIONS = {"color": (0, 3), "opacity": (3, 4), "scales": (4, 7), "quats": (7, 10)}
-"""Columns of the attribute matrix by section; SH bands 1 to 3 follow with one section each."""
+SECTIONS = ("color", "opacity", "scales", "quats")
+"""Sections of the first columns of the attribute matrix; SH bands 1 to 3 follow with one section each."""
 
 ROWS_AT_ONCE = 1 << 12
 """Rows that are dequantised together: intermediate doubles of all rows would outweigh the model several times."""
@@ -60,11 +61,29 @@ class Layout(Params):
     scale_step: float = Field(gt=0, le=1e3)
     quat_step: float = Field(gt=0, le=1e3)
     sh_classes: int = Field(ge=1, le=MAX_CLASSES)
+    primitive: Literal["surfel"] | None = None
+
+    @property
+    def scales(self) -> int:
+        """Of a Gaussian 3, of a surfel 2."""
+        return GaussianModel.NUM_SCALES if self.primitive is None else SurfelModel.NUM_SCALES
 
     @property
     def decoded_bytes(self) -> int:
-        """Of the model in float32: 236 a Gaussian at SH degree 3."""
-        return 4 * self.num_gaussians * (14 + 3 * ((self.max_sh_degree + 1) ** 2 - 1))
+        """Of the model in float32: 236 a Gaussian at SH degree 3, 232 a surfel."""
+        return 4 * self.num_gaussians * (11 + self.scales + 3 * ((self.max_sh_degree + 1) ** 2 - 1))
+
+    @property
+    def base_columns(self) -> int:
+        """Columns of the attribute matrix before those of SH bands 1 to 3."""
+        return base_columns(self.scales)
+
+    @property
+    def sections(self) -> dict[str, tuple[int, int]]:
+        """First column and end of each of SECTIONS."""
+        quats = SCALES_FROM + self.scales
+        limits = (0, 3), (3, SCALES_FROM), (SCALES_FROM, quats), (quats, self.base_columns)
+        return dict(zip(SECTIONS, limits, strict=True))
 
     @property
     def grid(self) -> PositionGrid:
@@ -80,13 +99,13 @@ def encode(model: GaussianModel, writer: ContainerWriter, settings: QuantizedSet
     octree = plugins.position_codecs.load("octree")()
     layout, cells, symbols = lattice(model, settings, octree.sort)
     writer.raster["sh_degree"] = layout.max_sh_degree
-    writer.static.update(layout.model_dump(mode="json"))
+    writer.static.update(layout.model_dump(mode="json", exclude_none=True))
     writer.add("positions", octree.encode(cells, layout.position_bits))
     columns = plugins.entropy_models.load("columns")()
-    for name, (start, stop) in SECTIONS.items():
+    for name, (start, stop) in layout.sections.items():
         writer.add(name, columns.encode(symbols[:, start:stop], None))
     for band, start, stop in _bands(layout):
-        classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
+        classes, count = _classes(layout, band, symbols[:, layout.base_columns : start])
         writer.add(f"sh{band}", encode_band(columns, symbols[:, start:stop], classes, count))
     writer.allow(layout.decoded_bytes, f"a model of {layout.num_gaussians:,} Gaussians")
 
@@ -103,12 +122,12 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
         if n and not 0 <= int(cells.min()) <= int(cells.max()) < 1 << layout.position_bits:
             raise BitstreamError(f"a point leaves the grid of {layout.position_bits} bits")
     columns = plugins.entropy_models.load("columns")()
-    symbols = np.empty((n, BASE_COLUMNS + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
-    for name, (start, stop) in SECTIONS.items():
+    symbols = np.empty((n, layout.base_columns + 3 * ((layout.active_sh_degree + 1) ** 2 - 1)), dtype=np.int32)
+    for name, (start, stop) in layout.sections.items():
         with reader.decoding(name) as data:
             symbols[:, start:stop] = decode_matrix(columns, data, n, stop - start)
     for band, start, stop in _bands(layout):
-        classes, count = _classes(layout, band, symbols[:, BASE_COLUMNS:start])
+        classes, count = _classes(layout, band, symbols[:, layout.base_columns : start])
         with reader.decoding(f"sh{band}") as data:
             symbols[:, start:stop] = decode_band(columns, data, classes, count, stop - start)
     model = reconstruct(layout, cells, symbols)
@@ -159,6 +178,7 @@ def lattice(
         scale_step=settings.scale_step,
         quat_step=settings.quat_step,
         sh_classes=suitable_classes(len(order)),
+        primitive="surfel" if model.NUM_SCALES == SurfelModel.NUM_SCALES else None,
     )
     return layout, cells[order], quantize(values, layout.steps)
 
@@ -167,18 +187,18 @@ def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.in
     """The model that these integers stand for; what the decoder returns."""
     n, grid, steps = layout.num_gaussians, layout.grid, layout.steps
     tails = {"means": (3,), "dc": (3,), "rest": ((layout.max_sh_degree + 1) ** 2 - 1, 3), "opacity_logits": (),
-             "log_scales": (3,), "quats": (4,)}  # fmt: skip
+             "log_scales": (layout.scales,), "quats": (4,)}  # fmt: skip
     found = {name: np.zeros((n, *tail), dtype=np.float32) for name, tail in tails.items()}
     for start in range(0, n, ROWS_AT_ONCE):
         part = slice(start, start + ROWS_AT_ONCE)
         with np.errstate(over="ignore", invalid="ignore"):  # a hostile header may overflow; the caller looks
-            values = dequantize(symbols[part], steps)
+            values = dequantize(symbols[part], steps, layout.scales)
             found["means"][part] = grid.dequantize(cells[part])
         found["rest"][part, : values.rest.shape[1]] = values.rest
         for name in ("dc", "opacity_logits", "log_scales", "quats"):
             found[name][part] = getattr(values, name)
     found["dc"] = found["dc"][:, None, :]
-    return GaussianModel(
+    return gaussians_of(
         *(torch.from_numpy(array) for array in found.values()), active_sh_degree=layout.active_sh_degree
     )
 
@@ -186,7 +206,7 @@ def reconstruct(layout: Layout, cells: NDArray[np.int64], symbols: NDArray[np.in
 def _bands(layout: Layout) -> list[tuple[int, int, int]]:
     """(band, first column, end) of the SH bands that are stored."""
     return [
-        (band, BASE_COLUMNS + 3 * (band**2 - 1), BASE_COLUMNS + 3 * ((band + 1) ** 2 - 1))
+        (band, layout.base_columns + 3 * (band**2 - 1), layout.base_columns + 3 * ((band + 1) ** 2 - 1))
         for band in range(1, layout.active_sh_degree + 1)
     ]
 
@@ -198,7 +218,7 @@ def _classes(layout: Layout, band: int, lower: NDArray[np.int32]) -> tuple[NDArr
     return activity_classes(lower, layout.sh_classes), layout.sh_classes
 
 
-BESIDE = ("mode", "codec", "method")
+BESIDE = ("mode", "codec", "method", "depth_ratio", "lambda_dist", "lambda_normal")
 """Header values that a method keeps beside the codec's own."""
 
 

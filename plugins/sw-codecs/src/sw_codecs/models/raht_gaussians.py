@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
+from sw_gaussians.surfels import refuse_surfels
 from torch import Tensor, nn
 
 from splatwizard_core.api import SH, GaussianInputs, GaussianModel, SplatOptimizer
@@ -72,7 +73,9 @@ class RahtGaussians(GaussianModel):
         """Return copies of those of a model's Gaussians that are finite, not settled.
 
         Opacity logits become at most +-20: beyond it opacities are 0 or 1, and one such number would spoil a block.
+        Raises UserInputError for surfels.
         """
+        refuse_surfels(model, "codec raht")
         finite = finite_rows(model)
         if not bool(finite.all()):
             log.info("%d of %d Gaussians are not finite and are left out", int((~finite).sum()), len(finite))

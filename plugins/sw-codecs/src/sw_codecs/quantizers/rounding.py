@@ -1,4 +1,4 @@
-"""Quantizers with a step: straight-through rounding and uniform noise. Round means half to even (torch.round).
+"""Quantizer `ste-round` with a step, and the noise that stands in for it. Round means half to even (torch.round).
 
 Noise and rounding never mix: training renders and rates the noisy value, everything else the rounded one.
 """
@@ -125,27 +125,3 @@ def add_noise(x: Tensor, step: Tensor, uniform: Tensor) -> Tensor:
     uniform     draws u ~ U(0,1) of the shape of x; they are overwritten
     """
     return torch.addcmul(x, uniform.sub_(0.5), step)
-
-
-class UniformNoise(SteRound):
-    """x + step * u with u ~ U(-1/2, 1/2) in training; the gradient is 1 for x and u for the step. Files are rounded.
-
-    The limit of indices holds x within `index_clamp` steps of k0 * step, with gradient 0 beyond.
-    """
-
-    def forward(
-        self,
-        x: Tensor,
-        step: float | Tensor | None = None,
-        generator: torch.Generator | None = None,
-        *,
-        mean: float | Tensor | None = None,
-    ) -> Tensor:
-        u = torch.rand(x.shape, generator=generator, device=x.device, dtype=x.dtype)
-        q = self._step(x, step)
-        low, high = self._limits(x, q, mean)
-        if low is not None and high is not None:
-            x = torch.clamp(x, low * q.detach(), high * q.detach())
-        return add_noise(x, q, u)
-
-    __call__ = forward

@@ -85,6 +85,14 @@ class World:
                 n[:, at] = solid.shape.rotate_out(solid.shape.normal(solid.shape.to_local(p[:, at])))
         return n
 
+    def distance(self, points: Vec) -> Vec:
+        """Signed distance [n] of world points [n,3] to the surface of all solids together, negative inside.
+
+        Exact outside; inside of solids that meet at least as near as the surface is.
+        """
+        p = np.asarray(points, dtype=np.float64).T
+        return cast(Vec, np.min([s.shape.distance(s.shape.to_local(p)) for s in self.solids], axis=0))
+
     def shade(self, p: Vec, which: NDArray[np.int64], view: Vec, lamp: Vec) -> Vec:
         """Display RGB [3,n] of surface points seen from unit directions `view` (towards the eye).
 
@@ -189,3 +197,12 @@ def depth_map(world: World, camera: Camera) -> torch.Tensor:
     t, which = world.trace(eye_of(camera), d)
     z = np.where(which >= 0, np.where(which >= 0, t, 0) * z_of, 0).astype(np.float32)
     return torch.from_numpy(z.reshape(1, camera.height, camera.width))
+
+
+def normal_map(world: World, camera: Camera) -> torch.Tensor:
+    """float32 [3,H,W]: exact outward unit normals at pixel centres, world frame; 0 where nothing is hit."""
+    d, _ = camera_rays(camera)
+    eye = eye_of(camera)
+    t, which = world.trace(eye, d)
+    n = world.normals(eye + np.where(which >= 0, t, 0) * d, which)
+    return torch.from_numpy(n.astype(np.float32).reshape(3, camera.height, camera.width))

@@ -82,9 +82,13 @@ class Shape:
         """Outward unit normals [3,n] at surface points p [3,n], local frame."""
         raise NotImplementedError
 
+    def distance(self, p: Vec) -> Vec:
+        """Signed distance [n] to the surface, exact everywhere, negative inside, local frame."""
+        raise NotImplementedError
+
     def contains(self, p: Vec) -> Mask:
         """[n], strictly inside, local frame."""
-        raise NotImplementedError
+        return self.distance(p) < 0
 
     def sample(self, n: int, generator: torch.Generator) -> Vec:
         """n points [3,n], uniform by area, local frame."""
@@ -150,6 +154,9 @@ class Sphere(Shape):
     def normal(self, p: Vec) -> Vec:
         return normalize(p)
 
+    def distance(self, p: Vec) -> Vec:
+        return cast(Vec, np.sqrt(dot(p, p)) - self.r)
+
     def contains(self, p: Vec) -> Mask:
         return dot(p, p) < self.r**2
 
@@ -191,6 +198,11 @@ class Box(Shape):
         n = np.zeros_like(p)
         n[axis, columns] = np.sign(scaled[axis, columns])
         return n
+
+    def distance(self, p: Vec) -> Vec:
+        beyond = np.abs(p) - np.array(self.half)[:, None]
+        outside = np.maximum(beyond, 0)
+        return np.sqrt(dot(outside, outside)) + np.minimum(beyond.max(axis=0), 0)
 
     def contains(self, p: Vec) -> Mask:
         return cast(Mask, (np.abs(p) < np.array(self.half)[:, None]).all(axis=0))
@@ -239,6 +251,11 @@ class Cylinder(Shape):
         zero = np.zeros_like(p[0])
         return np.where(is_cap, np.stack([zero, zero, np.sign(p[2])]), np.stack([p[0] / self.r, p[1] / self.r, zero]))
 
+    def distance(self, p: Vec) -> Vec:
+        beyond = np.stack([np.sqrt(p[0] * p[0] + p[1] * p[1]) - self.r, np.abs(p[2]) - self.half_height])
+        outside = np.maximum(beyond, 0)
+        return cast(Vec, np.sqrt((outside * outside).sum(axis=0)) + np.minimum(beyond.max(axis=0), 0))
+
     def contains(self, p: Vec) -> Mask:
         return cast(Mask, (p[0] * p[0] + p[1] * p[1] < self.r**2) & (np.abs(p[2]) < self.half_height))
 
@@ -268,7 +285,6 @@ class Torus(Shape):
         return 4 * math.pi**2 * self.ring * self.tube
 
     def distance(self, p: Vec) -> Vec:
-        """Signed distance [n] of local points, exact everywhere."""
         q = np.sqrt(p[0] * p[0] + p[1] * p[1]) - self.ring
         return cast(Vec, np.sqrt(q * q + p[2] * p[2]) - self.tube)
 
@@ -306,9 +322,6 @@ class Torus(Shape):
         rho = np.sqrt(p[0] * p[0] + p[1] * p[1])
         shrink = 1 - self.ring / rho
         return normalize(np.stack([p[0] * shrink, p[1] * shrink, p[2]]))
-
-    def contains(self, p: Vec) -> Mask:
-        return self.distance(p) < 0
 
     def sample(self, n: int, generator: torch.Generator) -> Vec:
         kept = np.empty((2, 0))

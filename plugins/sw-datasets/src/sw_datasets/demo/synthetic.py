@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
 
@@ -15,7 +15,7 @@ from torch import Tensor
 from splatwizard_core.api import Camera, PointCloud, Protocol, Scene, View, stream
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.demo.kept import kept_or_drawn, picture_key
-from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of
+from sw_datasets.demo.raycast import Solid, World, depth_map, draw, eye_of, normal_map
 from sw_datasets.demo.shapes import Box, Cylinder, Sphere, Torus, Vec, dot, rotation_x, rotation_z, uniform
 from sw_datasets.demo.textures import Material, bands, checker, dots, marble, planks
 
@@ -132,15 +132,18 @@ def orbit(count: int, width: int, height: int) -> list[Camera]:
     return cameras
 
 
-class DepthMaps(Mapping[str, Tensor]):
-    """View name -> exact depth [1,H,W] float32 (z in the camera frame, 0 = nothing), computed when asked for."""
+class ExactMaps(Mapping[str, Tensor]):
+    """View name -> an exact map of the world, computed when asked for.
 
-    def __init__(self, world: World, views: list[View]) -> None:
-        self._world = world
+    draw    depth_map ([1,H,W] float32, z in the camera frame, 0 = nothing) or normal_map ([3,H,W], world frame)
+    """
+
+    def __init__(self, world: World, views: list[View], draw: Callable[[World, Camera], Tensor]) -> None:
+        self._world, self._draw = world, draw
         self._cameras = {view.name: view.camera for view in views}
 
     def __getitem__(self, name: str) -> Tensor:
-        return depth_map(self._world, self._cameras[name])
+        return self._draw(self._world, self._cameras[name])
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._cameras)
@@ -254,6 +257,8 @@ def make_scene(
         ground_truth={
             "points": torch.from_numpy(xyz.T.astype(np.float32)),
             "normals": torch.from_numpy(normals.T.astype(np.float32)),
-            "depth": DepthMaps(world, views),
+            "distance": world.distance,
+            "depth": ExactMaps(world, views, depth_map),
+            "normal_maps": ExactMaps(world, views, normal_map),
         },
     )

@@ -21,12 +21,13 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+STEPS = 20
 SLACK = 1.05
-"""After 40 steps a rate term has hardly worked, so two points of it differ by chance."""
+"""After so few steps a rate term has hardly worked, so two points of it differ by chance."""
 
 
 def check_rate_points(entry: Entry, plugins: PluginManager, settings: Sequence[str] = ()) -> str:
-    """Hold the files of the first and the last rate point, each trained for some 40 steps, to be in order of size."""
+    """Hold the files of the first and the last rate point, each trained for 20 steps, to be in order of size."""
     rates = list(entry.load().RATES)
     if len(rates) < 2:
         return "one rate point, nothing to compare"
@@ -42,7 +43,7 @@ def check_rate_points(entry: Entry, plugins: PluginManager, settings: Sequence[s
 
 def _size(entry: Entry, plugins: PluginManager, settings: Sequence[str], rate: str) -> int:
     """Bytes of the file of a short training at a rate point."""
-    resolved = small_configuration(entry, plugins, settings, rate)
+    resolved = small_configuration(entry, plugins, settings, rate, STEPS)
     method = entry.load()(plugins, resolved.config)
     with tempfile.TemporaryDirectory() as folder:
         directory = Path(folder) / "demo-tiny" / resolved.method / resolved.rate

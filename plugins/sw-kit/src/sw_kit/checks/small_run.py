@@ -50,33 +50,33 @@ def check_small_run(entry: Entry, plugins: PluginManager, settings: Sequence[str
         model = train_in(session, whole, directory).model
         stages = list(entry.load()(plugins, resolved.config).stages())
         steps, stops = sum(stage.iterations for stage in stages), stops_of(stages, resolved.ppl, entry)
-        resumed = "nothing to resume"
-        if stops:
-            _check_resume(model.digest(), halved, plugins, stops)
-            resumed = f"resumes bit-equal after step {', '.join(map(str, stops))}"
-        _check_encoding(entry.load()(plugins, resolved.config), model)
-        file = directory / "scene.swz"
-        digests = {open_model(file, plugins, CPU)[0].digest() for _ in range(2)}
-        hold(
-            digests == {record.file.digest},
-            "the file decodes to another model here than in a fresh process",
-            "decode() must be a function of the file: no random numbers, no state",
-        )
-        hostile = _check_hostile(file)
+        resumed, file = "nothing to resume", directory / "scene.swz"
+        with _hostile_child(file) as child:  # meanwhile, since it takes as long as the rest
+            if stops:
+                _check_resume(model.digest(), halved, plugins, stops)
+                resumed = f"resumes bit-equal after step {', '.join(map(str, stops))}"
+            _check_encoding(entry.load()(plugins, resolved.config), model)
+            digests = {open_model(file, plugins, CPU)[0].digest() for _ in range(2)}
+            hold(
+                digests == {record.file.digest},
+                "the file decodes to another model here than in a fresh process",
+                "decode() must be a function of the file: no random numbers, no state",
+            )
+            hostile = _check_hostile(child)
     return f"{steps} steps, {record.file.bytes:,} bytes, {psnr:.1f} dB; {resumed}; {hostile}"
 
 
 def small_configuration(
-    entry: Entry, plugins: PluginManager, settings: Sequence[str] = (), rate: str | None = None
+    entry: Entry, plugins: PluginManager, settings: Sequence[str] = (), rate: str | None = None, steps: int = STEPS
 ) -> ResolvedConfig:
-    """Return the configuration of a short run on `demo:tiny`: every stage has some 40 steps, its plan scaled down.
+    """Return the configuration of a short run on `demo:tiny`: every stage has `steps` steps, its plan scaled down.
 
     rate        rate point; None: the method's default
     """
     stages = make(entry, plugins).stages()
-    sets = dict.fromkeys(_lengths(entry.load().Config), STEPS) | {"scale_schedule": "true"}
+    sets = dict.fromkeys(_lengths(entry.load().Config), steps) | {"scale_schedule": "true"}
     if any(stage.starts_from or stage.taught_by for stage in stages):
-        sets["pretrained.iterations"] = STEPS
+        sets["pretrained.iterations"] = steps
     words = (*(f"{key}={value}" for key, value in sets.items()), *settings)
     return Choices((entry.name,), TINY, preset="paper", rate=rate, sets=words, device="cpu").resolve_one(plugins)
 
@@ -119,21 +119,31 @@ def _check_encoding(method: Method, model: Any) -> None:
     hold(files[0] == files[1], "encoding twice gives two files", "seed what is random in encode()")
 
 
-def _check_hostile(file: Path) -> str:
-    """Show the decoder damaged files, in a process of its own that may crash or hang."""
+@contextlib.contextmanager
+def _hostile_child(file: Path) -> Iterator[subprocess.Popen[str]]:
+    """Show the decoder damaged files, in a process of its own that may crash or hang; it ends with the block."""
     command = [sys.executable, "-m", "sw_kit.checks.hostile_child", str(file), str(HOSTILE)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+        try:
+            yield child
+        finally:
+            child.kill()
+
+
+def _check_hostile(child: subprocess.Popen[str]) -> str:
+    """Hold what that process found to be BitstreamErrors, or legal files."""
     try:
-        done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HOSTILE_S)
+        out, err = child.communicate(timeout=HOSTILE_S)
     except subprocess.TimeoutExpired as error:
         raise BrokenContractError(
             f"{HOSTILE} damaged files take more than {HOSTILE_S} s", "hold counts against reader.allow before a loop"
         ) from error
-    if done.returncode != 0:
+    if child.returncode != 0:
         raise BrokenContractError(
-            f"a damaged file ends the process (status {done.returncode}): {done.stderr.strip()[-300:]}",
+            f"a damaged file ends the process (status {child.returncode}): {err.strip()[-300:]}",
             "check lengths before native code sees them",
         )
-    told: Mapping[str, Any] = json.loads(done.stdout.splitlines()[-1])
+    told: Mapping[str, Any] = json.loads(out.splitlines()[-1])
     hold(
         not told["problems"],
         f"{len(told['problems'])} of {HOSTILE} damaged files: {'; '.join(told['problems'][:2])}",

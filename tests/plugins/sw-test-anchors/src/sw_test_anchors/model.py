@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import PluginManager
 from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.quantizers.rounding import add_noise
 
 POSITION_BITS = 16
 OCTAVES = 5
@@ -62,7 +63,6 @@ class ContextAnchors(AnchorModel):
         self.feature_step = feature_step
         self.noise = generator
         self._uniform = plugins.quantizers.load("uniform")
-        self._noisy = plugins.quantizers.load("uniform-noise")(feature_step)
         self._rounded = plugins.quantizers.load("ste-round")(feature_step)
 
     @property
@@ -78,7 +78,8 @@ class ContextAnchors(AnchorModel):
         positions, features = self.positions()[rows], self.features[rows]
         extras = {}
         if self.training:
-            features = self._noisy.forward(features, generator=self.noise)
+            uniform = torch.rand(features.shape, generator=self.noise, device=features.device)
+            features = add_noise(features, features.new_tensor(self.feature_step), uniform)
             codes, _ = self.grid.encode(positions)
             mean, scale = self.context(context_inputs(codes).to(features) / 4096).chunk(2, dim=1)
             step = self.feature_step

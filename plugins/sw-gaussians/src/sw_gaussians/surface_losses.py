@@ -1,0 +1,57 @@
+"""Losses that draw surfels together into one surface: distortion, and normals that agree with the depth map.
+
+Source: 2D Gaussian Splatting (arXiv 2403.17888), section 5.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import Camera, RenderResult
+from sw_gaussians.surface import depth_normals, surface_depth, world_normals
+
+
+def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str, Any]:
+    """Return the fields of RasterOptions whose maps the losses of this module read.
+
+    distortion, normals     which of the two losses has a weight
+    depth_ratio             0..1, see `surface_depth`: only the depths that it blends are drawn
+    """
+    found: dict[str, Any] = {"distortion": True} if distortion else {}
+    if normals:
+        modes = {"expected": depth_ratio < 1, "median": depth_ratio > 0}
+        drawn = frozenset(mode for mode, wanted in modes.items() if wanted)
+        found |= {"normals": True, "alpha": True, "depth": drawn}
+    return found
+
+
+def distortion_loss(result: RenderResult) -> Tensor:
+    """Return the mean over all pixels of the distortion: pairs of surfels on a ray should be near or faint; scalar.
+
+    The map is not scale invariant (depths are compared between z = 0.2 and 100 world units), so neither is a weight.
+    Raises ValueError if the distortion was not drawn.
+    """
+    if result.distortion is None:
+        raise ValueError("the distortion loss needs RasterOptions(distortion=True)")
+    return result.distortion.mean()
+
+
+def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float) -> Tensor:
+    """Return [1,H,W], 1 - n . (A n_surf): how far drawn normals are from those of the depth map, 0 .. 2.
+
+    n is the sum of the weighted normals of the surfels, n_surf that of the depth map, A the opacity of the pixel
+    without gradient. Pixels that show nothing, and the border, are 1; the loss is the mean over all pixels.
+
+    depth_ratio     0..1, see `surface_depth`
+
+    Raises ValueError if normals or opacity were not drawn, ConfigError for a depth that was not.
+    """
+    if result.normals is None or result.alpha is None:
+        raise ValueError("the normal loss needs RasterOptions(normals=True, alpha=True) and the depths")
+    surface = depth_normals(surface_depth(result.depth, depth_ratio), camera) * result.alpha.detach()
+    agreement = (world_normals(result.normals, camera) * surface).sum(dim=0, keepdim=True)
+    disagreement: Tensor = torch.ones_like(agreement) - agreement
+    return disagreement

@@ -1,0 +1,122 @@
+"""The losses of surfaces on a few surfels that the rasterizers draw, and on maps worked out by hand."""
+
+import math
+
+import pytest
+import torch
+from sw_gaussians.surface_losses import distortion_loss, maps_for, normal_disagreement
+from sw_gaussians.surfels import SurfelModel
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.gaussians.inputs import GaussianInputs
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
+from splatwizard_core.scene.camera import Camera
+
+BOTH = maps_for(distortion=True, normals=True, depth_ratio=0.5)
+
+
+@pytest.fixture(scope="module")
+def rasterizer() -> NegotiatedRasterizer:
+    return NegotiatedRasterizer(load_plugins(), device="cpu")
+
+
+def camera() -> Camera:
+    """At the origin, looking along z; pixel (8, 6) has the optical axis at its corner."""
+    return Camera(16, 12, 20.0, 20.0, 8.0, 6.0, torch.eye(3), torch.zeros(3))
+
+
+def planes(depths: list[float], opacities: list[float], tilt: float = 0.0) -> SurfelModel:
+    """Surfels larger than the picture, one behind the other, turned by `tilt` degrees about y."""
+    n = len(depths)
+    size = 1000.0 if tilt == 0 else 1.2  # a tilted one must not reach behind the camera
+    half = math.radians(tilt) / 2
+    return SurfelModel(
+        torch.tensor([[0.0, 0.0, z] for z in depths]), torch.zeros(n, 1, 3), torch.zeros(n, 0, 3),
+        torch.logit(torch.tensor(opacities)), torch.full((n, 2), math.log(size)),
+        torch.tensor([[math.cos(half), 0.0, math.sin(half), 0.0]]).repeat(n, 1),
+    )  # fmt: skip
+
+
+@torch.no_grad()
+def drawn(model: SurfelModel, rasterizer: NegotiatedRasterizer, **options: object) -> RenderResult:
+    return rasterizer.render(model.gaussians(camera(), rasterizer), camera(), RasterOptions(**{**BOTH, **options}))
+
+
+@pytest.mark.parametrize("tilt", [0.0, 30.0])
+def test_an_opaque_plane_has_no_distortion_and_agrees_with_its_depth(rasterizer, tilt):
+    result = drawn(planes([2.0] * 3, [0.98] * 3, tilt), rasterizer)
+    assert float(result.alpha.min()) > (0.9995 if tilt == 0 else 0.9)
+    if tilt == 0:
+        assert torch.allclose(result.depth["median"], torch.tensor(2.0), rtol=1e-5)
+        assert torch.allclose(result.depth["expected"], torch.tensor(2.0), rtol=1e-5)
+    assert float(distortion_loss(result)) < 1e-8
+    found = normal_disagreement(result, camera(), 0.5)
+    assert found.shape == (1, 12, 16)
+    # n is A times the normal of the plane, n_surf its normal.
+    assert torch.allclose(found[:, 1:-1, 1:-1], (1 - result.alpha**2)[:, 1:-1, 1:-1], atol=1e-5)
+    border = found.clone()
+    border[:, 1:-1, 1:-1] = 1
+    assert torch.equal(border, torch.ones_like(border))
+
+
+def test_two_planes_have_the_depths_and_the_distortion_of_the_formula(rasterizer):
+    result = drawn(planes([2.0, 3.0], [0.6, 0.99]), rasterizer)
+    assert torch.allclose(result.depth["expected"], torch.tensor((0.6 * 2 + 0.396 * 3) / 0.996), rtol=1e-5)
+    assert torch.allclose(result.depth["median"], torch.tensor(2.0), rtol=1e-5)
+    m = [100 / 99.8 * (1 - 0.2 / z) for z in (2.0, 3.0)]
+    assert float(distortion_loss(result)) == pytest.approx(0.6 * 0.396 * (m[0] - m[1]) ** 2, rel=1e-3)
+    faint = drawn(planes([2.0, 3.0], [0.4, 0.99]), rasterizer)
+    assert torch.allclose(faint.depth["median"], torch.tensor(3.0), rtol=1e-5)
+
+
+def by_hand(alpha: torch.Tensor, depth: torch.Tensor, normals: torch.Tensor) -> RenderResult:
+    nothing = GaussianInputs(means=torch.zeros(0, 3), opacities=torch.zeros(0))
+    return RenderResult(torch.zeros(3), torch.zeros(0), nothing, alpha=alpha, depth={"median": depth}, normals=normals)
+
+
+def test_the_factor_of_opacity_has_no_gradient_and_pixels_of_nothing_cost_one():
+    alpha = torch.full((1, 12, 16), 0.5).requires_grad_()
+    depth = torch.full((1, 12, 16), 2.0).requires_grad_()
+    normals = torch.tensor([0.0, 0.0, -0.5])[:, None, None].repeat(1, 12, 16).requires_grad_()
+    found = normal_disagreement(by_hand(alpha, depth, normals), camera(), 1.0)
+    assert torch.allclose(found[:, 1:-1, 1:-1], torch.tensor(0.75))  # 1 - 0.5 * 0.5
+    found.mean().backward()
+    assert alpha.grad is None
+    assert depth.grad is not None
+    assert normals.grad is not None
+    empty = by_hand(torch.zeros(1, 12, 16), torch.zeros(1, 12, 16), torch.zeros(3, 12, 16))
+    assert torch.equal(normal_disagreement(empty, camera(), 1.0), torch.ones(1, 12, 16))
+
+
+def test_the_gradient_of_the_normal_loss_is_that_of_finite_differences():
+    generator = torch.Generator().manual_seed(1)
+    small = Camera(6, 5, 7.0, 7.0, 3.0, 2.5, torch.eye(3).double(), torch.zeros(3).double())
+    alpha = torch.rand(1, 5, 6, generator=generator, dtype=torch.float64)
+    depth = (2 + torch.rand(1, 5, 6, generator=generator, dtype=torch.float64)).requires_grad_()
+    normals = torch.randn(3, 5, 6, generator=generator, dtype=torch.float64).requires_grad_()
+
+    def loss(depth: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
+        return normal_disagreement(by_hand(alpha, depth, normals), small, 1.0).mean()
+
+    assert torch.autograd.gradcheck(loss, (depth, normals), atol=1e-6)
+
+
+def test_only_what_a_loss_reads_is_drawn():
+    assert maps_for(distortion=False, normals=False, depth_ratio=1.0) == {}
+    assert maps_for(distortion=True, normals=False, depth_ratio=1.0) == {"distortion": True}
+    assert maps_for(distortion=False, normals=True, depth_ratio=1.0)["depth"] == {"median"}
+    assert maps_for(distortion=False, normals=True, depth_ratio=0.0)["depth"] == {"expected"}
+    assert BOTH["depth"] == {"expected", "median"}
+
+
+def test_maps_that_were_not_drawn_are_named(rasterizer):
+    model = planes([2.0], [0.9])
+    plain = rasterizer.render(model.gaussians(camera(), rasterizer), camera(), RasterOptions())
+    with pytest.raises(ValueError, match="distortion=True"):
+        distortion_loss(plain)
+    with pytest.raises(ValueError, match="normals=True"):
+        normal_disagreement(plain, camera(), 0.0)
+    with pytest.raises(ConfigError, match="median"):
+        normal_disagreement(drawn(model, rasterizer, depth=frozenset({"expected"})), camera(), 1.0)

@@ -1,0 +1,60 @@
+"""A model of a file together with what draws it: opened once, drawn from any camera."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from splatwizard_core.tooling import opener, render_options, render_view, suggested_rasterizers
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, RasterOptions, RenderResult, Scene, SplatModel
+    from splatwizard_core.tooling import NegotiatedRasterizer, ResolvedConfig, Session
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """A model on its device, the scene whose cameras see it, and how its file wants it drawn.
+
+    options     with the background of the scene
+    """
+
+    model: SplatModel
+    scene: Scene
+    rasterizer: NegotiatedRasterizer
+    options: RasterOptions
+    device: torch.device
+
+    def render(self, camera: Camera, options: RasterOptions | None = None) -> RenderResult:
+        """Draw one view, without gradients; `options` None: as the file asks. Raises CapabilityError."""
+        return render_view(self.model, camera.to(self.device), self.rasterizer, options or self.options)
+
+    def has_surfels(self, camera: Camera) -> bool:
+        """Whether what a camera sees is drawn as flat Gaussians (scales [N,2]), which have normals of their own."""
+        with torch.no_grad():
+            scales = self.model.gaussians(camera.to(self.device), self.rasterizer).scales
+        return scales is not None and scales.shape[-1] == 2
+
+    @property
+    def depth_ratio(self) -> float:
+        """The share of the median in the depth of the surface that the model was trained with; 0 if it says none."""
+        surface = getattr(self.model, "surface", None)
+        return float(getattr(surface, "depth_ratio", 0.0))
+
+
+def open_drawing(path: Path, session: Session, resolved: ResolvedConfig) -> Drawing:
+    """Open the model of a .swz or .ply, then the scene; choose among rasterizers as the run and the file ask.
+
+    Raises BitstreamError, PluginError, UserInputError for a file that cannot be opened, SceneError.
+    """
+    opened = opener(path, session)()
+    scene = session.scene(resolved)
+    rasterizer = session.rasterizer(resolved, suggested_rasterizers(opened.raster))
+    opened.model.check_finite()
+    with torch.no_grad():
+        opened.model.prepare()
+    options = render_options(opened.raster, scene.background.to(session.device))
+    return Drawing(opened.model, scene, rasterizer, options, session.device)

@@ -1,0 +1,100 @@
+"""CUDA sources: when they are compiled, for which GPUs, and what is said where they cannot be."""
+
+import json
+import re
+from pathlib import Path
+
+import pytest
+from native_package import digest_of, needs_compiler
+
+from splatwizard_native import cuda_toolkit, toolchain
+
+CUDA_KERNEL = """
+#include "value.h"
+#ifndef SW_WITH_CUDA
+#error "not told about CUDA"
+#endif
+__global__ void fill(int* out) { out[threadIdx.x] = VALUE; }
+"""
+
+
+def test_cuda_sources_are_left_out_without_cuda_in_torch(package):
+    import torch
+
+    if torch.version.cuda is not None:
+        pytest.skip("this torch has CUDA")
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",))
+    assert module.key("native") == package.module().key("native")
+    assert module.state()["target"] == "cpu"
+
+
+@needs_compiler
+@pytest.mark.skipif(cuda_toolkit.find_nvcc() is None, reason="no CUDA compiler on this machine")
+def test_cuda_sources_are_compiled_for_each_architecture(package, monkeypatch, tmp_path):
+    import torch
+
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",))
+    before = module.key("native")
+    monkeypatch.setattr(torch.version, "cuda", torch.version.cuda or "13.0")
+    monkeypatch.setenv("TORCH_CUDA_ARCH_LIST", "8.0 9.0")
+    assert module.state()["target"] == "cuda"
+    assert module.key("native") != before
+    (job,) = [job for job in module._jobs("native", tmp_path) if job.cuda]
+    assert {"-gencode=arch=compute_80,code=sm_80", "-gencode=arch=compute_90,code=sm_90"} <= set(job.flags)
+    toolchain.Toolchain().compile([job], tmp_path / "log")
+    assert job.output.stat().st_size > 0
+    assert (package.folder / "value.h") in toolchain.read_dependencies(Path(f"{job.output}.d"))
+
+
+@pytest.mark.parametrize(
+    ("torchs", "nvcc", "message"),
+    [
+        (None, (13, 0), "this torch is built without CUDA"),
+        ("13.0", None, "no CUDA compiler was found .* install the CUDA 13 toolkit"),
+        ("12.8", (13, 0), r"torch is built for CUDA 12.8, .*nvcc is of CUDA 13.0: install a toolkit of CUDA 12"),
+        ("13.0", (13, 2), None),
+    ],
+)
+def test_a_cuda_toolkit_that_does_not_fit_torch_is_named(package, monkeypatch, torchs, nvcc, message):
+    import torch
+
+    module = package.module(cuda_sources=("fill.cu",))
+    monkeypatch.setattr(torch.version, "cuda", torchs)
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None if nvcc is None else "/opt/cuda/bin/nvcc")
+    monkeypatch.setattr(cuda_toolkit, "nvcc_version", lambda _: nvcc)
+    package.write("fill.cu", CUDA_KERNEL)
+    reason = module.available(cuda=True)
+    if message is None:
+        assert reason is None
+    else:
+        assert reason is not None
+        assert re.search(message, reason)
+    assert module.state()["target"] == ("cpu" if message else "cuda")
+
+
+@needs_compiler
+def test_a_packaged_cuda_library_is_used_without_a_cuda_compiler_if_it_fits_the_gpu(package, monkeypatch):
+    import torch
+
+    package.write("fill.cu", CUDA_KERNEL)
+    module = package.module(cuda_sources=("fill.cu",))
+    monkeypatch.setattr(torch.version, "cuda", "13.0")
+    monkeypatch.setattr(cuda_toolkit, "find_nvcc", lambda: None)
+    library = module._library(module.prebuilt_folder, "portable", True)
+    library.parent.mkdir()
+    library.write_bytes(b"not looked into")
+    facts = {"sha256": digest_of(library), "architectures": ["8.0", "9.0", "12.0a"]}
+    library.with_suffix(".json").write_text(json.dumps(facts))
+    for gpu, suits in (
+        ((9, 0), True),
+        ((8, 6), True),
+        ((7, 5), False),
+        ((10, 0), False),
+        ((12, 0), True),
+        ((12, 1), False),
+    ):
+        monkeypatch.setattr(cuda_toolkit, "gpus", lambda gpu=gpu: [gpu])
+        assert (library in module._existing()) == suits
+        assert (module.available(cuda=True) is None) == suits
