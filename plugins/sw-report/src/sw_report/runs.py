@@ -124,7 +124,10 @@ def collect(paths: Sequence[Path]) -> Collection:
     runs, by_configuration = _tell_configurations_apart(runs)
     runs, told_apart = _tell_apart(runs)
     notes += by_configuration + told_apart + _protocol_notes(runs)
-    return Collection(sorted(_seeds_joined(runs), key=_order), notes)
+    joined = sorted(_seeds_joined(runs), key=_order)
+    if len(joined) < len(runs):
+        notes.append(OF_SEEDS)
+    return Collection(joined, notes)
 
 
 def record_paths(root: Path) -> list[Path]:
@@ -145,6 +148,10 @@ def _order(run: Run) -> tuple[object, ...]:
     return natural(facts.scene), facts.protocol.id, natural(run.variant), run.size, facts.rate or ""
 
 
+OF_SEEDS = (
+    "runs that differ in the seed alone are one row, mean ± standard deviation; pictures, sections, training and "
+    "scores view by view are of the smallest seed"
+)
 MOST_KEYS = 3  # in the name of a configuration
 MOST_TOLD = 8  # in a note about them
 
