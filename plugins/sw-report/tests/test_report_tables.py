@@ -1,5 +1,6 @@
 """Means over scenes, BD values over scenes, and how numbers are written."""
 
+import re
 import shlex
 
 import pytest
@@ -7,7 +8,8 @@ from sw_report import numbers
 from sw_report.aggregate import dataset_tables, mean
 from sw_report.commands import command_of, commands_table
 from sw_report.distortion import bd_metrics, bd_tables, choose_anchor, drawn_metrics, with_values
-from sw_report.plots import section_bars
+from sw_report.looks import looks_of
+from sw_report.plots import mean_charts, section_bars
 from sw_report.results_tables import (
     bd_table,
     cost_table,
@@ -506,3 +508,26 @@ def test_files_that_are_not_compressed_are_marked(make_run, tmp_path):
     table = runs_table(collect([tmp_path]).runs)
     assert [row[1] for row in texts(table)] == ["r1", "r2, float32", "r3", "r4"]
     assert "float32: the parameters as they were trained, not compressed." in table.notes
+
+
+def test_means_over_scenes_are_drawn_as_curves(make_curve, make_run, tmp_path):
+    for scene in ("a", "b"):
+        make_curve("toy", scene=scene)
+        make_curve("3dgs", 0.5, scene=scene)
+    make_curve("lacking", scene="a")
+    runs = collect([tmp_path]).runs
+    (table,) = dataset_tables(runs)
+    charts = mean_charts(table, runs, looks_of(runs))
+    assert [figure.caption for figure in charts.figures] == ["PSNR, dB", "SSIM"]
+    assert [name for _, name in charts.legend] == ["3dgs", "toy"]  # no mean, no curve
+    told = re.findall(r"<title>(toy r1: [^<]*)</title>", charts.figures[0].svg)
+    row = next(row for row in table.rows if (row.variant, row.rate) == ("toy", "r1"))
+    assert told == [f"toy r1: {row.metrics['psnr']:.2f} dB at 0.001 MB"]
+    assert charts.figures[0].svg.count('class="target"') == 8
+
+
+def test_means_without_a_curve_are_not_drawn(make_run, tmp_path):
+    for scene in ("a", "b"):
+        make_run(scene=scene)
+    runs = collect([tmp_path]).runs
+    assert mean_charts(dataset_tables(runs)[0], runs, looks_of(runs)) is None

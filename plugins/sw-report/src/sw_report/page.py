@@ -178,7 +178,12 @@ def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
     sections = []
     means = dataset_tables(runs, partial=options.partial)
     if means:
-        parts = [Part(f"{t.title}: {', '.join(t.protocols)}", table=tables.means_table(t)) for t in means]
+        parts = []
+        for table in means:
+            parts.append(Part(f"{table.title}: {', '.join(table.protocols)}", table=tables.means_table(table)))
+            own = [r for r in runs if r.facts.dataset == table.dataset and r.facts.protocol.id in table.protocols]
+            curves = plots.mean_charts(table, own, style_of)
+            parts += [Part(charts=curves)] if curves is not None else []
         sections.append(Section("means", "Means over scenes", parts, short="Means"))
     places: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
