@@ -113,6 +113,14 @@ def test_a_key_that_an_older_record_lacks_has_its_default(make, tmp_path):
     assert len({run.variant for run in collect([tmp_path]).runs}) == 2
 
 
+def test_values_that_a_preset_chooses_by_the_scene_tell_no_scenes_apart(make, tmp_path):
+    for scene, start in (("garden", 7), ("bicycle", 9)):
+        make("r1", scene=scene, more=[("prune", {"share": 0.3, "start": start}), ("grid", start)])
+    assert set(labels(tmp_path)) == {"toy r1"}
+    make("r1", "b", scene="bonsai", grid=3, more=[("grid", 3)])
+    assert len(set(labels(tmp_path))) == 3
+
+
 def test_a_run_made_again_from_its_own_configuration_file_belongs_to_the_others(make, tmp_path):
     for rate in ("r1", "r2", "r3"):
         make(rate, "first")
