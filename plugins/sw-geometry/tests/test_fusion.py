@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from sw_geometry import build as building
 from sw_geometry.build import build
 from sw_geometry.chamfer import Truth, compare
@@ -17,7 +18,7 @@ from sw_geometry.fusion import Fusion
 from sw_geometry.nearest import to_triangles
 from sw_geometry.open3d_import import import_open3d
 from sw_geometry.parameters import Parameters, resolve
-from sw_geometry.picture import draw
+from sw_geometry.picture import caster_of, draw, save_pictures, turntable
 from sw_geometry.settings import MeshSettings
 
 from splatwizard_core.api import Camera, CapabilityError, SceneOptions, SplatwizardError, UserInputError, View
@@ -164,15 +165,26 @@ def test_the_estimate_counts_the_room_that_is_there():
 
 
 def test_a_picture_shows_the_outside_in_grey_and_the_inside_in_red(ball):
-    camera = ring(1)[0]
-    picture = draw(ball.post, camera).astype(int)
+    camera, caster = ring(1)[0], caster_of(ball.post)
+    picture = draw(ball.post, camera, caster).astype(int)
     assert (picture[0, 0] == 255).all()
     grey = picture[120, 160]
     assert grey[0] == grey[1] == grey[2] == pytest.approx(0.75 * 255, abs=4)
     assert np.abs((picture.sum(axis=2) < 765) ^ (sphere_depth(camera).numpy() > 0)).mean() < 0.01
     inside_out = replace(ball.post, triangles=ball.post.triangles[:, ::-1])
-    assert np.ptp(draw(inside_out, camera)[120, 160].astype(int)) > 20
-    assert draw(ball.post, camera, colored=True)[120, 160] == pytest.approx(128, abs=3)
+    assert np.ptp(draw(inside_out, camera, caster_of(inside_out))[120, 160].astype(int)) > 20
+    assert draw(ball.post, camera, caster, colored=True)[120, 160] == pytest.approx(128, abs=3)
+
+
+def test_the_pictures_of_a_file_go_around(ball, tmp_path):
+    cameras = ring(20, rise=0.3)
+    chosen = turntable(cameras, 4)
+    angles = sorted(math.atan2(c.center[1], c.center[0]) for c in chosen)
+    assert np.diff(angles) == pytest.approx(math.pi / 2, abs=0.01)
+    save_pictures(ball.post, cameras, tmp_path / "mesh.png")
+    with Image.open(tmp_path / "mesh.png") as picture:
+        assert picture.size == (4 * 320, 2 * 240)
+    assert len(turntable(cameras[:2], 4)) == 2
 
 
 @pytest.fixture(scope="module")
@@ -200,12 +212,6 @@ def test_the_chamfer_distance_of_exact_depth_falls_with_the_voxel(demo):
 
 def test_distances_to_triangles_agree_with_open3d(ball):
     """An independent check of the Chamfer code."""
-    open3d = import_open3d()
-    caster = open3d.t.geometry.RaycastingScene()
-    core = open3d.core
-    caster.add_triangles(
-        core.Tensor(ball.post.vertices.astype(np.float32)), core.Tensor(ball.post.triangles.astype(np.uint32))
-    )
     queries = np.random.default_rng(0).normal(size=(2000, 3)) * 0.4
-    theirs = caster.compute_distance(core.Tensor(queries.astype(np.float32))).numpy()
+    theirs = caster_of(ball.post).compute_distance(import_open3d().core.Tensor(queries.astype(np.float32))).numpy()
     assert to_triangles(queries, ball.post)[0] == pytest.approx(theirs, abs=2e-6)  # theirs is float32
