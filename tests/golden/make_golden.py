@@ -240,7 +240,7 @@ CASES: dict[str, Case] = {
     "trimming_the_fat_ply_v1": ("trimming-the-fat", "r3", {"codec": "gaussians-ply"}, lambda: procedural(5, 1)),
     "trimming_the_fat_zstd_v1": ("trimming-the-fat", "r1", {"codec": "gaussians-zstd"}, lambda: procedural(24, 1, 0)),
     "flat_3dgs_v1": ("flat-3dgs", "r6", {}, lambda: flat(6, 1)),
-    "trim_3dgs_v1": ("trim-3dgs", "r3", {}, lambda: flat(40, 1)),
+    "trim_3dgs_median_v1": ("trim-3dgs", "r3", {}, lambda: flat(40, 1)),
     "trim_2dgs_v1": ("trim-2dgs", "r4", {}, lambda: surfels(30, 1)),
     "trim_2dgs_scratch_v1": ("trim-2dgs-scratch", "r6", {}, lambda: surfels(5, 1)),
     "pup_3dgs_exact_v1": ("pup-3dgs", "r3", {}, lambda: procedural(5, 1)),

@@ -213,6 +213,10 @@ def test_a_fresh_decoder_draws_what_was_trained(plugins, whole, toy, rasterizer,
     assert float(found.scales.detach().amin(dim=1).max()) < 2e-8
 
 
+def test_a_file_says_that_its_surface_is_the_median_depth(plugins, whole):
+    assert ContainerReader(encoded(*whole), "file.swz").static["depth_ratio"] == 1
+
+
 def test_files_shrink_with_the_rate_point(plugins, whole):
     sizes = []
     for rate in ("r1", "r3", "r6"):

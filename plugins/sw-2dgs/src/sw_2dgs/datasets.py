@@ -1,4 +1,4 @@
-"""How surfaces are trained on each data set, where the user does not say it.
+"""Depth ratio and weights of the surface by data set, where the user does not set them.
 
 Source: 2D Gaussian Splatting (arXiv 2403.17888) and the authors' scripts; where they differ, a comment says it.
 """

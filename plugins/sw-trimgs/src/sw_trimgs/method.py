@@ -17,7 +17,10 @@ from sw_trimgs.stage import FlatStage, TrimFlatStage
 if TYPE_CHECKING:
     import torch
 
-    from splatwizard_core.api import Scene, SplatModel, Stage
+    from splatwizard_core.api import ContainerWriter, Scene, SplatModel, Stage
+
+MEDIAN = 1.0
+"""Depth ratio of a surface that is the median depth, for who makes a mesh of it."""
 
 
 class Flat3DGS(GaussianMethod):
@@ -40,7 +43,11 @@ class Flat3DGS(GaussianMethod):
             raise SceneError(
                 f"scene '{scene.name}' has no start points: flat-3dgs needs SfM points or random ones", path=scene.path
             )
-        round_ones = gaussians_from_points(scene.points, max_sh_degree=self.config.sh_degree)
+        config: FlatConfig = self.config
+        chain = {"opacity": config.mcmc.init_opacity, "scale_factor": config.mcmc.init_scale}
+        round_ones = gaussians_from_points(
+            scene.points, max_sh_degree=config.sh_degree, **(chain if config.mcmc.enabled else {})
+        )
         tensors = [getattr(round_ones, name).detach() for name, _ in round_ones.named_parameters()]
         return FlatGaussians(*tensors, active_sh_degree=0)
 
@@ -66,3 +73,8 @@ class Trim3DGS(GaussianMethod):
 
     def stages(self) -> Sequence[Stage]:
         return [TrimFlatStage(self.config, self.plugins)]
+
+    def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
+        """Write `model` with the chosen codec, and that its surface is the median depth: the authors mesh with it."""
+        super().encode(model, writer)
+        writer.static["depth_ratio"] = MEDIAN
