@@ -103,6 +103,27 @@ def test_the_order_of_views_does_not_matter(views, ball):
     assert to_triangles(turned.post.vertices[::7], ball.post)[0].max() < 0.01 * PARAMETERS.voxel_size
 
 
+def moved(view: DepthView, scale: float, offset: tuple[float, float, float]) -> DepthView:
+    """The view of a world that is scaled, then shifted."""
+    E = view.E.copy()
+    E[:3, 3] = scale * E[:3, 3] - E[:3, :3] @ np.array(offset)
+    return replace(view, depth=(scale * view.depth).astype(np.float32), E=E)
+
+
+def test_a_scaled_and_a_shifted_world_have_the_same_mesh(views, ball):
+    """Powers of two, and whole blocks: nothing is rounded otherwise than before."""
+    larger = replace(PARAMETERS, voxel_size=0.08, sdf_trunc=0.32, depth_trunc=20.0)
+    scaled = build([moved(v, 4.0, (0, 0, 0)) for v in views], len(views), larger, label="test")
+    assert scaled.post.vertices == pytest.approx(4 * ball.post.vertices, abs=1e-5)
+    block = 16 * PARAMETERS.voxel_size
+    shifted = build(
+        [moved(v, 1.0, (2 * block, -block, 3 * block)) for v in views], len(views), PARAMETERS, label="test"
+    )
+    there = shifted.post.vertices - np.array([2, -1, 3]) * block
+    assert len(there) == pytest.approx(len(ball.post.vertices), rel=2e-3)
+    assert to_triangles(there[::7], ball.post)[0].max() < 0.02 * PARAMETERS.voxel_size
+
+
 def test_views_without_depth_are_counted_and_change_nothing(views, ball):
     empty = [replace(views[0], depth=np.full_like(views[0].depth, value)) for value in (0, np.nan, np.inf, 9.0)]
     with_them = build([*empty, *views], len(views) + 4, PARAMETERS, label="test")
