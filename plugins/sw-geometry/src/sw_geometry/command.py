@@ -89,7 +89,7 @@ def mesh(
     from sw_geometry.files import write_files
     from sw_geometry.metrics import build_from_model
     from sw_geometry.open3d_import import Open3DMissing, import_open3d
-    from sw_geometry.parameters import resolve
+    from sw_geometry.parameters import resolve, stated
 
     run = Path(file) if (Path(file) / "config.toml").is_file() else None
     path = existing_file(run / "scene.swz" if run is not None else file)
@@ -112,7 +112,7 @@ def mesh(
     raster = session.rasterizer(chosen, suggested_rasterizers(opened.raster))
     drawing = render_options(opened.raster, loaded.background.to(session.device))
     subject = Subject(opened.model, loaded, raster, drawing, setup, opened.static)
-    parameters = resolve(settings, loaded, opened.static)
+    parameters = resolve(settings, loaded, stated(opened.model, opened.static))
     built = build_from_model(subject, parameters, settings.max_memory)
     scores, culled = _measured(subject, parameters, settings, built, units=units, asked=chamfer)
     facts = {
