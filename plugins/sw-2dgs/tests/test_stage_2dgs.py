@@ -65,6 +65,19 @@ def test_the_plan_is_that_of_the_authors_code():
     assert stage.densification().settings["min_opacity"] == 0.05
 
 
+def least_opacity(**values) -> float:
+    return TwoDGSStage(configured(**values)).densification().settings["min_opacity"]
+
+
+def test_a_plan_too_short_to_recover_from_a_reset_prunes_below_it():
+    assert least_opacity() == 0.05
+    assert least_opacity(iterations=11_000, scale_schedule=True) == 0.05  # 37 steps; 33 lead from 0.01 to 0.05
+    assert least_opacity(iterations=9_000, scale_schedule=True) == 0.005
+    assert least_opacity(densify__interval=10) == 0.005
+    assert least_opacity(densify__interval=10, densify__reset_interval=15_000) == 0.05  # no reset
+    assert least_opacity(densify__interval=10, densify__min_opacity=0.001) == 0.001
+
+
 def test_every_preset_and_rate_point_resolves():
     for preset in TwoDGS.PRESETS:
         for rate in TwoDGS.RATES:

@@ -9,7 +9,7 @@ from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity, UpdateLearningRate
 
-from splatwizard_core.errors import SceneError
+from splatwizard_core.errors import SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides, resolve
@@ -243,3 +243,12 @@ def test_a_ply_is_a_start_with_all_bands_active(tmp_path):
     model = create(tiny_scene(), init=str(tmp_path / "m.ply"))
     assert model.active_sh_degree == 3
     assert torch.equal(model.means, trained.means)
+
+
+def test_a_start_from_surfels_is_refused(tmp_path):
+    trained = gaussians_from_points(PointCloud(torch.rand(5, 3), None))
+    export_ply(trained, tmp_path / "m.ply")
+    flat = (tmp_path / "m.ply").read_bytes().replace(b"float scale_2", b"float other_2")
+    (tmp_path / "m.ply").write_bytes(flat)
+    with pytest.raises(UserInputError, match="these are surfels"):
+        create(tiny_scene(), init=str(tmp_path / "m.ply"))

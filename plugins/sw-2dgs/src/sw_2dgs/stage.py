@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.start import logit
 from sw_gaussians.surface_losses import distortion_loss, maps_for, normal_disagreement
 from sw_gaussians.surfels import Surface, SurfelModel
+from sw_gaussians.tasks import PruneAndDensify
 
 from splatwizard_core.api import ConfigError, LossPack, RasterOptions
 from sw_2dgs.datasets import OTHER, surface_of
@@ -57,6 +60,20 @@ class TwoDGSStage(ThreeDGSStage):
         self._drawn.clear()
         log.info("surface of %s (%s): %s", scene.name, scene.protocol.dataset, self.surface)
         return model
+
+    def densification(self) -> Callable[..., None]:
+        """Return the task of 3DGS; where a reset leaves too few steps before it, with a threshold below the reset.
+
+        An opacity of 0.01 needs 33 steps of Adam to come back to 0.05; the published plan leaves 100. In a plan that is
+        scaled down a threshold above the reset would remove every surfel.
+        """
+        task, plan = super().densification(), self.config.densify
+        assert isinstance(task, PruneAndDensify)
+        has_resets = plan.reset_interval < plan.stop or (self.white and 0 < plan.white_reset < plan.stop)
+        way = logit(plan.min_opacity) - logit(plan.reset_opacity) if plan.min_opacity > 0 else 0.0
+        if has_resets and self.steps(plan.interval) * self.config.lr.opacity < way:
+            task.settings["min_opacity"] = min(plan.min_opacity, plan.reset_opacity / 2)
+        return task
 
     def weights(self, step: int) -> tuple[float, float]:
         """Return the weights of distortion and normals at a step; 0 until their steps have come."""

@@ -26,7 +26,7 @@ THICKNESS = 1e-8
 
 @dataclass(frozen=True)
 class Surface:
-    """How the surface of a model was trained, and so how it is to be read.
+    """The way in which the surface of a model was trained, and so is to be read.
 
     depth_ratio     r of `sw_gaussians.surface.surface_depth`, 0..1
     lambda_dist     weight of the distortion, >= 0
