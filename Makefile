@@ -1,5 +1,6 @@
 # make demo   set up .venv and run ChimeraGS beside 3DGS, float32 and entropy-coded, on the demo scene; one table
 # make test   set up .venv and run the default tests (no network, no GPU), TEST_JOBS=2 at a time
+# make test-geometry  the tests that need Open3D (100 MB), which it installs; Debian's libraries: sw doctor names them
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
 # make kernels  compile every native module ahead of time
@@ -17,7 +18,7 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test coverage lint format bench kernels docs clean
+.PHONY: demo test test-geometry coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
@@ -27,6 +28,10 @@ demo: $(VENV)/.ready
 
 test: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) $(PYTEST_ARGS)
+
+test-geometry: $(VENV)/.ready-dev
+	$(PIP) install -q -c constraints.txt -e 'plugins/sw-geometry[mesh,unbounded]' --no-build-isolation
+	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-geometry $(PYTEST_ARGS)
 
 coverage: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)

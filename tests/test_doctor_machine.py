@@ -65,17 +65,46 @@ def test_it_is_done_while_one_waits(sound):
     assert sound[1] < 100  # 13 on a server's core
 
 
-def test_everything_that_is_wrong_has_its_own_line(tmp_path):
-    """No compiler, a cache that cannot be written, plugins that break, an extra that is absent: one machine."""
-    site, binaries = tmp_path / "site", tmp_path / "bin"
+RADIO = """
+import os
+from splatwizard_core.api import hookimpl
+from splatwizard_core.tooling import Check
+
+@hookimpl
+def register_checks(registry):
+    registry.add("aerial", "sw_radio:aerial", summary="", group="radio")
+    registry.add("fuse", "sw_radio:fuse", summary="", group="radio")
+    registry.add("liar", "sw_radio:liar", summary="")
+
+def aerial():
+    return [Check("radio", "aerial", "missing", "none is plugged in", "buy one")]
+
+def fuse():
+    os.abort()
+
+def liar():
+    return [Check("main job", "liar", "broken", "nothing works", needed=True)]
+"""
+"""A stranger's checks: one that works, one that kills its process, one that claims to be the main job."""
+
+
+@pytest.fixture(scope="module")
+def faulty(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
+    """What it says of a machine that has no compiler, a cache that cannot be written, and strangers' plugins."""
+    root = tmp_path_factory.mktemp("faulty")
+    site, binaries = root / "site", root / "bin"
     plugin(site, "sw-bad", "import no_such_library\n")
     plugin(site, "sw-needy", "", "Requires-Dist: sw-absent")
     plugin(site, "sw-extra", "", "Provides-Extra: speed", "Requires-Dist: no-such-package>=2; extra == 'speed'")
+    plugin(site, "sw-radio", RADIO)
     binaries.mkdir()
-    (tmp_path / "file").write_text("")
-    env = {"PYTHONPATH": str(site), "PATH": str(binaries), "SPLATWIZARD_CACHE": str(tmp_path / "file" / "cache")}
-    done = doctor("--json", **{**env, "CXX": "", "SPLATWIZARD_DATA": str(tmp_path / "nowhere")})
-    checks = checks_of(done)
+    (root / "file").write_text("")
+    env = {"PYTHONPATH": str(site), "PATH": str(binaries), "SPLATWIZARD_CACHE": str(root / "file" / "cache")}
+    return doctor("--json", **{**env, "CXX": "", "SPLATWIZARD_DATA": str(root / "nowhere")})
+
+
+def test_everything_that_is_wrong_has_its_own_line(faulty):
+    checks = checks_of(faulty)
     states = {name: checks[name]["state"] for name in ("C++", "cache folder", "sw-bad", "sw-needy", "SPLATWIZARD_DATA")}
     assert states == {
         "C++": "missing", "cache folder": "broken", "sw-bad": "broken", "sw-needy": "broken",
@@ -90,7 +119,16 @@ def test_everything_that_is_wrong_has_its_own_line(tmp_path):
     }  # fmt: skip
     # Kernels cannot be built here, so it is slow, but it works: the reference draws.
     assert checks["sw_rasterizers"]["state"] in ("missing", "ok")  # ok: prebuilt beside its sources
-    assert done.returncode == 0
+    assert faulty.returncode == 0
+
+
+def test_checks_of_strangers_stand_beside_ours_and_harm_none(faulty):
+    checks = checks_of(faulty)
+    assert (checks["aerial"]["state"], checks["aerial"]["mend"]) == ("missing", "buy one")
+    assert (checks["fuse"]["group"], checks["fuse"]["state"]) == ("radio", "broken")
+    assert "the check of sw-radio" in checks["fuse"]["detail"]
+    assert "SIGABRT" in checks["fuse"]["detail"]
+    assert (checks["liar"]["group"], checks["liar"]["needed"]) == ("checks", False)
 
 
 def test_without_a_torch_that_imports_the_main_job_cannot_run(tmp_path):
@@ -117,41 +155,6 @@ def test_without_torch_a_registered_check_that_needs_it_is_left_out(tmp_path):
     checks = checks_of(doctor("--json", PYTHONPATH=str(tmp_path)))
     assert checks["torch"]["state"] == "broken"
     assert not any(check["group"] == "metrics" for check in checks.values())
-
-
-def test_checks_of_strangers_stand_beside_ours_and_harm_none(tmp_path):
-    """One that works, one that kills its process, one that claims to be the main job."""
-    plugin(
-        tmp_path, "sw-radio",
-        """
-import os
-from splatwizard_core.api import hookimpl
-from splatwizard_core.tooling import Check
-
-@hookimpl
-def register_checks(registry):
-    registry.add("aerial", "sw_radio:aerial", summary="", group="radio")
-    registry.add("fuse", "sw_radio:fuse", summary="", group="radio")
-    registry.add("liar", "sw_radio:liar", summary="")
-
-def aerial():
-    return [Check("radio", "aerial", "missing", "none is plugged in", "buy one")]
-
-def fuse():
-    os.abort()
-
-def liar():
-    return [Check("main job", "liar", "broken", "nothing works", needed=True)]
-""",
-    )  # fmt: skip
-    done = doctor("--json", PYTHONPATH=str(tmp_path))
-    assert done.returncode == 0, done.stdout
-    checks = checks_of(done)
-    assert (checks["aerial"]["state"], checks["aerial"]["mend"]) == ("missing", "buy one")
-    assert (checks["fuse"]["group"], checks["fuse"]["state"]) == ("radio", "broken")
-    assert "the check of sw-radio" in checks["fuse"]["detail"]
-    assert "SIGABRT" in checks["fuse"]["detail"]
-    assert (checks["liar"]["group"], checks["liar"]["needed"]) == ("checks", False)
 
 
 def test_a_gpu_without_the_package_gsplat_is_told_how_to_get_it(monkeypatch):

@@ -95,3 +95,32 @@ def test_a_terminal_gets_a_bar_with_the_same_facts_and_nested_bars_share_it(monk
 )
 def test_durations(seconds: float, text: str):
     assert duration(seconds) == text
+
+
+def foretold(monkeypatch: pytest.MonkeyPatch, seconds: float, total: int, steps: int, **options: bool) -> list[str]:
+    """Lines that foretell something, of so many steps of `seconds` each; the first takes a minute."""
+    now = [0.0]
+    monkeypatch.setattr(progress.time, "monotonic", lambda: now[0])
+    out = io.StringIO()
+    with track("train 3dgs", total=total, stream=out, **options) as bar:
+        for i in range(steps):
+            now[0] += seconds if i else 60.0
+            bar.advance()
+    return [line for line in out.getvalue().splitlines() if "just measured" in line]
+
+
+def test_a_long_run_is_foretold_once_from_the_first_steps_without_the_one_that_warms_up(
+    monkeypatch: pytest.MonkeyPatch,
+):
+    assert foretold(monkeypatch, 0.125, 30_000, 300, foretells=True) == [
+        "train 3dgs: about 1 h 02 min for the 29,967 steps that are left, by the 32 just measured "
+        "(more as a model grows)"
+    ]
+    assert foretold(monkeypatch, 30.0, 100, 10, foretells=True) == [
+        "train 3dgs: about 48 min 00 s for the 96 steps that are left, by the 3 just measured (more as a model grows)"
+    ]
+
+
+def test_what_does_not_take_long_or_is_no_training_is_not_foretold(monkeypatch: pytest.MonkeyPatch):
+    assert foretold(monkeypatch, 0.125, 900, 600, foretells=True) == []
+    assert foretold(monkeypatch, 0.125, 30_000, 300) == []

@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+from sw_kit import short_training
+from sw_kit.short_training import demo, psnr
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import ConfigError
@@ -9,12 +11,9 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
-from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from sw_3dgs.config import ThreeDGSConfig
 from sw_3dgs.method import ThreeDGS
 
@@ -32,13 +31,9 @@ PLAN = {
 }
 
 
-def no_trained_scene(name: str):
-    raise AssertionError(f"3dgs starts from nothing, yet asked for '{name}'")
-
-
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene("demo:tiny", SceneOptions(init_points=600), load_plugins())
+    return demo()
 
 
 @pytest.fixture(scope="module")
@@ -51,29 +46,8 @@ def method(**values) -> ThreeDGS:
     return ThreeDGS(load_plugins(), apply_overrides(ThreeDGSConfig(), {**PLAN, **values}, source="test"))
 
 
-def train(scene, rasterizer, **values):
-    made = method(**values)
-    return TrainingRun(
-        made.stages(),
-        lambda: made.create_model(scene, stream(0, "init")),
-        scene,
-        PipelineParams(),
-        rasterizer,
-        directory=None,
-        identity={},
-        trained=no_trained_scene,
-    ).train()
-
-
-@torch.no_grad()
-def psnr(model, scene: Scene, rasterizer) -> float:
-    """Mean over the training views, dB: enough to see that something was learned."""
-    values = []
-    for view in scene.train:
-        options = RasterOptions(background=scene.background)
-        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
-        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
-    return float(torch.stack(values).mean())
+def train(scene, rasterizer, directory=None, stop_after=None, **values):
+    return short_training.train(method(**values), scene, rasterizer, directory=directory, stop_after=stop_after)
 
 
 @pytest.fixture(scope="module")
@@ -132,28 +106,26 @@ def test_training_starts_again_from_a_decoded_file(scene, rasterizer, trained, t
 
 def test_absgrad_trains(scene, rasterizer):
     outcome = train(scene, rasterizer, iterations=60, densify__absgrad=True, densify__grad_threshold=8e-4)
-    assert outcome.steps == 60
+    assert len(outcome.losses) == 60
     assert torch.isfinite(outcome.model.means).all()
 
 
+@pytest.fixture(scope="module")
+def dense(scene, rasterizer):
+    """What the usual optimizer makes of the plan of the sparse ones."""
+    return train(scene, rasterizer, iterations=80)
+
+
 @pytest.mark.parametrize("correction", ["none", "per_row"])
-def test_sparse_adam_trains_and_resumes(scene, rasterizer, tmp_path, correction):
+def test_sparse_adam_trains_and_resumes(scene, rasterizer, dense, tmp_path, correction):
     values = {"iterations": 80, "sparse_adam": correction}
-
-    def stopped_after(stop, directory):
-        made = method(**values)
-        return TrainingRun(
-            made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-            directory=directory, identity={}, trained=no_trained_scene, stop_after=stop,
-        ).train()  # fmt: skip
-
     whole = train(scene, rasterizer, **values)
     start = method().create_model(scene, stream(0, "init"))
     assert psnr(whole.model, scene, rasterizer) > psnr(start, scene, rasterizer) + 2
-    assert whole.model.digest() != train(scene, rasterizer, iterations=80).model.digest()
+    assert whole.model.digest() != dense.model.digest()
     with pytest.raises(TrainingStopped):
-        stopped_after(60, tmp_path)  # after the first densification
-    assert stopped_after(None, tmp_path).model.digest() == whole.model.digest()
+        train(scene, rasterizer, tmp_path, 60, **values)  # after the first densification
+    assert train(scene, rasterizer, tmp_path, **values).model.digest() == whole.model.digest()
 
 
 def test_sparse_adam_and_the_regularisers_of_mcmc_exclude_each_other():

@@ -4,17 +4,14 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_kit import short_training
 
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.scene.camera import Camera
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
-from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.method import Cat3DGS
 
@@ -63,7 +60,7 @@ def method():
 
 @pytest.fixture(scope="session")
 def scene() -> Scene:
-    return load_scene("demo:tiny", SceneOptions(init_points=400), load_plugins())
+    return short_training.demo(points=400)
 
 
 @pytest.fixture(scope="session")
@@ -75,10 +72,7 @@ def rasterizer() -> NegotiatedRasterizer:
 def train(scene, rasterizer):
     def run(directory=None, stop_after=None, **values):
         made = make_method(**values)
-        return TrainingRun(
-            made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-            directory=directory, identity={}, trained=None, stop_after=stop_after,
-        ).train()  # fmt: skip
+        return short_training.train(made, scene, rasterizer, directory=directory, stop_after=stop_after)
 
     return run
 

@@ -1,18 +1,13 @@
 """Compact3DGS on the small procedural scene: it learns, removes Gaussians, resumes, and its file holds all of it."""
 
 import pytest
-import torch
 from compact_models import PLUGINS, decoded, method
 from sw_compact3dgs.model import QUANTIZED
+from sw_kit import short_training
+from sw_kit.short_training import demo, file_of, psnr
 
-from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-from splatwizard_core.rendering.rasterizer import RasterOptions
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.streams import stream
-from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 
 pytestmark = pytest.mark.pipeline
 
@@ -29,7 +24,7 @@ SMALL = {
 
 @pytest.fixture(scope="module")
 def scene():
-    return load_scene("demo:tiny", SceneOptions(init_points=600), PLUGINS)
+    return demo()
 
 
 @pytest.fixture(scope="module")
@@ -39,31 +34,8 @@ def rasterizer():
 
 def train(scene, rasterizer, directory=None, stop_after=None, **values):
     made = method(**{key.replace(".", "__"): value for key, value in {**SMALL, **values}.items()})
-    losses = []
-    outcome = TrainingRun(
-        made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-        directory=directory, identity={}, trained=None, stop_after=stop_after,
-        on_step=lambda _, record: losses.append({name: float(part) for name, part in record.parts.items()}),
-    ).train()  # fmt: skip
-    return outcome.model.eval(), losses, made
-
-
-@torch.no_grad()
-def psnr(model, scene, rasterizer) -> float:
-    """Mean over the training views, dB: enough to see that something was learned."""
-    values = []
-    for view in scene.train:
-        options = RasterOptions(background=scene.background)
-        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
-        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
-    return float(torch.stack(values).mean())
-
-
-def file_of(model, made) -> bytes:
-    writer = ContainerWriter("compact3dgs", 1)
-    with torch.no_grad():
-        made.encode(model, writer)
-    return writer.to_bytes()
+    model, losses = short_training.train(made, scene, rasterizer, directory=directory, stop_after=stop_after)
+    return model.eval(), losses, made
 
 
 @pytest.fixture(scope="module")
@@ -85,12 +57,12 @@ def test_it_learns_the_scene(scene, rasterizer, trained):
 def test_a_larger_weight_of_the_mask_leaves_fewer_gaussians_and_a_smaller_file(trained):
     (few, _, heavy), (many, _, light) = trained[200.0], trained[1.0]
     assert few.num_rows < 0.8 * many.num_rows
-    assert len(file_of(few, heavy)) < len(file_of(many, light))
+    assert len(file_of(heavy, few)) < len(file_of(light, many))
 
 
 def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
     model, _, made = trained[1.0]
-    found = decoded(file_of(model, made))
+    found = decoded(file_of(made, model))
     assert found.num_rows == int(model.mask_on().sum())
     assert psnr(found, scene, rasterizer) > psnr(model, scene, rasterizer) - 0.5
 
@@ -100,5 +72,5 @@ def test_an_interrupted_training_ends_as_a_whole_one(scene, rasterizer, tmp_path
     whole = train(scene, rasterizer, **short)[0]
     for stop in (25, 50):  # while it densifies; after its codebooks were made
         with pytest.raises(TrainingStopped):
-            train(scene, rasterizer, tmp_path / str(stop), stop, **short)
-        assert train(scene, rasterizer, tmp_path / str(stop), **short)[0].digest() == whole.digest()
+            train(scene, rasterizer, tmp_path, stop, **short)
+    assert train(scene, rasterizer, tmp_path, **short)[0].digest() == whole.digest()

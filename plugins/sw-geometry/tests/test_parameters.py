@@ -59,8 +59,13 @@ def test_cameras_that_look_one_way_have_no_focus():
 def test_a_bounded_scene_decides_by_its_cameras(scene):
     found = resolve(MeshSettings(), scene, {})
     assert found.depth_trunc == pytest.approx(6)
-    assert found.voxel_size == pytest.approx(6 / 1024)
+    pixel = 3 / scene.train[0].camera.fx  # 32 px wide: coarser than 6 / 1024
+    assert found.voxel_size == pytest.approx(pixel)
+    assert resolve(MeshSettings(mesh_res=1024), scene, {}).voxel_size == pytest.approx(6 / 1024)
+    fine = replace(scene, train=[replace(v, camera=v.camera.resized(1600, 1200)) for v in scene.train])
+    assert resolve(MeshSettings(), fine, {}).voxel_size == pytest.approx(6 / 1024)
     assert found.sdf_trunc == pytest.approx(5 * found.voxel_size)
+    assert resolve(MeshSettings(unbounded=True), scene, {}).mesh_res == 256
     assert (found.clusters, found.depth_ratio, found.cull, found.min_views) == (50, 0.0, "none", 1)
 
 

@@ -4,12 +4,14 @@ import copy
 
 import pytest
 import torch
+from sw_kit import short_training
+from sw_kit.short_training import file_of as encoded
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, EmptyModel, SceneError
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_codecs.models.raht_gaussians import RahtGaussians
 from sw_mesongs.config import MesonGSConfig
@@ -34,16 +36,23 @@ def configured(plugins, **values):
     return MesonGS(plugins, apply_overrides(MesonGSConfig(), values, source="test").completed(plugins, {}))
 
 
+def tuned(method, start, scene, rasterizer, **options):
+    """The method's model after its steps on a trained scene, and the losses."""
+    return short_training.train(
+        method, scene, rasterizer, model=lambda: None, trained={"3dgs": start}.__getitem__, **options
+    )
+
+
 @pytest.fixture(scope="module")
 def train(plugins, rasterizer, toy):
-    def run(directory=None, stop_after=None, on_step=None, **values):
+    def run(directory=None, stop_after=None, totals=None, **values):
         method = configured(plugins, **values)
-        outcome = TrainingRun(
-            list(method.stages()), lambda: None, toy.scene, PipelineParams(checkpoint_every=5), rasterizer,
-            directory=directory, identity={}, trained={"3dgs": toy.truth}.__getitem__, stop_after=stop_after,
-            on_step=on_step,
-        ).train()  # fmt: skip
-        return method, outcome.model
+        model, losses = tuned(
+            method, toy.truth, toy.scene, rasterizer, checkpoint_every=5, directory=directory, stop_after=stop_after
+        )
+        if totals is not None:
+            totals += [each["total"] for each in losses]
+        return method, model
 
     return run
 
@@ -51,12 +60,6 @@ def train(plugins, rasterizer, toy):
 @pytest.fixture(scope="module")
 def whole(train):
     return train()
-
-
-def encoded(method, model):
-    writer = ContainerWriter(method.name, method.version)
-    method.encode(model, writer)
-    return writer.to_bytes()
 
 
 def decoded(plugins, data):
@@ -111,7 +114,7 @@ def test_each_voxel_holds_one_and_positions_stay_there(whole):
 
 def test_training_comes_nearer_to_the_photographs(train):
     losses = []
-    train(iterations=60, prune__tau=0.0, on_step=lambda _, record: losses.append(float(record.total)))
+    train(iterations=60, prune__tau=0.0, totals=losses)
     assert sum(losses[-9:]) < 0.8 * sum(losses[:9])
 
 
@@ -186,14 +189,7 @@ def test_gaussians_that_are_not_finite_are_left_out(plugins, toy, rasterizer):
     broken = copy.deepcopy(toy.truth)
     broken.means[3], broken.log_scales[5, 1], broken.opacity_logits[7] = torch.nan, torch.inf, torch.inf
     method = configured(plugins, iterations=0, prune__tau=0.0, codec__settings__depth=21)
-    model = (
-        TrainingRun(
-            list(method.stages()), lambda: None, toy.scene, PipelineParams(), rasterizer, identity={}, directory=None,
-            trained={"3dgs": broken}.__getitem__,
-        )
-        .train()
-        .model
-    )  # fmt: skip
+    model, _ = tuned(method, broken, toy.scene, rasterizer)
     assert 390 < model.num_rows <= 397  # the lowest goes too
     assert float(model.opacity_logits.detach().max()) == 20
     assert decoded(plugins, encoded(method, model)).num_rows == model.num_rows
@@ -233,14 +229,7 @@ def test_what_a_gpu_trains_decodes_on_the_cpu_to_what_was_drawn(plugins, toy):
     gpu, cpu = (NegotiatedRasterizer(plugins, device=device) for device in ("cuda", "cpu"))
     method = configured(plugins)
     trained = copy.deepcopy(toy.truth).cuda()
-    model = (
-        TrainingRun(
-            list(method.stages()), lambda: None, toy.scene, PipelineParams(), gpu, identity={}, directory=None,
-            trained={"3dgs": trained}.__getitem__,
-        )
-        .train()
-        .model
-    )  # fmt: skip
+    model, _ = tuned(method, trained, toy.scene, gpu)
     assert model.device.type == "cuda"
     found = decoded(plugins, encoded(method, model))
     ours = drawn(copy.deepcopy(model).cpu().eval(), toy.scene, cpu)

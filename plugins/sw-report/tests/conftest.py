@@ -56,11 +56,17 @@ def register_methods(registry: Any) -> None:
     registry.add("another", "nowhere:method", summary="")
 
 
+@hookimpl
+def register_coders(registry: Any) -> None:
+    registry.add("range", "nowhere:coder", summary="", codes="gaussians")
+    registry.add("plain", "nowhere:coder", summary="", codes="gaussians", stores="float32")
+
+
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> PluginManager:
     """The core, and beside it what the hooks above declare, whatever is installed where the tests run."""
     plugin = ModuleType("declaring_plugin")
-    for hook in (register_metrics, register_datasets, register_methods):
+    for hook in (register_metrics, register_datasets, register_methods, register_coders):
         setattr(plugin, hook.__name__, hook)
     monkeypatch.setitem(sys.modules, plugin.__name__, plugin)
     found = PluginManager(

@@ -7,6 +7,7 @@ import re
 
 import pytest
 from sw_report import exports
+from sw_report.latex import methods_by_datasets, to_latex
 from sw_report.runs import collect
 
 from splatwizard_core.cli.main import main
@@ -69,7 +70,7 @@ def test_latex_compiles_in_shape_and_escapes(make_curve, tmp_path):
     make_curve("3dgs", 2.0)
     collection = collect([tmp_path])
     tables = exports.tables_of(collection, anchor="3dgs", partial=False, pareto=False)
-    text = exports.to_latex(tables, ["50 % of\nnothing"])
+    text = to_latex(tables, ["50 % of\nnothing"])
     assert text.startswith("% 50 % of nothing\n")
     assert r"my\_method \& 100\% & r1 &" in text
     body = text.split("\n", 1)[1]
@@ -81,6 +82,42 @@ def test_latex_compiles_in_shape_and_escapes(make_curve, tmp_path):
         lines = [line for line in table.splitlines() if line.rstrip().endswith(r"\\")]
         assert all(len(re.findall(r"(?<!\\)&", line)) == columns - 1 for line in lines)
     assert "$-$50.0" in body
+
+
+def test_latex_has_bold_bests_labels_and_no_advice(make_curve, tmp_path):
+    def without_weights(content):
+        content["metrics"]["lpips_vgg"] = {"mean": None, "per_view": [], "direction": "lower"}
+        content["unknown"]["metrics.lpips_vgg.mean"] = "weights-missing: pip install 'sw-metrics[lpips]'"
+
+    make_curve("toy", change=without_weights)
+    make_curve("3dgs", 2.0, change=without_weights)
+    collection = collect([tmp_path])
+    tables = exports.tables_of(collection, anchor="3dgs", partial=False, pareto=False)
+    text = to_latex(tables, [], collection.runs)
+    labels = re.findall(r"\\label\{(.*?)\}", text)
+    assert labels == ["tab:garden", "tab:psnr-db-against-3dgs", "tab:ssim-against-3dgs"]
+    assert text.count(r"\textbf{") == 5  # PSNR and SSIM of both r4, which are equal; the smallest file; FPS are equal
+    assert "pip" not in text
+    assert "LPIPS (VGG): weights-missing" in text
+
+
+def test_latex_of_several_data_sets_begins_with_methods_by_data_sets(make_run, tmp_path):
+    for dataset, scenes in (("theirs", ("a", "b")), ("tandt", ("train",)), ("single", ("c",))):
+        for scene in scenes:
+            for method, noise in (("toy", 8.0), ("3dgs", 4.0)):
+                make_run(method=method, scene=scene, noise=noise, change=lambda c, d=dataset: c.update(dataset=d))
+    runs = collect([tmp_path]).runs
+    first = methods_by_datasets(runs)
+    assert first.count(r"\multicolumn{3}{c}") == 3  # PSNR, SSIM, MB
+    assert r"\multicolumn{3}{c}{theirs}" in first
+    assert r"\multicolumn{3}{c}{train}" in first  # the other scene of its data set is missing: no mean
+    lines = [line for line in first.splitlines() if line.strip().startswith(("toy", "3dgs"))]
+    assert len(lines) == 2
+    assert all(len(re.findall(r"(?<!\\)&", line)) == 10 for line in lines)
+    assert lines[0].count(r"\textbf{") == 6
+    assert first.count("{") == first.count("}")
+    assert to_latex([], [], runs).startswith(r"\begin{table*}")
+    assert methods_by_datasets([run for run in runs if run.facts.scene == "c"]) == ""
 
 
 def test_markdown_tables_keep_their_columns(make_run, tmp_path):

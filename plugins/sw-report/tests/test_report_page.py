@@ -136,6 +136,27 @@ def test_everything_asked_for_is_there(kinds):
         assert [words for words in wanted if words not in found.text] == []
 
 
+def test_the_page_begins_with_the_answer(make_curve, tmp_path):
+    make_curve("toy")
+    make_curve("3dgs", 0.5)
+    found = page(tmp_path)
+    heads = [attributes["id"] for tag, attributes in found.elements if tag == "h2"]
+    assert heads == [
+        "results", "rate-and-distortion", "renders-beside-the-ground-truth", "bd", "bytes-by-section", "training",
+        "scores-view-by-view", "provenance",
+    ]  # fmt: skip
+    assert "Bold: the best of its column." in found.text
+    assert any((table.get("class") or "").split() == ["sortable"] for table in found.all("table"))
+    assert "sw run --method 3dgs --scene garden --preset paper --rate r1 --set iterations=300" in found.text
+
+
+def test_there_is_no_section_of_bd_values_where_there_are_none(make_run, tmp_path):
+    make_run(method="toy")
+    make_run(method="3dgs")
+    found = page(tmp_path)
+    assert "bd" not in [attributes.get("id") for _, attributes in found.elements]
+
+
 def test_names_from_strangers_stay_text(make_run, make_curve, tmp_path):
     def rename(content):
         content["scene"] = content["method"] = content["rate"] = HOSTILE

@@ -25,6 +25,7 @@ MODULES = {
     "runs.measure": "opener",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
+    "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
     "coding.container": "decoded_limit",
     "evaluation.evaluate": "png_names render_options render_view save_png suggested_rasterizers",

@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 REFRESH_SECONDS = 0.1  # a bar is redrawn at most ten times a second
 LINE_SECONDS = 5.0  # a plain line appears at most this often
+FORETOLD_AFTER_SECONDS = 4.0  # of measuring, and FORETOLD_AFTER_STEPS, before it is said how long all will take
+FORETOLD_AFTER_STEPS = 3
+LONG_SECONDS = 120.0  # from here on that is worth a line
 RATE_WINDOW_SECONDS = 20.0  # the rate is that of the last seconds: models grow while they train
 
 # Nested displays share the outer one's screen lines.
@@ -31,12 +34,17 @@ class Bar:
     label   what is being done
     total   steps in all; None if unknown
     start   steps done before (a resumed run); they do not count for the rate
+    foretells   a line says how long it will take, from the first steps, if that is long
     """
 
     _interval = LINE_SECONDS
 
-    def __init__(self, label: str, total: int | None, start: int, *, unit: str, stream: TextIO) -> None:
+    def __init__(
+        self, label: str, total: int | None, start: int, *, unit: str, stream: TextIO, foretells: bool = False
+    ) -> None:
         self.label, self.total, self.unit = label, total, unit
+        self._foretells = foretells and total is not None
+        self._measured_from: tuple[float, int] | None = None
         self.done = start
         self._stream = stream
         self._fields: dict[str, Any] = {}
@@ -53,6 +61,8 @@ class Bar:
         self.done += steps
         self._fields.update(fields)
         now = time.monotonic()
+        if self._foretells:
+            self._foretell(now)
         if now - self._drawn < self._interval:
             return
         self._drawn = now
@@ -61,6 +71,21 @@ class Bar:
             self._marks.popleft()
         left = self.seconds_left
         self._show(f"{duration(left)} left" if left else "")
+
+    def _foretell(self, now: float) -> None:
+        """Say once how long the rest will take, if that is long; the first step, which warms up, does not count."""
+        if self._measured_from is None:
+            self._measured_from = (now, self.done)
+        seconds, steps = now - self._measured_from[0], self.done - self._measured_from[1]
+        if seconds < FORETOLD_AFTER_SECONDS or steps < FORETOLD_AFTER_STEPS or self.total is None:
+            return
+        self._foretells = False
+        left = (self.total - self.done) * seconds / steps
+        if left >= LONG_SECONDS:
+            self.say(
+                f"{self.label}: about {duration(left)} for the {self.total - self.done:,} steps that are left, by the "
+                f"{steps:,} just measured (more as a model grows)"
+            )
 
     def say(self, line: str) -> None:
         """Print a line for the user, above the bar on a terminal."""
@@ -107,8 +132,10 @@ class _RichBar(Bar):
 
     _interval = REFRESH_SECONDS
 
-    def __init__(self, display: Progress, label: str, total: int | None, start: int, *, unit: str) -> None:
-        super().__init__(label, total, start, unit=unit, stream=sys.stderr)
+    def __init__(
+        self, display: Progress, label: str, total: int | None, start: int, *, unit: str, foretells: bool = False
+    ) -> None:
+        super().__init__(label, total, start, unit=unit, stream=sys.stderr, foretells=foretells)
         self._display = display
         self.task = display.add_task(label, total=total, completed=start, facts="", left="")
 
@@ -119,8 +146,9 @@ class _RichBar(Bar):
 
 @contextmanager
 def track(
-    label: str, *, total: int | None = None, start: int = 0, unit: str = "it", stream: TextIO | None = None
-) -> Iterator[Bar]:
+    label: str, *, total: int | None = None, start: int = 0, unit: str = "it", stream: TextIO | None = None,
+    foretells: bool = False,
+) -> Iterator[Bar]:  # fmt: skip
     """Show the progress of one long step.
 
         with track("train", total=7000, start=1200) as bar:
@@ -131,21 +159,22 @@ def track(
     start   steps that an earlier run did
     unit    of the rate: "it", "views"
     stream  where to (default: stderr)
+    foretells   after the first seconds a line says how long the whole will take, if that is two minutes or more
     """
     out, outer = stream or sys.stderr, _display.get()
     if not out.isatty():
-        bar = Bar(label, total, start, unit=unit, stream=out)
+        bar = Bar(label, total, start, unit=unit, stream=out, foretells=foretells)
         yield bar
         bar.finish()
     elif outer is not None:
-        nested = _RichBar(outer, label, total, start, unit=unit)
+        nested = _RichBar(outer, label, total, start, unit=unit, foretells=foretells)
         try:
             yield nested
         finally:
             outer.remove_task(nested.task)
     else:
         with _new_display(out) as display:
-            bar = _RichBar(display, label, total, start, unit=unit)
+            bar = _RichBar(display, label, total, start, unit=unit, foretells=foretells)
             yield bar
             bar.finish()
 

@@ -117,11 +117,11 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="float vectors: a codebook for the least sensitive, own entries for the rest")  # fmt: skip
     registry.add("residual-vq", "sw_codecs.vectors.residual_vq:ResidualVQ", codes="vectors",
                  summary="vectors as sums of codebook entries, indices Huffman coded or packed")  # fmt: skip
-    registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians",
+    registry.add("gaussians-exact", "sw_codecs.models.codecs:Exact", codes="gaussians", stores="float32",
                  summary="whole Gaussian models, float32 as trained")  # fmt: skip
     registry.add("gaussians-quantized", "sw_codecs.models.codecs:Quantized", codes="gaussians",
                  summary="whole Gaussian models on a lattice, octree positions, range coded")  # fmt: skip
-    registry.add("gaussians-ply", "sw_codecs.models.codecs:Ply", codes="gaussians",
+    registry.add("gaussians-ply", "sw_codecs.models.codecs:Ply", codes="gaussians", stores="float32",
                  summary="whole Gaussian models, the .ply of 3DGS bit for bit")  # fmt: skip
     registry.add("gaussians-zstd", "sw_codecs.models.codecs:Lossless", codes="gaussians",
                  summary="whole Gaussian models, float32 as trained, packed without loss")  # fmt: skip

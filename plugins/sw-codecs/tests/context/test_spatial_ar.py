@@ -138,7 +138,7 @@ def test_it_learns_a_smooth_ramp():
     independent = -(share * share.log2()).sum().item() * plane.numel()
     made = SpatialAr(torch.Generator().manual_seed(0))
     optimizer = torch.optim.Adam(made.parameters(), lr=5e-3)
-    for _ in range(500):
+    for _ in range(200):
         optimizer.zero_grad()
         made.bits(plane).sum().backward()
         optimizer.step()

@@ -32,6 +32,10 @@ def model():
     )  # fmt: skip
 
 
+QUICK = {"vectree": {"iterations": 5, "batch": 100}, "raht": {"vq_steps": 5}}
+"""Settings with which a codec that trains a codebook takes no seconds."""
+
+
 class SomeMethod(GaussianMethod):
     """Writes with whichever codec it is told."""
 
@@ -55,7 +59,7 @@ def decoded_from(plugins, reader):
 def test_each_codec_that_says_it_codes_gaussians_decodes_what_it_encodes(plugins, model):
     assert {"gaussians-exact", "gaussians-quantized"} <= set(plugins.gaussian_codecs.names)
     for name in (n for n in plugins.gaussian_codecs.names if is_ours(plugins.coders.entry(n).distribution)):
-        reader = ContainerReader(written(plugins, name, model).to_bytes(), "file.swz")
+        reader = ContainerReader(written(plugins, name, model, **QUICK.get(name, {})).to_bytes(), "file.swz")
         decoded = decoded_from(plugins, reader)
         assert isinstance(decoded, GaussianModel)
         assert 0 < decoded.num_rows <= model.num_rows

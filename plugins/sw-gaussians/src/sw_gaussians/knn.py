@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from scipy.spatial import cKDTree
 from torch import Tensor
 
 
@@ -20,6 +19,8 @@ def mean_squared_neighbor_distance(points: Tensor, neighbors: int = 3) -> Tensor
     k = min(neighbors, n - 1)
     if k < 1:
         return torch.zeros(n, dtype=torch.float32, device=points.device)
+    from scipy.spatial import cKDTree  # here, so that a process that only decodes does not import it
+
     xyz = points.detach().cpu().numpy().astype(np.float64)
     # k + 1: every point is its own nearest neighbour, at distance 0. Among duplicates the tree may name another
     # one first, which changes nothing: the distance is the same 0.

@@ -40,7 +40,7 @@ LENGTH = click.FloatRange(min=0, min_open=True)
     click.option("--depth-trunc", type=LENGTH, metavar="X",
                  help="Leave out larger depths, scene units.  [default: twice the cameras' distance; DTU 3]"),
     click.option("--mesh-res", type=click.IntRange(8, 65_536), metavar="N",
-                 help="Voxels along depth-trunc.  [default: 1024]"),
+                 help="Voxels along depth-trunc, or of the unbounded grid.  [default: 1024; unbounded 256]"),
     click.option("--clusters", type=click.IntRange(min=1), metavar="K",
                  help="Largest pieces that stay in mesh_post.ply.  [default: 50; DTU 1]"),
     click.option("--min-views", type=click.IntRange(min=1), metavar="N",

@@ -17,6 +17,8 @@ from sw_geometry.settings import MeshSettings
 
 DTU = {"voxel_size": 0.004, "sdf_trunc": 0.016, "depth_trunc": 3.0, "clusters": 1}
 """Of scenes whose object lies in the unit sphere, as 2DGS and TrimGS mesh DTU."""
+MESH_RES, UNBOUNDED_RES = 1024, 256
+"""Voxels along depth_trunc, and along the grid of the unbounded mode: published code takes 1024 there, 80 GB here."""
 AUTO_CLUSTERS = 50
 AUTO_TRUNCATION = 5.0  # voxels; with 8, the library's default, the surface moves outwards at edges
 
@@ -56,13 +58,16 @@ def resolve(settings: MeshSettings, scene: Scene, static: Mapping[str, Any]) -> 
     focus, radius = focus_and_radius([view.camera for view in scene.train])
     bounded: Mapping[str, Any] = DTU if is_dtu else {"depth_trunc": 2 * radius, "clusters": AUTO_CLUSTERS}
     depth_trunc = settings.depth_trunc or bounded["depth_trunc"]
-    voxel = settings.voxel_size or bounded.get("voxel_size") or depth_trunc / settings.mesh_res
+    mesh_res = settings.mesh_res or (UNBOUNDED_RES if settings.unbounded else MESH_RES)
+    # Published code knows no such limit; below a pixel, depth that is looked up at the nearest one has no detail.
+    footprint = 0.0 if settings.mesh_res else radius / max(view.camera.fx for view in scene.train)
+    voxel = settings.voxel_size or bounded.get("voxel_size") or max(depth_trunc / mesh_res, footprint)
     truncation = DTU["sdf_trunc"] / DTU["voxel_size"] if is_dtu else AUTO_TRUNCATION
     return Parameters(
         voxel_size=voxel,
         sdf_trunc=settings.sdf_trunc or truncation * voxel,
         depth_trunc=depth_trunc,
-        mesh_res=settings.mesh_res,
+        mesh_res=mesh_res,
         clusters=settings.clusters or bounded["clusters"],
         min_views=settings.min_views,
         depth_ratio=_depth_ratio(settings.depth, static, 1.0 if is_dtu else 0.0),

@@ -17,7 +17,9 @@ class MeshSettings(BaseModel):
     voxel_size: Positive | None = Field(None, description="edge of a voxel, units of the scene")
     sdf_trunc: Positive | None = Field(None, description="reach of the signed distance, units of the scene")
     depth_trunc: Positive | None = Field(None, description="larger depths are left out, units of the scene")
-    mesh_res: int = Field(1024, ge=8, le=65_536, description="voxels along depth_trunc, where no voxel_size is given")
+    mesh_res: int | None = Field(
+        None, ge=8, le=65_536, description="voxels along depth_trunc where no voxel_size is given, or along the grid"
+    )
     clusters: int | None = Field(None, ge=1, description="largest connected pieces that stay")
     min_views: int = Field(1, ge=1, description="views that must have seen a voxel")
     depth: str | None = Field(

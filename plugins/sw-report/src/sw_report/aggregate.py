@@ -45,6 +45,7 @@ class DatasetTable:
 
     published   whether `scenes` are the published ones (else: all that the runs are of)
     protocols   ids; several only where they differ in nothing but the picture folder
+    directions  metric -> "higher" or "lower", what is better
     """
 
     dataset: str
@@ -53,6 +54,7 @@ class DatasetTable:
     published: bool
     protocols: tuple[str, ...]
     rows: list[MeanRow]
+    directions: dict[str, str] = field(default_factory=dict)
 
 
 def dataset_tables(runs: Sequence[Run], *, partial: bool = False) -> list[DatasetTable]:
@@ -116,6 +118,7 @@ def _table(runs: Sequence[Run], partial: bool) -> DatasetTable:
             (_row(variant, rate, by_scene, scenes, names, partial) for (variant, rate), by_scene in rows.items()),
             key=lambda row: (natural(row.variant), natural(row.rate or "")),
         ),
+        {name: metric.direction for run in runs for name, metric in run.facts.metrics.items()},
     )
 
 

@@ -12,21 +12,23 @@ from sw_report.pictures import Gallery
 
 @dataclass(frozen=True)
 class Column:
-    """text: left-aligned; long: may break into lines."""
+    """text: left-aligned; long: may break into lines; code: in a typewriter's letters."""
 
     name: str
     text: bool = False
     long: bool = False
+    code: bool = False
 
 
 @dataclass(frozen=True)
 class Cell:
-    """`share` (0..1) draws a bar of that width in colour `style` instead of text."""
+    """`share` (0..1) draws a bar of that width in colour `style` instead of text; `best`: of its column."""
 
     text: str
     title: str = ""
     share: float | None = None
     style: int = 0
+    best: bool = False
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Table:
-    """Table whose first column names the rows."""
+    """Table whose first column names the rows; a click on a heading sorts a `sortable` one."""
 
     title: str
     columns: list[Column]
@@ -45,6 +47,12 @@ class Table:
     caption: str = ""
     notes: list[str] = field(default_factory=list)
     wide: bool = False
+    sortable: bool = False
+
+    @property
+    def has_best(self) -> bool:
+        """Whether a cell is marked as the best of its column."""
+        return any(cell.best for row in self.rows for cell in row.cells)
 
 
 @dataclass(frozen=True)

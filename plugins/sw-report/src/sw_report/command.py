@@ -32,6 +32,9 @@ if TYPE_CHECKING:
     click.option("--survey", metavar="FOLDER", type=OUTPUT_FOLDER,
                  help="Write FOLDER/<dataset>/<scene>/<method>.csv, as the survey of 3DGS compression asks.  "
                  "[default: none]"),
+    click.option("--plots", metavar="FOLDER", type=OUTPUT_FOLDER,
+                 help="Write FOLDER/rd-<scene>.svg and .pdf, rate-distortion curves for papers; needs matplotlib.  "
+                 "[default: none]"),
     click.option("--csv", "form", flag_value="csv",
                  help="Print CSV: the survey's columns after what tells runs apart."),
     click.option("--latex", "form", flag_value="latex", help="Print LaTeX tables (booktabs)."),
@@ -52,6 +55,7 @@ def report(
     folders: tuple[str, ...],
     html: Path | None,
     survey: Path | None,
+    plots: Path | None,
     form: str | None,
     anchor: str | None,
     pareto: bool,
@@ -77,16 +81,23 @@ def report(
     if survey is not None:
         for path in exports.write_survey(collection.runs, survey):
             say(f"wrote {path}")
+    if plots is not None:
+        from sw_report.figures import write_figures
+
+        for path in write_figures(collection.runs, plots):
+            say(f"wrote {path}")
     if form == "csv":
         click.echo(exports.to_csv(collection.runs), nl=False)
     elif form == "jsonl":
         click.echo(exports.to_json_lines(collection.runs), nl=False)
     elif form == "json":
         print_json(exports.to_dict(collection, anchor=against, partial=partial, pareto=pareto))
-    elif form is not None or (html is None and survey is None):
+    elif form is not None or (html is None and survey is None and plots is None):
         tables = exports.tables_of(collection, anchor=against, partial=partial, pareto=pareto)
         if form == "latex":
-            click.echo(exports.to_latex(tables, collection.notes), nl=False)
+            from sw_report.latex import to_latex
+
+            click.echo(to_latex(tables, collection.notes, collection.runs), nl=False)
         elif form == "markdown":
             click.echo(exports.to_markdown(tables, collection.notes), nl=False)
         else:
@@ -115,8 +126,11 @@ def print_tables(tables: list[tuple[str, Table]], notes: list[str]) -> None:
         for i, column in enumerate(table.columns):
             drawn.add_column(escape(column.name), justify="left" if column.text or not i else "right")
         for row in table.rows:
-            drawn.add_row(*(escape(cell.text) for cell in row.cells), end_section=row.emphasis)
+            cells = [f"[bold]*{escape(cell.text)}[/bold]" if cell.best else escape(cell.text) for cell in row.cells]
+            drawn.add_row(*cells, end_section=row.emphasis)
         out.print(drawn)
+        if table.has_best:
+            out.print("* best of its column")
         for note in table.notes:
             out.print(escape(note), soft_wrap=True)
         out.print()

@@ -102,13 +102,13 @@ def _texts(block: object, prefix: str = "") -> dict[str, str]:
 
 
 def _sources(run: RunFacts) -> dict[str, str]:
-    """Who set which key: "preset 'quick'", "rate 'r2'", "--set" or a file."""
+    """Sources of the keys that were set: "preset 'quick'", "rate 'r2'", "--set" or a file."""
     found = (run.config or {}).get("provenance")
     return {key: who for key, who in found.items() if isinstance(who, str)} if isinstance(found, dict) else {}
 
 
 def _source(sources: Mapping[str, str], key: str) -> str | None:
-    """Who set a key, or a table that it is in; None: it has its default."""
+    """Source of a key, or of a table that it is in; None: it has its default."""
     while key and key not in sources:
         key = key.rpartition(".")[0]
     return sources.get(key)

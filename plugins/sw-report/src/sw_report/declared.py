@@ -7,7 +7,7 @@ nothing more is known of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -98,6 +98,16 @@ def bd_anchor_rank(method: str) -> float:
     declared: Mapping[str, Any] = methods.entry(method).declared if method in methods else {}
     rank = declared.get("bd_anchor")
     return rank if isinstance(rank, (int, float)) else math.inf
+
+
+def uncompressed(encoders: Iterable[tuple[str, str]]) -> str:
+    """Number format of the parameters in a file that holds them as they are; empty if anything compressed them.
+
+    encoders    (kind, name) of the parts that served the encoding
+    """
+    coders = load_plugins().coders
+    names = [name for kind, name in encoders if kind == "coder"]
+    return str(coders.entry(names[0]).declared.get("stores", "")) if len(names) == 1 and names[0] in coders else ""
 
 
 def rate_settings(method: str, preset: str | None, rate: str | None) -> tuple[set[str], dict[str, Any]]:

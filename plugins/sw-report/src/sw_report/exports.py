@@ -1,4 +1,4 @@
-"""Results for other programs and for papers: CSV, JSON, JSON lines, Markdown, LaTeX."""
+"""Results for other programs: CSV, JSON, JSON lines, Markdown."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import Any
 from splatwizard_core.tooling import write_atomic
 from sw_report import numbers
 from sw_report.aggregate import dataset_tables
-from sw_report.blocks import Table
+from sw_report.blocks import Cell, Table
 from sw_report.configurations import seed_of
 from sw_report.distortion import bd_tables, with_values
 from sw_report.results_tables import bd_table, means_table, metric_names, runs_table
@@ -146,31 +146,11 @@ def to_markdown(tables: Sequence[tuple[str, Table]], notes: Sequence[str]) -> st
     for title, table in tables:
         lines = [f"**{_markdown(title)}**", "", "| " + " | ".join(_markdown(c.name) for c in table.columns) + " |"]
         lines.append("|" + "|".join("---" if c.text or not i else "---:" for i, c in enumerate(table.columns)) + "|")
-        lines += ["| " + " | ".join(_markdown(cell.text) for cell in row.cells) + " |" for row in table.rows]
+        lines += ["| " + " | ".join(map(_marked, row.cells)) + " |" for row in table.rows]
         lines += ["", *(f"{_markdown(note)}  " for note in [table.caption, *table.notes] if note)]
         blocks.append("\n".join(lines).rstrip() + "\n")
     if notes:
         blocks.append("\n".join(f"- {_markdown(note)}" for note in notes) + "\n")
-    return "\n".join(blocks)
-
-
-def to_latex(tables: Sequence[tuple[str, Table]], notes: Sequence[str]) -> str:
-    """Tables for booktabs (\\usepackage{booktabs}); what must be known stands in comments and under the table."""
-    blocks = [f"% {_comment(note)}\n" for note in notes]
-    for title, table in tables:
-        align = "".join("l" if c.text or not i else "r" for i, c in enumerate(table.columns))
-        lines = [
-            r"\begin{table}", r"  \centering", f"  \\caption{{{_latex(title)}. {_latex(table.caption)}}}",
-            f"  \\begin{{tabular}}{{{align}}}", r"    \toprule",
-            "    " + " & ".join(_latex(c.name) for c in table.columns) + r" \\", r"    \midrule",
-        ]  # fmt: skip
-        for row in table.rows:
-            if row.emphasis:
-                lines.append(r"    \midrule")
-            lines.append("    " + " & ".join(_latex(cell.text) for cell in row.cells) + r" \\")
-        lines += [r"    \bottomrule", r"  \end{tabular}"]
-        lines += [f"  \\par\\smallskip\\footnotesize {_latex(note)}" for note in table.notes]
-        blocks.append("\n".join([*lines, r"\end{table}"]) + "\n")
     return "\n".join(blocks)
 
 
@@ -184,20 +164,9 @@ def _name(text: str) -> str:
     return re.sub(r"[^\w.+@()\[\]-]+", "_", text).strip(".") or "_"
 
 
+def _marked(cell: Cell) -> str:
+    return f"**{_markdown(cell.text)}**" if cell.best else _markdown(cell.text)
+
+
 def _markdown(text: str) -> str:
     return re.sub(r"([\\`*_{}\[\]<>|#])", r"\\\1", text.replace("\n", " "))
-
-
-def _comment(text: str) -> str:
-    return " ".join(text.split())
-
-
-_LATEX = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}", ">": r"\textgreater{}",
-    "–": "--", "−": "$-$", "×": r"$\times$", "·": r"$\cdot$", "†": r"\dag{}",
-}  # fmt: skip
-
-
-def _latex(text: str) -> str:
-    return "".join(_LATEX.get(character, character) for character in text)

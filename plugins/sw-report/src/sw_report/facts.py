@@ -16,7 +16,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import SCHEMA
 from sw_report import numbers
-from sw_report.declared import metric_style
+from sw_report.declared import metric_style, uncompressed
 
 LONGEST_TEXT = 300
 LARGEST_RECORD = 64_000_000  # bytes; ten thousand views with ten metrics take a tenth of it
@@ -169,7 +169,7 @@ class RunFacts(Facts):
     speed: SpeedFacts = SpeedFacts()
     memory: MemoryFacts = MemoryFacts()
     train: TrainFacts = TrainFacts()
-    geometry: dict[Text, float] | None = None
+    geometry: dict[Text, dict[Text, Any]] | None = None
     rasterizers: dict[Text, dict[Text, Text]] = {}
     phases: list[PhaseFacts] = []
     environment: dict[Text, Any] = {}
@@ -177,6 +177,15 @@ class RunFacts(Facts):
     flags: list[Text] = []
     unknown: dict[Text, Text] = {}
     date: Text | None = None
+
+    def uncompressed(self) -> str:
+        """Number format of the parameters in the file, where nothing in it is compressed; empty otherwise."""
+        encoded = (phase for phase in self.phases if phase.phase == "encode")
+        return uncompressed((part.kind, part.name) for phase in encoded for part in phase.provided_by)
+
+    def rate_label(self) -> str:
+        """Name of the rate point, and "float32" beside it where the file is no compressed one; empty if neither is."""
+        return ", ".join(filter(None, (self.rate, self.uncompressed())))
 
     def is_diagnostic(self, metric: str) -> bool:
         """Whether a metric only tells conventions apart, and stands in no table; older records do not say it."""

@@ -11,6 +11,7 @@ MISSING = "–"
 MACHINES = "ᵃᵇᶜᵈᵉᶠᵍʰ"
 """Marks of values that come from different machines; later ones share the last."""
 SEEDS_NOTE = "± standard deviation over the seeds (of the sample, n - 1); the value is their mean."
+UNCOMPRESSED_NOTE = "{}: the parameters as they were trained, not compressed."
 SHARED = "†"
 SHARED_NOTE = f"{SHARED} Other processes wanted the cores meanwhile: on an idle machine it is faster."
 FIELD_LPIPS = "lpips_vgg_3dgs"  # the form that the field's tables, the survey's among them, print

@@ -18,8 +18,10 @@ from sw_report import numbers, plots
 from sw_report import results_tables as tables
 from sw_report.aggregate import dataset_tables
 from sw_report.blocks import Part, Section, Table
+from sw_report.commands import commands_table
 from sw_report.declared import metric_style
-from sw_report.distortion import bd_tables, choose_anchor
+from sw_report.distortion import bd_tables, choose_anchor, with_values
+from sw_report.geometry import geometry_parts
 from sw_report.looks import looks_of
 from sw_report.pictures import (
     GAIN,
@@ -123,7 +125,8 @@ def _lede(runs: Sequence[Run]) -> str:
     views = facts.test_views or len(facts.views)
     psnr = runs[0].mean("psnr")
     reached = f" that reach {psnr:.2f} dB on {_plural(views, 'test view')}" if psnr is not None else ""
-    return f"{numbers.megabytes(facts.file.bytes)} MB hold {stored}{reached}; every score is of the decoded file."
+    form = f" in {facts.uncompressed()}, not compressed," if facts.uncompressed() else ""
+    return f"{numbers.megabytes(facts.file.bytes)} MB hold {stored}{form}{reached}; every score is of the decoded file."
 
 
 def _plural(n: int, word: str) -> str:
@@ -162,34 +165,20 @@ def _single_sections(run: Run, options: PageOptions) -> list[Section]:
     sections.append(Section("bytes", BYTES, [part], short=SHORT[BYTES]))
     sections.append(_training("training", "Training", [run], tables.breakdown_table(facts)))
     sections.append(Section("cost", "Time and memory", [Part(table=tables.cost_table(facts))]))
-    if facts.geometry:
-        values = "; ".join(f"{name} {tables.plain(value)}" for name, value in facts.geometry.items())
-        sections.append(Section("geometry", "Geometry", [Part(text=f"{values}.")]))
+    if parts := geometry_parts(run, pictures=options.pictures):
+        sections.append(Section("geometry", "Geometry", parts))
     sections.append(_provenance([run]))
     return sections
 
 
 def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
-    anchor = choose_anchor(runs, options.anchor)
+    """Results, curves, pictures; then BD values; then the rest."""
     style_of = looks_of(runs)
     sections = []
     means = dataset_tables(runs, partial=options.partial)
     if means:
         parts = [Part(f"{t.title}: {', '.join(t.protocols)}", table=tables.means_table(t)) for t in means]
         sections.append(Section("means", "Means over scenes", parts, short="Means"))
-    comparisons = bd_tables(runs, anchor, pareto=options.pareto, partial=options.partial)
-    if comparisons:
-        parts = [
-            Part(f"{numbers.heading(t.metric)} · {t.protocol}" if i else "", table=tables.bd_table(t))
-            for i, t in enumerate(comparisons)
-        ]
-        sections.append(
-            Section(
-                "bd", "Rate saved against the anchor", parts,
-                "Mean distance between rate-distortion curves, scene by scene (Bjøntegaard; monotone piecewise cubic).",
-                "BD-rate",
-            )
-        )  # fmt: skip
     places: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
         places.setdefault(run.place, []).append(run)
@@ -198,29 +187,49 @@ def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
     scenes = [scene for scene, _ in places]
     for number, ((scene, protocol), group) in enumerate(places.items()):
         title = scene if scenes.count(scene) == 1 else f"{scene}, {protocol}"
-        parts = _place_parts(group, style_of, views, budget, options)
+        answer, rest = _answer(group, style_of, views, budget, options), _rest(group, style_of)
         if len(places) == 1:  # what would be sub-headings under a lonely heading
-            sections += _as_sections(parts, f"Results on {scene}", f"Protocol {protocol}.")
+            sections += _as_sections(answer, f"Results on {scene}", f"Protocol {protocol}.")
+            sections += _bd_sections(runs, options)
+            sections += _as_sections(rest)
         else:
+            parts = [*answer, *rest]
             sections.append(Section(f"scene-{number}", title, parts, f"Protocol {protocol}.", title))
+    if len(places) > 1:
+        sections += _bd_sections(runs, options)
     sections.append(_provenance(runs))
     return sections
 
 
-def _as_sections(parts: Sequence[Part], title: str, text: str) -> list[Section]:
+def _bd_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
+    """BD values, if there are any; where several methods have none, why."""
+    anchor = choose_anchor(runs, options.anchor)
+    shown, missing = with_values(bd_tables(runs, anchor, pareto=options.pareto, partial=options.partial))
+    text = "Mean distance between rate-distortion curves, scene by scene (Bjøntegaard; monotone piecewise cubic)."
+    parts = [
+        Part(f"{numbers.heading(t.metric)} · {t.protocol}" if i else "", table=tables.bd_table(t))
+        for i, t in enumerate(shown)
+    ]
+    if parts and missing:
+        parts.append(Part(text=" ".join(missing)))
+    return [Section("bd", "Rate saved against the anchor", parts, text, "BD-rate")] if parts else []
+
+
+def _as_sections(parts: Sequence[Part], title: str = "", text: str = "") -> list[Section]:
     """A section for every part with a heading; those without one belong to the section before them."""
-    sections = [Section("results", title, [], text, "Results")]
+    sections = [Section("results", title, [], text, "Results")] if title else []
     for part in parts:
         if part.heading:
-            sections.append(Section(f"part-{len(sections)}", part.heading, [], short=SHORT.get(part.heading, "")))
+            name = "-".join(part.heading.lower().split())
+            sections.append(Section(name, part.heading, [], short=SHORT.get(part.heading, "")))
         sections[-1].parts.append(replace(part, heading=""))
     return sections
 
 
-def _place_parts(
+def _answer(
     runs: Sequence[Run], style_of: dict[str, int], views: int, budget: PictureBudget, options: PageOptions
 ) -> list[Part]:
-    """Compose the parts about the runs of one scene under one protocol."""
+    """Compose what the runs of one scene under one protocol reach: table, curves, pictures."""
     parts = [Part(table=tables.runs_table(runs))]
     charts = plots.distortion_charts(runs, style_of)
     if charts is not None and len(runs) > 1:
@@ -231,6 +240,12 @@ def _place_parts(
         else:
             gallery = scene_gallery(runs, views, Truth(runs, options.opener), budget)
             parts.append(Part(PICTURES, gallery=gallery))
+    return parts
+
+
+def _rest(runs: Sequence[Run], style_of: dict[str, int]) -> list[Part]:
+    """Compose how they reach it: bytes by section, training, scores view by view."""
+    parts = []
     bars = plots.section_bars(runs)
     if bars is not None:
         parts.append(Part(BYTES, charts=bars))
@@ -259,7 +274,9 @@ def _sentence(missing: Sequence[str]) -> str:
 
 def _provenance(runs: Sequence[Run]) -> Section:
     phases = tables.phases_table(runs)
+    commands = commands_table(list(runs))
     parts = [
+        *([Part("Commands", table=commands)] if commands is not None else []),
         Part("Served by", table=tables.served_table(runs)),
         *([Part("Phases", table=phases)] if phases is not None else []),
         Part("Protocol", table=tables.protocol_table(runs)),

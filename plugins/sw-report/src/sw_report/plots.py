@@ -17,6 +17,7 @@ from sw_report.training_log import TrainingCurves, log_path, read_training
 
 MOST_SECTIONS = 2 * STYLES - 1  # with a colour of their own; smaller ones are joined
 MOST_LINES = 8
+MOST_LABELLED = 16  # points of a chart with their rate points beside them
 MOST_VIEWS_IN_TABLE = 300
 MOST_BARS = 24
 
@@ -44,9 +45,9 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
                 Point(
                     run.size / 1e6,
                     value,
-                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} "
-                    f"at {numbers.megabytes(run.size)} MB",
-                    run.facts.rate or "" if len(variants) <= 2 else "",
+                    f"{run.label}: {f'{numbers.score(metric, value)} {style.unit}'.strip()} at "
+                    f"{' '.join((numbers.megabytes(run.size), 'MB', run.facts.uncompressed())).strip()}",
+                    run.facts.rate or "" if len(runs) <= MOST_LABELLED else "",
                 )
                 for run in own
                 if (value := run.mean(metric)) is not None
@@ -93,7 +94,8 @@ def section_bars(runs: Sequence[Run]) -> Charts | None:
         bars.append(Bar(run.label, f"{numbers.megabytes(size)} MB", parts))
     legend = [(square(style), name) for name, style in styles.items() if style < MOST_SECTIONS]
     if len(styles) > MOST_SECTIONS:
-        legend.append((square(MOST_SECTIONS), f"{len(styles) - MOST_SECTIONS} smaller sections"))
+        smaller = [name for name, style in styles.items() if style == MOST_SECTIONS]
+        legend.append((square(MOST_SECTIONS), f"smaller: {', '.join(smaller)}"))
     svg = stacked_bars(f"Bytes by section for {len(shown)} runs", bars)
     notes = [f"{len(shown)} of {len(with_sections)} runs, spread evenly."] if len(shown) < len(with_sections) else []
     if len(with_sections) < len(runs):

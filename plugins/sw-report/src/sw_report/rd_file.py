@@ -73,11 +73,17 @@ def rd_svg(runs: Sequence[Run], title: str) -> str | None:
     return str(drawn)
 
 
-def _style() -> str:
-    """Style rules with the colours of the page, in both themes; no variables, which few drawing programs know."""
+def themes() -> tuple[dict[str, str], dict[str, str]]:
+    """Colours of the page by the names of their variables (`--s0`), in the light and in the dark theme."""
     sheet = resources.files("sw_report").joinpath("templates/style.css").read_text("utf-8")
     blocks = re.findall(r"\{\s*color-scheme: (?:light|dark);([^}]*)\}", sheet)
-    light, dark = (_coloured(dict(re.findall(r"(--\w+): (#\w+);", block))) for block in blocks[:2])
+    light, dark = (dict(re.findall(r"(--\w+): (#\w+);", block)) for block in blocks[:2])
+    return light, dark
+
+
+def _style() -> str:
+    """Style rules with the colours of the page, in both themes; no variables, which few drawing programs know."""
+    light, dark = map(_coloured, themes())
     return f"{light} @media (prefers-color-scheme: dark) {{ {dark} }}"
 
 

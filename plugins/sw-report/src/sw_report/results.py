@@ -65,7 +65,7 @@ def print_table(records: Sequence[Record], out: Console) -> None:
     for i, record in enumerate(records):
         for name, text in _cells(record, names, digits).items():
             columns.setdefault(name, []).append(f"*{text}" if i in best.get(name, ()) else text)
-    fixed = {"method": [record.method for record in records], "rate": [record.rate or "-" for record in records]}
+    fixed = {"method": [record.method for record in records], "rate": [_rate(record) for record in records]}
     heads = {name: heading(name) if name in names else name for name in columns}
     left_out = _too_wide(fixed, columns, heads, names, out.width)
 
@@ -85,7 +85,7 @@ def print_table(records: Sequence[Record], out: Console) -> None:
         same = i > 0 and records[i - 1].method == record.method
         last = i + 1 < len(records) and records[i + 1].method != record.method
         table.add_row(
-            "" if same else escape(record.method), escape(record.rate or "-"),
+            "" if same else escape(record.method), escape(_rate(record)),
             *(f"[bold]{text}[/bold]" if text.startswith("*") else text for text in cells), end_section=last,
         )  # fmt: skip
     out.print(table)
@@ -96,6 +96,18 @@ def print_table(records: Sequence[Record], out: Console) -> None:
     if left_out:
         told = ", ".join(heads[name] for name in columns if name in left_out)
         out.print(f"no room for {told}: metrics.json has them, and `sw report`", soft_wrap=True)
+
+
+def _stored(record: Record) -> str:
+    """Number format of the parameters in the file, where nothing in it is compressed; empty otherwise."""
+    from sw_report.declared import uncompressed
+
+    encoded = (phase for phase in record.phases if phase.phase == "encode")
+    return uncompressed((part.kind, part.name) for phase in encoded for part in phase.provided_by)
+
+
+def _rate(record: Record) -> str:
+    return ", ".join(filter(None, (record.rate, _stored(record)))) or "-"
 
 
 def _cells(record: Record, names: Sequence[str], digits: int) -> dict[str, str]:
@@ -157,7 +169,9 @@ def _best(records: Sequence[Record], names: Sequence[str]) -> dict[str, set[int]
 
 
 def notes(records: Sequence[Record]) -> list[str]:
-    """Lines under the table: which times include another training, and why values are missing."""
+    """Lines under the table: which times include another training, what is not compressed, why values are missing."""
+    from sw_report.numbers import UNCOMPRESSED_NOTE
+
     found = []
     before: dict[str, dict[str, None]] = {}
     for record in records:
@@ -172,6 +186,7 @@ def notes(records: Sequence[Record]) -> list[str]:
             why = record.unknown.get("train.with_pretraining_s", "the record gives no reason")
             missing.setdefault(why, {})[record.method] = None
     found += [f"train s of {', '.join(methods)} is not known: {why}" for why, methods in missing.items()]
+    found += [UNCOMPRESSED_NOTE.format(name) for name in dict.fromkeys(map(_stored, records)) if name]
     found += [f"{', '.join(affected)}: {reason}" for reason, affected in reasons_of_metrics(records).items()]
     return found
 

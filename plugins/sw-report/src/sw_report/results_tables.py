@@ -11,6 +11,7 @@ from sw_report.blocks import Cell, Row, Table, columns, row
 from sw_report.declared import metric_style
 from sw_report.distortion import BdCell, BdTable
 from sw_report.facts import RunFacts, clean
+from sw_report.marks import marked
 from sw_report.runs import Run, machine
 
 
@@ -44,10 +45,10 @@ def runs_table(runs: Sequence[Run]) -> Table:
         *(head for head, _, _, _ in MEASURED),
     ]  # fmt: skip
     marks = machine_marks(runs)
-    rows = []
+    rows: list[Row] = []
     for run in runs:
         facts = run.facts
-        cells: list[str | Cell] = [run.variant, facts.rate or numbers.MISSING]
+        cells: list[str | Cell] = [run.variant, facts.rate_label() or numbers.MISSING]
         cells += [str(len(run.seeds))] if several else []
         cells += [_scored(run, name) for name in names]
         cells += [
@@ -57,11 +58,19 @@ def runs_table(runs: Sequence[Run]) -> Table:
             *(_measured(run, column, marks) for column in MEASURED),
         ]
         rows.append(row(cells))
+    if len({run.variant for run in runs}) > 1:
+        first = 2 + several
+        compared = {first + i: ([run.mean(n) for run in runs], _direction(runs, n)) for i, n in enumerate(names)}
+        compared[first + len(names)] = ([run.size for run in runs], "lower")
+        if not marks and not any(run.contended("render") for run in runs):
+            compared[len(heads) - 1] = ([run.over_seeds(lambda facts: facts.speed.fps)[0] for run in runs], "higher")
+        rows = marked(rows, compared)
     views = {run.facts.test_views or len(run.facts.views) for run in runs}
     caption = f"Means over {', '.join(map(str, sorted(views)))} test views."
     notes = missing_metrics(runs)
     if any("fit" in run.facts.flags for run in runs):
         notes.append("The test views are training views too: scores are quality of fit, not of novel views.")
+    notes += uncompressed_notes(run.facts for run in runs)
     if several:
         notes.append(numbers.SEEDS_NOTE)
     if any(facts.contended for run in runs for facts in run.seeds):
@@ -71,7 +80,14 @@ def runs_table(runs: Sequence[Run]) -> Table:
         notes.append(f"Times and FPS come from different machines, and are not comparable: {told}.")
     if bound := sorted({run.facts.method for run in runs if "device-bound" in run.facts.flags}):
         notes.append(f"Device-bound: files of {', '.join(bound)} decode only on the machine that made them.")
-    return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes)
+    return Table("Results", columns(heads, text=("method", "rate")), rows, caption, notes, sortable=True)
+
+
+def uncompressed_notes(runs: Iterable[RunFacts]) -> list[str]:
+    """One line for each number format of files that are not compressed."""
+    return [
+        numbers.UNCOMPRESSED_NOTE.format(name) for name in dict.fromkeys(run.uncompressed() for run in runs) if name
+    ]
 
 
 MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[float | None], str]], ...] = (
@@ -81,6 +97,10 @@ MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[fl
     ("FPS", "render", lambda facts: facts.speed.fps, numbers.rate),
 )
 """What depends on the machine: head of its column, phase, value, spelling. Training is with what it starts from."""
+
+
+def _direction(runs: Sequence[Run], metric: str) -> str:
+    return next((run.facts.metrics[metric].direction for run in runs if metric in run.facts.metrics), "higher")
 
 
 def machine_marks(runs: Sequence[Run]) -> dict[str, str]:
@@ -131,9 +151,14 @@ def means_table(table: DatasetTable) -> Table:
                 ]
             )
         )  # fmt: skip
+    if len({r.variant for r in table.rows}) > 1:
+        first = 3 + several
+        compared = {first + i: ([r.metrics[n] for r in table.rows], table.directions[n]) for i, n in enumerate(names)}
+        compared[first + len(names)] = ([r.size for r in table.rows], "lower")
+        rows = marked(rows, compared)
     return Table(
         f"Means over {table.title}", columns(heads, text=("method", "rate")), rows,
-        f"Plain means over {', '.join(table.scenes)}.", means_notes(table),
+        f"Plain means over {', '.join(table.scenes)}.", means_notes(table), sortable=True,
     )  # fmt: skip
 
 

@@ -8,7 +8,9 @@ from collections.abc import Mapping
 from typing import Any
 
 NAME = re.compile(r"\w[\w.+-]{0,63}")
-TEXTS = ("label", "group", "unit", "settings", "suffix", "codes", "looks_for", "without_poses", "title", "prefix")
+TEXTS = (
+    "label", "group", "unit", "settings", "suffix", "codes", "stores", "looks_for", "without_poses", "title", "prefix",
+)  # fmt: skip
 NUMBERS = ("position", "digits", "bd_anchor")
 LISTS = ("presets", "rates", "scenes", "table_scenes", "folders")
 

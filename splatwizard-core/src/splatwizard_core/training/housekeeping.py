@@ -74,7 +74,7 @@ class Housekeeping:
         label = f"train {run.identity.get('method', self.name)}"
         if len(run.stages) > 1:
             label += f": {self.name} ({trainer.index + 1} of {len(run.stages)})"
-        bar = track(label, total=trainer.stage.iterations, start=trainer.step)
+        bar = track(label, total=trainer.stage.iterations, start=trainer.step, foretells=True)
         with self.guard, bar as self._bar:
             self.clock.start()
             try:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 DENSITY_FLOOR = 1e-10
 """Added to mean reachability distances, so that duplicates have a density; the value of scikit-learn."""
@@ -22,6 +21,8 @@ def local_outlier_factor(points: np.ndarray, neighbors: int = 50) -> np.ndarray:
     k = min(neighbors, n - 1)
     if k < 1:
         return np.ones(n)
+    from scipy.spatial import cKDTree  # here, so that a process that only decodes does not import it
+
     distances, index = cKDTree(points).query(points, k=k + 1)
     # The nearest is the point itself (or a duplicate of it, at the same distance 0).
     distances, index = distances[:, 1:], index[:, 1:]

@@ -50,7 +50,7 @@ METRIC: dict[str, Rule] = {
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "method": {"presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG},
     "metric": METRIC,
-    "coder": {"codes": CODES, "available": WHERE},
+    "coder": {"codes": CODES, "available": WHERE, "stores": TEXT},
     "exporter": {"suffix": SUFFIX},
     "importer": {"suffix": SUFFIX},
     "command": {"position": NUMBER},

@@ -26,6 +26,34 @@
     document.querySelectorAll("details").forEach((d) => { d.open = true; });
   });
 
+  // Tables that a click on a heading sorts: by number where every cell of the column begins with one, unknown ones last.
+  const numberOf = (cell) => {
+    const text = cell.textContent.replace(/,/g, "").replace("\u2212", "-");
+    return /^\s*-?[\d.]/.test(text) ? parseFloat(text) : NaN;
+  };
+  const isUnknown = (cell) => /^\s*[\u2013-]?\s*$/.test(cell.textContent);
+  document.querySelectorAll("table.sortable").forEach((table) => {
+    const heads = [...table.tHead.rows[0].cells], body = table.tBodies[0];
+    heads.forEach((head, column) => {
+      const button = document.createElement("button");
+      button.type = "button";
+      button.className = "sort";
+      button.append(...head.childNodes);
+      head.append(button);
+      button.addEventListener("click", () => {
+        const rows = [...body.rows], turn = head.getAttribute("aria-sort") === "ascending" ? -1 : 1;
+        const known = rows.filter((row) => !isUnknown(row.cells[column]));
+        const numeric = known.every((row) => !Number.isNaN(numberOf(row.cells[column])));
+        known.sort((a, b) => turn * (numeric
+          ? numberOf(a.cells[column]) - numberOf(b.cells[column])
+          : a.cells[column].textContent.localeCompare(b.cells[column].textContent, "en", { numeric: true })));
+        body.append(...known, ...rows.filter((row) => isUnknown(row.cells[column])));
+        heads.forEach((other) => other.removeAttribute("aria-sort"));
+        head.setAttribute("aria-sort", turn > 0 ? "ascending" : "descending");
+      });
+    });
+  });
+
   // Two pictures of one view, one over the other, with a border that can be moved.
   const make = (tag, attributes, parent) => {
     const element = document.createElement(tag);

@@ -1,0 +1,106 @@
+"""A short training inside a test: of a method, or of some of its stages; the PSNR of what came out, and its file.
+
+from sw_kit.short_training import demo, file_of, psnr, train
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+
+from splatwizard_core.api import (
+    ContainerWriter,
+    Method,
+    PipelineParams,
+    Rasterizer,
+    RasterOptions,
+    Scene,
+    SceneOptions,
+    SplatModel,
+    Stage,
+    stream,
+)
+from splatwizard_core.tooling import TrainingRun, load_plugins, load_scene
+
+
+class Training(NamedTuple):
+    """What a training gave.
+
+    model   as the last stage left it; its class is the method's own
+    losses  for each step the parts of its loss by name, and "total"
+    """
+
+    model: Any
+    losses: list[dict[str, float]]
+
+
+def nothing_trained(name: str) -> SplatModel:
+    """Raise AssertionError: for a method that starts from nothing."""
+    raise AssertionError(f"it asks for a scene trained by '{name}', and was given none")
+
+
+def demo(points: int = 600) -> Scene:
+    """Return the scene `demo:tiny`, with so many start points."""
+    return load_scene("demo:tiny", SceneOptions(init_points=points), load_plugins())
+
+
+def train(
+    method: Method,
+    scene: Scene,
+    rasterizer: Rasterizer,
+    *,
+    stages: Sequence[Stage] | None = None,
+    model: Callable[[], SplatModel] | None = None,
+    trained: Callable[[str], SplatModel] = nothing_trained,
+    checkpoint_every: int | None = None,
+    directory: Path | None = None,
+    stop_after: int | None = None,
+) -> Training:
+    """Train, or go on with what `directory` holds.
+
+    stages      those of the method, where None
+    model       makes the model of step 0; None: the method's, drawn from seed 0
+    trained     (method name) -> a trained model
+    stop_after  write a checkpoint after this step and raise TrainingStopped
+    """
+    losses: list[dict[str, float]] = []
+
+    def on_step(_: SplatModel, record: Any) -> None:
+        parts = {name: float(part) for name, part in record.parts.items()}
+        losses.append({**parts, "total": float(record.total)})
+
+    outcome = TrainingRun(
+        list(method.stages()) if stages is None else stages,
+        model or (lambda: method.create_model(scene, stream(0, "init"))),
+        scene,
+        PipelineParams() if checkpoint_every is None else PipelineParams(checkpoint_every=checkpoint_every),
+        rasterizer,
+        directory=directory,
+        identity={},
+        trained=trained,
+        stop_after=stop_after,
+        on_step=on_step,
+    ).train()
+    return Training(outcome.model, losses)
+
+
+@torch.no_grad()
+def psnr(model: SplatModel, scene: Scene, rasterizer: Rasterizer) -> float:
+    """Return the mean over the training views, dB: enough to see that something was learned."""
+    options, values = RasterOptions(background=scene.background), []
+    for view in scene.train:
+        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
+        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
+    return float(torch.stack(values).mean())
+
+
+@torch.no_grad()
+def file_of(method: Method, model: SplatModel) -> bytes:
+    """Return the file that the method writes of a model; writing it must not change the model."""
+    writer, before = ContainerWriter(method.name, method.version), model.digest()
+    method.encode(model, writer)
+    assert model.digest() == before, "encode changes the model"
+    return writer.to_bytes()

@@ -1,0 +1,153 @@
+"""Rate-distortion curves for papers, drawn by matplotlib: SVG and PDF with the colours and markers of the page."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import write_atomic
+from sw_report import numbers
+from sw_report.aggregate import DatasetTable, dataset_tables
+from sw_report.charts import STYLES
+from sw_report.distortion import drawn_metrics
+from sw_report.looks import looks_of
+from sw_report.plots import counts_anchors
+from sw_report.rd_file import themes
+from sw_report.runs import Run
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+FORMS = ("svg", "pdf")
+MARKERS = "os^DvPh*"  # in the order of `charts.MARKERS`
+PANEL = (3.4, 2.6)  # inches: half of a page of two columns
+SALT = "splatwizard"  # equal curves make equal files
+
+
+@dataclass(frozen=True)
+class Line:
+    """Curve of one method: (megabytes, value, standard deviation over the seeds or None) by size."""
+
+    name: str
+    points: list[tuple[float, float, float | None]]
+    look: int
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves of one metric."""
+
+    label: str
+    lines: list[Line]
+
+
+def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
+    """Write rd-<scene>.svg and .pdf for every scene and protocol, and rd-<data set> for means over scenes.
+
+    Nothing is written where no metric has a value. Raises UserInputError without matplotlib; returns the files.
+    """
+    try:
+        import matplotlib
+        from matplotlib.figure import Figure
+    except ImportError:
+        raise UserInputError("--plots needs matplotlib: pip install 'sw-report[plots]'") from None
+    looks = looks_of(runs)
+    drawings: dict[str, list[Panel]] = {}
+    for place in dict.fromkeys(run.place for run in runs):
+        drawings[_free(drawings, place[0])] = _of_scene([run for run in runs if run.place == place], looks)
+    for table in dataset_tables(runs):
+        drawings[_free(drawings, table.dataset)] = _of_means(table, runs, looks)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = []
+    with matplotlib.rc_context({"svg.hashsalt": SALT, "svg.fonttype": "none", "pdf.fonttype": 42, "font.size": 9}):
+        for name, panels in drawings.items():
+            if panels:
+                figure = Figure((PANEL[0] * len(panels), PANEL[1]), layout="constrained")
+                _draw(figure, panels)
+                written += _save(figure, folder / f"rd-{name}")
+    return written
+
+
+def _free(taken: dict[str, list[Panel]], title: str) -> str:
+    """A file name from a scene or data set, numbered where another has it."""
+    name = re.sub(r"[^\w.+-]+", "_", title).strip(".") or "_"
+    same = sum(key == name or key.startswith(f"{name}@") for key in taken)
+    return f"{name}@{same + 1}" if same else name
+
+
+def _of_scene(runs: Sequence[Run], looks: dict[str, int]) -> list[Panel]:
+    panels = []
+    for metric in drawn_metrics(runs):
+        lines = []
+        for variant in dict.fromkeys(run.variant for run in runs):
+            own = [run for run in runs if run.variant == variant]
+            points = [(r.size / 1e6, v, r.deviation(metric)) for r in own if (v := r.mean(metric)) is not None]
+            lines.append(Line(variant, sorted(points, key=lambda p: p[:2]), looks[variant],
+                              any(map(counts_anchors, own))))  # fmt: skip
+        panels.append(Panel(numbers.heading(metric), [line for line in lines if line.points]))
+    return panels
+
+
+def _of_means(table: DatasetTable, runs: Sequence[Run], looks: dict[str, int]) -> list[Panel]:
+    panels = []
+    of_table = [run for run in runs if run.facts.dataset == table.dataset]
+    for metric in drawn_metrics(of_table):
+        lines = []
+        for variant in dict.fromkeys(row.variant for row in table.rows):
+            points = [
+                (row.size / 1e6, value, row.deviations.get(metric)) for row in table.rows
+                if row.variant == variant and row.size is not None and (value := row.metrics.get(metric)) is not None
+            ]  # fmt: skip
+            dashed = any(counts_anchors(run) for run in of_table if run.variant == variant)
+            lines.append(Line(variant, sorted(points, key=lambda p: p[:2]), looks[variant], dashed))
+        lines = [line for line in lines if line.points]
+        if lines:
+            panels.append(Panel(numbers.heading(metric), lines))
+    return panels
+
+
+def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
+    colours = [themes()[0][f"--s{i}"] for i in range(STYLES)]
+    handles: dict[str, Any] = {}
+    for panel, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
+        for line in panel.lines:
+            x, y, deviations = zip(*line.points, strict=True)
+            marker = MARKERS[(line.look + line.look // STYLES) % len(MARKERS)]
+            style: dict[str, Any] = {
+                "color": colours[line.look % STYLES], "marker": marker,
+                "markersize": 4.5, "linewidth": 1.3, "linestyle": "--" if line.dashed else "-",
+            }  # fmt: skip
+            (handles[line.name],) = axes.plot(x, y, **style)
+            if any(deviation is not None for deviation in deviations):
+                axes.errorbar(x, y, [d or 0.0 for d in deviations], fmt="none", ecolor=style["color"], capsize=2)
+        axes.set_xscale("log")
+        axes.set_xlabel("file size, MB")
+        axes.set_ylabel(_plain(panel.label))
+        axes.grid(alpha=0.3, linewidth=0.5)
+        axes.spines[["top", "right"]].set_visible(False)
+    if len(handles) > 1:
+        figure.legend(handles.values(), map(_plain, handles), loc="outside lower center", ncols=4, frameon=False,
+                      fontsize=8)  # fmt: skip
+
+
+def _plain(text: str) -> str:
+    """Text that matplotlib does not take for mathematics."""
+    return text.replace("$", r"\$")
+
+
+def _save(figure: Figure, stem: Path) -> list[Path]:
+    written = []
+    for form in FORMS:
+        content = io.BytesIO()
+        undated = {"Date": None} if form == "svg" else {"CreationDate": None, "ModDate": None}
+        figure.savefig(content, format=form, metadata=undated)
+        path = stem.with_name(f"{stem.name}.{form}")
+        write_atomic(path, content.getvalue())
+        written.append(path)
+    return written
