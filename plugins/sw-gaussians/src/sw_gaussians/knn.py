@@ -41,6 +41,8 @@ def nearest_neighbors(points: Tensor, neighbors: int) -> Tensor:
     k = min(neighbors, n)
     if k < 1:
         return torch.zeros(n, 0, dtype=torch.int32, device=points.device)
+    from scipy.spatial import cKDTree  # as above
+
     xyz = points.detach().cpu().numpy().astype(np.float64)
     _, found = cKDTree(xyz).query(xyz, k=k, workers=-1)
     return torch.from_numpy(found.reshape(n, k).astype(np.int32)).to(points.device)
