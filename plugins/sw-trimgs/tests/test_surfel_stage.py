@@ -216,7 +216,7 @@ def test_the_opaque_part_of_a_picture_is_its_mask(make):
 def test_from_scratch_it_trains_and_trims(plugins, toy, rasterizer):
     sets = {
         "iterations": 8, "densify.start": 2, "densify.interval": 2, "trim.after": 0, "trim.interval": 3,
-        "surface.normal_after": 4, "base.densify.start": 2, "base.densify.interval": 2, "densify.min_opacity": 0.0,
+        "surface.normal_after": 4, "base.densify.start": 2, "base.densify.interval": 2,
         "base.densify.min_opacity": 0.0,
     }  # fmt: skip
     method = preset(plugins, Trim2DGSScratch, "paper", **sets)

@@ -47,7 +47,6 @@ class ScratchSplit(Params):
     interval: int = Field(100, ge=1, description="steps between two")
     percent_dense: float = Field(0.01, gt=0, description="scale above it, times factor and extent, is split")
     factor: float = Field(0.3, gt=0, description="k of the scale split")
-    min_opacity: float = Field(0.05, ge=0, lt=1, description="surfels fainter than this are pruned")
     box: Box = Field("own", description="room around the cameras where it splits; xx: as deep as wide, authors' code")
 
 

@@ -7,10 +7,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import torch
+from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.surface import surface_depth
 from sw_gaussians.surface_losses import distortion_loss, maps_for, normal_disagreement
 from sw_gaussians.surfels import Surface, SurfelModel
-from sw_gaussians.tasks import ResetOpacity
+from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 from sw_gaussians.wrapped_stage import WrappedStage
 
 from splatwizard_core.api import EmptyModel, LossPack, RasterOptions, UserInputError
@@ -179,11 +180,14 @@ class ScratchStage(WrappedStage):
         super().register_post_task(scheduler, ppl, opt)
         scheduler.reprioritise(ResetOpacity, RESET)
         split = self.config.densify
+        assert isinstance(self.inner, ThreeDGSStage)
+        control = self.inner.densification()
+        assert isinstance(control, PruneAndDensify)
         task = ScaleSplit(
             percent_dense=split.percent_dense,
             factor=split.factor,
             size_px=None,
-            min_opacity=split.min_opacity,
+            min_opacity=control.settings["min_opacity"],  # lower where a scaled plan leaves few steps after a reset
             box=split.box,
         )
         steps = self.when(range(split.start, split.stop, split.interval))
