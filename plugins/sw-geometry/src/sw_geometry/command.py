@@ -35,7 +35,8 @@ def _depths(_context: click.Context, _parameter: click.Parameter, incomplete: st
 @click.command(short_help="the surface of a scene as a triangle mesh")
 @click.argument("file", metavar="FILE|RUN", type=click.Path())
 @options(
-    click.option("--scene", metavar="SCENE", type=SCENE, help="Whose cameras see it.  [default: that of the run directory]"),
+    click.option("--scene", metavar="SCENE", type=SCENE,
+                 help="Whose cameras see it.  [default: that of the run directory]"),
     click.option("--out", metavar="DIR", type=OUTPUT_FOLDER,
                  help="Folder for mesh.ply, mesh_post.ply, mesh.png, mesh.json.  [default: RUN/mesh, else mesh]"),
     click.option("--voxel-size", type=LENGTH, metavar="X",
