@@ -14,12 +14,12 @@ from splatwizard_core.runs.config import apply_overrides
 PLUGINS = load_plugins()
 METHODS = [e.name for e in PLUGINS.methods if is_ours(e.distribution) and issubclass(e.load(), GaussianMethod)]
 EXACT = [name for name in METHODS if PLUGINS.methods.load(name).Config().codec.name == "gaussians-exact"]
-CODECS = [
-    pytest.param(name, marks=pytest.mark.slow) if name == "vectree" else name
-    for name in PLUGINS.gaussian_codecs.names
-    if is_ours(PLUGINS.coders.entry(name).distribution)
-]
-"""`vectree` trains a codebook."""
+CODECS = [name for name in PLUGINS.gaussian_codecs.names if is_ours(PLUGINS.coders.entry(name).distribution)]
+QUICK = {
+    "vectree": {"codec.settings.iterations": 5, "codec.settings.batch": 100},
+    "raht": {"codec.settings.vq_steps": 5},
+}
+"""Settings with which a codec that trains a codebook takes no seconds."""
 
 
 def model_of(n=60):
@@ -64,7 +64,7 @@ def test_by_default_every_bit_comes_back_at_236_bytes_a_gaussian(name):
 @pytest.mark.parametrize("codec", CODECS)
 @pytest.mark.parametrize("name", METHODS)
 def test_every_codec_of_gaussians_serves(name, codec):
-    reader = written(name, model_of(), codec=codec)
+    reader = written(name, model_of(), **{"codec.name": codec}, **QUICK.get(codec, {}))
     assert PLUGINS.methods.load(name)(PLUGINS, None).codec_of(reader) == codec
     assert 0 < decoded(name, reader).num_rows <= 60
 

@@ -1,5 +1,6 @@
 """The file of 3DGS: exact to the bit, quantised within stated errors, and safe against strangers."""
 
+import functools
 import math
 import tracemalloc
 
@@ -53,6 +54,12 @@ def encoded(model: GaussianModel, rate: str | None = None, **values) -> bytes:
     writer = ContainerWriter("3dgs", ThreeDGS.version)
     method(rate, **values).encode(model, writer)
     return writer.to_bytes()
+
+
+@functools.cache
+def example(n: int, rate: str) -> bytes:
+    """The file of n Gaussians, for tests that damage it many times."""
+    return encoded(random_model(n), rate)
 
 
 def decoded(data: bytes) -> GaussianModel:
@@ -236,7 +243,7 @@ def test_a_truncated_file_is_refused_at_every_length(rate):
 @settings(max_examples=60, deadline=None)
 @given(position=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
 def test_a_flipped_bit_is_refused(rate, position, bit):
-    data = bytearray(encoded(random_model(20), rate))
+    data = bytearray(example(20, rate))
     data[int(position * len(data))] ^= 1 << bit
     with pytest.raises(BitstreamError):
         decoded(bytes(data))
@@ -245,7 +252,7 @@ def test_a_flipped_bit_is_refused(rate, position, bit):
 @settings(max_examples=80, deadline=None)
 @given(section=st.integers(0, 7), position=st.floats(0, 1, exclude_max=True), value=st.integers(0, 255))
 def test_a_section_forged_with_a_right_checksum_gives_a_model_or_a_bitstream_error(section, position, value):
-    data = encoded(random_model(30), "r4")
+    data = example(30, "r4")
     name = list(ContainerReader(data).sections)[section]
 
     def forge(content: bytes) -> bytes:
@@ -281,9 +288,8 @@ def test_a_section_forged_with_a_right_checksum_gives_a_model_or_a_bitstream_err
     ],
 )
 def test_a_hostile_header_is_refused(static, message):
-    data = encoded(random_model(30), "r4")
     with pytest.raises(BitstreamError, match=message):
-        decoded(rebuilt(data, static=static))
+        decoded(rebuilt(example(30, "r4"), static=static))
 
 
 @pytest.mark.parametrize(

@@ -19,8 +19,10 @@ from sw_gaussians.surfels import (
 )
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, SceneError, ShapeError
+from splatwizard_core.errors import BitstreamError, SceneError, ShapeError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.decode import export_model
 from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 
@@ -151,6 +153,16 @@ def test_surfels_can_be_written_as_flat_ellipsoids(tmp_path):
     assert as_ellipsoids(flat) is flat
     export_ply_as_3dgs(model, tmp_path / "flat.ply")
     assert (tmp_path / "flat.ply").read_bytes() == to_ply(flat)
+
+
+def test_export_takes_the_flat_form_only_by_name(tmp_path):
+    model, plugins = SurfelModel(*tensors(3)), load_plugins()
+    assert export_model(model, tmp_path / "native.ply", plugins) == "ply"
+    assert type(load_ply(tmp_path / "native.ply")) is SurfelModel
+    assert export_model(model, tmp_path / "flat.ply", plugins, "ply-as-3dgs") == "ply-as-3dgs"
+    assert type(load_ply(tmp_path / "flat.ply")) is GaussianModel
+    with pytest.raises(UserInputError, match="no installed exporter writes ''"):
+        export_model(model, tmp_path / "nothing", plugins)
 
 
 def header_of(**values: object) -> ContainerReader:

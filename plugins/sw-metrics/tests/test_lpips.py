@@ -80,10 +80,18 @@ def pictures(seed: int = 0, height: int = 48, width: int = 56) -> tuple[Tensor, 
 
 
 @pytest.fixture(scope="module")
-def forms(lpips_folder: Path):
+def loads() -> list[str]:
+    """Nets that were loaded while `forms` was made."""
+    return []
+
+
+@pytest.fixture(scope="module")
+def forms(lpips_folder: Path, loads: list[str]):
     """name -> the prepared metric."""
-    setup = setup_with(lpips_folder)
-    return {name: form.prepare(setup) for name, form in FORMS.items()}
+    setup, real = setup_with(lpips_folder), perceptual._network
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(perceptual, "_network", lambda net, setup: loads.append(net) or real(net, setup))
+        return {name: form.prepare(setup) for name, form in FORMS.items()}
 
 
 @pytest.mark.parametrize("name", FORMS)
@@ -107,13 +115,8 @@ def test_the_forms_differ_by_the_net_and_the_input_map_alone(forms):
     assert len({round(v, 4) for v in values.values()}) == 3
 
 
-def test_the_two_forms_of_one_net_share_it(lpips_folder: Path, monkeypatch: pytest.MonkeyPatch):
-    loads: list[str] = []
-    real = perceptual._network
-    monkeypatch.setattr(perceptual, "_network", lambda net, setup: loads.append(net) or real(net, setup))
-    setup = setup_with(lpips_folder)
-    for form in FORMS.values():
-        form.prepare(setup)
+def test_the_two_forms_of_one_net_share_it(forms, loads: list[str]):
+    assert len(forms) == 3
     assert loads == ["vgg", "alex"]
 
 
@@ -150,9 +153,8 @@ def test_getting_ready_moves_no_random_stream_and_asks_no_network(lpips_folder: 
 
 
 @pytest.mark.parametrize("net", ["vgg", "alex"])
-def test_the_smallest_picture_is_one_that_leaves_every_layer_something(net: str, lpips_folder: Path):
-    form = {"vgg": VGG, "alex": ALEX}[net]
-    compute = form.prepare(setup_with(lpips_folder)).compute
+def test_the_smallest_picture_is_one_that_leaves_every_layer_something(net: str, forms):
+    compute = next(forms[name] for name, form in FORMS.items() if form.net == net).compute
     side = SMALLEST[net]
     assert compute(*pictures(1, side, side)) > 0
     with pytest.raises(CapabilityError, match=f"too-small.*{side} pixels"):

@@ -10,7 +10,7 @@ from sw_report.runs import collect
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")]
 
-PHONE, DESKTOP = 390, 1280
+PHONE, TABLET, DESKTOP = 390, 768, 1280
 # Of every text, the contrast with what it stands on, by WCAG 2.1; texts over pictures have a ground of their own.
 CONTRAST = """
 (() => {
@@ -60,7 +60,7 @@ def pages(make_run, make_curve, tmp_path):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-@pytest.mark.parametrize("width", [DESKTOP, PHONE])
+@pytest.mark.parametrize("width", [DESKTOP, TABLET, PHONE])
 def test_the_page_fits_is_readable_and_asks_for_nothing(browser, pages, tmp_path, width, scheme):
     for page in pages:
         browser.open(page, width=width, scheme=scheme)
@@ -73,6 +73,36 @@ def test_the_page_fits_is_readable_and_asks_for_nothing(browser, pages, tmp_path
         assert browser.ask("[...document.images].every(i => i.naturalWidth > 0)")
         background = browser.ask("getComputedStyle(document.body).backgroundColor")
         assert (sum(map(int, background[4:-1].split(","))) < 200) == (scheme == "dark")
+
+
+def test_no_column_of_the_results_is_cut_on_a_desktop(browser, make_curve, tmp_path):
+    def with_lpips(content):
+        for name in ("lpips_vgg_3dgs", "lpips_vgg", "lpips_alex", "l1"):
+            content["metrics"][name] = {"mean": 0.1234, "per_view": [], "direction": "lower"}
+
+    for method in ("trimming-the-fat", "3dgs"):
+        make_curve(method, change=with_lpips)
+    write_page(collect([tmp_path / "out"]), tmp_path / "page.html", PageOptions(pictures=False))
+    browser.open(tmp_path / "page.html", width=DESKTOP)
+    assert browser.ask("(t => t.scrollWidth <= t.clientWidth)(document.querySelector('.sortable').parentElement)")
+
+
+def test_a_click_on_a_heading_sorts_the_results(browser, make_curve, tmp_path):
+    for method, saving in (("toy", 1.0), ("3dgs", 0.5)):
+        make_curve(method, saving)
+    write_page(collect([tmp_path / "out"]), tmp_path / "page.html", PageOptions(pictures=False))
+    browser.open(tmp_path / "page.html", width=DESKTOP)
+    head = "[...document.querySelectorAll('.sortable th')].find(th => th.textContent === 'MB')"
+    column = (
+        f"(at => [...document.querySelectorAll('.sortable tbody tr')].map(r => +r.cells[at].textContent))"
+        f"({head}.cellIndex)"
+    )
+    before = browser.ask(column)
+    browser.ask(f"{head}.querySelector('button').click()")
+    assert browser.ask(column) == sorted(before) != before
+    assert browser.ask(f"{head}.getAttribute('aria-sort')") == "ascending"
+    browser.ask(f"{head}.querySelector('button').click()")
+    assert browser.ask(column) == sorted(before, reverse=True)
 
 
 def test_these_checks_would_see_what_they_look_for(browser, pages, tmp_path):

@@ -10,8 +10,9 @@ from sw_report import declared, exports
 from sw_report.aggregate import dataset_tables
 from sw_report.configurations import configurations
 from sw_report.distortion import bd_tables
+from sw_report.page import PageOptions, render_page
 from sw_report.results_tables import means_table, runs_table
-from sw_report.runs import collect
+from sw_report.runs import OF_SEEDS, collect
 
 from splatwizard_core.cli.main import main
 
@@ -110,6 +111,14 @@ def test_a_key_that_an_older_record_lacks_has_its_default(make, tmp_path):
     assert labels(tmp_path) == ["toy r1", "toy r2"]
     make("r3", new=True)
     assert len({run.variant for run in collect([tmp_path]).runs}) == 2
+
+
+def test_values_that_a_preset_chooses_by_the_scene_tell_no_scenes_apart(make, tmp_path):
+    for scene, start in (("garden", 7), ("bicycle", 9)):
+        make("r1", scene=scene, more=[("prune", {"share": 0.3, "start": start}), ("grid", start)])
+    assert set(labels(tmp_path)) == {"toy r1"}
+    make("r1", "b", scene="bonsai", grid=3, more=[("grid", 3)])
+    assert len(set(labels(tmp_path))) == 3
 
 
 def test_a_run_made_again_from_its_own_configuration_file_belongs_to_the_others(make, tmp_path):
@@ -221,3 +230,15 @@ def test_bd_rates_go_by_the_means_of_seeds(make_curve, tmp_path):
         make_curve("toy", saving, out=tmp_path / str(seed), change=configured("r4", seed=seed))
     runs = collect([tmp_path]).runs
     assert bd_tables(runs, "3dgs")[0].rows[0].rate.value == pytest.approx(-50)
+
+
+def test_the_page_about_the_seeds_of_one_rate_point_shows_their_mean(make, tmp_path):
+    for seed, noise in enumerate((6.0, 12.0)):
+        make("r1", f"seed{seed}", noise, seed=seed)
+    collection = collect([tmp_path])
+    assert collection.notes == [OF_SEEDS]
+    text = render_page(collection, PageOptions(pictures=False))
+    (run,) = collection.runs
+    assert f"{run.mean('psnr'):.2f} ± {run.deviation('psnr'):.2f}" in text
+    assert "2 runs: 1 method on 1 scene" in text
+    assert text.count("sw run --method toy --scene garden --preset paper --rate r1") == 2

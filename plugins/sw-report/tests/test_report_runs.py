@@ -100,3 +100,10 @@ def test_a_copied_directory_says_what_it_said_before(make_run, tmp_path):
 
 def test_numbers_in_names_sort_as_numbers():
     assert sorted(["scan114", "scan24", "Scan9", "scan"], key=natural) == ["scan", "Scan9", "scan24", "scan114"]
+
+
+def test_a_method_of_different_releases_is_told(make_run, tmp_path):
+    make_run("r1")
+    make_run("r2", size=2000, change=lambda c: c.update(distribution="sw-toy 0.2"))
+    make_run("r1", method="other", change=lambda c: c.update(distribution="sw-other 0.2"))
+    assert collect([tmp_path]).notes == ["runs of toy were made by different releases: sw-toy 0.1, sw-toy 0.2"]

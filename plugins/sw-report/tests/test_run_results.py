@@ -123,3 +123,14 @@ def test_times_beside_other_processes_are_marked(make_run):
     told = printed([(read_record(path / "metrics.json"), path)], 200)
     assert "†" in "".join(rows(told)[0])
     assert "Other processes wanted the cores" in told
+
+
+def test_no_speed_is_the_best_where_one_was_disturbed(make_run):
+    def of(fps, contended):
+        return lambda c: (c["speed"].update(fps=fps), c.update(contended=contended))
+
+    quick = make_run(method="quick", change=of(20.0, {}))
+    for name, contended, marked in (("idle", {}, True), ("disturbed", {"render": 0.5}, False)):
+        slow = make_run(method=name, change=of(10.0, contended))
+        text = printed([(read_record(path / "metrics.json"), path) for path in (quick, slow)], 200)
+        assert rows(text)[0][-1].startswith("*") == marked

@@ -62,10 +62,10 @@ class TwoDGSStage(ThreeDGSStage):
         return model
 
     def densification(self) -> Callable[..., None]:
-        """Return the task of 3DGS; where a reset leaves too few steps before it, with a threshold below the reset.
+        """Return the task of 3DGS, with a threshold that surfels can reach again after an opacity reset.
 
-        An opacity of 0.01 needs 33 steps of Adam to come back to 0.05; the published plan leaves 100. In a plan that is
-        scaled down a threshold above the reset would remove every surfel.
+        Adam needs 33 steps from an opacity of 0.01 to 0.05, and the published plan leaves 100. In one that is scaled
+        down to fewer the threshold is below the reset: else nothing would survive it.
         """
         task, plan = super().densification(), self.config.densify
         assert isinstance(task, PruneAndDensify)

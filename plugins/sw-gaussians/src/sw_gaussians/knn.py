@@ -41,7 +41,7 @@ def nearest_neighbors(points: Tensor, neighbors: int) -> Tensor:
     k = min(neighbors, n)
     if k < 1:
         return torch.zeros(n, 0, dtype=torch.int32, device=points.device)
-    from scipy.spatial import cKDTree  # as above
+    from scipy.spatial import cKDTree  # here, as above
 
     xyz = points.detach().cpu().numpy().astype(np.float64)
     _, found = cKDTree(xyz).query(xyz, k=k, workers=-1)

@@ -27,7 +27,7 @@ from splatwizard_core.tooling import TrainingRun, load_plugins, load_scene
 
 
 class Training(NamedTuple):
-    """What a training gave.
+    """Outcome of a training.
 
     model   as the last stage left it; its class is the method's own
     losses  for each step the parts of its loss by name, and "total"

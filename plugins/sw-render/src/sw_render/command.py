@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -38,6 +39,11 @@ def _modes(_context: click.Context, _parameter: click.Parameter, value: str | No
     return tuple(dict.fromkeys(words))
 
 
+def _offered(names: Iterable[str]) -> Callable[[click.Context, click.Parameter, str], list[str]]:
+    """Complete a word on the command line to one of these names."""
+    return lambda _context, _parameter, incomplete: [name for name in names if name.startswith(incomplete)]
+
+
 @click.command(short_help="draw an encoded scene: pictures, depth, normals")
 @click.argument("file", metavar="FILE", type=EXISTING)
 @options(
@@ -52,11 +58,12 @@ def _modes(_context: click.Context, _parameter: click.Parameter, value: str | No
     ),
     click.option(
         "--depth", "depths", is_flag=False, flag_value="expected", metavar="[MODE[,MODE]]", callback=_modes,
+        shell_complete=_offered(DEPTHS),
         help=f"Depth maps in the units of the scene, depth_MODE/NAME.npz: {', '.join(DEPTHS)} (of surfels).  "
         "[default: none; without MODE: expected]",
     ),
     click.option(
-        "--normals", is_flag=False, flag_value=AUTO, metavar="[KIND]",
+        "--normals", is_flag=False, flag_value=AUTO, metavar="[KIND]", shell_complete=_offered(NORMALS),
         help="Normals, normals/NAME.npz and .png: rendered (of surfels), or surface (of the depth).  [default: none; "
         "without KIND: rendered if there are surfels]",
     ),

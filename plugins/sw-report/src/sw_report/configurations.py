@@ -26,6 +26,7 @@ def configurations(runs: Sequence[RunFacts]) -> list[Configuration]:
 
     A key belongs to the rate points if one of them sets it in any of the runs: then it counts only where a file or
     --set gave it another value than the rate point's. A key that an older record lacks has the default of the others.
+    A key that presets choose by the scene, or that names the scene's own start, tells no runs apart.
     """
     values = [dict(_values(run)) for run in runs]
     sources = [_sources(run) for run in runs]
@@ -41,6 +42,7 @@ def configurations(runs: Sequence[RunFacts]) -> list[Configuration]:
             rated |= keys
             usual[run.preset, run.rate] = {**_texts(settings), **usual[run.preset, run.rate]}
     blocks = {key.partition(".")[0] for key in rated}
+    chosen_by_scene = _chosen_by_scene(runs, values, sources)
     defaults: dict[str, str] = {}
     found = []
     for run, own, source in zip(runs, values, sources, strict=True):
@@ -50,11 +52,28 @@ def configurations(runs: Sequence[RunFacts]) -> list[Configuration]:
             # Beside what a rate point chose, the preset and the defaults follow from it and from the preset's name.
             if key.partition(".")[0] in blocks and (not _is_given(who) or usual[run.preset, run.rate].get(key) == text):
                 continue
+            if key in chosen_by_scene:
+                continue
             kept[key] = text
             if who is None:
                 defaults.setdefault(key, text)
         found.append(kept)
     return [{**defaults, **kept} for kept in found]
+
+
+def _chosen_by_scene(
+    runs: Sequence[RunFacts], values: Sequence[Mapping[str, str]], sources: Sequence[Mapping[str, str]]
+) -> set[str]:
+    """Return keys that nobody set by hand, and that have one value on each scene with each preset."""
+    given: set[str] = {PRESET}
+    seen: dict[str, dict[tuple[str | None, ...], set[str]]] = {}
+    for run, own, source in zip(runs, values, sources, strict=True):
+        for key, text in own.items():
+            if _is_given(_source(source, key)):
+                given.add(key)
+            place = (run.dataset, run.scene, run.preset)
+            seen.setdefault(key, {}).setdefault(place, set()).add(text)
+    return {key for key, places in seen.items() if key not in given and all(len(x) == 1 for x in places.values())}
 
 
 def differing(found: Sequence[Configuration]) -> list[str]:

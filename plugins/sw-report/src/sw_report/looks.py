@@ -9,8 +9,8 @@ from sw_report.charts import MARKERS, STYLES
 from sw_report.runs import Run
 
 LOOKS = STYLES * len(MARKERS)
-SALT = "71989"
-"""Chosen so that of the published methods no two share colour and marker, and at most two a colour."""
+SALT = "144963"
+"""Chosen so that of the published methods no two share colour and marker, and at most three a colour."""
 
 
 def look_of(method: str) -> int:

@@ -69,7 +69,7 @@ def write_page(collection: Collection, path: Path, options: PageOptions | None =
 def render_page(collection: Collection, options: PageOptions) -> str:
     """Return the HTML text. Raises UserInputError for an anchor that no run is of."""
     runs = collection.runs
-    single = len(runs) == 1
+    single = len(runs) == 1 and not runs[0].repeats
     sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
     environment = Environment(
         loader=PackageLoader("sw_report"), autoescape=True, undefined=StrictUndefined,
@@ -112,12 +112,13 @@ def _title(runs: Sequence[Run]) -> str:
 
 def _lede(runs: Sequence[Run]) -> str:
     facts = runs[0].facts
-    if len(runs) > 1:
+    made = sum(len(run.seeds) for run in runs)
+    if made > 1:
         methods, scenes = _unique([r.variant for r in runs]), _unique([r.facts.scene for r in runs])
         protocols = _unique([r.facts.protocol.id for r in runs])
         sizes = sorted(r.size for r in runs)
         return (
-            f"{len(runs)} runs: {_plural(len(methods), 'method')} on {_plural(len(scenes), 'scene')}, under "
+            f"{made} runs: {_plural(len(methods), 'method')} on {_plural(len(scenes), 'scene')}, under "
             f"{_plural(len(protocols), 'protocol')}. Files of {numbers.megabytes(sizes[0])} to "
             f"{numbers.megabytes(sizes[-1])} MB; every score is of a model that was decoded from its file."
         )
@@ -177,7 +178,12 @@ def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
     sections = []
     means = dataset_tables(runs, partial=options.partial)
     if means:
-        parts = [Part(f"{t.title}: {', '.join(t.protocols)}", table=tables.means_table(t)) for t in means]
+        parts = []
+        for table in means:
+            parts.append(Part(f"{table.title}: {', '.join(table.protocols)}", table=tables.means_table(table)))
+            own = [r for r in runs if r.facts.dataset == table.dataset and r.facts.protocol.id in table.protocols]
+            curves = plots.mean_charts(table, own, style_of)
+            parts += [Part(charts=curves)] if curves is not None else []
         sections.append(Section("means", "Means over scenes", parts, short="Means"))
     places: dict[tuple[str, str], list[Run]] = {}
     for run in runs:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from sw_report import numbers
+from sw_report.aggregate import DatasetTable
 from sw_report.blocks import Cell, Charts, Figure, Table, columns, row
 from sw_report.charts import STYLES, Bar, Chart, Point, Series, square, stacked_bars, swatch
 from sw_report.declared import MetricStyle, metric_style
@@ -63,6 +64,39 @@ def distortion_charts(runs: Sequence[Run], style_of: dict[str, int]) -> Charts |
     legend = [(swatch(style_of[v], dashed=any(counts_anchors(r) for r in runs if r.variant == v)), v) for v in variants]
     notes = ["Dashed: anchors, not Gaussians, are stored."] if any(map(counts_anchors, runs)) else []
     return Charts(figures, legend if len(variants) > 1 else [], notes)
+
+
+def mean_charts(table: DatasetTable, runs: Sequence[Run], style_of: dict[str, int]) -> Charts | None:
+    """Mean quality against mean bytes over the scenes of a data set; None if no method has a curve.
+
+    runs    those that the means are of
+    """
+    figures = []
+    rows = [row for row in table.rows if row.size is not None]
+    variants = list(dict.fromkeys(row.variant for row in rows))
+    dashed = {v: any(counts_anchors(run) for run in runs if run.variant == v) for v in variants}
+    for metric in drawn_metrics(runs):
+        style = metric_style(metric)
+        lines = []
+        for variant in variants:
+            points = [
+                Point(size / 1e6, value, f"{variant} {row.rate or ''}: {numbers.score(metric, value)} {style.unit} at "
+                      f"{numbers.megabytes(size)} MB", row.rate or "" if len(rows) <= MOST_LABELLED else "")
+                for row in sorted(rows, key=lambda row: row.size or 0.0)
+                if row.variant == variant and (size := row.size) and (value := row.metrics.get(metric)) is not None
+            ]  # fmt: skip
+            lines.append(Series(variant, points, style_of[variant], dashed[variant]))
+        if any(len(line.points) > 1 for line in lines):
+            chart = Chart(
+                f"Mean {style.heading} over {table.title}", lines, "mean file size, MB (logarithmic)", x_log=True
+            )
+            better = " (lower is better)" if table.directions.get(metric) == "lower" else ""
+            figures.append(Figure(f"{_caption(style)}{better}", chart.draw()))
+    if not figures:
+        return None
+    legend = [(swatch(style_of[v], dashed=dashed[v]), v) for v in variants] if len(variants) > 1 else []
+    notes = ["Dashed: anchors, not Gaussians, are stored."] if any(dashed.values()) else []
+    return Charts(figures, legend, notes)
 
 
 def _caption(style: MetricStyle) -> str:

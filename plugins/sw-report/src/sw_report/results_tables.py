@@ -96,7 +96,7 @@ MEASURED: tuple[tuple[str, str, Callable[[RunFacts], float | None], Callable[[fl
     ("decode s", "decode", lambda facts: facts.codec.decode_s, numbers.seconds),
     ("FPS", "render", lambda facts: facts.speed.fps, numbers.rate),
 )
-"""What depends on the machine: head of its column, phase, value, spelling. Training is with what it starts from."""
+"""Values that depend on the machine: head of the column, phase, value, spelling. Training includes the base scene's."""
 
 
 def _direction(runs: Sequence[Run], metric: str) -> str:

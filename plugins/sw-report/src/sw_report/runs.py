@@ -124,7 +124,10 @@ def collect(paths: Sequence[Path]) -> Collection:
     runs, by_configuration = _tell_configurations_apart(runs)
     runs, told_apart = _tell_apart(runs)
     notes += by_configuration + told_apart + _protocol_notes(runs)
-    return Collection(sorted(_seeds_joined(runs), key=_order), notes)
+    joined = sorted(_seeds_joined(runs), key=_order)
+    if len(joined) < len(runs):
+        notes.append(OF_SEEDS)
+    return Collection(joined, notes)
 
 
 def record_paths(root: Path) -> list[Path]:
@@ -145,6 +148,10 @@ def _order(run: Run) -> tuple[object, ...]:
     return natural(facts.scene), facts.protocol.id, natural(run.variant), run.size, facts.rate or ""
 
 
+OF_SEEDS = (
+    "runs that differ in the seed alone are one row, mean ± standard deviation; pictures, sections, training and "
+    "scores view by view are of the smallest seed"
+)
 MOST_KEYS = 3  # in the name of a configuration
 MOST_TOLD = 8  # in a note about them
 
@@ -224,13 +231,16 @@ def _by_root(run: Run) -> str:
 
 
 def _protocol_notes(runs: list[Run]) -> list[str]:
-    """Say where one scene was measured under several protocols, and speed on several machines."""
+    """Say where one scene was measured under several protocols, speed on several machines, a method in releases."""
     notes = []
+    releases: dict[str, dict[str, None]] = {}
     by_scene: dict[tuple[str, str], list[str]] = {}
     machines: dict[str, None] = {}
     for run in runs:
         by_scene.setdefault((run.facts.dataset, run.facts.scene), []).append(run.facts.protocol.id)
         machines.setdefault(machine(run.facts))
+        if run.facts.distribution:
+            releases.setdefault(run.variant, {})[run.facts.distribution] = None
     for (_, scene), ids in by_scene.items():
         different = list(dict.fromkeys(ids))
         if len(different) > 1:
@@ -238,6 +248,9 @@ def _protocol_notes(runs: list[Run]) -> list[str]:
                 f"scene {scene} was measured under {len(different)} protocols, which are not comparable and stand "
                 f"apart: {'; '.join(different)}"
             )
+    for variant, names in releases.items():
+        if len(names) > 1:
+            notes.append(f"runs of {variant} were made by different releases: {', '.join(names)}")
     if len(machines) > 1:
         notes.append(f"times, FPS and memory come from different machines: {'; '.join(machines)}")
     return notes
