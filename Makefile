@@ -31,6 +31,7 @@ test: $(VENV)/.ready-dev
 
 test-geometry: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt -e 'plugins/sw-geometry[mesh,unbounded]' --no-build-isolation
+	@$(BIN)/python -c 'from sw_geometry.check import check_open3d as c; x = c()[0]; exit(x.state != "ok" and f"{x.detail}: {x.mend}")'
 	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-geometry $(PYTEST_ARGS)
 
 coverage: $(VENV)/.ready-dev

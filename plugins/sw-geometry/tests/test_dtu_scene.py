@@ -131,7 +131,8 @@ def test_an_evaluation_measures_the_culled_mesh_in_millimetres(scene, tmp_path, 
     official(tmp_path / "dtu_gt")
     mesh = with_floater(sphere(60, r=1 + 0.5 / SCALE))  # half a millimetre too large
     monkeypatch.setattr(metrics, "mesh_of", lambda subject: Built(mesh, mesh, {"voxel_size": 0.004}))
-    subject = SimpleNamespace(scene=scene, setup=MetricSetup(torch.device("cpu")), static={}, keep=None)
+    setup = MetricSetup(torch.device("cpu"))
+    subject = SimpleNamespace(scene=scene, setup=setup, static={}, keep=None, model=None)
     found = metrics.DTU_CHAMFER(subject)
     assert found.details["protocol"] == dtu.PROTOCOL
     assert found.details["unit"] == "mm"

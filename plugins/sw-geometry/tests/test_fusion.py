@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from sw_geometry import build as building
 from sw_geometry.build import build
 from sw_geometry.chamfer import Truth, compare
@@ -17,7 +18,7 @@ from sw_geometry.fusion import Fusion
 from sw_geometry.nearest import to_triangles
 from sw_geometry.open3d_import import import_open3d
 from sw_geometry.parameters import Parameters, resolve
-from sw_geometry.picture import draw
+from sw_geometry.picture import caster_of, draw, save_pictures, turntable
 from sw_geometry.settings import MeshSettings
 
 from splatwizard_core.api import Camera, CapabilityError, SceneOptions, SplatwizardError, UserInputError, View
@@ -102,6 +103,27 @@ def test_the_order_of_views_does_not_matter(views, ball):
     assert to_triangles(turned.post.vertices[::7], ball.post)[0].max() < 0.01 * PARAMETERS.voxel_size
 
 
+def moved(view: DepthView, scale: float, offset: tuple[float, float, float]) -> DepthView:
+    """The view of a world that is scaled, then shifted."""
+    E = view.E.copy()
+    E[:3, 3] = scale * E[:3, 3] - E[:3, :3] @ np.array(offset)
+    return replace(view, depth=(scale * view.depth).astype(np.float32), E=E)
+
+
+def test_a_scaled_and_a_shifted_world_have_the_same_mesh(views, ball):
+    """Powers of two, and whole blocks: nothing is rounded otherwise than before."""
+    larger = replace(PARAMETERS, voxel_size=0.08, sdf_trunc=0.32, depth_trunc=20.0)
+    scaled = build([moved(v, 4.0, (0, 0, 0)) for v in views], len(views), larger, label="test")
+    assert scaled.post.vertices == pytest.approx(4 * ball.post.vertices, abs=1e-5)
+    block = 16 * PARAMETERS.voxel_size
+    shifted = build(
+        [moved(v, 1.0, (2 * block, -block, 3 * block)) for v in views], len(views), PARAMETERS, label="test"
+    )
+    there = shifted.post.vertices - np.array([2, -1, 3]) * block
+    assert len(there) == pytest.approx(len(ball.post.vertices), rel=2e-3)
+    assert to_triangles(there[::7], ball.post)[0].max() < 0.02 * PARAMETERS.voxel_size
+
+
 def test_views_without_depth_are_counted_and_change_nothing(views, ball):
     empty = [replace(views[0], depth=np.full_like(views[0].depth, value)) for value in (0, np.nan, np.inf, 9.0)]
     with_them = build([*empty, *views], len(views) + 4, PARAMETERS, label="test")
@@ -164,15 +186,26 @@ def test_the_estimate_counts_the_room_that_is_there():
 
 
 def test_a_picture_shows_the_outside_in_grey_and_the_inside_in_red(ball):
-    camera = ring(1)[0]
-    picture = draw(ball.post, camera).astype(int)
+    camera, caster = ring(1)[0], caster_of(ball.post)
+    picture = draw(ball.post, camera, caster).astype(int)
     assert (picture[0, 0] == 255).all()
     grey = picture[120, 160]
     assert grey[0] == grey[1] == grey[2] == pytest.approx(0.75 * 255, abs=4)
     assert np.abs((picture.sum(axis=2) < 765) ^ (sphere_depth(camera).numpy() > 0)).mean() < 0.01
     inside_out = replace(ball.post, triangles=ball.post.triangles[:, ::-1])
-    assert np.ptp(draw(inside_out, camera)[120, 160].astype(int)) > 20
-    assert draw(ball.post, camera, colored=True)[120, 160] == pytest.approx(128, abs=3)
+    assert np.ptp(draw(inside_out, camera, caster_of(inside_out))[120, 160].astype(int)) > 20
+    assert draw(ball.post, camera, caster, colored=True)[120, 160] == pytest.approx(128, abs=3)
+
+
+def test_the_pictures_of_a_file_go_around(ball, tmp_path):
+    cameras = ring(20, rise=0.3)
+    chosen = turntable(cameras, 4)
+    angles = sorted(math.atan2(c.center[1], c.center[0]) for c in chosen)
+    assert np.diff(angles) == pytest.approx(math.pi / 2, abs=0.01)
+    save_pictures(ball.post, cameras, tmp_path / "mesh.png")
+    with Image.open(tmp_path / "mesh.png") as picture:
+        assert picture.size == (4 * 320, 2 * 240)
+    assert len(turntable(cameras[:2], 4)) == 2
 
 
 @pytest.fixture(scope="module")
@@ -200,12 +233,6 @@ def test_the_chamfer_distance_of_exact_depth_falls_with_the_voxel(demo):
 
 def test_distances_to_triangles_agree_with_open3d(ball):
     """An independent check of the Chamfer code."""
-    open3d = import_open3d()
-    caster = open3d.t.geometry.RaycastingScene()
-    core = open3d.core
-    caster.add_triangles(
-        core.Tensor(ball.post.vertices.astype(np.float32)), core.Tensor(ball.post.triangles.astype(np.uint32))
-    )
     queries = np.random.default_rng(0).normal(size=(2000, 3)) * 0.4
-    theirs = caster.compute_distance(core.Tensor(queries.astype(np.float32))).numpy()
+    theirs = caster_of(ball.post).compute_distance(import_open3d().core.Tensor(queries.astype(np.float32))).numpy()
     assert to_triangles(queries, ball.post)[0] == pytest.approx(theirs, abs=2e-6)  # theirs is float32

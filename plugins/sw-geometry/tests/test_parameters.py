@@ -14,7 +14,7 @@ from sw_geometry.depth import depth_views, modes_of
 from sw_geometry.fusion import BLOCK_BYTES, EXTRACTION_BYTES, needed_bytes
 from sw_geometry.maps import depth_and_normal_error
 from sw_geometry.open3d_import import import_open3d, why_not
-from sw_geometry.parameters import focus_and_radius, resolve
+from sw_geometry.parameters import focus_and_radius, resolve, stated
 from sw_geometry.settings import MeshSettings
 
 from splatwizard_core.api import (
@@ -84,6 +84,13 @@ def test_dtu_has_its_own_values(scene):
 )  # fmt: skip
 def test_the_user_then_the_file_decides_the_depth(scene, asked, static, ratio):
     assert resolve(MeshSettings(depth=asked), scene, static).depth_ratio == ratio
+
+
+def test_a_model_that_was_just_trained_says_its_depth_itself():
+    trained = SimpleNamespace(surface=SimpleNamespace(depth_ratio=1.0))
+    assert stated(trained, {})["depth_ratio"] == 1
+    assert stated(trained, {"depth_ratio": 0.5})["depth_ratio"] == 0.5
+    assert stated(SimpleNamespace(surface=None), {}) == stated(object(), {}) == {}
 
 
 @pytest.mark.parametrize("value", ["1", True, 2, float("nan"), None])

@@ -36,7 +36,7 @@ MODULES = {
         "config_option console debug_option device_option images_option json_option options print_facts print_json "
         "print_table say scene_option set_option"
     ),
-    "cli.complete": "name_of",
+    "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
     "cli.setup": "Choices open_session takes_choices",
 }

@@ -1,3 +1,4 @@
+from splatwizard_core.cli.complete import SCENE as SCENE
 from splatwizard_core.cli.complete import name_of as name_of
 from splatwizard_core.cli.options import config_option as config_option
 from splatwizard_core.cli.options import console as console

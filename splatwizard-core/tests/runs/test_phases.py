@@ -91,12 +91,17 @@ def test_what_a_scene_that_is_started_from_asks_for_is_not_told_of_the_stage(hel
 
 
 def test_a_metric_without_a_value_served_nothing(helped_plugins):
-    metrics = {"psnr": {"per_view": [30.0]}, "l1": {"per_view": []}, "gone": {"per_view": [1.0]}}
+    metrics = {
+        name: {"per_view": values, "mean": mean}
+        for name, values, mean in (
+            ("psnr", [30.0], 30.0), ("l1", [], None), ("gone", [1.0], None), ("mesh", [], 0.01),
+        )
+    }  # fmt: skip
     phases = phases_of_run(helped_plugins, {"phases": []}, {"parts": []}, {"rasterizers": {}, "metrics": metrics})
     psnr = helped_plugins.metrics.entry("psnr")
     assert psnr.distribution == CORE[0]
     assert told(phases)["evaluate"] == [
-        ("metric", "psnr", psnr.distribution, psnr.version), ("metric", "gone", "", ""),
+        ("metric", "psnr", psnr.distribution, psnr.version), ("metric", "gone", "", ""), ("metric", "mesh", "", ""),
     ]  # fmt: skip
     assert named_parts(helped_plugins, "metric", ["psnr", "psnr"]) == [part_of(psnr)]
 

@@ -9,6 +9,7 @@ import click
 
 from splatwizard_core.tooling import (
     OUTPUT_FOLDER,
+    SCENE,
     Choices,
     debug_option,
     existing_file,
@@ -27,10 +28,14 @@ if TYPE_CHECKING:
 LENGTH = click.FloatRange(min=0, min_open=True)
 
 
+def _depths(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    return [mode for mode in ("expected", "median", "ratio=") if mode.startswith(incomplete)]
+
+
 @click.command(short_help="the surface of a scene as a triangle mesh")
 @click.argument("file", metavar="FILE|RUN", type=click.Path())
 @options(
-    click.option("--scene", metavar="SCENE", help="Whose cameras see it.  [default: that of the run directory]"),
+    click.option("--scene", metavar="SCENE", type=SCENE, help="Whose cameras see it.  [default: that of the run directory]"),
     click.option("--out", metavar="DIR", type=OUTPUT_FOLDER,
                  help="Folder for mesh.ply, mesh_post.ply, mesh.png, mesh.json.  [default: RUN/mesh, else mesh]"),
     click.option("--voxel-size", type=LENGTH, metavar="X",
@@ -45,8 +50,9 @@ LENGTH = click.FloatRange(min=0, min_open=True)
                  help="Largest pieces that stay in mesh_post.ply.  [default: 50; DTU 1]"),
     click.option("--min-views", type=click.IntRange(min=1), metavar="N",
                  help="Views that must have seen a voxel.  [default: 1]"),
-    click.option("--depth", metavar="MODE", help="expected, median, or ratio=R between them.  [default: what the file "
-                 "says, else median for DTU, else expected]"),
+    click.option("--depth", metavar="MODE", shell_complete=_depths,
+                 help="expected, median, or ratio=R between them.  [default: what the file says, else median for DTU, "
+                 "else expected]"),
     click.option("--alpha-min", type=click.FloatRange(0, 1), metavar="A",
                  help="Pixels that are less opaque show no surface.  [default: 0.5]"),
     click.option("--views", type=click.Choice(["train", "all"]), help="Whose depth is fused.  [default: train]"),
@@ -89,7 +95,7 @@ def mesh(
     from sw_geometry.files import write_files
     from sw_geometry.metrics import build_from_model
     from sw_geometry.open3d_import import Open3DMissing, import_open3d
-    from sw_geometry.parameters import resolve
+    from sw_geometry.parameters import resolve, stated
 
     run = Path(file) if (Path(file) / "config.toml").is_file() else None
     path = existing_file(run / "scene.swz" if run is not None else file)
@@ -112,7 +118,7 @@ def mesh(
     raster = session.rasterizer(chosen, suggested_rasterizers(opened.raster))
     drawing = render_options(opened.raster, loaded.background.to(session.device))
     subject = Subject(opened.model, loaded, raster, drawing, setup, opened.static)
-    parameters = resolve(settings, loaded, opened.static)
+    parameters = resolve(settings, loaded, stated(opened.model, opened.static))
     built = build_from_model(subject, parameters, settings.max_memory)
     scores, culled = _measured(subject, parameters, settings, built, units=units, asked=chamfer)
     facts = {

@@ -23,13 +23,13 @@ from sw_geometry.sampling import grid_samples, grid_thinned, thinned
 PROTOCOL = "dtu-chamfer"
 POINTS_PROTOCOL = "dtu-chamfer-points"
 MISSING = "dtu-gt-missing"
-"""How the reason begins where the official files are not there."""
+"""Beginning of the reason where the official files are not there."""
 SCANS = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
 """The scans of published tables of surface reconstruction."""
 SPACING, GRID = 0.2, 1.0
 """Distance between the points of a mesh, and cell of a point cloud, mm."""
 PATCH = 60.0
-"""How far a point may lie below the box of the observed space, mm; twice that above it."""
+"""Distance that a point may lie below the box of the observed space, mm; twice that above it."""
 FARTHEST = 20.0
 """Distance from which a point counts as an outlier, mm."""
 

@@ -30,7 +30,7 @@ def write_files(
     write_mesh(built.post, folder / POST)
     if culled is not None:
         write_mesh(culled, folder / CULLED)
-    save_pictures(built.post, (scene.test or scene.train)[0].camera, folder / PICTURE)
+    save_pictures(built.post, [view.camera for view in scene.train], folder / PICTURE)
     with replacing(folder / FACTS) as temporary:
         temporary.write_text(json.dumps(dict(facts), indent=2, allow_nan=False) + "\n", encoding="utf-8")
     return [name for name in (RAW, POST, CULLED, PICTURE, FACTS) if (folder / name).exists()]

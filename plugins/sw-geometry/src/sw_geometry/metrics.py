@@ -19,7 +19,7 @@ from sw_geometry.files import write_files
 from sw_geometry.maps import depth_and_normal_error
 from sw_geometry.mesh import Mesh
 from sw_geometry.open3d_import import Open3DMissing, import_open3d
-from sw_geometry.parameters import Parameters, resolve
+from sw_geometry.parameters import Parameters, resolve, stated
 from sw_geometry.settings import MeshSettings
 
 GROUP = "mesh"
@@ -67,7 +67,7 @@ def settings_of(subject: Subject) -> MeshSettings:
 
 def parameters_of(subject: Subject) -> Parameters:
     """Parameters of the mesh of a subject."""
-    return resolve(settings_of(subject), subject.scene, subject.static)
+    return resolve(settings_of(subject), subject.scene, stated(subject.model, subject.static))
 
 
 def mesh_of(subject: Subject) -> Built:

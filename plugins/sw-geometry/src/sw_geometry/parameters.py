@@ -47,10 +47,16 @@ class Parameters:
     radius: float
 
 
+def stated(model: object, static: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Values of a model's file, with the depth_ratio that the model itself was trained with if the file says none."""
+    surface = getattr(model, "surface", None)
+    return static if surface is None else {"depth_ratio": surface.depth_ratio, **static}
+
+
 def resolve(settings: MeshSettings, scene: Scene, static: Mapping[str, Any]) -> Parameters:
     """Parameters of a mesh of a scene.
 
-    static  values of the model's file, whose depth_ratio holds where the user names no depth
+    static  as `stated` tells it; its depth_ratio holds where the user names no depth
 
     Raises SceneError for cameras that do not look at anything in common, BitstreamError for a bad depth_ratio.
     """

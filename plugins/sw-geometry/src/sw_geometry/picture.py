@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,17 +16,26 @@ from sw_geometry.open3d_import import import_open3d
 AMBIENT = 0.35
 """Brightness of what faces away from the light, which stands at the camera."""
 GREY = 0.75
+VIEWS = 4
+WIDEST = 2048  # px, of all views together
 
 
-def draw(mesh: Mesh, camera: Camera, *, colored: bool = False) -> NDArray[np.uint8]:
+def caster_of(mesh: Mesh) -> Any:
+    """Open3D's ray caster with the triangles of a mesh."""
+    open3d = import_open3d()
+    caster, core = open3d.t.geometry.RaycastingScene(), open3d.core
+    caster.add_triangles(core.Tensor(mesh.vertices.astype(np.float32)), core.Tensor(mesh.triangles.astype(np.uint32)))
+    return caster
+
+
+def draw(mesh: Mesh, camera: Camera, caster: Any, *, colored: bool = False) -> NDArray[np.uint8]:
     """A picture [H,W,3] of a mesh in grey, or in the colours of its vertices; white where it is not.
+
+    caster  `caster_of` the mesh
 
     A triangle that is seen from inside is drawn darker, with a tint: such faces are a fault of a mesh.
     """
-    open3d = import_open3d()
-    caster = open3d.t.geometry.RaycastingScene()
-    core = open3d.core
-    caster.add_triangles(core.Tensor(mesh.vertices.astype(np.float32)), core.Tensor(mesh.triangles.astype(np.uint32)))
+    core = import_open3d().core
     rays = _rays(camera)
     found = caster.cast_rays(core.Tensor(rays))
     hit = np.isfinite(found["t_hit"].numpy())
@@ -55,10 +66,27 @@ def _rays(camera: Camera) -> NDArray[np.float32]:
     return np.concatenate([np.broadcast_to(center, way.shape), way], axis=2).astype(np.float32)
 
 
-def save_pictures(mesh: Mesh, camera: Camera, path: Path) -> None:
-    """Write a PNG of the mesh, atomically: grey beside its colours where it has some."""
+def turntable(cameras: Sequence[Camera], count: int) -> list[Camera]:
+    """At most `count` of the cameras, evenly spread as seen from above their middle."""
+    centers = np.stack([camera.center.double().cpu().numpy() for camera in cameras])
+    away = centers - centers.mean(axis=0)
+    _, _, axes = np.linalg.svd(away, full_matrices=False)  # the two in which they spread most
+    around = np.argsort(np.arctan2(away @ axes[min(1, len(axes) - 1)], away @ axes[0]), kind="stable")
+    return [
+        cameras[i] for i in around[np.linspace(0, len(cameras), min(count, len(cameras)), endpoint=False, dtype=int)]
+    ]
+
+
+def save_pictures(mesh: Mesh, cameras: Sequence[Camera], path: Path) -> None:
+    """Write a PNG of the mesh from four of the cameras, atomically: in grey, and below in its colours."""
     from PIL import Image
 
-    shown = [draw(mesh, camera)] + ([draw(mesh, camera, colored=True)] if mesh.colors is not None else [])
+    caster, chosen = caster_of(mesh), turntable(cameras, VIEWS)
+    chosen = [each.resized(chosen[0].width, chosen[0].height) for each in chosen]
+    rows = [np.concatenate([draw(mesh, camera, caster) for camera in chosen], axis=1)]
+    if mesh.colors is not None:
+        rows.append(np.concatenate([draw(mesh, camera, caster, colored=True) for camera in chosen], axis=1))
     with replacing(path) as temporary:
-        Image.fromarray(np.concatenate(shown, axis=1)).save(temporary, format="PNG")
+        picture = Image.fromarray(np.concatenate(rows, axis=0))
+        picture.thumbnail((WIDEST, WIDEST))
+        picture.save(temporary, format="PNG")
