@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Any
 
+from sw_codecs.models.rate_points import QUANTIZED_RATES
+
 FLAT_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
     # That of 3dgs: a plan for a CPU and the demo scene, without opacity resets and with larger steps.
@@ -108,25 +110,5 @@ SCRATCH_PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
 }
 
-
-def _quantized(bits: int, dc: float, rest: float, opacity: float, scale: float, quat: float) -> dict[str, Any]:
-    return {
-        "codec.name": "gaussians-quantized",
-        "codec.settings.position_bits": bits,
-        "codec.settings.dc_step": dc,
-        "codec.settings.rest_step": rest,
-        "codec.settings.opacity_step": opacity,
-        "codec.settings.scale_step": scale,
-        "codec.settings.quat_step": quat,
-    }
-
-
 # The steps are those of 3dgs.
-RATES: Mapping[str, Mapping[str, Any]] = {
-    "r1": _quantized(13, 0.2, 0.2, 0.6, 0.3, 0.07),
-    "r2": _quantized(14, 0.12, 0.1, 0.4, 0.18, 0.04),
-    "r3": _quantized(15, 0.07, 0.055, 0.25, 0.1, 0.022),
-    "r4": _quantized(16, 0.04, 0.028, 0.15, 0.06, 0.012),
-    "r5": _quantized(18, 0.02, 0.012, 0.08, 0.03, 0.007),
-    "r6": {"codec.name": "gaussians-exact"},
-}
+RATES = QUANTIZED_RATES
