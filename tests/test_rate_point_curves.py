@@ -1,4 +1,4 @@
-"""Rate points of every installed method are one configuration to reports, also when runs are made again from files."""
+"""Rate points of every method of ours are one configuration to reports, also when runs are made again from files."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from sw_report.configurations import configurations
 from sw_report.facts import RunFacts
 
 from splatwizard_core.plugins import load_plugins
+from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.runs.config import resolve
 
-METHODS = sorted(entry.name for entry in load_plugins().methods)
+METHODS = sorted(entry.name for entry in load_plugins().methods if is_ours(entry.distribution))
 
 
 @pytest.mark.parametrize("name", METHODS)

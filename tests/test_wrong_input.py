@@ -91,6 +91,7 @@ ROWS = [
     Row("run --device tpu", "'tpu' is not one of 'auto', 'cpu', 'cuda'"),
     Row("run --repeats 0", "Invalid value for '--repeats'"),
     Row("decode {grey.swz} --repeats -1", "Invalid value for '--repeats'"),
+    Row("mesh {grey.swz} --scene demo:tiny --depth ratio=2", "must be expected, median, or ratio=R with R in 0..1"),
     Row("render {grey.swz} --views some", "'some' is not one of 'test', 'train', 'all'"),
     Row("build-kernels --jobs 0", "Invalid value for '--jobs'"),
     Row("new-plugin 'a b' --into {new}", "'a b'"),

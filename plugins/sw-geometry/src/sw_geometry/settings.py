@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
@@ -23,9 +24,8 @@ class MeshSettings(BaseModel):
     clusters: int | None = Field(None, ge=1, description="largest connected pieces that stay")
     min_views: int = Field(1, ge=1, description="views that must have seen a voxel")
     depth: str | None = Field(
-        None, pattern=r"^(expected|median|ratio=(0(\.\d+)?|1(\.0+)?|\.\d+))$",
-        description="depth of the surface: expected, median, or ratio=R between the two (1: median)",
-    )  # fmt: skip
+        None, description="depth of the surface: expected, median, or ratio=R between the two (1: median)"
+    )
     alpha_min: float = Field(0.5, ge=0, le=1, description="pixels that are less opaque show no surface")
     mask: bool = Field(True, description="pixels outside the masks of the scene show no surface")
     views: Literal["train", "all"] = Field("train", description="views whose depth is fused")
@@ -35,3 +35,11 @@ class MeshSettings(BaseModel):
     tau: Positive | None = Field(None, description="distance within which a point counts as right, units of the scene")
     points: bool = Field(False, description="measure the centres of the Gaussians too")
     dtu_gt: str | None = Field(None, description="folder of the official DTU files Points/ and ObsMask/")
+
+    @field_validator("depth")
+    @classmethod
+    def _known(cls, value: str | None) -> str | None:
+        ratio = None if value is None else re.fullmatch(r"ratio=(\d*\.?\d+)", value)
+        if value in (None, "expected", "median") or (ratio and float(ratio[1]) <= 1):
+            return value
+        raise ValueError("must be expected, median, or ratio=R with R in 0..1")
