@@ -18,7 +18,7 @@ from sw_kit.finding import BrokenContractError, NotCheckedError, PackageCheck
 from sw_kit.samples import some_gaussians
 from sw_kit.suite import checks_of
 
-from splatwizard_core.api import ConfigError, Method, OptimizationParams, Params, Stage, UserInputError
+from splatwizard_core.api import ConfigError, Method, MetricResult, OptimizationParams, Params, Stage, UserInputError
 from splatwizard_core.tooling import Entry, PluginInfo, load_plugins
 
 PLUGINS = load_plugins()
@@ -130,6 +130,7 @@ def test_a_plugin_with_an_entry_that_is_refused(monkeypatch):
      (Entry("metric", "name", "m:C", "line"), "does not declare 'direction'"),
      (Entry("metric", "name", "m:C", "line", {"directoin": "higher"}), "'direction', but 'directoin', which"),
      (Entry("metric", "name", "m:C", "line", {"direction": "up"}), "direction='up'"),
+     (Entry("metric", "name", "m:C", "line", {"direction": "lower", "over": "mesh"}), "over='mesh'"),
      (Entry("coder", "name", "m:C", "line", {"codes": "colours"}), "codes='colours'"),
      (Entry("exporter", "name", "m:C", "line", {"suffix": "ply"}), "suffix='ply'"),
      (Entry("command", "name", "m:C", "line", {"position": print}), "no plain value")],
@@ -279,6 +280,27 @@ def in_place(render, truth):
 def test_metrics_that_are_no_function_of_two_images(entry_of, metric, direction, said):
     with pytest.raises(BrokenContractError, match=said):
         BEHAVIOUR["metric"](entry_of("metric", metric, direction=direction), PLUGINS)
+
+
+def counted(subject):
+    return MetricResult(float(subject.model.num_rows), [], "lower")
+
+
+def moved(subject):
+    subject.model.means.data += 1
+    return counted(subject)
+
+
+@pytest.mark.parametrize(
+    ("metric", "said"),
+    [(lambda subject: 1.0, "returns a float"), (moved, "changes the model"),
+     (lambda subject: MetricResult(None, [], "lower"), "mean is None"),
+     (lambda subject: MetricResult(float(torch.rand(())), [], "lower"), "a second call")],
+)  # fmt: skip
+def test_metrics_over_models_that_measure_no_model(entry_of, metric, said):
+    with pytest.raises(BrokenContractError, match=said):
+        BEHAVIOUR["metric"](entry_of("metric", metric, direction="lower", over="model"), PLUGINS)
+    assert "200" in BEHAVIOUR["metric"](entry_of("metric", counted, direction="lower", over="model"), PLUGINS)
 
 
 @pytest.mark.parametrize(

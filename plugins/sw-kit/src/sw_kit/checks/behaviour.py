@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from PIL import Image
 
-from splatwizard_core.api import CapabilityError, MetricSetup, PreparedMetric
+from splatwizard_core.api import CapabilityError, MetricResult, MetricSetup, PreparedMetric, RasterOptions, Subject
 from splatwizard_core.tooling import Check, NegotiatedRasterizer
 from sw_kit.checks.coding import check_coder
 from sw_kit.checks.rasterizer import check_rasterizer
@@ -66,6 +66,8 @@ def check_pruner(entry: Entry, plugins: PluginManager) -> str:
 def check_metric(entry: Entry, plugins: PluginManager) -> str:
     """Hold a metric to one finite number, repeatable, on images that stay as they are, in the declared direction."""
     target = entry.load()
+    if entry.declared.get("over") == "model":
+        return _check_model_metric(entry, plugins)
     try:
         prepared = target.prepare(MetricSetup(CPU)) if hasattr(target, "prepare") else PreparedMetric(target)
     except CapabilityError as error:
@@ -87,6 +89,29 @@ def check_metric(entry: Entry, plugins: PluginManager) -> str:
         f"direction='{entry.declared['direction']}' says the opposite",
     )
     return f"{values[0]:.4g} for a little noise, {values[2]:.4g} for much"
+
+
+def _check_model_metric(entry: Entry, plugins: PluginManager) -> str:
+    """Hold a metric over models to a MetricResult or None, repeatable, and to leave the model as it is."""
+    model, scene = some_gaussians(), tiny_scene()
+    before, values = model.digest(), []
+    for _ in range(2):
+        setup = MetricSetup(CPU)
+        subject = Subject(model, scene, NegotiatedRasterizer(plugins, device=CPU), RasterOptions(), setup, {})
+        try:
+            found = entry.load()(subject)
+        except CapabilityError as error:
+            raise NotCheckedError(str(error), "check where it can be computed") from error
+        if found is None:
+            return "does not apply to demo:tiny"
+        hold(isinstance(found, MetricResult), f"it returns a {type(found).__name__}", "return a MetricResult or None")
+        hold(
+            found.mean is not None and math.isfinite(found.mean), f"its mean is {found.mean}", "return a finite number"
+        )
+        values.append(found.mean)
+    hold(model.digest() == before, "it changes the model", "work on a copy")
+    hold(values[0] == values[1], f"a second call gives {values[1]}, not {values[0]}", "seed what is random")
+    return f"{values[0]:.4g} for 200 Gaussians that nobody trained"
 
 
 def check_dataset(entry: Entry, plugins: PluginManager) -> str:

@@ -36,23 +36,25 @@ NUMBER: Rule = (_is(int, float), "a number")
 COUNT: Rule = (lambda value: _is(int)(value) and value >= 0, "a whole number")
 FLAG: Rule = (_is(bool), "True or False")
 NAMES: Rule = (_names, "a list of names")
-SUFFIX: Rule = (lambda value: isinstance(value, str) and value.startswith(".") and len(value) > 1, 'such as ".ply"')
+SUFFIXED: Rule = (lambda value: isinstance(value, str) and value.startswith(".") and len(value) > 1, 'such as ".ply"')
+SUFFIX: Rule = (lambda value: value == "" or SUFFIXED[0](value), 'such as ".ply", or "" (by --format alone)')
 WHERE: Rule = (lambda value: isinstance(value, str) and bool(TARGET.fullmatch(value)), '"module:attribute"')
 DIRECTION: Rule = (lambda value: value in ("higher", "lower"), '"higher" or "lower"')
+OVER: Rule = (lambda value: value in ("image", "model"), '"image" or "model"')
 CODES: Rule = (lambda value: value in SORTS, f"one of {', '.join(SORTS)}")
 ANY: Rule = (lambda value: True, "")
 
 METRIC: dict[str, Rule] = {
     **{field.name: ANY for field in dataclasses.fields(MetricInfo)},
     "direction": DIRECTION, "digits": COUNT, "position": NUMBER, "label": TEXT, "unit": TEXT, "settings": WHERE,
-    "diagnostic": FLAG, "slow": FLAG, "unrounded": FLAG,
+    "diagnostic": FLAG, "slow": FLAG, "unrounded": FLAG, "over": OVER,
 }  # fmt: skip
 FIELDS: Mapping[str, Mapping[str, Rule]] = {
     "method": {"presets": NAMES, "rates": NAMES, "bd_anchor": COUNT, "default": FLAG},
     "metric": METRIC,
     "coder": {"codes": CODES, "available": WHERE, "stores": TEXT},
     "exporter": {"suffix": SUFFIX},
-    "importer": {"suffix": SUFFIX},
+    "importer": {"suffix": SUFFIXED},
     "command": {"position": NUMBER},
     "check": {"group": TEXT, "needs": ANY},
     "dataset": {

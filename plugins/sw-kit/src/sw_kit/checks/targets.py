@@ -47,6 +47,9 @@ def check_target(entry: Entry, plugins: PluginManager) -> str:
         _takes(target.prepare, 1, f"{whose}: prepare")
         _takes(target.identity, 1, f"{whose}: identity")
         return "gets ready with prepare(setup)"
+    if entry.kind == "metric" and entry.declared.get("over") == "model":
+        _takes(target, 1, whose)
+        return "takes a subject"
     if entry.kind in ARGUMENTS:
         hold(callable(target), f"{whose} stands for a {type(target).__name__}", f"{entry.target} must be a function")
         _takes(target, ARGUMENTS[entry.kind], whose)
