@@ -67,6 +67,7 @@ READER = """
     counts = dict.fromkeys(READ, 0)
     directory, stop = Path(sys.argv[1]), Path(sys.argv[2])
     while not stop.exists():
+        time.sleep(0.01)
         for pattern, read in READ.items():
             for path in directory.glob(pattern):
                 try:
