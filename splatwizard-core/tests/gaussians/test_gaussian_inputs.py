@@ -104,3 +104,24 @@ def test_gathered_inputs_have_rows_of_their_own():
     assert g.gathered(geometry=False).scales is table["scales"]
     assert g.gathered(colors=False).sh is sh
     assert g.geom_indices is rows  # the inputs themselves are left alone
+
+
+def test_gradients_of_shared_shapes_and_colours_have_the_same_bits_with_several_threads():
+    indices = torch.randint(8, (20_000,), generator=torch.Generator().manual_seed(0))
+    tables = [torch.ones(8, *tail, requires_grad=True) for tail in ((3,), (4,), (1, 3))]
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        found = []
+        for _ in range(10):
+            sh = SH(codebook=tables[2], indices=indices, active_degree=0)
+            g = GaussianInputs(
+                torch.zeros(20_000, 3), torch.ones(20_000), tables[0], tables[1], sh=sh, geom_indices=indices
+            )
+            own, weights = g.gathered(), torch.randn(20_000, 3, generator=torch.Generator().manual_seed(1))
+            colors = (own.sh.to_dense()[:, 0] + sh.to_dense()[:, 0]) * weights
+            total = (own.scales * weights).sum() + (own.quats[:, :3] * weights).sum() + colors.sum()
+            found.append(torch.autograd.grad(total, tables))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for each in found for a, b in zip(each, found[0], strict=True))

@@ -146,3 +146,20 @@ def test_wrong_use_is_refused():
     for wrong in ({"size": 0}, {"stages": 0}, {"block": 0}):
         with pytest.raises(ValueError, match="size"):
             ResidualVectorQuantizer(**wrong)
+
+
+def test_the_gradient_of_the_codebooks_has_the_same_bits_with_several_threads(several_threads):
+    x = torch.randn(20_000, 3, generator=gen())
+    q = ResidualVectorQuantizer(16, 2)
+    q.fit(x[:2000], generator=gen(), iterations=1, spread=False)
+    found = [torch.autograd.grad(q.codebook_loss(x), q.codebooks)[0] for _ in range(10)]
+    assert all(torch.equal(each, found[0]) for each in found)
+
+
+@pytest.fixture
+def several_threads():
+    """As on a machine whose cores nobody else wants."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    yield
+    torch.set_num_threads(threads)

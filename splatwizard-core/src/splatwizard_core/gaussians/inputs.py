@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -51,7 +50,7 @@ class SH:
         rest = self.rest
         if self.codebook is not None:
             assert self.indices is not None
-            rest = self.codebook[self.indices]
+            rest = self.codebook.index_select(0, self.indices)
         if self.dc is None:
             assert rest is not None
             return rest
@@ -103,6 +102,11 @@ _SIZES: dict[str, tuple[int | str, ...]] = {
 """The tensors of GaussianInputs and their sizes; "rows" is N, or M with `geom_indices`."""
 
 
+def _rows_of(table: Tensor, indices: Tensor) -> Tensor:
+    """Rows of a table. On the CPU several threads sum the gradient of `table[indices]` in any order, not of this."""
+    return table.index_select(0, indices)
+
+
 @dataclass
 class GaussianInputs:
     """Activated Gaussians, all tensors on one device.
@@ -149,7 +153,7 @@ class GaussianInputs:
         *,
         geometry: bool = True,
         colors: bool = True,
-        lookup: Callable[[Tensor, Tensor], Tensor] = operator.getitem,
+        lookup: Callable[[Tensor, Tensor], Tensor] = _rows_of,
     ) -> GaussianInputs:
         """A shallow copy in which every Gaussian has its own scales, quaternion and colours; differentiable.
 

@@ -94,7 +94,8 @@ class ResidualVectorQuantizer(nn.Module):
         symbols, found = self._search(x, books.detach())
         residual, loss = x.detach().to(books.dtype), books.new_zeros(())
         for stage in range(self.stages):
-            entries = books[stage][symbols[:, stage]]
+            # On the CPU the gradient of an index is summed by several threads in any order; this one is not.
+            entries = books[stage].index_select(0, symbols[:, stage])
             loss = loss + (residual - entries).square().mean()
             residual = residual - entries.detach()
         return straight_through(x, found), loss
