@@ -1,10 +1,11 @@
-"""`python -m sw_kit.checks.hostile_child FILE COUNT`: decode damaged versions of a file; prints one JSON object."""
+"""`python -m sw_kit.checks.hostile_child FILE COUNT SECONDS`: decode damaged versions of a file; prints JSON."""
 
 from __future__ import annotations
 
 import json
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import torch
@@ -17,8 +18,8 @@ SEED = 17
 MOST_PROBLEMS = 5
 
 
-def main(path: Path, count: int) -> None:
-    """Decode `count` damaged files, always the same ones."""
+def main(path: Path, count: int, seconds: float) -> None:
+    """Decode `count` damaged files, always the same ones; fewer where they take more than `seconds` of CPU time."""
     plugins, cpu, good = load_plugins(), torch.device("cpu"), path.read_bytes()
     open_model(path, plugins, cpu)  # imports what is imported late
     mutator, tally = Mutator(SEED), Tally()
@@ -29,7 +30,10 @@ def main(path: Path, count: int) -> None:
             open_model(hostile, plugins, cpu)
             return "decoded"
 
+        began = time.process_time()
         for i in range(count):
+            if time.process_time() - began > seconds:
+                break
             data, kind = mutator.file([good])
             hostile.write_bytes(data)
             limit = 4 * decoded_limit(len(data)) + NOISE
@@ -37,8 +41,9 @@ def main(path: Path, count: int) -> None:
             if len(tally.problems) >= MOST_PROBLEMS:
                 break
     refused = sum(n for outcome, n in tally.outcomes.items() if outcome != "decoded")
-    print(json.dumps({"problems": tally.problems, "refused": refused, "slowest_s": tally.slowest_s}))
+    shown = sum(tally.outcomes.values())
+    print(json.dumps({"problems": tally.problems, "refused": refused, "shown": shown, "slowest_s": tally.slowest_s}))
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), int(sys.argv[2]))
+    main(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]))
