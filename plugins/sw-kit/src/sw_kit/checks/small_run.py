@@ -32,7 +32,7 @@ CPU = torch.device("cpu")
 STEPS = 40
 HOSTILE = 100
 """Number of damaged files that the decoder is shown, unless they take longer than `ENOUGH_S`."""
-ENOUGH_S = 15
+ENOUGH_S = 12
 HOSTILE_S = 120
 
 
