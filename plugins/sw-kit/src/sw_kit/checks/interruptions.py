@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     from splatwizard_core.api import PipelineParams, Stage
     from splatwizard_core.tooling import Entry
 
-MOST = 6
+MOST = 4
 
 
 def stops_of(stages: Sequence[Stage], ppl: PipelineParams, entry: Entry) -> list[int]:
-    """Return at most 6 steps, counted over all stages, ascending: the middle, and those around firings of tasks.
+    """Return at most 4 steps, counted over all stages, ascending: the middle, and those around firings of tasks.
 
     Of each task one stop lies between two of its firings and one before its first, since what it keeps outside the
     model is lost there. Tasks of the method's own package come first, then those that fire seldom. A training of less
