@@ -3,30 +3,18 @@
 from collections.abc import Mapping
 from typing import Any
 
+from sw_gaussians.quick import QUICK
+
 from sw_codecs.models.rate_points import QUANTIZED_RATES
 
 FLAT_PRESETS: Mapping[str, Mapping[str, Any]] = {
     "paper": {},
-    # That of 3dgs: a plan for a CPU and the demo scene, without opacity resets and with larger steps.
-    "quick": {
-        "iterations": 2000,
-        "sh_interval": 150,
-        "lr.max_steps": 2000,
-        "lr.position_init": 8e-4,
-        "lr.position_final": 8e-6,
-        "lr.sh_dc": 1e-2,
-        "lr.sh_rest": 1e-3,
-        "lr.scales": 1e-2,
-        "lr.quats": 2e-3,
-        "densify.start": 200,
-        "densify.stop": 1200,
-        "densify.grad_threshold": 4e-4,
-    },
+    "quick": QUICK,
 }
 
 # A tenth of the plan for a CPU and the demo scene, with smaller steps of the means, larger ones else, and no reset.
 # The last 200 steps let it settle.
-QUICK: Mapping[str, Any] = {
+QUICK_TUNE: Mapping[str, Any] = {
     "iterations": 700,
     "scale_schedule": True,
     "densify.reset_interval": 0,
@@ -59,7 +47,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     },
     "mipnerf360-outdoor": {**_MIPNERF360, "normals.weight": 0.1},
     "mipnerf360-indoor": {**_MIPNERF360, "normals.weight": 0.01},
-    "quick": QUICK,
+    "quick": QUICK_TUNE,
 }
 
 SURFEL_PRESETS: Mapping[str, Mapping[str, Any]] = {
@@ -89,7 +77,7 @@ SURFEL_PRESETS: Mapping[str, Mapping[str, Any]] = {
         "surface.lambda_dist": 10.0,
     },
     # Surfels of 2,000 steps are larger than the published factor expects, which would split nearly all of them at once.
-    "quick": {**QUICK, "densify.factor": 2.0},
+    "quick": {**QUICK_TUNE, "densify.factor": 2.0},
 }
 
 SCRATCH_PRESETS: Mapping[str, Mapping[str, Any]] = {

