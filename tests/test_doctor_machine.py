@@ -90,7 +90,7 @@ def liar():
 
 @pytest.fixture(scope="module")
 def faulty(tmp_path_factory: pytest.TempPathFactory) -> subprocess.CompletedProcess[str]:
-    """What it says of a machine that has no compiler, a cache that cannot be written, and strangers' plugins."""
+    """Findings about a machine that has no compiler, a cache that cannot be written, and strangers' plugins."""
     root = tmp_path_factory.mktemp("faulty")
     site, binaries = root / "site", root / "bin"
     plugin(site, "sw-bad", "import no_such_library\n")

@@ -112,7 +112,7 @@ def test_absgrad_trains(scene, rasterizer):
 
 @pytest.fixture(scope="module")
 def dense(scene, rasterizer):
-    """What the usual optimizer makes of the plan of the sparse ones."""
+    """Scene that the usual optimizer trains by the plan of the sparse ones."""
     return train(scene, rasterizer, iterations=80)
 
 

@@ -1,4 +1,4 @@
-"""What `sw doctor` says of required and optional packages, and the line that mends each."""
+"""Findings of `sw doctor` about required and optional packages, and the line that mends each."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What `sw doctor` tries with torch: the GPU, kernels, entries, rasterizers, scenes, the main job."""
+"""Trials of `sw doctor` with torch: the GPU, kernels, entries, rasterizers, scenes, the main job."""
 
 from __future__ import annotations
 

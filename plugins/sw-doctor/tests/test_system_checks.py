@@ -1,4 +1,4 @@
-"""What `sw doctor` says of folders, disk, memory and Python."""
+"""Findings of `sw doctor` about folders, disk, memory and Python."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the results table and what follows from it tell beside numbers: marks, best values, commands, mean curves."""
+"""Results table and its companions, beside the numbers: marks, best values, commands, mean curves."""
 
 import re
 import shlex

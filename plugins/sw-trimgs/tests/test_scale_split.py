@@ -1,4 +1,4 @@
-"""What is too large becomes three children, in its plane, inside the room around the cameras."""
+"""Scale split: large Gaussians become three children, in their plane, inside the room around the cameras."""
 
 import math
 

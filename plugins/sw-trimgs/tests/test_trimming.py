@@ -1,4 +1,4 @@
-"""Which scores lie below a quantile, and what a trim does to the rows."""
+"""Scores below a quantile, and the effect of a trim on the rows."""
 
 import pytest
 import torch
