@@ -38,7 +38,7 @@ def walls(camera: Camera, *distances_and_opacities: tuple[float, float]) -> Gaus
 
 @pytest.fixture(scope="module")
 def camera() -> Camera:
-    """Map of view_000."""
+    """Camera of view_000."""
     return load_scene("demo:tiny", SceneOptions(), load_plugins()).test[0].camera
 
 
