@@ -284,5 +284,5 @@ def test_a_header_of_the_largest_size_is_read_within_time_and_memory(tmp_path, f
             taken.append(tally.slowest_s)
         return min(taken)
 
-    # 8 times the bytes take 8 times as long; if anything took quadratic time, 64 times.
-    assert attempts(1 << 19) < 3 * 8 * attempts(1 << 16)
+    # 8 times the bytes take 8 times as long, 25 times with the garbage collector at work; in quadratic time, 64 times.
+    assert attempts(1 << 19) < 5 * 8 * attempts(1 << 16)
