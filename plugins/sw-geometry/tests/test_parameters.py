@@ -9,8 +9,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from sw_gaussians.surface import depth_modes
 from sw_geometry import check, metrics
-from sw_geometry.depth import depth_views, modes_of
+from sw_geometry.depth import depth_views
 from sw_geometry.fusion import BLOCK_BYTES, EXTRACTION_BYTES, needed_bytes
 from sw_geometry.maps import depth_and_normal_error
 from sw_geometry.open3d_import import import_open3d, why_not
@@ -137,9 +138,9 @@ INPUTS = SimpleNamespace(sh=None)
 
 
 def test_a_ratio_asks_for_the_depth_that_it_needs():
-    assert modes_of(0) == {"expected"}
-    assert modes_of(1) == {"median"}
-    assert modes_of(0.5) == {"expected", "median"}
+    assert depth_modes(0) == {"expected"}
+    assert depth_modes(1) == {"median"}
+    assert depth_modes(0.5) == {"expected", "median"}
 
 
 def test_depth_is_cut_by_opacity_and_by_masks(scene):

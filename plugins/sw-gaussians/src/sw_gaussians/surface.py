@@ -14,6 +14,11 @@ from torch import Tensor
 from splatwizard_core.api import Camera, ConfigError
 
 
+def depth_modes(depth_ratio: float) -> frozenset[str]:
+    """Return the modes of `RasterOptions.depth` that `surface_depth` blends with a ratio, 0..1: those with a weight."""
+    return frozenset(mode for mode, weight in (("expected", 1 - depth_ratio), ("median", depth_ratio)) if weight > 0)
+
+
 def surface_depth(depth: Mapping[str, Tensor], depth_ratio: float) -> Tensor:
     """Return the depth of the surface, [1,H,W] camera z in world units: (1 - r) expected + r median.
 

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, RenderResult
-from sw_gaussians.surface import depth_normals, surface_depth, world_normals
+from sw_gaussians.surface import depth_modes, depth_normals, surface_depth, world_normals
 
 
 def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str, Any]:
@@ -22,9 +22,7 @@ def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str
     """
     found: dict[str, Any] = {"distortion": True} if distortion else {}
     if normals:
-        modes = {"expected": depth_ratio < 1, "median": depth_ratio > 0}
-        drawn = frozenset(mode for mode, wanted in modes.items() if wanted)
-        found |= {"normals": True, "alpha": True, "depth": drawn}
+        found |= {"normals": True, "alpha": True, "depth": depth_modes(depth_ratio)}
     return found
 
 

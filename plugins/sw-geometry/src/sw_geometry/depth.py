@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from sw_gaussians.surface import surface_depth
+from sw_gaussians.surface import depth_modes, surface_depth
 from torch import Tensor
 
 from splatwizard_core.api import GaussianInputs, Rasterizer, RasterOptions, SplatModel, View
@@ -31,11 +31,6 @@ class DepthView:
     E: Floats
 
 
-def modes_of(depth_ratio: float) -> frozenset[str]:
-    """The depth modes that a ratio needs."""
-    return frozenset(mode for mode, weight in (("expected", 1 - depth_ratio), ("median", depth_ratio)) if weight > 0)
-
-
 def diffuse(inputs: GaussianInputs) -> GaussianInputs:
     """The Gaussians with the colour that does not depend on the view: spherical harmonics of degree 0."""
     return inputs if inputs.sh is None else replace(inputs, sh=replace(inputs.sh, active_degree=0))
@@ -49,7 +44,7 @@ def depth_of(
     Raises CapabilityError if no rasterizer offers the depth.
     """
     camera = view.camera.to(model.device)
-    asked = replace(options, depth=modes_of(depth_ratio), alpha=True, background=None)
+    asked = replace(options, depth=depth_modes(depth_ratio), alpha=True, background=None)
     with torch.no_grad():
         result = rasterizer.render(diffuse(model.gaussians(camera, rasterizer)), camera, asked)
     assert result.alpha is not None

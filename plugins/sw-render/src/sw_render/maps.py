@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import torch
-from sw_gaussians.surface import depth_normals, surface_depth, world_normals
+from sw_gaussians.surface import depth_modes, depth_normals, surface_depth, world_normals
 from torch import Tensor
 
 from splatwizard_core.api import Camera, RasterOptions, RenderResult, UserInputError
@@ -59,12 +59,8 @@ class MapRequest:
             return base
         modes = set(self.depths) - {SURFACE}
         if SURFACE in (*self.depths, self.normals):
-            modes |= {mode for mode, share in zip(("expected", "median"), self._shares, strict=True) if share > 0}
+            modes |= depth_modes(self.depth_ratio)
         return replace(base, depth=frozenset(modes), normals=self.normals == RENDERED, alpha=True)
-
-    @property
-    def _shares(self) -> tuple[float, float]:
-        return 1 - self.depth_ratio, self.depth_ratio
 
 
 @dataclass(frozen=True)
