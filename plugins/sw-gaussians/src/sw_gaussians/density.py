@@ -15,7 +15,6 @@ from torch import Tensor
 from splatwizard_core.api import EmptyModel, GaussianModel, SplatOptimizer
 
 SPLIT_CHILDREN = 2
-SPLIT_SHRINK = 0.8 * SPLIT_CHILDREN
 """Scales of the children of a split are divided by this."""
 
 
@@ -71,7 +70,10 @@ def densify_and_prune(
         doomed = model.max_radii2d > prune_screen_px
     doomed[parents] = True
 
-    children = _split(model, parents, revised_opacity)
+    children = split_children(model, parents, SPLIT_CHILDREN)
+    if revised_opacity:
+        opacity = torch.sigmoid(children["opacity_logits"])
+        children["opacity_logits"] = torch.logit(1 - (1 - opacity).sqrt(), eps=1e-6)
     new_rows = {
         name: torch.cat([getattr(model, name).detach()[cloned], children[name]])  # [C + 2P, ...]
         for name, _ in model.named_parameters(recurse=False)
@@ -97,10 +99,14 @@ def densify_and_prune(
     )
 
 
-def _split(model: GaussianModel, parents: Tensor, revised_opacity: bool) -> dict[str, Tensor]:
-    """Rows of the two children of each parent, all first children before all second ones; tensors [2P, ...]."""
+def split_children(model: GaussianModel, parents: Tensor, count: int) -> dict[str, Tensor]:
+    """Rows of `count` children of each of `parents` [P]: all first children, all second, ...; tensors [count P, ...].
+
+    A child lies at centre + R (scales * z) with z from the model's stream of splits, has the parent's scales divided
+    by 0.8 count, and the rest unchanged; those of a surfel, of two scales, stay in its plane.
+    """
     rows = {
-        name: parameter.detach()[parents].repeat(SPLIT_CHILDREN, *[1] * (parameter.dim() - 1))
+        name: parameter.detach()[parents].repeat(count, *[1] * (parameter.dim() - 1))
         for name, parameter in model.named_parameters(recurse=False)
         if name in model.ROWS
     }
@@ -110,10 +116,7 @@ def _split(model: GaussianModel, parents: Tensor, revised_opacity: bool) -> dict
     if offsets.shape[1] == 2:
         offsets = torch.nn.functional.pad(offsets, (0, 1))  # children of a surfel stay in its plane
     rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
-    rows["log_scales"] = (scales / SPLIT_SHRINK).log()
-    if revised_opacity:
-        opacity = torch.sigmoid(rows["opacity_logits"])
-        rows["opacity_logits"] = torch.logit(1 - (1 - opacity).sqrt(), eps=1e-6)
+    rows["log_scales"] = (scales / (0.8 * count)).log()
     return rows
 
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import torch
-from sw_gaussians.density import rotate
+from sw_gaussians.density import split_children
 from sw_gaussians.statistics import GRADIENT_STATISTICS
 
 from splatwizard_core.api import (
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 Box = Literal["own", "xx"]
 CHILDREN = 3
-SHRINK = 0.8 * CHILDREN
-"""Scales of the children are divided by this."""
 THINNEST = 0.25
 """Least side of the box, of its longest side: a flat ring of cameras would leave no room."""
 
@@ -68,27 +66,15 @@ def too_large(
 def split_rows(model: GaussianModel, rows: SplatOptimizer, selected: Tensor) -> int:
     """Replace each of the rows `selected` [N] bool by three children; returns how many were replaced.
 
-    A child lies at centre + R (scales * z) with z from the model's stream of splits, has the parent's scales divided
-    by 2.4 and the rest unchanged; those of a surfel, of two scales, stay in its plane. Survivors keep their order,
-    then come all first children, all second, all third. The statistics of density control start again at zero.
+    Children are those of `split_children`, of scales divided by 2.4. Survivors keep their order, then come all first
+    children, all second, all third. The statistics of density control start again at zero.
     """
     parents = selected.nonzero().squeeze(1)  # [P]
     for name in (*GRADIENT_STATISTICS, "max_radii2d"):
         getattr(model, name).zero_()
     if parents.numel() == 0:
         return 0
-    new = {
-        name: parameter.detach()[parents].repeat(CHILDREN, *[1] * (parameter.dim() - 1))
-        for name, parameter in model.named_parameters(recurse=False)
-        if name in model.ROWS
-    }
-    scales = new["log_scales"].exp()  # [3P, 2 or 3]
-    noise = torch.randn(scales.shape, generator=model.next_split_generator(), dtype=torch.float32)
-    offset = scales.new_zeros(len(scales), 3)
-    offset[:, : scales.shape[1]] = noise.to(scales) * scales
-    new["means"] = new["means"] + rotate(new["quats"], offset)
-    new["log_scales"] = (scales / SHRINK).log()
-    rows.append_rows(model, new)
+    rows.append_rows(model, split_children(model, parents, CHILDREN))
     keep = torch.cat([~selected, selected.new_ones(CHILDREN * parents.numel())])
     rows.keep_rows(model, keep)
     return parents.numel()
