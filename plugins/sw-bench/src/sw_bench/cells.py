@@ -117,6 +117,7 @@ class Job:
     needs       jobs that must have ended well before
     fresh       discard what the directories hold (once)
     about       label and scene, for estimates
+    trains      its training is not one that it needs
     attempts    starts so far
     """
 
@@ -128,6 +129,7 @@ class Job:
     fresh: bool = False
     attempts: int = 0
     about: tuple[str, str] = ("", "")
+    trains: bool = True
 
     @property
     def log(self) -> str:
@@ -234,6 +236,7 @@ def jobs_of(
         first = group[0]
         job = run_job(group, fresh=is_changed(first))
         job.needs = tuple(shared[key] for key in keys if key in shared)
+        job.trains = keys[-1] not in shared
         made.append(job)
     return [*shared.values(), *made]
 

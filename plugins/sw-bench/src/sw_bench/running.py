@@ -30,7 +30,7 @@ from sw_bench.executor import Executor, Site
 from sw_bench.index import Index
 from sw_bench.plan import Plan, checked_plan, read_plan
 from sw_bench.results import results, table_of
-from sw_bench.state import State, state_of
+from sw_bench.state import State, changes_of, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
@@ -119,7 +119,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     changed = [cell for cell in cells if states[cell] is State.CHANGED]
     again = bool(given["rerun_changed"]) or not given.get("resume", True)
     if changed and not again and not given["dry_run"]:
-        raise UserInputError(_about_changed(changed, cells, states, layout))
+        raise UserInputError(_about_changed(changed, cells, states, layout, plugins))
     if not given.get("resume", True):
         states = dict.fromkeys(cells, State.CHANGED)
     elif given["recheck"]:
@@ -209,13 +209,15 @@ def _counts(cells: Sequence[Cell], states: Mapping[Cell, State], jobs: Sequence[
     return f"{len(cells)} runs: {', '.join(parts)}; {len(jobs)} processes to go{places}"
 
 
-def _about_changed(changed: Sequence[Cell], cells: Sequence[Cell], states: Mapping[Cell, State], layout: Layout) -> str:
+def _about_changed(
+    changed: Sequence[Cell], cells: Sequence[Cell], states: Mapping[Cell, State], layout: Layout, plugins: PluginManager
+) -> str:
     """Message about runs whose directories hold another training."""
-    named = ", ".join(cell.name for cell in changed[:NAMED]) + (", ..." if len(changed) > NAMED else "")
+    named = f"{changed[0].name}: {changes_of(changed[0], plugins)}" + ("; ..." if len(changed) > 1 else "")
     kept = sum(state in (State.FINISHED, State.BEGUN) for state in states.values())
     return (
         f"{_shown(layout.out)}: {len(changed)} of {len(cells)} runs were trained with other values ({named}), {kept} "
-        "fit the plan: --rerun-changed discards those and trains them anew, --out elsewhere keeps them"
+        "fit the plan: --rerun-changed discards those and trains them anew, another --out keeps them"
     )
 
 
