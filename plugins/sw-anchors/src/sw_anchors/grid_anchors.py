@@ -1,4 +1,4 @@
-"""The model of HAC: anchors, a binary hash grid over their positions, and a network that predicts distributions.
+"""Anchors, a binary hash grid over their positions, and a network that predicts distributions: the model of HAC.
 
 For an anchor at u in [0,1]^3 the network gives mean and deviation of its F features, 6 scales and 3k coordinates of
 offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t); Q0 = 1, 0.001 and 0.2 as published.
@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
+from torch import Tensor, nn
+
 from sw_anchors.anchors import linear_layers, two_layers
 from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from sw_anchors.lattice import TOP
 from sw_anchors.shape import AnchorShape
-from torch import Tensor, nn
-
 from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
 
 SMALLEST_STEP = 1 / 64
@@ -26,7 +26,7 @@ PLACES_LIMIT = 1 << 30
 """Bytes that the places of all anchors in the grid may take to be kept, 1,152 an anchor in the published one."""
 
 
-class HACAnchors(CodedAnchors):
+class GridAnchors(CodedAnchors):
     """CodedAnchors with the grid and its network.
 
     grid        hash grid over the box of the anchors, signs
