@@ -120,7 +120,7 @@ class AnchorStage(Stage):
         report = adjust_anchors(
             model, optimizer, step=step, generator=self.growth_draws, interval=self.steps(growth.interval),
             success=growth.success, grad_threshold=growth.grad_threshold, min_opacity=growth.min_opacity,
-            levels=growth.levels, init_factor=growth.init_factor, hierarchy=growth.hierarchy,
+            levels=growth.levels, init_factor=growth.init_factor, hierarchy=growth.hierarchy, subvoxel=growth.subvoxel,
         )  # fmt: skip
         if log is not None:
             log.scalar("grown", report.grown)
