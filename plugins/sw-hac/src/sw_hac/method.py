@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from sw_anchors.dataset_values import BY_DATASET
 from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.grid_stage import GridStage
 
@@ -36,6 +37,7 @@ class HAC(Method):
     version: ClassVar[int] = 1
     Config = HACConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = BY_DATASET
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
     DEFAULT_RATE: ClassVar[str] = "r4"
 
