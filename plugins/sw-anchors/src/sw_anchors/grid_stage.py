@@ -50,8 +50,8 @@ class GridStage(CodedAnchorStage):
             return {}
         assert rate.own_bits is not None
         weights = self.opt.rate_term
-        return {
+        terms = {
             "rate": weights.weight * rate.bits,
             "grid": weights.weight * rate.own_bits / (model.num_rows * sum(model.shape.widths)),
-            "masks": weights.masks * model.soft_masks().mean(),
         }
+        return {**terms, "masks": weights.masks * model.soft_masks().mean()} if weights.masks else terms

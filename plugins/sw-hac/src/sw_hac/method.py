@@ -9,8 +9,7 @@ from sw_anchors.dataset_values import BY_DATASET
 from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.grid_stage import GridStage
 
-from splatwizard_core.api import Method, SceneError
-from sw_codecs.context.hash_grid import MixedHashGrid
+from splatwizard_core.api import Method
 from sw_hac import codec
 from sw_hac.config import HACConfig
 from sw_hac.presets import PRESETS, RATES
@@ -43,20 +42,7 @@ class HAC(Method):
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Put an anchor into every voxel with a start point of the scene."""
-        if scene.points is None or len(scene.points) == 0:
-            raise SceneError(
-                f"scene '{scene.name}' has no start points: HAC needs SfM points or random ones", path=scene.path
-            )
-        c: HACConfig = self.config
-        grid = MixedHashGrid(
-            c.grid.space, c.grid.planes, features=c.grid.features, log2_space=c.grid.log2_space,
-            log2_planes=c.grid.log2_planes, generator=generator,
-        )  # fmt: skip
-        return GridAnchors.from_points(
-            scene.points, voxel_size=c.voxel_size, num_offsets=c.num_offsets, feature_dim=c.feature_dim,
-            hidden=c.hidden, margin=c.margin, sample=c.rate_term.sample, base_steps=c.steps.triple,
-            generator=generator, grid=grid, grid_hidden=c.grid.hidden, in_steps=c.rate_term.units == "steps",
-        )  # fmt: skip
+        return GridAnchors.of_scene(scene, self.config, generator)
 
     def stages(self) -> Sequence[Stage]:
         return [HACStage(self.config)]
