@@ -23,6 +23,7 @@ from splatwizard_core.api import (
 )
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.fixed_decoder import FixedDecoder
 from sw_anchors.fused_ops import mean_product
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
@@ -139,8 +140,11 @@ class AnchorStage(Stage):
         settings, inputs = self.opt.loss, result.inputs
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
-        assert inputs.scales is not None
-        terms = {"volume": settings.volume * mean_product(inputs.scales), **self.extra_loss(model, result, step)}
+        volume = result.extras.get("volume")
+        if volume is None:
+            assert inputs.scales is not None
+            volume = mean_product(inputs.scales)
+        terms = {"volume": settings.volume * volume, **self.extra_loss(model, result, step)}
         total = sum(terms.values(), start=found.total)
         return LossPack(total, found.parts | {name: term.detach() for name, term in terms.items()})
 
@@ -161,7 +165,13 @@ class CodedAnchorStage(AnchorStage):
         model = super().begin(context)
         assert isinstance(model, CodedAnchors)
         model.noise = context.generator("noise")
+        model.fixed = FixedDecoder() if self.opt.graphs and model.device.type == "cuda" else None
         return model
+
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        assert isinstance(model, CodedAnchors)
+        model.fixed = None  # its graphs hold memory
+        return super().finish(model, scene)
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr, rates = self.opt.lr, super().learning_rates(step)
