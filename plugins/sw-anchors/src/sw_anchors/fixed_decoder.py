@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of
-from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep
+from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
 if TYPE_CHECKING:
     from sw_anchors.coded_anchors import CodedAnchors
@@ -48,9 +48,8 @@ class FixedDecoder:
         self._pool: tuple[int, int] | None = None
         self._steps: dict[int, tuple[FixedStep, FixedRows]] = {}
         self._key: tuple[Any, ...] = ()
-        self._watched: list[tuple[dict[str, Any], str, Tensor, int, bool]] = []
+        self._watched = Watched([])
         self._shared: dict[str, Tensor] = {}
-        self._networks: list[Tensor] = []
 
     def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor) -> GaussianInputs | None:
         """Decode the anchors `rows` [V]; Gaussians that are not drawn are marked as not visible.
@@ -72,15 +71,14 @@ class FixedDecoder:
         with torch.no_grad():
             at.load(model, camera, rows, parts)
         sources = [getattr(model, name) for name in PARAMETERS]
-        results, others = _Decoded.found(step, rows, self._networks, sources)
+        results, others = _Decoded.found(step, rows, self._watched.learning, sources)
         return inputs_of(model, rows, (results, others))
 
     def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int) -> tuple[FixedStep, FixedRows]:
         key = (*model.step_key(), *(part.shape[1:] for part in parts))
-        if key != self._key or not all(map(_is_same, self._watched)) or capacity > self._rows_held():
+        if key != self._key or not self._watched.unchanged() or capacity > self._rows_held():
             self._drop()
-            self._key, self._watched = key, _watched(model)
-            self._networks = [t for _, _, t, _, learns in self._watched if learns]
+            self._key, self._watched = key, Watched.of(model, {*model.ROWS, "bounds"})
         found = self._steps.get(capacity)
         if found is None:
             if len(self._steps) >= KEPT:
@@ -114,7 +112,7 @@ class FixedDecoder:
                 rows_like("random", model.features.new_zeros(0, numbers + 1)).view(-1),
             )
         compute = functools.partial(decode_rows, model, at)
-        inputs = [*at.parameters, *self._networks]
+        inputs = [*at.parameters, *self._watched.learning]
         if not self._graphs:
             return PlainStep(compute, inputs), at
         with torch.cuda.device(model.device):
@@ -136,8 +134,7 @@ class FixedDecoder:
 class _Decoded(torch.autograd.Function):
     """Results of a FixedStep, with the gradients of rows at their places among all anchors.
 
-    Those of networks are not returned but set, or added, where the optimizer looks for them: the engine would copy
-    them.
+    Those of networks are not returned but added where the optimizer looks for them.
     """
 
     @classmethod
@@ -168,11 +165,7 @@ class _Decoded(torch.autograd.Function):
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
         (rows,) = ctx.saved_tensors
         grads = ctx.step.backward(slopes[: ctx.count])
-        for parameter, grad in zip(ctx.networks, grads[len(ctx.shapes) :], strict=True):
-            if grad is not None and parameter.grad is None:
-                parameter.grad = grad
-            elif grad is not None:
-                parameter.grad.add_(grad)
+        add_gradients(ctx.networks, grads[len(ctx.shapes) :])
         found = [
             None if grad is None else grad.new_zeros(shape[0], *grad.shape[1:]).index_copy_(0, rows, grad[: len(rows)])
             for grad, shape in zip(grads, ctx.shapes, strict=False)
@@ -186,21 +179,3 @@ def capacity_of(count: int) -> int:
     size = max(count + 1, SMALLEST)
     unit = 1 << (size.bit_length() - 3)
     return -(-size // unit) * unit
-
-
-def _watched(model: CodedAnchors) -> list[tuple[dict[str, Any], str, Tensor, int, bool]]:
-    """Every tensor of the model but rows of anchors and their lattice: where it stands, and what stood there."""
-    rows = {*model.ROWS, "bounds"}
-    return [
-        (held, name, tensor, tensor.data_ptr(), tensor.requires_grad)
-        for path, module in model.named_modules()
-        for held in (module._parameters, module._buffers)
-        for name, tensor in held.items()
-        if tensor is not None and (path or name not in rows)
-    ]
-
-
-def _is_same(watched: tuple[dict[str, Any], str, Tensor, int, bool]) -> bool:
-    held, name, tensor, address, learns = watched
-    found = held.get(name)
-    return found is tensor and tensor.data_ptr() == address and tensor.requires_grad == learns

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import functools
 import gc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Protocol
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 WARM_UPS = 3
 """Runs before a capture, in which libraries set themselves up; as torch's own `make_graphed_callables`."""
@@ -138,3 +139,50 @@ def differentiate(
 def _in_order(grad: Tensor) -> Tensor:
     grad = grad.contiguous()
     return grad if grad.data_ptr() % 16 == 0 else grad.clone()
+
+
+def add_gradients(parameters: Sequence[Tensor], grads: Sequence[Tensor | None]) -> None:
+    """Add gradients to those of leaves; where there are none yet, they become these very tensors.
+
+    Returned by a node instead, autograd would copy each of them, since a FixedStep holds it too.
+    """
+    for parameter, grad in zip(parameters, grads, strict=True):
+        if grad is not None and parameter.grad is None:
+            parameter.grad = grad
+        elif grad is not None and parameter.grad is not None:
+            parameter.grad.add_(grad)
+
+
+@dataclass
+class Watched:
+    """Parameters and buffers that a captured computation reads where they stood.
+
+    tensors     of each: the dict that holds it, its name there, itself, its address, whether it learns
+    """
+
+    tensors: list[tuple[dict[str, Any], str, Tensor, int, bool]]
+
+    @classmethod
+    def of(cls, module: nn.Module, but: Collection[str] = ()) -> Watched:
+        """All tensors of a module and its submodules, but those of its own that are named."""
+        return cls(
+            [
+                (held, name, tensor, tensor.data_ptr(), tensor.requires_grad)
+                for path, part in module.named_modules()
+                for held in (part._parameters, part._buffers)
+                for name, tensor in held.items()
+                if tensor is not None and (path or name not in but)
+            ]
+        )
+
+    @property
+    def learning(self) -> list[Tensor]:
+        """Those that learn."""
+        return [tensor for _, _, tensor, _, learns in self.tensors if learns]
+
+    def unchanged(self) -> bool:
+        """Whether each is still the same, at its address, and learns if it did."""
+        return all(
+            held.get(name) is tensor and tensor.data_ptr() == address and tensor.requires_grad == learns
+            for held, name, tensor, address, learns in self.tensors
+        )
