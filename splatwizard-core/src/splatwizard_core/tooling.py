@@ -8,7 +8,7 @@ from __future__ import annotations
 from splatwizard_native import lend
 
 MODULES = {
-    "plugins.manager": "load_plugins",
+    "plugins.manager": "PluginManager load_plugins",
     "plugins.check": "Check State",
     "plugins.kernels": "declared_modules",
     "plugins.registry": "Entry",
@@ -17,7 +17,9 @@ MODULES = {
     "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
     "runs.lock": "directory_lock",
     "runs.config": "ResolvedConfig resolve",
-    "runs.directory": "RunRequest",
+    "runs.directory": "RunRequest run_directory",
+    "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
+    "runs.training": "cached_directory",
     "runs.run": "run train_in",
     "runs.decode": "open_model",
     "runs.session": "Session",
@@ -33,8 +35,9 @@ MODULES = {
     "errors": "RunLockedError",
     "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": (
-        "config_option console debug_option device_option images_option json_option options print_facts print_json "
-        "print_table say scene_option set_option"
+        "config_option console debug_option device_option geometry_option images_option init_option json_option "
+        "methods_option options preset_option print_facts print_json print_table rates_option repeats_option say "
+        "scene_option seeds_option set_option"
     ),
     "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",
