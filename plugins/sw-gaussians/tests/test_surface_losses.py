@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from sw_gaussians.native import GAUSSIANS
 from sw_gaussians.surface_losses import (
     add_surface_losses,
     distortion_loss,
@@ -155,6 +156,30 @@ def test_the_key_of_the_term_changes_no_identity_where_it_says_what_was_done_bef
     assert identity_before_terms(content) == {"surface": {"lambda_normal": 0.05}}
     content = {"surface": {"normal_term": "paper"}}
     assert identity_before_terms(content) == content
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("term", ["code", "paper"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 7), (3, 3), (37, 65)])
+def test_the_kernel_gives_the_disagreement_and_the_gradients_of_torch(size, term):
+    assert GAUSSIANS.has_cuda(), "built without CUDA"
+    height, width = size
+    generator = torch.Generator().manual_seed(2)
+    lens = Camera(width, height, 40.0, 35.0, width / 2 + 0.3, height / 2, torch.eye(3), torch.zeros(3))
+    depth = 2 + torch.rand(1, height, width, generator=generator)
+    depth[torch.rand(1, height, width, generator=generator) < 0.2] = 0  # no surface
+    alpha = torch.rand(1, height, width, generator=generator)
+    normals = torch.randn(3, height, width, generator=generator)
+    weights = torch.randn(1, height, width, generator=generator)
+    found = []
+    for device, dtype in (("cpu", torch.float64), ("cuda", torch.float32)):
+        z, n = (t.to(device, dtype).requires_grad_() for t in (depth, normals))
+        value = normal_disagreement(by_hand(alpha.to(device, dtype), z, n), lens, 1.0, term)
+        (value * weights.to(device, dtype)).sum().backward()
+        found.append([t.detach().cpu().double() for t in (value, z.grad, n.grad)])
+    for exact, measured in zip(*found, strict=True):
+        assert torch.allclose(measured, exact, rtol=1e-3, atol=1e-4 * float(exact.abs().max()))
 
 
 def test_only_what_a_loss_reads_is_drawn():

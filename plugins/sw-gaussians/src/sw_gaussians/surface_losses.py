@@ -9,9 +9,11 @@ from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, LossPack, RenderResult
-from sw_gaussians.surface import depth_modes, depth_normals, surface_depth, world_normals
+from sw_gaussians.native import GAUSSIANS
+from sw_gaussians.surface import camera_normals, depth_modes, surface_depth
 
 NormalTerm = Literal["code", "paper"]
 """Form of the normal loss, see `normal_disagreement`."""
@@ -66,12 +68,27 @@ def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float
     """
     if result.normals is None or result.alpha is None:
         raise ValueError("the normal loss needs RasterOptions(normals=True, alpha=True) and the depths")
-    surface = depth_normals(surface_depth(result.depth, depth_ratio), camera)
-    drawn = world_normals(result.normals, camera)
+    depth, alpha, normals = surface_depth(result.depth, depth_ratio), result.alpha.detach(), result.normals
     if term == "paper":
-        known = (surface.detach().square().sum(dim=0, keepdim=True) > 0).to(surface)
-        return known * (result.alpha - (drawn * surface).sum(dim=0, keepdim=True))
-    agreement = (drawn * (surface * result.alpha.detach())).sum(dim=0, keepdim=True)
+        without = _disagreement(depth, normals, torch.ones_like(alpha), camera)  # 1 - n . n_surf; 1: there is no n_surf
+        return torch.where(without == 1, 0.0, without - (1 - result.alpha))
+    return _disagreement(depth, normals, alpha, camera)
+
+
+def _disagreement(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    if depth.is_cuda and depth.dtype == torch.float32 and GAUSSIANS.has_cuda():
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        found: Tensor = _Disagreement.apply(depth, normals, alpha, lens)  # type: ignore[no-untyped-call]
+        return found
+    return disagreement_in_torch(depth, normals, alpha, camera)
+
+
+def disagreement_in_torch(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    """Return what `normal_disagreement` does of a depth [1,H,W], normals [3,H,W] of the camera's frame and alpha.
+
+    An angle is the same in any frame: nothing is turned to the world's.
+    """
+    agreement = (normals * camera_normals(depth, camera) * alpha).sum(dim=0, keepdim=True)
     disagreement: Tensor = torch.ones_like(agreement) - agreement
     return disagreement
 
@@ -102,3 +119,19 @@ def add_surface_losses(
         terms["normals"] = (found if mask is None else mask * found).mean()
         total = total + normals * terms["normals"]
     return LossPack(total, {name: part.detach() for name, part in {**loss.parts, **terms}.items()})
+
+
+class _Disagreement(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, depth: Tensor, normals: Tensor, alpha: Tensor, lens: tuple[float, ...]) -> Tensor:
+        tensors = depth.contiguous(), normals.contiguous(), alpha.contiguous()
+        ctx.save_for_backward(*tensors)
+        ctx.lens = lens
+        found: Tensor = torch.ops.splatwizard_gaussians.disagreement(*tensors, lens)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        found = torch.ops.splatwizard_gaussians.disagreement_backward(grad.contiguous(), *ctx.saved_tensors, ctx.lens)
+        return *found, None, None
