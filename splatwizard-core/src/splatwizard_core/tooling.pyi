@@ -30,10 +30,8 @@ from splatwizard_core.cli.setup import takes_choices as takes_choices
 from splatwizard_core.coding.container import decoded_limit as decoded_limit
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
-from splatwizard_core.evaluation.evaluate import render_options as render_options
 from splatwizard_core.evaluation.evaluate import render_view as render_view
 from splatwizard_core.evaluation.evaluate import save_png as save_png
-from splatwizard_core.evaluation.evaluate import suggested_rasterizers as suggested_rasterizers
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
 from splatwizard_core.plugins.check import Check as Check
@@ -51,7 +49,7 @@ from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
 from splatwizard_core.runs.lock import directory_lock as directory_lock
-from splatwizard_core.runs.measure import opener as opener
+from splatwizard_core.runs.measure import open_subject as open_subject
 from splatwizard_core.runs.observers import FinishedRun as FinishedRun
 from splatwizard_core.runs.observers import FinishedRuns as FinishedRuns
 from splatwizard_core.runs.observers import StartedTraining as StartedTraining
