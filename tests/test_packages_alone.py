@@ -101,7 +101,7 @@ def test_a_library_that_is_gone_is_named(everything):
 @pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("command", "package"),
-    [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
+    [(["report", "out"], "sw-report"), (["bench"], "sw-bench"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
      (["render", "x.swz"], "sw-render"), (["run", "--method", "hac"], "sw-hac"),
      (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip

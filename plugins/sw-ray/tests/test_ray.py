@@ -106,7 +106,7 @@ def test_a_sweep_survives_the_loss_of_a_node(cluster, tmp_path):
     made, nodes = cluster
 
     def sweep(out, *options):
-        words = ["bench", "--method", "3dgs", "--scene", "demo:tiny", "--rate", "r1", "--seed", "0,1,2,3", "--out", out]
+        words = ["bench", "--method", "3dgs", "--scene", "demo:tiny", "--rate", "r1", "--seed", "0,1,2", "--out", out]
         words += ["--set", "iterations=150", "--set", "checkpoint_every=10", "--device", "cpu", "--json", *options]
         return subprocess.Popen(
             [sys.executable, "-m", "splatwizard_core", *words], stdout=subprocess.PIPE, text=True,
