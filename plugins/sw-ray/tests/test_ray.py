@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from sw_ray.executor import LOST, RayExecutor, RayOptions
 
 from splatwizard_core.api import UserInputError
-from sw_ray.executor import LOST, RayExecutor, RayOptions
 
 if sys.platform != "linux":
     pytest.skip("its cluster is for Linux", allow_module_level=True)

@@ -34,6 +34,7 @@ from sw_bench.state import State, changes_of, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
+LOCAL = "local"  # the executor of this machine
 OF_A_PLAN = ("rate", "preset", "images", "init", "config_file", "sets")
 
 
@@ -129,7 +130,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 
-        executor = None if plan.executor != "local" else make_executor(plan, layout, plugins)
+        executor = None if plan.executor != LOCAL else make_executor(plan, layout, plugins)
         dry_run(plan, jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
         return 0
     executor = make_executor(plan, layout, plugins)
@@ -172,8 +173,9 @@ def make_executor(plan: Plan, layout: Layout, plugins: PluginManager) -> Executo
             raise ConfigError(f"executor '{plan.executor}' has no option '{key}': {hint}", key=key) from None
         reason = first["msg"].removeprefix("Input should be ")
         raise ConfigError(f"bad value {first['input']!r} for option '{key}' of '{plan.executor}': {reason}") from None
-    device = choose_device(plan.device or "auto", plugins)
-    made: Executor = cls(chosen, Site(layout.out, device.type))
+    asked = plan.device or "auto"  # other machines may have what this one lacks
+    device = choose_device(asked, plugins).type if plan.executor == LOCAL else asked
+    made: Executor = cls(chosen, Site(layout.out, device))
     return made
 
 
