@@ -139,8 +139,7 @@ class SlurmExecutor:
         while any(not job.done() for job in self._jobs.values()) and time.monotonic() < until:
             time.sleep(MOMENT)
         self._jobs.clear()
-        if self._folder.exists():
-            self._note()
+        self._note()
 
     def _is_done(self, job: Any) -> bool:
         if self._options.cluster == "debug":
@@ -156,6 +155,7 @@ class SlurmExecutor:
 
     def _note(self) -> None:
         """Keep the numbers of the jobs, for the next sweep to cancel if this one is killed."""
+        self._folder.mkdir(parents=True, exist_ok=True)
         write_json(self._folder / SUBMITTED, [str(job.job_id) for job in self._jobs.values()])
 
     def _cancel_those_before(self) -> None:
