@@ -233,8 +233,7 @@ def jobs_of(
         job.needs = tuple(shared[each] for each in bases if each in shared)
     made = []
     for group, keys in zip(groups.values(), needs, strict=True):
-        first = group[0]
-        job = run_job(group, fresh=is_changed(first))
+        job = run_job(group, fresh=is_changed(group[0]))
         job.needs = tuple(shared[key] for key in keys if key in shared)
         job.trains = keys[-1] not in shared
         made.append(job)

@@ -41,7 +41,8 @@ class RayExecutor:
             import ray
         except ImportError:
             raise UserInputError("executor 'ray' needs Ray: pip install 'sw-ray[ray]'") from None
-        self._ray, self._options = ray, options
+        self._ray: Any = ray
+        self._options = options
         self._tasks: dict[Any, str] = {}
         self._owns = not ray.is_initialized()
         if self._owns:
