@@ -135,6 +135,7 @@ def test_sw_run_with_several_scenes_or_seeds_is_a_sweep(monkeypatch, capsys, tmp
 @pytest.mark.parametrize(
     ("words", "told"),
     [
+        ("", "name a PLAN.toml, or what to run by --method, --scene and --seed"),
         ("--method 3dsg", "no method is called '3dsg'; did you mean '3dgs'?"),
         ("--scene nowhere", "3dgs on nowhere: scene 'nowhere' is not there"),
         ("--scene demo:tiny --rate r9", "3dgs on demo:tiny: method '3dgs' has no rate point 'r9'"),

@@ -55,6 +55,8 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
     if given.get("allow_changed_plan"):
         raise click.UsageError("--allow-changed-plan is for one run at a time: leave out further scenes and seeds")
     methods, scenes, seeds = words_of(given["methods"]), scenes_of(given["scene"]), seeds_of(given["seed"])
+    if path is None and not (methods or scenes or seeds):
+        raise click.UsageError("name a PLAN.toml, or what to run by --method, --scene and --seed")
     if path is None:
         plan, text = _plan_of_words(methods, scenes, seeds, given), ""
     else:
