@@ -205,11 +205,7 @@ def _resolved(plan: Plan, label: str, scene: str, seed: int, layout: Layout, plu
 
 
 def jobs_of(
-    cells: Sequence[Cell],
-    layout: Layout,
-    plugins: PluginManager,
-    *,
-    is_changed: Callable[[Cell], bool] = lambda cell: False,
+    cells: Sequence[Cell], layout: Layout, plugins: PluginManager, is_changed: Callable[[Cell], bool]
 ) -> list[Job]:
     """Put unfinished cells into processes, what others need first; a training that several need is a job of its own.
 

@@ -128,7 +128,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     elif given["recheck"]:
         states |= {cell: State.BEGUN for cell in cells if states[cell] is State.FINISHED}
     unfinished = [cell for cell in cells if states[cell] is not State.FINISHED]
-    jobs = jobs_of(unfinished, layout, plugins, is_changed=lambda cell: states[cell] is State.CHANGED)
+    jobs = jobs_of(unfinished, layout, plugins, lambda cell: states[cell] is State.CHANGED)
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 
