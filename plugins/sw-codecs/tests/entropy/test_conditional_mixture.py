@@ -127,7 +127,7 @@ def test_every_width_of_a_window_is_met():
     symbols, context = block(20, 1)
     met = set()
     for apart in (0, 2, 4, 6, 9, 13, 20, 30, 50, 100, 200, 10**5):
-        narrow = context.scale * (apart > 0)  # two spikes at one place, or Gaussians that far apart
+        narrow = context.scale * (apart > 4)  # spikes, or Gaussians that far apart
         far = C.Context(context.mean, narrow, context.mean + apart * context.step, narrow, context.logit, context.step)
         mixtures = C()._rows(far, Ellipsis, symbols.shape)
         met |= set(mixtures.width.tolist())
