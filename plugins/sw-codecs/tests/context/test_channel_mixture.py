@@ -25,6 +25,8 @@ def test_counts_are_the_published_ones():
     tiny = ChannelMixture([10] * 5, context=0, hidden=None)
     assert [count(network) for network in tiny.networks.values()] == [1260, 1560, 1860, 2160]
     assert count(tiny) == 6870
+    for model in (full, tiny, made(), made(0)):
+        assert ChannelMixture.count(model.slices, context=model.context, hidden=model.hidden) == count(model)
 
 
 @pytest.mark.parametrize("context", [5, 0])
