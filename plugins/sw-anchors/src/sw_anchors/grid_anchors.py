@@ -94,28 +94,28 @@ class GridAnchors(CodedAnchors):
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
-        return {**self.__dict__, "_places": None}
+        return {**super().__getstate__(), "_places": None}
 
     def networks(self) -> dict[str, nn.Module]:
         """Networks that the file holds, in its order."""
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
-    def _looked_up(self, rows: Tensor) -> tuple[Tensor, Tensor]:
-        """Look up features of the grid at anchors `rows`; and the bits of its signs."""
+    def context_rows(self) -> tuple[Tensor, ...]:
+        """The places of the anchors in the grid, or their codes where places would take too much memory."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
             fits = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
             self._places = None  # the old ones go before the new ones come
             self._places = (codes, self.grid.places(codes.to(self.features) / TOP) if fits else None)
-        places = self._places[1]
-        if places is None:
-            places = self.grid.places(codes.index_select(0, rows).to(self.features) / TOP)
-        else:
-            places = places.rows(rows)
+        return self._places[1] or (codes,)
+
+    def _looked_up(self, parts: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+        """Look up features of the grid at rows of `context_rows`; and the bits of its signs."""
+        places = self.grid.places(parts[0].to(self.features) / TOP) if len(parts) == 1 else GridPlaces(*parts)
         return self.grid.at_places(places)
 
-    def forecast(self, rows: Tensor) -> AnchorForecast:
-        features, bits = self._looked_up(rows)
+    def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
+        features, bits = self._looked_up(parts)
         first, last = linear_layers(self.mlp_grid)
         hidden = torch.relu(first(features))
         # All anchors have noise of their own steps; the rest of the last layer is for the sample.
@@ -135,7 +135,7 @@ class GridAnchors(CodedAnchors):
         return AnchorForecast(steps, bits, hidden, sample)
 
     def predict(self, rows: Tensor) -> AnchorContext:
-        features, bits = self._looked_up(rows)
+        features, bits = self._looked_up(tuple(part.index_select(0, rows) for part in self.context_rows()))
         outputs = (self.mlp_grid(features) * self.units)[:, : sum(self.shape.outputs)]
         return context_of(outputs, self.shape, self.base_steps, own_bits=bits)
 

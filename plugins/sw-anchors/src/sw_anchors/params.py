@@ -73,3 +73,4 @@ class CodedAnchorParams(AnchorParams):
     """Hyper-parameters of a method whose anchors have masks and a rate, to be subclassed."""
 
     lr: CodedAnchorLearningRates = Field(CodedAnchorLearningRates(), description="step sizes")
+    graphs: bool = Field(True, description="on a GPU, start the decoding of a step as a CUDA graph")

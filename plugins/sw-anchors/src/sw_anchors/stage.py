@@ -23,6 +23,7 @@ from splatwizard_core.api import (
 )
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.fixed_decoder import FixedDecoder
 from sw_anchors.fused_ops import mean_product
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
@@ -137,6 +138,9 @@ class AnchorStage(Stage):
 
     def mean_volume(self, result: RenderResult) -> Tensor:
         """Mean product of the scales of what is drawn, scalar; differentiable."""
+        known: Tensor | None = result.extras.get("volume")
+        if known is not None:
+            return known
         assert result.inputs.scales is not None
         return mean_product(result.inputs.scales)
 
@@ -165,7 +169,14 @@ class CodedAnchorStage(AnchorStage):
         model = super().begin(context)
         assert isinstance(model, CodedAnchors)
         model.noise = context.generator("noise")
+        fits = self.opt.graphs and model.HAS_FIXED_FORM and model.device.type == "cuda"
+        model.fixed = FixedDecoder() if fits else None
         return model
+
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        assert isinstance(model, CodedAnchors)
+        model.fixed = None  # its graphs hold memory
+        return super().finish(model, scene)
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         rates = super().learning_rates(step)

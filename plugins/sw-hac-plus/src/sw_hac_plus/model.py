@@ -51,6 +51,7 @@ class HACPlusAnchors(GridAnchors):
     """
 
     COUNTS_MASKED = True
+    HAS_FIXED_FORM = False  # its sample is of all anchors, and its masks have a gradient through scales
 
     def __init__(
         self, *tensors: Tensor, channel: ChannelMixture | None, anchor_gradient: bool = True, **kwargs: Any
@@ -87,7 +88,8 @@ class HACPlusAnchors(GridAnchors):
     def forecast(self, rows: Tensor) -> PoolForecast:
         """Predict steps of the anchors `rows`, and for a sample of all anchors what their bits are counted with."""
         drawn = self._sample(self.num_rows)
-        features, bits = self._looked_up(torch.cat([rows, drawn]))
+        both = torch.cat([rows, drawn])
+        features, bits = self._looked_up(tuple(part.index_select(0, both) for part in self.context_rows()))
         first, last = linear_layers(self.mlp_grid)
         hidden = torch.relu(first(features))
         part = slice(self._distributions, self._distributions + 3)

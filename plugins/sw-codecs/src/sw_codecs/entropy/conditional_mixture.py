@@ -26,7 +26,7 @@ from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.symbol_stream import guarded
 from sw_codecs.entropy.conditional import Numbers, _array, _where
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
-from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _lattice
+from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _flat_lattice
 from sw_codecs.entropy.rates import gaussian_mass
 
 WIDTHS = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256])
@@ -229,7 +229,7 @@ def _exact_rows(
     if not np.issubdtype(logit.dtype, np.integer):
         raise ValueError(f"the logits must be integers, not {logit.dtype}")
     flat, middle, radius, escapes = _padded_tables()
-    both = [_lattice(IntegerContext(*each, step), n) for each in ((mean, scale), (second_mean, second_scale))]
+    both = [_flat_lattice(IntegerContext(*each, step), n) for each in ((mean, scale), (second_mean, second_scale))]
     # sigmoid(d) = (1 + tanh(d / 2)) / 2: the table of step multipliers has it.
     j = np.clip(((logit.astype(np.int64) >> 1) + (1 << 15)) >> 9, 0, 127)
     top = 1 << WEIGHT_BITS
