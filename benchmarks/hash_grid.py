@@ -62,7 +62,7 @@ def main() -> None:
             continue
         if way == "torch":
             hash_grid.fits_kernel = lambda *_: False
-        forward, backward, peak, gradient = found[way] = measure(grid, x, asked.repeats)
+        forward, backward, peak, _ = found[way] = measure(grid, x, asked.repeats)
         told = f"  {peak / 1e6:8.1f} MB" if asked.device == "cuda" else ""
         print(f"{way:8} forward {1e3 * forward:8.3f} ms  backward {1e3 * backward:8.3f} ms{told}")
     if kernels:
