@@ -8,10 +8,10 @@ import torch
 from sw_codecs.context import hash_grid
 from sw_codecs.context.grid_lookup import fits_kernel
 from sw_codecs.context.hash_grid import HashGrid
-from sw_codecs.grid_native import GRID
+from sw_codecs.native import CODECS
 
-needs_kernels = pytest.mark.skipif(GRID.available() is not None, reason=str(GRID.available()))
-ON_CUDA = GRID.available(cuda=True)
+needs_kernels = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))
+ON_CUDA = CODECS.available(cuda=True)
 DEVICES = [
     pytest.param("cpu", marks=needs_kernels),
     pytest.param("cuda", marks=[pytest.mark.cuda, pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))]),
@@ -108,7 +108,7 @@ def test_what_has_no_kernel_goes_through_torch():
     ],
 )
 def test_levels_that_do_not_fit_the_table_are_refused(change, said):
-    GRID.load()
+    CODECS.load()
     levels = {"scales": [3.0, 3.0], "lasts": [3, 3], "starts": [0, 64], "dense": [1, 1], "log2_size": 9, **change}
     with pytest.raises(RuntimeError, match=said):
-        torch.ops.sw_codecs_grid.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())
+        torch.ops.sw_codecs.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())

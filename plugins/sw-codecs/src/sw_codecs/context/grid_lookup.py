@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sw_codecs.grid_native import GRID
+from sw_codecs.native import CODECS
 
 if TYPE_CHECKING:
     from sw_codecs.context.hash_grid import HashGrid
 
 MAX_LEVELS = 32
 MAX_FEATURES = 8
-"""`kMaxLevels` of grid_kernels/grid.h, `kMaxFeatures` of grid_kernels/cuda/kernels.h."""
+"""`kMaxLevels` of kernels/grid.h, `kMaxFeatures` of kernels/cuda/kernels.h."""
 
 
 def fits_kernel(grid: HashGrid, x: Tensor, values: Tensor) -> bool:
@@ -25,7 +25,7 @@ def fits_kernel(grid: HashGrid, x: Tensor, values: Tensor) -> bool:
         return False
     if x.requires_grad and torch.is_grad_enabled():
         return False
-    return GRID.has_cuda() if x.is_cuda else x.device.type == "cpu" and GRID.try_load()
+    return CODECS.has_cuda() if x.is_cuda else x.device.type == "cpu" and CODECS.try_load()
 
 
 def lookup(grid: HashGrid, x: Tensor, values: Tensor) -> Tensor:
@@ -49,11 +49,11 @@ class _Lookup(torch.autograd.Function):
             [int(level.dense) for level in levels],
             grid.log2_size,
         )
-        found: Tensor = torch.ops.sw_codecs_grid.lookup(x, values.contiguous(), *ctx.levels)
+        found: Tensor = torch.ops.sw_codecs.lookup(x, values.contiguous(), *ctx.levels)
         return found
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
-        return torch.ops.sw_codecs_grid.backward(x, gradient.contiguous(), *ctx.shape, *ctx.levels), None, None
+        return torch.ops.sw_codecs.backward(x, gradient.contiguous(), *ctx.shape, *ctx.levels), None, None
