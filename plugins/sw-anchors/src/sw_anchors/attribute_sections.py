@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
-from sw_anchors.row_parts import EXACT_NUMBERS, by_parts
+from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
@@ -137,7 +137,11 @@ class ExactNetwork:
         features    places of some rows -> int64 [rows, inputs] with 12 fractional bits; each row on its own
         width       the most numbers that a row has while they are looked up
         """
-        outputs = by_parts(lambda part: self._network(features(part)), places, width, EXACT_NUMBERS)
+        outputs = torch.empty(len(places), self._network.outputs, dtype=torch.int64)
+        start = 0
+        for part in parts_of(places, width, EXACT_NUMBERS):
+            self._network(features(part), out=outputs[start : start + len(part)])
+            start += len(part)
         parts = torch.split(outputs, self._shape.outputs, dim=1)
         multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
         return {
