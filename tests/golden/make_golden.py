@@ -254,9 +254,7 @@ CASES: dict[str, Case] = {
         {**SMALL_CODEBOOK, "codec.vq_ratio": 1.0, "codec.codebook_size": 2},
         orderly,
     ),
-    **dict.fromkeys(
-        ("hac_exact_v1", "hac_exact_v2"), ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC))
-    ),
+    **dict.fromkeys(("hac_exact_v1", "hac_exact_v2"), ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC))),
     **dict.fromkeys(
         ("hac_half_v1", "hac_half_v2"),
         ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),

@@ -7,9 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.context import wavefront
-from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.context.plane_fields import NEIGHBORS, Field
+from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.entropy.exact_tables import exact_tables
 
 
