@@ -9,6 +9,7 @@ import numpy as np
 
 from bitstream_page.building_blocks import (
     RangeWords,
+    RansWords,
     bernoulli_model,
     class_e,
     class_smallest,
@@ -174,7 +175,7 @@ def centre_and_table(mean: int, level: int, m: int) -> tuple[int, int]:
 
 
 def coded_values(
-    words: RangeWords, bits: Iterator[str], tables: ExactTables, family: str, numbers: Sequence[int]
+    words: RangeWords | RansWords, bits: Iterator[str], tables: ExactTables, family: str, numbers: Sequence[int]
 ) -> list[int]:
     """s for each entry of `numbers`, the tables."""
     entries = symbols_by_table(words, tables.tables[family], numbers)
@@ -188,12 +189,22 @@ def coded_values(
     return values
 
 
+def stream_values(
+    words: RansWords, bits: Iterator[str], tables: ExactTables, numbers: Sequence[int], centres: Sequence[int]
+) -> list[int]:
+    """Symbols of a whole stream."""
+    coded = coded_values(words, bits, tables, "gaussian", numbers)
+    check(words.state == 0 and not words.words and not any(bit == "1" for bit in bits), "end of a stream")
+    return [value + centre for value, centre in zip(coded, centres, strict=True)]
+
+
 def exact(
     data: bytes, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
 ) -> list[int]:
     """`gaussian-exact`."""
     file = Bytes(data)
-    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    version, crc = file.unpack("HI")
+    check(version in (1, 2) and crc == tables.crc, "other tables")
     centres, numbers = [], []
     for mu, sigma, m in zip(mean, scale, multiplier, strict=True):
         level = bisect.bisect_left(tables.thresholds, (max(sigma, 0) << 12) // m)
@@ -202,6 +213,15 @@ def exact(
         numbers.append(number)
 
     found: list[int] = []
+    if version == 2:
+        starts = range(0, len(centres), 1 << 16)
+        sizes = [(file.one("I"), file.varint(), file.varint()) for _ in starts]
+        for start, (crc, length, escapes) in zip(starts, sizes, strict=True):
+            part = slice(start, start + (1 << 16))
+            words, bits = RansWords(file.take(length)), Bytes(file.take(escapes)).bits()
+            values = stream_values(words, bits, tables, numbers[part], centres[part])
+            check(crc_i32(values) == crc, "CRC of a stream")
+            found += values
     while len(found) < len(centres):
         count, _, _, length, crc = file.unpack("IiiII")
         start = len(found)

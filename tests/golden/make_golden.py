@@ -275,11 +275,16 @@ CASES: dict[str, Case] = {
         {**SMALL_CODEBOOK, "codec.vq_ratio": 1.0, "codec.codebook_size": 2},
         orderly,
     ),
-    "hac_exact_v1": ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC)),
-    "hac_half_v1": ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
+    **dict.fromkeys(("hac_exact_v1", "hac_exact_v2"), ("hac", "r4", SMALL_HAC, lambda: hac_anchors(SMALL_HAC))),
+    **dict.fromkeys(
+        ("hac_half_v1", "hac_half_v2"),
+        ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
+    ),
     "hac_plus_v1": ("hac-plus", "r4", SMALL_HAC_PLUS, lambda: hac_plus_anchors(SMALL_HAC_PLUS)),
     "hac_plus_tiny_v1": ("hac-plus", "r1", TINY_HAC_PLUS, lambda: hac_plus_anchors(TINY_HAC_PLUS)),
-    "cat_3dgs_refined_v1": ("cat-3dgs", "r1", SMALL_CAT, lambda: cat_anchors(SMALL_CAT)),
+    **dict.fromkeys(
+        ("cat_3dgs_refined_v1", "cat_3dgs_refined_v2"), ("cat-3dgs", "r1", SMALL_CAT, lambda: cat_anchors(SMALL_CAT))
+    ),
     "speedy_splat_v1": ("speedy-splat", "r3", {}, lambda: procedural(16, 2, 1)),
     "compact3dgs_v1": ("compact3dgs", "r5", SMALL_COMPACT, lambda: compact_gaussians(24, SMALL_COMPACT)),
     "compact3dgs_plain_v1": ("compact3dgs", "r7", SMALL_COMPACT, lambda: compact_gaussians(12, SMALL_COMPACT)),
@@ -307,6 +312,13 @@ CASES: dict[str, Case] = {
     "mesongs_empty_v1": ("mesongs", "r3", {}, lambda: settled(0)),
 }
 """File -> method, rate point, other values of its configuration, model."""
+
+SUPERSEDED = {
+    "hac_exact_v1": "hac_exact_v2",
+    "hac_half_v1": "hac_half_v2",
+    "cat_3dgs_refined_v1": "cat_3dgs_refined_v2",
+}
+"""Files whose layout is read, and no longer written -> the file of the same model that is."""
 
 
 def encoded(name: str) -> bytes:
