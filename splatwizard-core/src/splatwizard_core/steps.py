@@ -21,8 +21,10 @@ def _choices(options: dict[str, Any], **given: Any) -> tooling.Choices:
 
 
 def _training(method: str, scene: str | None, out: str | Path, options: dict[str, Any]) -> Any:
-    resolved = _choices(options, methods=(method,), scene=scene).resolve_one(tooling.load_plugins())
-    return open_training_session([resolved], tooling.load_plugins()), tooling.RunRequest(resolved, Path(out))
+    chosen = _choices(options, methods=(method,), scene=scene)
+    chosen.resolve_one(tooling.load_plugins())
+    (resolved,), session = open_training_session(chosen, tooling.load_plugins())
+    return session, tooling.RunRequest(resolved, Path(out))
 
 
 def _session(options: dict[str, Any], scene: str | None = None) -> Any:

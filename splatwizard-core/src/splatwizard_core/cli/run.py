@@ -38,8 +38,7 @@ def run(
     from splatwizard_core.runs.run import run as run_one
 
     plugins = load_plugins()
-    resolved = chosen.resolve(plugins)
-    session = open_training_session(resolved, plugins)
+    resolved, session = open_training_session(chosen, plugins)
     warn_of_metrics(session, None, resolved[0].metrics, geometry=geometry)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
         shared.say("preset quick: the plan scaled down for a procedural scene (--preset paper runs it in full)")

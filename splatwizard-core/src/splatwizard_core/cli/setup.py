@@ -13,6 +13,8 @@ import click
 from splatwizard_core.cli.options import say
 from splatwizard_core.errors import ConfigError
 
+TINY = 500_000  # pixels of all training pictures: the published plans take half an hour of a CPU for nothing
+
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.runs.config import ResolvedConfig
@@ -172,19 +174,25 @@ def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
     return session
 
 
-def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> Session:
-    """The session of trainings, with their scenes loaded: what is wrong with one is told before anything else is.
+def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list[ResolvedConfig], Session]:
+    """The configurations of trainings and their session, the scenes loaded: what is wrong with one is told first.
 
-    Tells where they compute, and why there.
+    A tiny scene gets the preset "quick" where nothing says otherwise. Tells so, and where they compute, and why there.
     """
     from splatwizard_core.runs.device import device_reason
 
+    resolved = chosen.resolve(plugins)
     _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
-    for each in resolved:
-        session.scene(each)
+    free = [chosen.preset is None and "iterations" not in each.provenance for each in resolved]
+    pixels = [sum(view.camera.width * view.camera.height for view in session.scene(each).train) for each in resolved]
+    if chosen.config_file is None and all(free) and max(pixels) < TINY and resolved[0].preset != "quick":
+        resolved = replace(chosen, preset="quick").resolve(plugins)
+        say(
+            f"preset quick: the plan scaled down for {max(pixels):,} pixels to train on (--preset paper runs it in full)"
+        )
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
-    return session
+    return resolved, session
 
 
 def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:

@@ -25,8 +25,8 @@ def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, chos
     from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.run import train_only
 
-    resolved = chosen.resolve_one(load_plugins())
-    session = open_training_session([resolved], load_plugins())
+    chosen.resolve_one(load_plugins())
+    (resolved,), session = open_training_session(chosen, load_plugins())
     trained, directory = train_only(session, RunRequest(resolved, out, resume, allow_changed_plan))
     facts = {
         "directory": str(directory),
