@@ -188,9 +188,7 @@ def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list
     pixels = [sum(view.camera.width * view.camera.height for view in session.scene(each).train) for each in resolved]
     if chosen.config_file is None and all(free) and max(pixels) < TINY and resolved[0].preset != "quick":
         resolved = replace(chosen, preset="quick").resolve(plugins)
-        say(
-            f"preset quick: the plan scaled down for {max(pixels):,} pixels to train on (--preset paper runs it in full)"
-        )
+        say(f"preset quick: the plan scaled down for {max(pixels):,} training pixels (--preset paper runs it in full)")
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
     return resolved, session
 
