@@ -3,6 +3,7 @@
     python benchmarks/train_anchors.py demo --preset quick --device cuda
     python benchmarks/train_anchors.py ../shared/data/fox:images_2 --iterations 7000 --device cuda --syncs
     python benchmarks/train_anchors.py demo --preset quick --iterations 300 --device cpu --methods hac
+    python benchmarks/train_anchors.py ../shared/data/room --device cuda --graphs on,off --brief
 
 A scene is FOLDER[:PICTURES] or demo. The plan of the preset is scaled to --iterations (default: as the preset has it).
 Iterations a second count all steps of a phase but those that are profiled, growth and pruning included. In the middle
@@ -10,6 +11,7 @@ of each phase a window of steps is watched by torch.profiler: what share of a st
 goes into which part, forward and backward together (a backward operator counts where its forward one ran); operators
 and kernels launched; and how often the host waits for the GPU (on a CPU: operators that would make it wait). The
 profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that wait (CUDA only).
+--graphs on,off trains twice, with the decoding as CUDA graphs and without, and prints both with the loss at the end.
 
 3DGS beside: the Gaussians that all anchors spawn for one view, thinned at random until views draw as many on average
 as the anchors' last steps did, trained as 3DGS without densification and with all its spherical harmonics.
@@ -90,7 +92,13 @@ class Phase:
     end: int
     seconds: float = 0.0
     steps: int = 0
+    busy: float = 0.0  # milliseconds of the GPU a step, in the window that was watched
     lines: list[str] = field(default_factory=list)
+
+    @property
+    def rate(self) -> float:
+        """Steps a second."""
+        return self.steps / self.seconds if self.seconds else math.nan
 
 
 @dataclass
@@ -101,7 +109,7 @@ class Watch:
     phases: list[Phase]
     window: int
     syncs: bool
-    drawn: collections.deque[int] = field(default_factory=lambda: collections.deque(maxlen=100))
+    losses: collections.deque[torch.Tensor] = field(default_factory=lambda: collections.deque(maxlen=500))
     _since: float = 0.0
     _profile: Any = None
     _caught: Any = None
@@ -111,6 +119,7 @@ class Watch:
 
     def __call__(self, record: StepRecord) -> None:
         step = record.step
+        self.losses.append(record.total)
         phase = next((p for p in self.phases if p.start < step <= p.end), None)
         if phase is None:
             return
@@ -126,6 +135,7 @@ class Watch:
             self._now()
             self._profile.__exit__(None, None, None)
             phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.num_rows)
+            phase.busy = busy(self._profile) / length
             self._profile = None
             self._listen(on=self.syncs and self.device.type == "cuda")
             self._since = self._now()
@@ -205,6 +215,12 @@ def report(watched: Any, steps: int, *, cuda: bool, rows: int) -> list[str]:
     return lines
 
 
+def busy(watched: Any) -> float:
+    """Milliseconds in which a GPU computed or copied; kernels of graphs included, which belong to no part."""
+    found = (e for e in watched.events() if str(e.device_type).endswith("CUDA") and not e.name.startswith(SECTION))
+    return float(sum(e.time_range.elapsed_us() for e in found)) / 1e3
+
+
 def _share(value: float, total: float) -> str:
     return f"{value / total:.1%}" if total else "-"
 
@@ -280,7 +296,9 @@ def phases_of(method: str, stage: Any) -> list[Phase]:
     return [Phase(*each) for each in zip(names, starts, (*starts[1:], end), strict=True) if each[1] < each[2]]
 
 
-def anchors(method: str, args: argparse.Namespace, session: Session, folder: str, pictures: str) -> None:
+def anchors(
+    method: str, args: argparse.Namespace, session: Session, folder: str, pictures: str, *, graphs: bool
+) -> None:
     """Train and print one method, and 3DGS beside it."""
     cls = session.plugins.methods.load(method)
     planned = resolve(cls, args.preset, sets={}, scene=folder).config
@@ -288,6 +306,7 @@ def anchors(method: str, args: argparse.Namespace, session: Session, folder: str
     # The plan of a preset is for its own number of steps: scaled, it is that of a longer run, which ends at `last`.
     nominal = round(last / planned.iterations * cls.Config.FULL_ITERATIONS)
     sets: dict[str, Any] = {"iterations": nominal, "scale_schedule": True, "seed": args.seed}
+    sets["graphs"] = graphs
     sets |= {"images": pictures} if pictures else {}
     resolved = resolve(cls, args.preset, sets=sets, scene=folder)
     scene = session.scene(resolved)
@@ -318,10 +337,21 @@ def anchors(method: str, args: argparse.Namespace, session: Session, folder: str
         with_pictures(scene, session.device, run)
     count = round(sum(int(d) for d in drawn) / max(len(drawn), 1))
     print(f"  {method}, {last:,} steps of preset {args.preset}, {trainer.model.num_rows:,} anchors, {count:,} drawn")
+    cuda, prepared = session.device.type == "cuda", getattr(trainer.model, "fixed", None)
+    if cuda:
+        said = f"{prepared.captures} captures" if prepared is not None else "off"
+        print(f"    graphs: {said}; peak {torch.cuda.max_memory_allocated() / 1e9:.2f} GB")
+        torch.cuda.reset_peak_memory_stats()
+    total = sum(phase.steps for phase in phases) / sum(phase.seconds for phase in phases)
+    loss = float(torch.stack(list(watch.losses)).mean())
+    print(f"    all phases: {total:.1f} it/s; mean loss of the last {len(watch.losses)} steps {loss:.5f}")
     for phase in phases:
-        rate = phase.steps / phase.seconds if phase.seconds else math.nan
-        print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {rate:7.1f} it/s")
-        print("\n".join(phase.lines), flush=True)
+        used = f", GPU busy {phase.busy * phase.rate / 10:.0f} % ({phase.busy:.2f} ms a step)" if cuda else ""
+        print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {phase.rate:7.1f} it/s{used}")
+        if not args.brief:
+            print("\n".join(phase.lines), flush=True)
+    if args.baseline_steps < 1:
+        return
     rate, drawn_there = explicit(trainer.model, count, args, session, scene, folder)
     print(f"    3DGS drawing {drawn_there:,} Gaussians a view: {rate:.1f} it/s", flush=True)
 
@@ -402,7 +432,9 @@ def main() -> None:
     parser.add_argument("--preset", default="paper")
     parser.add_argument("--iterations", type=int, default=0, help="default: those of the preset")
     parser.add_argument("--window", type=int, default=20, help="steps that are profiled in each phase")
-    parser.add_argument("--baseline-steps", type=int, default=500, help="of 3DGS")
+    parser.add_argument("--baseline-steps", type=int, default=500, help="of 3DGS; 0: none")
+    parser.add_argument("--graphs", default="on", help="decode as CUDA graphs: on, off or on,off")
+    parser.add_argument("--brief", action="store_true", help="no table of parts")
     parser.add_argument("--syncs", action="store_true", help="also which lines wait for the GPU")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")
     parser.add_argument("--seed", type=int, default=0)
@@ -417,7 +449,8 @@ def main() -> None:
         folder, _, pictures = asked.partition(":")
         print(asked)
         for method in args.methods.split(","):
-            anchors(method, args, session, folder, pictures)
+            for graphs in args.graphs.split(","):
+                anchors(method, args, session, folder, pictures, graphs=graphs == "on")
 
 
 if __name__ == "__main__":

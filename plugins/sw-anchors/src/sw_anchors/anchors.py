@@ -57,16 +57,18 @@ class AnchorSelection:
 
     rows        [V] int64, visible anchors
     opacities   [V,k] in (-1,1), all offsets of the visible anchors, detached
-    drawn       [M] int64, index into the V * k offsets of each Gaussian that was drawn
+    drawn       [M] int64, index into the V * k offsets of each Gaussian that was drawn; None: the first V * k
+                Gaussians of the result are all of them, and those with opacity <= 0 were not drawn
     """
 
     rows: Tensor
     opacities: Tensor
-    drawn: Tensor
+    drawn: Tensor | None
 
     def offset_index(self) -> Tensor:
-        """[M] int64: index into the N * k offsets of the model."""
+        """[M] int64: index into the N * k offsets of the model of each Gaussian in `drawn`."""
         k = self.opacities.shape[1]
+        assert self.drawn is not None
         return self.rows[self.drawn // k] * k + self.drawn % k
 
 
@@ -80,6 +82,8 @@ class AnchorSplats(SplatModel):
 
     ROW_LABEL = "anchors"
     NETWORKS: tuple[str, ...] = ("mlp_opacity", "mlp_cov", "mlp_color")
+    COUNTS_MASKED = False
+    """Whether statistics see the opacity that a masked Gaussian would have."""
 
     mlp_opacity: nn.Sequential
     mlp_cov: nn.Sequential
@@ -137,13 +141,14 @@ class AnchorSplats(SplatModel):
             camera.center.to(a.positions), a.positions, a.features, a.offsets, a.scales, a.masks,
             (self.mlp_opacity, self.mlp_cov, self.mlp_color),
         )  # fmt: skip
+        seen = found.alphas if self.COUNTS_MASKED else found.all_opacities
         return GaussianInputs(
             means=found.means,
             opacities=found.opacities,
             scales=found.scales,
             quats=found.quats,
             colors=found.colors,
-            extras={**a.extras, "anchors": AnchorSelection(rows, found.all_opacities, found.drawn)},
+            extras={**a.extras, "anchors": AnchorSelection(rows, seen, found.drawn)},
         )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,10 @@ from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_code
 from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound, add_noise
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, GaussianInputs
+    from sw_anchors.fixed_decoder import FixedDecoder
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
@@ -85,6 +89,7 @@ class CodedAnchors(AnchorModel):
     bounds          [2,3] buffer: ends of the position lattice; `update_bounds` sets them
     phase           FULL, QUANTIZED or ENTROPY (`PhaseSwitch` sets it)
     noise           generator of noise and samples; None: the default one of the device. Whoever trains sets it
+    fixed           decodes in training in tensors of fixed sizes; None: nothing does. Whoever trains sets it
     base_steps      quantiser step of each group before it is predicted
     """
 
@@ -92,6 +97,9 @@ class CodedAnchors(AnchorModel):
 
     mask_logits: nn.Parameter
     bounds: Tensor
+
+    HAS_FIXED_FORM: ClassVar[bool] = True
+    """Whether `sw_anchors.fixed_step` computes what a training step of this class does."""
 
     def __init__(
         self,
@@ -126,6 +134,11 @@ class CodedAnchors(AnchorModel):
         self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._groups: tuple[tuple[Any, ...], Tensor, Tensor, Tensor] | None = None
+        self.fixed: FixedDecoder | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy decodes by itself: graphs of a GPU belong to one model."""
+        return {**self.__dict__, "fixed": None}
 
     # Positions
 
@@ -148,9 +161,13 @@ class CodedAnchors(AnchorModel):
         if kept is None or any(
             a is not b if isinstance(a, Tensor) else a != b for a, b in zip(kept[0], state, strict=True)
         ):
-            codes = position_codes(self.anchors, self.bounds)
-            kept = self._lattice = (state, codes, coded_positions(codes, self.bounds))
+            kept = self._lattice = (state, *self.lattice_places())
         return kept[1], kept[2]
+
+    def lattice_places(self) -> tuple[Tensor, Tensor]:
+        """Codes [N,3] of the anchors on the 16-bit lattice, and where they are taken to be [N,3]."""
+        codes = position_codes(self.anchors, self.bounds)
+        return codes, coded_positions(codes, self.bounds)
 
     # Masks
 
@@ -195,10 +212,13 @@ class CodedAnchors(AnchorModel):
         return context
 
     def forecast(self, rows: Tensor) -> AnchorForecast:
-        """Predict for training: `predict`, then `refine` for a sample of the anchors `rows` alone.
+        """Predict for training: `forecast_at` the rows of `context_rows`, where there are any.
 
-        A method whose network need not compute all distributions for it overrides it.
+        Otherwise `predict`, then `refine` for a sample of the anchors `rows` alone.
         """
+        parts = self.context_rows()
+        if parts is not None:
+            return self.forecast_at(tuple(part.index_select(0, rows) for part in parts))
         context = self.predict(rows)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
@@ -209,6 +229,28 @@ class CodedAnchors(AnchorModel):
             return torch.cat(known.means, dim=1), torch.cat(known.scales, dim=1)
 
         return AnchorForecast(torch.cat(context.steps, dim=1), context.own_bits, None, sample)
+
+    def context_rows(self) -> tuple[Tensor, ...] | None:
+        """Tensors with a row for each anchor that `forecast_at` starts from, without gradients; or None.
+
+        A method whose network need not compute all distributions for training overrides both.
+        """
+        return None
+
+    def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
+        """Predict for training from rows of `context_rows`, without waiting for a GPU."""
+        raise NotImplementedError
+
+    def step_key(self) -> tuple[Any, ...]:
+        """Plain values that decide which operators a step of training runs."""
+        return self.phase, self.sample, self.smallest_probability, self.noise_factor
+
+    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
+        if self.fixed is not None and self.training and torch.is_grad_enabled() and self.features.requires_grad:
+            found = self.fixed.decode(self, camera, rows)
+            if found is not None:
+                return found
+        return super().decode(camera, rows)
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
         """Full-precision, noisy or rounded attributes, by phase and mode; each of `rows` at most once."""
@@ -221,12 +263,10 @@ class CodedAnchors(AnchorModel):
             steps = self.base_steps_like(values) if self.phase == QUANTIZED else self.predict(rows).steps
             values = torch.cat(self._rounded(groups, steps), dim=1)
         elif self.phase == QUANTIZED:
-            group, _ = self._columns(values)
-            base = self.base_steps_like(values).index_select(0, group) * self.noise_factor
-            values = add_noise(values, base, self.uniform(*values.shape))
+            values = add_noise(values, self.wide_base_steps(values), self.uniform(*values.shape))
         elif self.phase == ENTROPY:
             forecast = self.forecast(rows)
-            wide = widen(forecast.steps, *self._columns(values))
+            wide = self.widened(forecast.steps)
             values = add_noise(values, wide, self.uniform(*values.shape))
             extras["rate"] = self.rate(values, wide, forecast, masks)
         features, scales, offsets = torch.split(values, list(self.shape.widths), dim=1)
@@ -238,6 +278,15 @@ class CodedAnchors(AnchorModel):
             masks=masks,
             extras=extras,
         )
+
+    def wide_base_steps(self, like: Tensor) -> Tensor:
+        """[C] steps of the noise in the phase QUANTIZED, one for each column of `like` [V,C]."""
+        group, _ = self._columns(like)
+        return self.base_steps_like(like).index_select(0, group) * self.noise_factor
+
+    def widened(self, steps: Tensor) -> Tensor:
+        """[V,C] from steps [V,3] of the groups, one for each column; differentiable."""
+        return widen(steps, *self._columns(steps))
 
     def _columns(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The group of each number of an anchor [C], and the same as zeros and ones [C,3]; kept on the device."""
@@ -291,6 +340,23 @@ class CodedAnchors(AnchorModel):
         if not len(drawn):
             nothing = self.mask_logits.new_zeros(())
             return AnchorRate(nothing, nothing.new_zeros(3), nothing, forecast.own_bits)
+        return self.rate_of(drawn, values, steps, forecast, masks, kept.index_select(0, drawn), kept.mean())
+
+    def rate_of(
+        self,
+        drawn: Tensor,
+        values: Tensor,
+        steps: Tensor,
+        forecast: AnchorForecast,
+        masks: Tensor,
+        counted: Tensor,
+        share: Tensor,
+    ) -> AnchorRate:
+        """Estimate the bits of a sample `drawn` [S] of the V anchors; other arguments as of `rate`.
+
+        counted     [S] 1 where the anchor is kept, else 0
+        share       scalar: kept anchors over visible ones
+        """
         hidden = None
         if forecast.hidden is None:
             x, step, mask = take_rows(drawn, values, steps, masks)
@@ -298,14 +364,13 @@ class CodedAnchors(AnchorModel):
             x, step, mask, hidden = take_rows(drawn, values, steps, masks, forecast.hidden)
         mean, scale = forecast.sample(drawn, hidden, x)
         # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
-        counted = kept.index_select(0, drawn)
         widths = self.shape.widths
         alone = counted[:, None].expand(-1, widths[0] + widths[1])
         factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
         bits = gaussian_bits(x, mean, scale.clamp(min=1e-9), step, p_min=self.smallest_probability) * factors
         numbers = counted.sum() * sum(widths)
         by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
-        return AnchorRate(bits.sum() * (kept.mean() / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
+        return AnchorRate(bits.sum() * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
 
     # State
 

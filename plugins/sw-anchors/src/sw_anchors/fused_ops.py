@@ -14,7 +14,7 @@ from torch.autograd.function import once_differentiable
 
 
 def anchor_values(
-    rows: Tensor,
+    rows: Tensor | None,
     features: Tensor,
     log_scales: Tensor,
     offsets: Tensor,
@@ -24,7 +24,7 @@ def anchor_values(
 ) -> tuple[Tensor, Tensor]:
     """(values [V, F+6+3k]: features, exp(log_scales) and offsets of the anchors `rows`; their masks [V,k]).
 
-    rows            [V] int64, each at most once
+    rows            [V] int64, each at most once; None: all
     mask_weights    [N,1] or None for 1: a mask is 1 where sigmoid(logit) times its weight exceeds `threshold`, else 0;
                     its gradient is that of sigmoid(logit) times the weight, and none goes to the weight
     """
@@ -37,7 +37,7 @@ class _Values(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any,
-        rows: Tensor,
+        rows: Tensor | None,
         features: Tensor,
         log_scales: Tensor,
         offsets: Tensor,
@@ -45,10 +45,13 @@ class _Values(torch.autograd.Function):
         mask_weights: Tensor | None,
         threshold: float,
     ) -> tuple[Tensor, Tensor]:
-        scales = log_scales.index_select(0, rows).exp_()
-        values = torch.cat([features.index_select(0, rows), scales, offsets.flatten(1).index_select(0, rows)], dim=1)
-        soft = mask_logits.index_select(0, rows).sigmoid_()
-        weights = None if mask_weights is None else mask_weights.index_select(0, rows)
+        def taken(tensor: Tensor) -> Tensor:
+            return tensor if rows is None else tensor.index_select(0, rows)
+
+        scales = taken(log_scales).exp()
+        values = torch.cat([taken(features), scales, taken(offsets.flatten(1))], dim=1)
+        soft = taken(mask_logits).sigmoid()
+        weights = None if mask_weights is None else taken(mask_weights)
         weighted = soft if weights is None else soft * weights
         ctx.save_for_backward(rows, scales, soft, weights)
         ctx.shapes = [t.shape for t in (features, log_scales, offsets, mask_logits)]
@@ -63,6 +66,8 @@ class _Values(torch.autograd.Function):
         to_features, to_scales, to_offsets = torch.split(to_values, widths, dim=1)
         to_soft = torch.ops.aten.sigmoid_backward(to_masks if weights is None else to_masks * weights, soft)
         sources = (to_features, to_scales * scales, to_offsets.reshape(-1, *shapes[2][1:]), to_soft)
+        if rows is None:
+            return None, *sources, None, None
         found = [s.new_zeros(shape).index_copy_(0, rows, s) for s, shape in zip(sources, shapes, strict=True)]
         return None, *found, None, None
 

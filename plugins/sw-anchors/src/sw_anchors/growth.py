@@ -33,16 +33,24 @@ def accumulate_anchor_statistics(
     """Add one view to the four statistics of `model`, in place.
 
     selection   `RenderResult.extras["anchors"]`
-    gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d)
+    gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d); rows after those
+                of the selection are not looked at
     radii       [M] pixels; Gaussians with radius 0 do not count
     """
-    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
+    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU, and so
+    # would the 0 of `torch.where`.
     rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
     model.opacity_accum.index_add_(0, rows, selection.opacities.clamp(min=0).sum(dim=1))
     model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
-    at = selection.offset_index()
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
-    model.offset_grad_accum.view(-1).index_add_(0, at, torch.where(seen > 0, norms, 0))
+    norms.masked_fill_(seen == 0, 0)
+    if selection.drawn is None:
+        shape = selection.opacities.shape
+        model.offset_grad_accum.index_add_(0, rows, norms[: shape.numel()].view(shape))
+        model.offset_denom.index_add_(0, rows, seen[: shape.numel()].view(shape))
+        return
+    at = selection.offset_index()
+    model.offset_grad_accum.view(-1).index_add_(0, at, norms)
     model.offset_denom.view(-1).index_add_(0, at, seen)
 
 
@@ -60,6 +68,7 @@ def adjust_anchors(
     levels: int = 3,
     init_factor: int = 16,
     hierarchy: int = 4,
+    subvoxel: bool = False,
 ) -> GrowthReport:
     """Add anchors where offsets have high gradients, remove those that stay transparent.
 
@@ -69,7 +78,8 @@ def adjust_anchors(
     grad_threshold  mean gradient of an offset at level 0, NDC units (`>=`); doubles with each level
     min_opacity     an anchor goes if its summed opacity is below this, mean over views
     levels, init_factor, hierarchy
-                    level n has cells of voxel_size * init_factor / hierarchy^n
+                    level n has cells of init_factor // hierarchy^n voxels
+    subvoxel        take levels with cells below a voxel too, of init_factor / hierarchy^n voxels; else there are none
 
     Raises EmptyModel if nothing is left.
     """
@@ -82,7 +92,11 @@ def adjust_anchors(
     for level in range(levels):
         if level > 0 and model.num_rows == before:
             break  # Paper: every level by itself; authors' code: nothing grows if level 0 added nothing. We follow it.
-        size = model.voxel_size * init_factor / hierarchy**level
+        # Divided in integers as in the authors' code: a level of no whole voxels grows nothing.
+        voxels = init_factor / hierarchy**level if subvoxel else init_factor // hierarchy**level
+        if not voxels:
+            break
+        size = model.voxel_size * voxels
         draw = torch.rand(mean.shape, generator=generator).to(mean)
         chosen = eligible & (mean >= grad_threshold * 2**level) & (draw > 0.5 ** (level + 1))
         at, offset = torch.nonzero(chosen, as_tuple=True)

@@ -24,6 +24,7 @@ class NeuralGaussians:
 
     means, opacities, scales, quats, colors     [M,...] as in GaussianInputs; differentiable
     all_opacities   [V,k] in (-1,1), no gradient
+    alphas          [V,k] the same before masks
     drawn           [M] int64, which of the V * k they are
     """
 
@@ -33,6 +34,7 @@ class NeuralGaussians:
     quats: Tensor
     colors: Tensor
     all_opacities: Tensor
+    alphas: Tensor
     drawn: Tensor
 
 
@@ -44,16 +46,19 @@ def spawn(
     scales: Tensor,
     masks: Tensor | None,
     networks: tuple[nn.Sequential, nn.Sequential, nn.Sequential],
+    *,
+    drawn: Tensor | None = None,
 ) -> NeuralGaussians:
     """Decode the Gaussians of V anchors for a camera at `center` [3], which gets no gradient.
 
     positions [V,3], features [V,F], offsets [V,k,3], scales [V,6], masks [V,k] or None: as in AnchorAttributes
     networks    opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs
-
-    Waits for the device once, for M.
+    drawn       [M] int64 ascending, the Gaussians to decode, of the V * k; None: those with opacity > 0, for whose
+                number the device is waited for
     """
     parameters = [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
-    return NeuralGaussians(*_Spawn.apply(center, positions, features, offsets, scales, masks, *parameters))  # type: ignore[no-untyped-call]
+    found = _Spawn.apply(center, positions, features, offsets, scales, masks, drawn, *parameters)  # type: ignore[no-untyped-call]
+    return NeuralGaussians(*found)
 
 
 class _Spawn(torch.autograd.Function):
@@ -66,6 +71,7 @@ class _Spawn(torch.autograd.Function):
         offsets: Tensor,
         scales: Tensor,
         masks: Tensor | None,
+        drawn: Tensor | None,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         first, last = parameters[0::4], parameters[2::4]
@@ -85,7 +91,7 @@ class _Spawn(torch.autograd.Function):
         alpha = pre.tanh_()  # [V,k]
         opacities = alpha if masks is None else alpha * masks
         flat = opacities.view(-1)
-        drawn = torch.nonzero(flat > 0).squeeze(1)  # [M]
+        drawn = torch.nonzero(flat > 0).squeeze(1) if drawn is None else drawn.detach()  # [M]
         owner = torch.div(drawn, k, rounding_mode="floor")
         geometry = geometry.view(-1, GEOMETRY).index_select(0, drawn)
         color = color.view(-1, 3).index_select(0, drawn).sigmoid_()
@@ -104,8 +110,9 @@ class _Spawn(torch.autograd.Function):
             quats, norms, color, *last,
         )  # fmt: skip
         ctx.widths = [len(w) for w in first]
-        ctx.mark_non_differentiable(opacities, drawn)
-        return means, flat.index_select(0, drawn), sizes, quats, color, opacities, drawn
+        unmasked = alpha.detach()
+        ctx.mark_non_differentiable(opacities, unmasked, drawn)
+        return means, flat.index_select(0, drawn), sizes, quats, color, opacities, unmasked, drawn
 
     @staticmethod
     @once_differentiable
@@ -168,6 +175,7 @@ class _Spawn(torch.autograd.Function):
             dense[:, :3].reshape(n, k, 3),
             by_anchor[:, :, 3:9].sum(dim=1),
             to_masks,
+            None,
             *to_parameters,
         )
 

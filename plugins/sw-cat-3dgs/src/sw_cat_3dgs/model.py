@@ -11,6 +11,7 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer
 from sw_cat_3dgs.context import STEP_OFFSET, CatContext
+from sw_cat_3dgs.plane_bits import FixedPlaneBits
 from sw_codecs.context.triplane import PlaneSites
 
 Trained = Literal["everything", "spatial models", "all but planes", "nothing"]
@@ -23,6 +24,7 @@ class CatAnchors(CodedAnchors):
     views_stale     anchors came or went since the views were counted
     context         predicts attributes
     trained         parameters that get gradients
+    fixed_planes    estimates the planes' bits in training; None: nothing does. Whoever trains sets it
     """
 
     ROWS = (*CodedAnchors.ROWS, "view_weights")
@@ -38,6 +40,11 @@ class CatAnchors(CodedAnchors):
         self.trained: Trained = "everything"
         self.register_buffer("view_weights", self.anchors.new_ones(len(self.anchors)))
         self._places: tuple[tuple[Any, ...], Tensor, PlaneSites] | None = None
+        self.fixed_planes: FixedPlaneBits | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A copy works out anew where its anchors lie."""
+        return {**super().__getstate__(), "_places": None, "fixed_planes": None}
 
     def mask_weights(self) -> Tensor:
         return self.view_weights[:, None]
@@ -70,9 +77,25 @@ class CatAnchors(CodedAnchors):
         found: AnchorContext = self.context(self.places()[rows])
         return found
 
-    def forecast(self, rows: Tensor) -> AnchorForecast:
-        sites = self._kept_places()[1].rows(rows)
+    def context_rows(self) -> tuple[Tensor, ...]:
+        """The sites of the anchors on the planes."""
+        return self._kept_places()[1]
+
+    def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
+        sites = PlaneSites(*parts)
         return self.context.forecast(sites, self.base_steps_like(sites.weights))
+
+    def step_key(self) -> tuple[Any, ...]:
+        return *super().step_key(), self.context.rounded, self.context.in_steps
+
+    def plane_bits(self, share: float) -> Tensor:
+        """Estimate the bits of the planes from a share of their channels; differentiable."""
+        if self.fixed_planes is not None and torch.is_grad_enabled():
+            own = self.noise is not None and self.noise.device.type == self.device.type
+            found = self.fixed_planes(self.context, share, self.noise if own else None)
+            if found is not None:
+                return found
+        return self.context.triplane_bits(self.uniform, share)
 
     def refine(self, context: AnchorContext, features: Tensor) -> AnchorContext:
         return self.context.refine(context, features)

@@ -15,6 +15,7 @@ from sw_anchors.stage import CodedAnchorStage
 from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer, TaskLog
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.model import CatAnchors, Trained
+from sw_cat_3dgs.plane_bits import FixedPlaneBits
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
         OptimizationParams,
         PipelineParams,
         RenderResult,
+        Scene,
         Scheduler,
         SplatModel,
         StageContext,
@@ -42,7 +44,15 @@ class CatStage(CodedAnchorStage):
     def begin(self, context: StageContext) -> SplatModel:
         self.plane_draws = context.generator("triplane")
         self._cameras: list[Camera] | None = None
-        return super().begin(context)
+        model = super().begin(context)
+        assert isinstance(model, CatAnchors)
+        model.fixed_planes = FixedPlaneBits() if model.fixed is not None else None
+        return model
+
+    def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
+        assert isinstance(model, CatAnchors)
+        model.fixed_planes = None
+        return super().finish(model, scene)
 
     # Optimizer
 
@@ -130,7 +140,7 @@ class CatStage(CodedAnchorStage):
     def _plane_bits(self, model: CatAnchors) -> Tensor:
         """Bits of the planes per number of all anchors."""
         numbers = model.num_rows * sum(model.context.shape.widths)
-        return model.context.triplane_bits(model.uniform, self.opt.rate_term.triplane_sample) / numbers
+        return model.plane_bits(self.opt.rate_term.triplane_sample) / numbers
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         assert isinstance(model, CatAnchors)

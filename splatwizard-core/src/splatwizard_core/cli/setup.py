@@ -74,6 +74,7 @@ class Choices:
         """One configuration for every method and rate point; wrong input fails before anything runs."""
         from splatwizard_core.runs.config import rate_points, resolve
         from splatwizard_core.runs.pretrained import checked_start
+        from splatwizard_core.training.keys import dotted
 
         values = self.values()
         found = [
@@ -81,14 +82,16 @@ class Choices:
             for method in map(plugins.methods.load, self.method_names(plugins))
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
+        for each in found:
+            values = dotted(each.config.model_dump() | each.scene_options, "")
+            told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
+            if told and each.rate == found[0].rate:
+                say(f"{each.method}, by data set: {', '.join(told)}")
         return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
         """The configuration of a command that makes one thing."""
-        found = self.resolve(plugins)
-        if len(found) != 1:
-            raise click.UsageError("this command takes one method and one rate point; `sw run` takes several")
-        return found[0]
+        return only(self.resolve(plugins))
 
     def resolve_without_method(self) -> ResolvedConfig:
         """The configuration of a command that needs no method: how a scene is read, and the keys of a run.
@@ -131,6 +134,13 @@ class Choices:
         )
         found = dotted(wanted.config.model_dump(), "").items()
         return replace(chosen, rate=None, below={k: v for k, v in found if f"{k}.".startswith(keys)})
+
+
+def only(found: Sequence[ResolvedConfig]) -> ResolvedConfig:
+    """The one of them. Raises click.UsageError for several."""
+    if len(found) != 1:
+        raise click.UsageError("this command takes one method and one rate point; `sw run` takes several")
+    return found[0]
 
 
 def takes_choices(function: Callable[..., None]) -> Callable[..., None]:

@@ -1,0 +1,150 @@
+"""The decoding of a training step in tensors of one capacity: what it reads, what it computes.
+
+Everything that `CodedAnchors.attributes` and `spawn` do, with masks in place of shapes that depend on values. Nothing
+in `decode_rows` waits for a GPU, draws at random or writes into what it reads.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import Camera, GaussianInputs
+from sw_anchors.anchors import AnchorSelection
+from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED, AnchorRate
+from sw_anchors.fused_ops import anchor_values
+from sw_anchors.neural_gaussians import spawn
+from sw_anchors.step_graphs import Found
+
+if TYPE_CHECKING:
+    from sw_anchors.coded_anchors import CodedAnchors
+
+PARAMETERS = ("features", "log_scales", "offsets", "mask_logits")
+"""Parameters with a row for each anchor that the decoding depends on."""
+
+
+@dataclass(frozen=True)
+class FixedRows:
+    """Rows of the visible anchors in tensors of capacity C; the first `count` hold, the rest is what was there before.
+
+    count       scalar float
+    center      [3] of the camera
+    positions   [C,3]
+    parameters  rows [C,...] of PARAMETERS, those of offsets flat; they take gradients
+    weights     [C,1] of the masks, or None
+    parts       rows of `CodedAnchors.context_rows`
+    random      [C (numbers of an anchor + 1)] draws of U(-1/2, 1/2): noise of all numbers, then one for the sample
+    """
+
+    count: Tensor
+    center: Tensor
+    positions: Tensor
+    parameters: tuple[Tensor, ...]
+    weights: Tensor | None
+    parts: tuple[Tensor, ...]
+    random: Tensor
+
+    def load(self, model: CodedAnchors, camera: Camera, rows: Tensor, parts: Sequence[Tensor]) -> None:
+        """Copy the anchors `rows` [V] of the model, V < C, and draw anew."""
+        v = len(rows)
+        self.count.fill_(v)
+        self.center.copy_(camera.center)
+        weights = model.mask_weights()
+        pairs = [(model.positions(), self.positions), *zip(parts, self.parts, strict=True)]
+        pairs += [(getattr(model, name).detach(), mine) for name, mine in zip(PARAMETERS, self.parameters, strict=True)]
+        if weights is not None and self.weights is not None:
+            pairs.append((weights, self.weights))
+        for source, mine in pairs:
+            flat = source if source.dim() == mine.dim() else source.flatten(1)
+            torch.index_select(flat, 0, rows, out=mine.detach()[:v])
+        self.draw(model)
+
+    def draw(self, model: CodedAnchors) -> None:
+        """Draw noise and sample."""
+        own = model.noise is not None and model.noise.device.type == self.random.device.type
+        self.random.uniform_(-0.5, 0.5, generator=model.noise if own else None)
+
+
+def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
+    """Decode all C k Gaussians; rows beyond the count have opacity 0 and no gradient.
+
+    Returns (means, opacities, scales, quats, colors, mean volume of what is visible, then in the entropy phase bits
+    and, if the context has any, own bits of `AnchorRate`), and (visible [C k] bool, opacities [C,k], then by_group and
+    numbers of the rate).
+    """
+    features, log_scales, offsets, logits = at.parameters
+    capacity, k = logits.shape
+    values, masks = anchor_values(
+        None, features, log_scales, offsets.view(capacity, k, 3), logits, at.weights, MASK_THRESHOLD
+    )
+    valid = (torch.arange(capacity, device=values.device) < at.count).to(values)
+    masks = masks * valid[:, None]
+    noise, draws = torch.split(at.random, [values.numel(), capacity])
+    rate: list[Tensor] = []
+    rate_counts: tuple[Tensor, ...] = ()
+    if model.phase == QUANTIZED:
+        values = torch.addcmul(values, noise.view_as(values), model.wide_base_steps(values))
+    elif model.phase == ENTROPY:
+        forecast = model.forecast_at(at.parts)
+        steps = model.widened(forecast.steps)
+        values = torch.addcmul(values, noise.view_as(values), steps)
+        kept = masks.detach().amax(dim=1)
+        drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
+        counted = kept.index_select(0, drawn) * is_drawn
+        share = kept.sum() / at.count.clamp(min=1)
+        found_rate = model.rate_of(drawn, values, steps, forecast, masks, counted, share)
+        rate = [found_rate.bits] + ([] if found_rate.own_bits is None else [found_rate.own_bits])
+        rate_counts = found_rate.by_group, found_rate.numbers
+    own, scales, shifts = torch.split(values, list(model.shape.widths), dim=1)
+    # What is not valid may stand at the camera's centre, where a direction is none.
+    positions = torch.where(valid[:, None] > 0, at.positions, at.center + 1)
+    found = spawn(
+        at.center, positions, own, shifts.reshape(capacity, k, 3), scales, masks,
+        (model.mlp_opacity, model.mlp_cov, model.mlp_color),
+        drawn=torch.arange(capacity * k, device=values.device),
+    )  # fmt: skip
+    visible = found.all_opacities.view(-1) > 0
+    x, y, z = found.scales.unbind(1)
+    shown = visible.to(values)
+    volume = (x * y * z * shown).sum() / shown.sum().clamp(min=1)
+    results = found.means, found.opacities, found.scales, found.quats, found.colors, volume, *rate
+    return results, (visible, found.all_opacities, *rate_counts)
+
+
+def sample_of(draws: Tensor, valid: Tensor, share: float) -> tuple[Tensor, Tensor]:
+    """(rows [S] int64 whose draw [C] of U(0,1) is below `share` and that are valid, 1 where there was one, else 0).
+
+    S is fixed: six standard deviations above the mean of C draws. Places that no row was drawn for name the last row,
+    which must not be valid.
+    """
+    capacity = len(draws)
+    size = sample_capacity(capacity, share)
+    chosen = (draws < share) & (valid > 0)
+    number = chosen.cumsum(0)
+    # Numbers are filled in: `torch.where` would copy them to the GPU, which a graph cannot.
+    place = (number - 1).masked_fill(~chosen | (number > size), size)
+    rows = torch.arange(capacity, device=draws.device)
+    found = torch.full((size + 1,), capacity - 1, dtype=torch.int64, device=draws.device)
+    found = found.scatter_(0, place, rows.masked_fill(~chosen, capacity - 1))[:size]
+    return found, (rows[:size] < number[-1]).to(valid)
+
+
+def sample_capacity(capacity: int, share: float) -> int:
+    """Rows of a sample of `share` of `capacity` rows."""
+    return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
+
+
+def inputs_of(model: CodedAnchors, rows: Tensor, found: Found) -> GaussianInputs:
+    """The Gaussians of `decode_rows` for the rasterizer; anchors `rows` are those that were loaded."""
+    (means, opacities, scales, quats, colors, volume, *rate), (visible, all_opacities, *counts) = found
+    extras = {"anchors": AnchorSelection(rows, all_opacities[: len(rows)], None), "volume": volume}
+    if rate:
+        extras["rate"] = AnchorRate(rate[0], counts[0], counts[1], rate[1] if len(rate) > 1 else None)
+    return GaussianInputs(
+        means=means, opacities=opacities, scales=scales, quats=quats, colors=colors, visible=visible, extras=extras
+    )

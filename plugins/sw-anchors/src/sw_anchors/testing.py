@@ -1,0 +1,100 @@
+"""Checks for the tests of methods on anchors: the decoding in tensors of fixed sizes equals that of any number of rows.
+
+def test_fixed_sizes_change_nothing():
+    check_fixed_decoder(make_model, camera, rasterizer, counts=(0, 1, 40))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+from unittest import mock
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import Camera, Rasterizer, RasterOptions
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
+from sw_anchors.fixed_decoder import FixedDecoder, capacity_of
+from sw_anchors.fixed_step import FixedRows
+from sw_anchors.fused_ops import mean_product
+from sw_anchors.growth import accumulate_anchor_statistics
+
+PHASES = (FULL, QUANTIZED, ENTROPY)
+
+
+def check_fixed_decoder(
+    make: Callable[[], CodedAnchors],
+    camera: Camera,
+    rasterizer: Rasterizer,
+    *,
+    counts: Sequence[int],
+    phases: Sequence[str] = PHASES,
+    graphs: bool = False,
+    sample: float = 0.3,
+    tolerance: float = 1e-4,
+) -> None:
+    """Raise AssertionError unless values, rate, gradients and statistics are the same, for counts of visible anchors.
+
+    make        the same model each time
+    graphs      as CUDA graphs
+    tolerance   of each tensor, as a share of its largest value
+    """
+    fixed = FixedDecoder(graphs=graphs)
+    same = make()
+    for phase in phases:
+        for count in counts:
+            found = []
+            for decoder in (None, fixed):
+                # Graphs belong to one model; what a step changes is put back.
+                model = same if decoder is not None else make()
+                model.fixed = decoder
+                found.append(_one_step(model, camera, rasterizer, phase, count, sample))
+            for name in found[0].keys() | found[1].keys():
+                # A sample without an anchor: no gradient in one form, zeros in the other.
+                expected, got = (each.get(name, torch.zeros(())) for each in found)
+                limit = tolerance * max(float(expected.abs().amax()), 1e-6) if expected.numel() else 0.0
+                difference = float((expected - got).abs().amax()) if got.numel() else 0.0
+                assert difference <= limit, f"{phase}, {count} anchors, {name}: {difference:.3g} apart"
+
+
+def _one_step(
+    model: CodedAnchors, camera: Camera, rasterizer: Rasterizer, phase: str, count: int, sample: float
+) -> dict[str, Tensor]:
+    """Loss, rate, gradients by name and statistics of a step on `count` anchors, with the same draws in both forms."""
+    model.train().zero_grad()
+    model.phase, model.sample = phase, sample
+    device, capacity = model.device, capacity_of(count)
+    generator = torch.Generator().manual_seed(count)
+    rows = torch.randperm(model.num_rows, generator=generator)[:count].sort().values.to(device)
+    noise = torch.rand(capacity, sum(model.shape.widths), generator=generator).to(device)
+    draws = torch.rand(capacity, generator=generator).to(device)
+
+    def fill(at: FixedRows, _: Any) -> None:
+        at.random.copy_(torch.cat([noise.flatten(), draws]) - 0.5)
+
+    with (
+        mock.patch.object(FixedRows, "draw", fill),
+        mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
+        mock.patch.object(model, "_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
+    ):
+        inputs = model.decode(camera, rows)
+    image = rasterizer.render(inputs, camera, RasterOptions(grad2d=True))
+    volume = inputs.extras.get("volume")
+    assert inputs.scales is not None
+    found = {"volume": mean_product(inputs.scales) if volume is None else volume}
+    rate = inputs.extras.get("rate")
+    if rate is not None:
+        found |= {"bits": rate.bits} | ({} if rate.own_bits is None else {"own bits": 1e-4 * rate.own_bits})
+    total = image.image.square().sum() + torch.stack(list(found.values())).sum() * 10
+    total.backward()  # type: ignore[no-untyped-call]
+    assert image.grad2d is not None
+    statistics = ("opacity_accum", "anchor_denom", "offset_grad_accum", "offset_denom")
+    for name in statistics:
+        getattr(model, name).zero_()
+    accumulate_anchor_statistics(model, inputs.extras["anchors"], image.grad2d.value, image.radii)
+    found |= {name: getattr(model, name).clone() for name in statistics}
+    found |= {f"d {name}": p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+    if rate is not None:
+        found |= {"by group": rate.by_group, "numbers": rate.numbers}
+    return {name: tensor.detach().cpu() for name, tensor in {**found, "loss": total, "image": image.image}.items()}
