@@ -32,7 +32,9 @@ class ThreeDGS(GaussianMethod):
     Config = ThreeDGSConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
-    DEFAULT_RATE: ClassVar[str] = "r6"  # exact: what the literature calls the size of 3DGS
+    DEFAULT_RATE: ClassVar[str] = (
+        "r3"  # a compressed file, as the other methods write; r6 is what the literature calls the size of 3DGS
+    )
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Gaussians of the .ply that `init` names, else one for each start point of the scene."""
