@@ -115,12 +115,9 @@ def within_masks(model: SurfelModel, views: Sequence[View]) -> SurfelModel:
         keep &= ~inside | hit
     if not bool(keep.any()):
         raise EmptyModel(0)
-    kept = SurfelModel(*(getattr(model, name).detach()[keep].clone() for name in TENSORS))
+    kept = SurfelModel(*(getattr(model, name).detach()[keep].clone() for name in model.RAW))
     kept.split_seed, kept.active_sh_degree, kept.surface = model.split_seed, model.active_sh_degree, model.surface
     return kept
-
-
-TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 
 
 def mask_of(view: View) -> Tensor | None:
