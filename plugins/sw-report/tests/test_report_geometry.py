@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from PIL import Image
 from sw_report.distortion import bd_tables, drawn_metrics, with_values
+from sw_report.dtu_table import dtu_table, published
+from sw_report.exports import tables_of
 from sw_report.geometry import geometry_parts
+from sw_report.numbers import MISSING
 from sw_report.page import PageOptions, render_page
 from sw_report.results_tables import bd_table, metric_names
 from sw_report.runs import collect
@@ -121,3 +124,42 @@ def test_meshes_of_other_voxels_are_not_compared(make_curve, tmp_path):
     assert [reason.lower() for reason in reasons] == [
         "no bd values by chamfer: meshes with voxels of 0.02, 0.04 are not compared."
     ]
+
+
+def on_dtu(scan: int, distance: float):
+    def change(content: dict[str, Any]) -> None:
+        content["dataset"], content["protocol"]["dataset"] = "dtu", "dtu"
+        content["metrics"]["chamfer_dtu"] = {"mean": distance, "per_view": [], "direction": "lower"}
+        content["geometry"] = {"chamfer_dtu": {"protocol": "dtu-chamfer", "unit": "mm"}}
+        del content["unknown"]["geometry"]
+
+    return {"scene": f"scan{scan}", "change": change}
+
+
+def test_published_rows_have_the_mean_of_their_scans():
+    known = published()
+    for each in known["rows"]:
+        assert len(each["values"]) == len(known["scans"]) == 15
+        assert each["mean"] == pytest.approx(float(np.mean(each["values"])), abs=0.0101)  # of values of two digits
+        assert each.get("remark", next(iter(known["remarks"]))) in known["remarks"]
+
+
+def test_distances_on_dtu_stand_beside_published_ones(make_run, tmp_path):
+    assert dtu_table(collect([make_run(method="hac")]).runs) is None
+    for i, scan in enumerate(published()["scans"]):
+        make_run(method="2dgs", keep=(), **on_dtu(scan, 0.5 + i / 10))
+    make_run(method="3dgs", keep=(), **on_dtu(24, 2.0))
+    collection = collect([tmp_path])
+    table = dtu_table(collection.runs)
+    found = {row.cells[0].text: [cell.text for cell in row.cells[1:]] for row in table.rows}
+    (whole,) = (cells for name, cells in found.items() if name.startswith("2dgs"))
+    assert whole[:3] == ["measured", "0.50", "0.60"]
+    assert whole[-1] == "1.20"
+    (one,) = (cells for name, cells in found.items() if name.startswith("3dgs"))
+    assert one[1] == "2.00"
+    assert set(one[2:]) == {MISSING}
+    assert found["2DGS, repository"][0] == "published"
+    assert found["PGSR, paper ***"][-1] == "0.53"
+    assert any(note.startswith("*** ") and "ICP" in note for note in table.notes)
+    assert any(title == table.title for title, _ in tables_of(collection, anchor=None, partial=False, pareto=False))
+    assert 'id="dtu"' in render_page(collection, PageOptions())
