@@ -88,7 +88,8 @@ def register_entropy_models(registry: Registry[Any]) -> None:
     registry.add("mixture", "sw_codecs.entropy.mixture:Mixture",
                  summary="weighted Gaussians or Laplacians, counts in the file")  # fmt: skip
     registry.add("conditional-gaussian", "sw_codecs.entropy.conditional:ConditionalGaussian",
-                 summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
+                 summary="blocks of rows with a predicted mean, scale and step; exact or float",
+                 native="sw_codecs.exact_native:EXACT")  # fmt: skip
     registry.add("conditional-mixture", "sw_codecs.entropy.conditional_mixture:ConditionalMixture",
                  summary="the same with two predicted Gaussians and their weights")  # fmt: skip
 
