@@ -1,6 +1,6 @@
 """Seconds to encode and to decode anchor files, by part, for each 100,000 anchors.
 
-    python benchmarks/anchor_files.py                               # synthetic anchors of hac and cat-3dgs, 1 and 2 threads
+    python benchmarks/anchor_files.py                               # synthetic anchors, 1 and 2 threads
     python benchmarks/anchor_files.py --anchors 20000 --methods hac --threads 1
     python benchmarks/anchor_files.py out/room/hac/r4/scene.swz     # decode that file
     python benchmarks/anchor_files.py --device cuda --threads 1,2,16  # the model goes to the GPU at the end

@@ -271,6 +271,15 @@ ROWS = [
     Row("compare", "Missing argument"),
     Row("compare {run}", "--published"),
     Row("compare {hollow} --published", "hollow"),
+    # Sweeps; more of them in the tests of sw-bench.
+    Row("bench {nowhere}.toml", "cannot read the plan {nowhere}.toml: No such file"),
+    Row("bench {broken.toml}", "broken.toml is not valid TOML: "),
+    Row("bench --scene demo:tiny --method 3dsg", "no method is called '3dsg'; did you mean '3dgs'?"),
+    Row("bench --scene demo:tiny --rate r9", "3dgs on demo:tiny: method '3dgs' has no rate point 'r9'"),
+    Row("bench --scene demo:tiny --out {notes.txt}", "cannot write into {notes.txt}"),
+    Row("bench --scene demo:tiny --executor cloud", "no executor is called 'cloud'"),
+    Row("run --scene demo:tiny,{nowhere}", "3dgs on {nowhere}: scene '{nowhere}' is not there"),
+    Row("run --scene demo:tiny --seed 0,-1", "Invalid value for '--seed'"),
     # Data sets.
     Row("data list mipnerf306", "mipnerf360", env={"SPLATWIZARD_DATA": "{data}"}),
     Row("data verify nerf_synthetic/lgeo", "has no scene 'lgeo'"),
