@@ -106,7 +106,7 @@ def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
     found = spawn(
         at.center, positions, own, shifts.reshape(capacity, k, 3), scales, masks,
         (model.mlp_opacity, model.mlp_cov, model.mlp_color),
-        drawn=torch.arange(capacity * k, device=values.device),
+        everything=True,
     )  # fmt: skip
     visible = found.all_opacities.view(-1) > 0
     x, y, z = found.scales.unbind(1)

@@ -45,17 +45,16 @@ def spawn(
     masks: Tensor | None,
     networks: tuple[nn.Sequential, nn.Sequential, nn.Sequential],
     *,
-    drawn: Tensor | None = None,
+    everything: bool = False,
 ) -> NeuralGaussians:
     """Decode the Gaussians of V anchors for a camera at `center` [3], which gets no gradient.
 
     positions [V,3], features [V,F], offsets [V,k,3], scales [V,6], masks [V,k] or None: as in AnchorAttributes
     networks    opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs
-    drawn       [M] int64 ascending, the Gaussians to decode, of the V * k; None: those with opacity > 0, for whose
-                number the device is waited for
+    everything  decode all V * k Gaussians, whatever their opacity; else the device is waited for once, for M
     """
     parameters = [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
-    found = _Spawn.apply(center, positions, features, offsets, scales, masks, drawn, *parameters)  # type: ignore[no-untyped-call]
+    found = _Spawn.apply(center, positions, features, offsets, scales, masks, everything, *parameters)  # type: ignore[no-untyped-call]
     return NeuralGaussians(*found)
 
 
@@ -69,7 +68,7 @@ class _Spawn(torch.autograd.Function):
         offsets: Tensor,
         scales: Tensor,
         masks: Tensor | None,
-        drawn: Tensor | None,
+        everything: bool,
         *parameters: Tensor,
     ) -> tuple[Tensor, ...]:
         first, last = parameters[0::4], parameters[2::4]
@@ -89,13 +88,22 @@ class _Spawn(torch.autograd.Function):
         alpha = pre.tanh_()  # [V,k]
         opacities = alpha if masks is None else alpha * masks
         flat = opacities.view(-1)
-        drawn = torch.nonzero(flat > 0).squeeze(1) if drawn is None else drawn.detach()  # [M]
-        owner = torch.div(drawn, k, rounding_mode="floor")
-        geometry = geometry.view(-1, GEOMETRY).index_select(0, drawn)
-        color = color.view(-1, 3).index_select(0, drawn).sigmoid_()
-        own_scales = scales.index_select(0, owner)  # [M,6]
-        own_offsets = offsets.reshape(-1, 3).index_select(0, drawn)
-        means = torch.addcmul(positions.index_select(0, owner), own_offsets, own_scales[:, :3])
+        drawn = torch.arange(flat.numel(), device=flat.device) if everything else torch.nonzero(flat > 0).squeeze(1)
+
+        def picked(rows: Tensor) -> Tensor:  # of V k rows
+            return rows if everything else rows.index_select(0, drawn)
+
+        def owned(rows: Tensor) -> Tensor:  # of V rows
+            if everything:
+                return rows[:, None].expand(-1, k, -1).reshape(len(flat), -1)
+            return rows.index_select(0, owner)
+
+        owner = drawn if everything else torch.div(drawn, k, rounding_mode="floor")  # [M]
+        geometry = picked(geometry.view(-1, GEOMETRY))
+        color = picked(color.view(-1, 3)).sigmoid_()
+        own_scales = owned(scales)  # [M,6]
+        own_offsets = picked(offsets.reshape(-1, 3))
+        means = torch.addcmul(owned(positions), own_offsets, own_scales[:, :3])
         factors = torch.sigmoid(geometry[:, :3])
         # Noise or rounding may take a base scale through zero: a Gaussian of scale -s is that of scale s.
         sizes = own_scales[:, 3:].abs() * factors
@@ -107,9 +115,9 @@ class _Spawn(torch.autograd.Function):
             direction, distance, context, weights, hidden, alpha, masks, drawn, own_scales, own_offsets, factors, sizes,
             quats, norms, color, *last,
         )  # fmt: skip
-        ctx.widths = [len(w) for w in first]
+        ctx.widths, ctx.everything = [len(w) for w in first], everything
         ctx.mark_non_differentiable(opacities, drawn)
-        return means, flat.index_select(0, drawn), sizes, quats, color, opacities, drawn
+        return means, flat.clone() if everything else picked(flat), sizes, quats, color, opacities, drawn
 
     @staticmethod
     @once_differentiable
@@ -133,10 +141,11 @@ class _Spawn(torch.autograd.Function):
         ]
         if positions_learn:
             columns.append(to_means)  # 20 to 22
-        # Each Gaussian was drawn once, so its row is written, not added to.
-        source = torch.cat(columns, dim=1)
-        dense = source.new_zeros(n * k, source.shape[1]).index_copy_(0, drawn, source)
-        by_anchor = dense.view(n, k, source.shape[1])
+        dense = torch.cat(columns, dim=1)
+        if not ctx.everything:
+            # Each Gaussian was drawn once, so its row is written, not added to.
+            dense = dense.new_zeros(n * k, dense.shape[1]).index_copy_(0, drawn, dense)
+        by_anchor = dense.view(n, k, dense.shape[1])
 
         to_alpha = by_anchor[:, :, 19]
         to_masks = to_alpha * alpha if ctx.needs_input_grad[5] else None
