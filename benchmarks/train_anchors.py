@@ -22,12 +22,17 @@ from __future__ import annotations
 import argparse
 import collections
 import math
+import os
 import sys
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
+
+# A profiler that is taken down and set up again does not survive graphs (torch issue 75504).
+os.environ.setdefault("DISABLE_CUPTI_LAZY_REINIT", "1")
+os.environ.setdefault("TEARDOWN_CUPTI", "0")
 
 import torch
 from torch.profiler import ProfilerActivity, profile, record_function
