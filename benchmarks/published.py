@@ -3,9 +3,9 @@
     SPLATWIZARD_DATA=DATA python benchmarks/published.py out/published
     python benchmarks/published.py out/published --only lego --table     # no runs, the table of what is finished
 
-Rows stand in published.json beside this file: method, rate point, preset and settings of ours, the scene (dataset/scene
-under $SPLATWIZARD_DATA, laid out as in docs/datasets.md), the published values with source, year and protocol, and what
-differs from it. Finished runs are not repeated, interrupted ones go on. A scene that is not there is named.
+Rows stand in published.json of the package sw-report, which `sw compare --published` reads too: those with a rate point
+and a preset of ours, and a scene (dataset/scene under $SPLATWIZARD_DATA, laid out as in docs/datasets.md). Finished
+runs are not repeated, interrupted ones go on. A scene that is not there is named.
 """
 
 from __future__ import annotations
@@ -22,80 +22,62 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table
+from sw_report.published import FILE as ROWS
+from sw_report.published import Figure, read_published
 
-ROWS = Path(__file__).with_name("published.json")
 FIGURES = ("psnr", "ssim", "lpips", "bytes", "gaussians")
 METRICS = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_vgg_3dgs"}
-DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "bytes": 0, "gaussians": 0}
+DIGITS = {"psnr": 2, "ssim": 4, "lpips": 4, "bytes": 0, "gaussians": 0, "steps": 0}
 
 
 @dataclass(frozen=True)
 class Row:
-    """A published row, and what of ours measures it.
+    """A published figure of one scene that can be run here, with the rate point and the preset that are meant."""
 
-    rate, preset, sets, images      of `sw run`; images "": the pictures of the scene's own folder
-    psnr, ..., gaussians            as published; None: not published
-    steps                           of the published training, all stages
-    protocol                        as published: pictures, split, background
-    differs                         what differs from our measurement whatever is done
-    verified                        False: recalled, not re-read at the source
-    """
-
-    method: str
+    figure: Figure
+    scene: str
     rate: str
     preset: str
-    sets: list[str]
-    dataset: str
-    scene: str
-    images: str
-    psnr: float | None
-    ssim: float | None
-    lpips: float | None
-    bytes: int | None
-    gaussians: int | None
-    steps: int
-    protocol: str
-    differs: list[str]
-    source: str
-    year: int
-    verified: bool
+
+    @property
+    def place(self) -> str:
+        """The scene as `sw run` takes it."""
+        return f"{self.figure.dataset}/{self.scene}" if self.figure.dataset else self.scene
 
     @property
     def name(self) -> str:
-        return f"{self.method} {self.rate} on {self.dataset}/{self.scene}"
+        return f"{self.figure.method} {self.rate} on {self.place}"
 
     def run(self, out: Path) -> Path:
         """Its run directory. Presets of a method must not share one."""
-        return out / self.preset / self.scene.replace(":", "-") / self.method / self.rate
+        return out / self.preset / self.scene.replace(":", "-") / self.figure.method / self.rate
 
     def command(self, out: Path, sets: Sequence[str]) -> list[str]:
-        words = ["run", "--method", self.method, "--rate", self.rate, "--preset", self.preset]
-        words += ["--scene", f"{self.dataset}/{self.scene}" if self.dataset else self.scene]
-        words += ["--out", str(out / self.preset), *(["--images", self.images] if self.images else [])]
-        return [*words, *(word for value in (*self.sets, *sets) for word in ("--set", value))]
+        words = ["run", "--method", self.figure.method, "--rate", self.rate, "--preset", self.preset]
+        words += ["--scene", self.place, "--out", str(out / self.preset)]
+        words += ["--images", self.figure.images] if self.figure.images else []
+        return [*words, *(word for value in (*self.figure.sets, *sets) for word in ("--set", value))]
 
 
 def read_rows(path: Path) -> list[Row]:
-    """The rows of a file. Raises SystemExit that names one whose fields are wrong."""
-    found = []
-    for number, values in enumerate(json.loads(path.read_text("utf-8"))["rows"], 1):
-        try:
-            found.append(Row(**values))
-        except TypeError as error:
-            raise SystemExit(f"{path}, row {number}: {error}") from None
-    return found
+    """The figures of a file that can be run: of one scene, with a rate point and a preset of ours."""
+    return [
+        Row(figure, figure.scene, figure.rate, figure.preset)
+        for figure in read_published(path)
+        if figure.scene is not None and figure.rate is not None and figure.preset is not None
+    ]
 
 
 def missing(row: Row, data: Path | None) -> str | None:
     """Tell why the scene of a row cannot be read; None: it is there. A row without a data set is made on the spot."""
-    if not row.dataset:
+    if not row.figure.dataset:
         return None
     if data is None:
-        return f"{row.dataset}/{row.scene}: SPLATWIZARD_DATA is not set"
-    folder = data / row.dataset / row.scene
+        return f"{row.place}: SPLATWIZARD_DATA is not set"
+    folder = data / row.figure.dataset / row.scene
     if folder.is_dir():
         return None
-    return f"{row.dataset}/{row.scene}: {folder} is not there (docs/datasets.md)"
+    return f"{row.place}: {folder} is not there (docs/datasets.md)"
 
 
 def measured(run: Path) -> dict[str, Any] | None:
@@ -122,14 +104,15 @@ def print_table(rows: Sequence[Row], out: Path, console: Console) -> None:
     notes = []
     for number, row in enumerate(rows, 1):
         found = measured(row.run(out))
-        cells = [
-            f"{_number(None if found is None else found[figure], figure)} / {_number(getattr(row, figure), figure)}"
-            for figure in FIGURES
-        ]
-        table.add_row(f"{number} {row.method} {row.rate} {row.scene}", *cells, "" if row.verified else "not re-read")
+        here = dict.fromkeys(FIGURES) if found is None else found
+        cells = [f"{_number(here[name], name)} / {_number(getattr(row.figure, name), name)}" for name in FIGURES]
+        table.add_row(
+            f"{number} {row.figure.method} {row.rate} {row.scene}", *cells, "" if row.figure.verified else "not re-read"
+        )
         by = "not measured yet" if found is None else f"here: {found['protocol']}, {found['views']} test views"
-        notes.append(f"{number} {row.year}, {row.source}; {row.steps:,} steps; {row.protocol}; {by}")
-        notes += [f"  differs: {what}" for what in row.differs]
+        of = row.figure
+        notes.append(f"{number} {of.year}, {of.source}; {_number(of.steps, 'steps')} steps; {of.protocol.text}; {by}")
+        notes += [f"  differs: {what}" for what in of.differs]
     console.print(table)
     for note in notes:
         console.print(note, markup=False, highlight=False)
@@ -142,7 +125,9 @@ def _number(value: float | None, figure: str) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="where the runs are kept")
-    parser.add_argument("--rows", type=Path, default=ROWS, help="file of rows (default: published.json beside this)")
+    parser.add_argument(
+        "--rows", type=Path, default=ROWS, help="file of rows (default: the published.json of sw-report)"
+    )
     parser.add_argument("--only", default="", help="rows whose name holds this text")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="for all runs, on top")
     parser.add_argument("--table", action="store_true", help="no runs, only the table of what is finished")

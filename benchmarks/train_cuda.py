@@ -2,11 +2,15 @@
 
     python benchmarks/train_cuda.py ../shared/data/mug ../shared/data/fox:images_2 ../shared/data/lego
 
+    python benchmarks/train_cuda.py DATA/room DATA/fox:images_2 --surfels 1000 --distortion 10 --iterations 5000
+
 A scene is FOLDER[:PICTURES]. Where gsplat cannot be imported, only ours is measured. Its trainer is train_gsplat.py
 beside this file, which says what SSIM and which opacity reset it has.
 
 One after the other, so that nothing shares the GPU. Iterations a second count the loop alone, densification included,
 as both trainers report it; PSNR is the mean over the held-out views, memory the peak of torch's allocator in the loop.
+
+--surfels STEP trains 2DGS: normal consistency to the expected depth, and distortion where it has a weight, after STEP.
 
 --profile trains ours once more and says, of windows of steps early, half-way and late: wall clock, the time in which
 the GPU had work, kernels launched, and what took longest on the device and on the host (torch.profiler slows the host
@@ -62,7 +66,7 @@ class Figures:
     def record(self, scene: str, args: argparse.Namespace) -> str:
         """A line of JSON with the fields of `Training` in tools/trainer_records.py."""
         values = {
-            "trainer": self.trainer, "scene": scene, "plan": "3dgs", "steps": args.iterations, "seed": args.seed,
+            "trainer": self.trainer, "scene": scene, "plan": plan_of(args), "steps": args.iterations, "seed": args.seed,
             "psnr": self.psnr, "gaussians": self.gaussians, "per_second": self.iterations_per_second,
             "peak_mib": self.peak_mib, "device": torch.cuda.get_device_name(),
             "date": datetime.now(timezone.utc).date().isoformat(), "note": self.note,
@@ -119,13 +123,22 @@ def _short(name: str) -> str:
     return name.replace("(anonymous namespace)::", "").replace("void ", "", 1)[:70]
 
 
-def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: Watch | None) -> Figures:
+def plan_of(args: argparse.Namespace) -> str:
+    """The method that both train."""
+    return "3dgs" if args.surfels is None else "2dgs"
+
+
+def ours(folder: str, pictures: str | None, args: argparse.Namespace, watch: Watch | None) -> Figures:
     """Figures of this trainer."""
     plugins = load_plugins()
-    sets: dict[str, Any] = {"iterations": iterations, "seed": seed, "device": "cuda"}
+    # As gsplat's trainer has them: steps by number, whatever the length of the plan.
+    sets: dict[str, Any] = {"iterations": args.iterations, "seed": args.seed, "device": "cuda"}
     if pictures is not None:
         sets["images"] = pictures
-    resolved = resolve(plugins.methods.load("3dgs"), "paper", sets=sets, scene=folder)
+    if args.surfels is not None:
+        after = {"surface.dist_after": args.surfels, "surface.normal_after": args.surfels, "surface.depth_ratio": 0.0}
+        sets |= {**after, "surface.lambda_dist": args.distortion, "surface.lambda_normal": 0.05}
+    resolved = resolve(plugins.methods.load(plan_of(args)), "paper", sets=sets, scene=folder)
     session = Session(plugins, torch.device("cuda"), lambda line: print(line, file=sys.stderr))
     session.load_kernels()
     scene = session.scene(resolved)
@@ -140,12 +153,14 @@ def ours(folder: str, pictures: str | None, iterations: int, seed: int, watch: W
         ppl,
         rasterizer,
         directory=None,
-        identity={"method": "3dgs"},
+        identity={"method": plan_of(args)},
         trained=_no_other,
         on_step=None if watch is None else lambda _, record: watch(record),
     ).train()
-    options = stages[-1].raster_options(iterations, scene.background.cuda())
-    options = replace(options, grad2d=False, absgrad=False)
+    options = stages[-1].raster_options(args.iterations, scene.background.cuda())
+    options = replace(
+        options, grad2d=False, absgrad=False, normals=False, distortion=False, alpha=False, depth=frozenset()
+    )
     result = evaluate(
         outcome.model, scene.test, rasterizer, plugins, device=session.device, options=options, metrics=["psnr"]
     )
@@ -158,12 +173,14 @@ def _no_other(name: str) -> Any:
     raise AssertionError(f"3dgs starts from no {name}")
 
 
-def theirs(folder: str, pictures: str | None, iterations: int, seed: int) -> Figures | str:
+def theirs(folder: str, pictures: str | None, args: argparse.Namespace) -> Figures | str:
     """Figures of gsplat's trainer in a process of its own, or why there are none."""
     if importlib.util.find_spec("gsplat") is None:
         return "it cannot be imported"
-    command = [sys.executable, str(Path(__file__).with_name("train_gsplat.py")), folder, "--seed", str(seed)]
-    command += ["--iterations", str(iterations), *(["--images", pictures] if pictures else [])]
+    command = [sys.executable, str(Path(__file__).with_name("train_gsplat.py")), folder, "--seed", str(args.seed)]
+    if args.surfels is not None:
+        command += ["--surfels", str(args.surfels), "--distortion", str(args.distortion)]
+    command += ["--iterations", str(args.iterations), *(["--images", pictures] if pictures else [])]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     lines = [line for line in done.stdout.splitlines() if line.startswith("RESULT ")]
     if done.returncode != 0 or not lines:
@@ -179,6 +196,8 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+", metavar="FOLDER[:PICTURES]")
     parser.add_argument("--iterations", type=int, default=7000)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--surfels", type=int, metavar="STEP", help="2DGS, losses of the surface after STEP")
+    parser.add_argument("--distortion", type=float, default=0.0, help="weight of its distortion (default: 0, no loss)")
     parser.add_argument("--records", type=Path, metavar="FILE", help="append a line of JSON a training")
     parser.add_argument("--profile", action="store_true", help="also where a step's time goes")
     args = parser.parse_args()
@@ -188,11 +207,11 @@ def main() -> None:
     ratios = []
     for asked in args.scenes:
         folder, _, pictures = asked.partition(":")
-        mine = ours(folder, pictures or None, args.iterations, args.seed, None)
+        mine = ours(folder, pictures or None, args, None)
         name = f"{Path(folder).name} {pictures}".strip()
         print(f"{name:16} {'it/s':>7} {'PSNR':>7} {'Gaussians':>10} {'peak MiB':>9}")
         print(_row("ours", mine))
-        other = theirs(folder, pictures or None, args.iterations, args.seed)
+        other = theirs(folder, pictures or None, args)
         if isinstance(other, str):
             print(f"  gsplat: not measured, {other}")
         else:
@@ -210,7 +229,7 @@ def main() -> None:
         if args.profile:
             last = args.iterations - 2 * WINDOW - 10
             watch = Watch(tuple(step for step in (1010, args.iterations // 2 + 10, last) if step > 0))
-            ours(folder, pictures or None, args.iterations, args.seed, watch)
+            ours(folder, pictures or None, args, watch)
             print("\n".join(watch.lines), flush=True)
     if ratios:
         print(f"iterations/s over gsplat's, geometric mean of {len(ratios)}: {statistics.geometric_mean(ratios):.2f}")

@@ -29,7 +29,7 @@ def offered(line: str, incomplete: str = "") -> list[str]:
     ("line", "incomplete", "wanted"),
     [
         ("", "ru", ["run"]),
-        ("", "comp", ["completion"]),
+        ("", "compl", ["completion"]),
         ("run", "--meth", ["--method"]),
         ("data", "syn", ["synth"]),
         ("run --method", "3", ["3dgs"]),

@@ -36,6 +36,7 @@ ROOMS = {
     "method": {"training", "coding", "gaussians", "scene", "plugins"},
     "runs": {"method", *BELOW_RUNS},
     "cli": {"runs", "method", *BELOW_RUNS},
+    "steps": {"cli", "runs", "training", "api", "tooling"},
     "builtin": {"plugins"},
     "__main__": {"cli"},
     # The faces import what they lend when somebody asks for it.

@@ -34,13 +34,15 @@ def script(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 @pytest.fixture
 def start(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys):
     """Run the command on three fake rows; returns the commands given to `sw` and what was printed."""
-    real = script.read_rows(script.ROWS)[0]
+    content = json.loads(script.ROWS.read_text("utf-8"))
+    real = next(f for f in content["figures"] if (f["method"], f["scene"], f["rate"]) == ("hac", "lego", "r1"))
     rows = [
-        {**vars(real), "method": "3dgs", "rate": "r6", "scene": "demo:tiny", "dataset": "", "sets": [], "differs": []},
-        {**vars(real), "scene": "absent", "dataset": "nowhere", "verified": False},
+        {**real, "method": "3dgs", "rate": "r6", "scene": "demo:tiny", "dataset": "", "sets": [], "differs": []},
+        {**real, "scene": "absent", "dataset": "nowhere", "verified": False},
+        {**real, "scene": None},
     ]
     path = tmp_path / "rows.json"
-    path.write_text(json.dumps({"rows": rows}))
+    path.write_text(json.dumps({**content, "figures": rows}))
 
     def started(*arguments: str) -> tuple[list[list[str]], str]:
         given = []
@@ -86,18 +88,9 @@ def test_without_data_nothing_runs_but_what_needs_none(start, monkeypatch):
 
 def test_the_rows_can_be_run_and_say_where_they_come_from(script):
     rows, plugins = script.read_rows(script.ROWS), load_plugins()
-    assert len({(r.name, r.preset) for r in rows}) == len(rows)
+    assert len({(r.name, r.preset) for r in rows}) == len(rows) >= 50
     for row in rows:
-        resolve(plugins.methods.load(row.method), row.preset, row.rate, sets=parse_set(row.sets), scene="demo:tiny")
-        assert row.source
-        assert row.protocol
-        assert 2020 < row.year < 2030
-        assert row.psnr is not None
-    assert any(not row.verified for row in rows)
-
-
-def test_a_row_with_a_wrong_field_is_named(script, tmp_path):
-    path = tmp_path / "rows.json"
-    path.write_text(json.dumps({"rows": [{"method": "3dgs", "psnrr": 3}]}))
-    with pytest.raises(SystemExit, match=r"row 1.*psnrr"):
-        script.read_rows(path)
+        of = row.figure
+        resolve(plugins.methods.load(of.method), row.preset, row.rate, sets=parse_set(of.sets), scene="demo:tiny")
+        assert of.psnr is not None
+    assert any(not row.figure.verified for row in rows)

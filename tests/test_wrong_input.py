@@ -265,6 +265,9 @@ ROWS = [
     Row("report {bad-record}", "metrics.json"),
     Row("report {bad-record} --html {folder}", "{folder} is a folder"),
     Row("report {hollow} --anchor nobody", "hollow"),
+    Row("compare", "Missing argument"),
+    Row("compare {run}", "--published"),
+    Row("compare {hollow} --published", "hollow"),
     # Data sets.
     Row("data list mipnerf306", "mipnerf360", env={"SPLATWIZARD_DATA": "{data}"}),
     Row("data verify nerf_synthetic/lgeo", "has no scene 'lgeo'"),

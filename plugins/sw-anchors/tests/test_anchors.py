@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from sw_anchors import growth
 from sw_anchors.anchors import AnchorAttributes, AnchorModel, AnchorSelection
 from sw_anchors.growth import _unique_cells, accumulate_anchor_statistics, adjust_anchors
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -247,6 +248,22 @@ def test_finer_levels_need_higher_gradients_and_a_coarse_success():
             torch.testing.assert_close(model.log_scales[fine][0, :3].detach(), torch.full((3,), math.log(0.1)))
     # Level 0 lets the coarse one pass in half of the cases, level 2 the fine one in seven of eight.
     assert 3 <= found <= 16
+
+
+@pytest.mark.parametrize(("subvoxel", "expected"), [(False, [0.4, 0.1]), (True, [0.4, 0.1, 0.025])])
+def test_levels_of_no_whole_voxels_grow_nothing(subvoxel, expected, monkeypatch):
+    """NeRF Synthetic has a factor of 4: 4 // 16 = 0 at level 2, as in the authors' code."""
+    free_cells, sizes = growth._free_cells, []
+
+    def noted(points, features, anchors, size):
+        sizes.append(size)
+        return free_cells(points, features, anchors, size)
+
+    monkeypatch.setattr(growth, "_free_cells", noted)
+    model = growing_model()
+    model.offset_grad_accum.fill_(41 * 9e-3)
+    adjust_anchors(model, optimizer_of(model), step=100, generator=always(), init_factor=4, subvoxel=subvoxel)
+    assert sizes == pytest.approx(expected)
 
 
 def test_offsets_that_were_hardly_drawn_do_not_grow():

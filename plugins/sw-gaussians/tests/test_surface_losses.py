@@ -4,7 +4,14 @@ import math
 
 import pytest
 import torch
-from sw_gaussians.surface_losses import distortion_loss, maps_for, normal_disagreement
+from sw_gaussians.native import GAUSSIANS
+from sw_gaussians.surface_losses import (
+    add_surface_losses,
+    distortion_loss,
+    identity_before_terms,
+    maps_for,
+    normal_disagreement,
+)
 from sw_gaussians.surfels import SurfelModel
 
 from splatwizard_core.errors import ConfigError
@@ -13,6 +20,7 @@ from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions, RenderResult
 from splatwizard_core.scene.camera import Camera
+from splatwizard_core.training.losses import LossPack
 
 BOTH = maps_for(distortion=True, normals=True, depth_ratio=0.5)
 
@@ -90,17 +98,88 @@ def test_the_factor_of_opacity_has_no_gradient_and_pixels_of_nothing_cost_one():
     assert torch.equal(normal_disagreement(empty, camera(), 1.0), torch.ones(1, 12, 16))
 
 
-def test_the_gradient_of_the_normal_loss_is_that_of_finite_differences():
+@pytest.mark.parametrize("opacity", [0.1, 0.9])
+def test_covering_an_empty_background_pays_by_the_code_and_not_by_the_paper(rasterizer, opacity):
+    model = planes([2.0], [opacity], tilt=20.0)
+    slopes = {}
+    for term in ("code", "paper"):
+        model.zero_grad()
+        result = rasterizer.render(model.gaussians(camera(), rasterizer), camera(), RasterOptions(**BOTH))
+        found = normal_disagreement(result, camera(), 0.5, term)
+        found.mean().backward()
+        slopes[term] = float(model.opacity_logits.grad)
+    assert slopes["code"] < -0.003
+    assert abs(slopes["paper"]) < 1e-6
+    assert float(found.detach().abs().max()) < 1e-5
+    empty = by_hand(torch.zeros(1, 12, 16), torch.zeros(1, 12, 16), torch.zeros(3, 12, 16))
+    assert torch.equal(normal_disagreement(empty, camera(), 1.0, "paper"), torch.zeros(1, 12, 16))
+
+
+def test_the_papers_term_is_the_sum_over_surfels_of_what_each_lacks():
+    alpha, depth = torch.full((1, 12, 16), 0.8), torch.full((1, 12, 16), 2.0)
+    # 0.5 of a surfel that faces the camera, 0.3 of one turned by 60 degrees: 0.5 (1 - 1) + 0.3 (1 - 0.5)
+    normals = 0.5 * torch.tensor([0.0, 0.0, -1.0]) + 0.3 * torch.tensor([math.sin(math.pi / 3), 0.0, -0.5])
+    found = normal_disagreement(by_hand(alpha, depth, normals[:, None, None].repeat(1, 12, 16)), camera(), 1.0, "paper")
+    assert torch.allclose(found[:, 1:-1, 1:-1], torch.tensor(0.15))
+    assert not found[:, 0].any()  # the border has no normal
+
+
+@pytest.mark.parametrize("term", ["code", "paper"])
+def test_the_gradient_of_the_normal_loss_is_that_of_finite_differences(term):
     generator = torch.Generator().manual_seed(1)
     small = Camera(6, 5, 7.0, 7.0, 3.0, 2.5, torch.eye(3).double(), torch.zeros(3).double())
-    alpha = torch.rand(1, 5, 6, generator=generator, dtype=torch.float64)
+    alpha = torch.rand(1, 5, 6, generator=generator, dtype=torch.float64).requires_grad_(term == "paper")
     depth = (2 + torch.rand(1, 5, 6, generator=generator, dtype=torch.float64)).requires_grad_()
     normals = torch.randn(3, 5, 6, generator=generator, dtype=torch.float64).requires_grad_()
 
-    def loss(depth: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
-        return normal_disagreement(by_hand(alpha, depth, normals), small, 1.0).mean()
+    def loss(alpha: torch.Tensor, depth: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
+        return normal_disagreement(by_hand(alpha, depth, normals), small, 1.0, term).mean()
 
-    assert torch.autograd.gradcheck(loss, (depth, normals), atol=1e-6)
+    assert torch.autograd.gradcheck(loss, (alpha, depth, normals), atol=1e-6)
+
+
+def test_weighted_terms_are_added_and_named_without_their_weight(rasterizer):
+    result = drawn(planes([2.0, 3.0], [0.6, 0.99]), rasterizer)
+    before = LossPack(torch.tensor(1.0), {"l1": torch.tensor(1.0)})
+    distortion, disagreement = distortion_loss(result), normal_disagreement(result, camera(), 0.5)
+    mask = torch.zeros(1, 12, 16)
+    mask[:, 3, 5] = 1
+    found = add_surface_losses(before, result, camera(), 0.5, distortion=100.0, normals=0.5, mask=mask)
+    assert set(found.parts) == {"l1", "distortion", "normals"}
+    assert float(found.parts["normals"]) == pytest.approx(float(disagreement[0, 3, 5]) / (12 * 16))
+    assert float(found.total) == pytest.approx(1 + 100 * float(distortion) + 0.5 * float(found.parts["normals"]))
+    assert add_surface_losses(before, result, camera(), 0.5).parts.keys() == {"l1"}
+
+
+def test_the_key_of_the_term_changes_no_identity_where_it_says_what_was_done_before():
+    content = {"surface": {"normal_term": "code", "lambda_normal": 0.05}}
+    assert identity_before_terms(content) == {"surface": {"lambda_normal": 0.05}}
+    content = {"surface": {"normal_term": "paper"}}
+    assert identity_before_terms(content) == content
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("term", ["code", "paper"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 7), (3, 3), (37, 65)])
+def test_the_kernel_gives_the_disagreement_and_the_gradients_of_torch(size, term):
+    assert GAUSSIANS.has_cuda(), "built without CUDA"
+    height, width = size
+    generator = torch.Generator().manual_seed(2)
+    lens = Camera(width, height, 40.0, 35.0, width / 2 + 0.3, height / 2, torch.eye(3), torch.zeros(3))
+    depth = 2 + torch.rand(1, height, width, generator=generator)
+    depth[torch.rand(1, height, width, generator=generator) < 0.2] = 0  # no surface
+    alpha = torch.rand(1, height, width, generator=generator)
+    normals = torch.randn(3, height, width, generator=generator)
+    weights = torch.randn(1, height, width, generator=generator)
+    found = []
+    for device, dtype in (("cpu", torch.float64), ("cuda", torch.float32)):
+        z, n = (t.to(device, dtype).requires_grad_() for t in (depth, normals))
+        value = normal_disagreement(by_hand(alpha.to(device, dtype), z, n), lens, 1.0, term)
+        (value * weights.to(device, dtype)).sum().backward()
+        found.append([t.detach().cpu().double() for t in (value, z.grad, n.grad)])
+    for exact, measured in zip(*found, strict=True):
+        assert torch.allclose(measured, exact, rtol=1e-3, atol=1e-4 * float(exact.abs().max()))
 
 
 def test_only_what_a_loss_reads_is_drawn():

@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.float_mode import this_machine
+from sw_anchors.grid_predictors import PREDICTORS
 from sw_anchors.sections import morton_order
 from sw_anchors.shape import GROUPS
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -26,7 +27,6 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
 from sw_hac import codec
 from sw_hac.method import HAC
-from sw_hac.predictors import PREDICTORS
 
 RASTERIZER = ReferenceRasterizer()
 SECTIONS = ["anchors", "masks", "grids", "networks", "features", "scalings", "offsets"]
@@ -379,7 +379,10 @@ def test_a_wide_grid_is_looked_up_a_few_anchors_at_a_time(mode, monkeypatch):
     whole = predictor(model, mode)(model.codes())
     grid = Lookups(model.grid)
     limit = 20 * grid.corners
-    for where, name in (("sw_anchors.attribute_sections", "EXACT_NUMBERS"), ("sw_hac.predictors", "FLOAT_NUMBERS")):
+    for where, name in (
+        ("sw_anchors.attribute_sections", "EXACT_NUMBERS"),
+        ("sw_anchors.grid_predictors", "FLOAT_NUMBERS"),
+    ):
         monkeypatch.setattr(f"{where}.{name}", limit)
     found = PREDICTORS[mode](grid, model.mlp_grid, model.shape, model.base_steps)(model.codes())
     assert 0 < max(grid.numbers) <= limit

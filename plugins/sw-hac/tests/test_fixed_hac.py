@@ -30,7 +30,7 @@ def test_fixed_sizes_change_neither_values_nor_gradients():
 
 
 def test_places_that_are_worked_out_anew_are_the_same(monkeypatch):
-    monkeypatch.setattr("sw_hac.model.PLACES_LIMIT", 0)
+    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 0)
     check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(90,), phases=(ENTROPY,))
 
 

@@ -12,7 +12,7 @@ from sw_reference.testing.raster_scenes import front_camera
 from splatwizard_core.errors import SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_hac.stage import HACStage
+from sw_hac.method import HACStage
 
 RASTERIZER = ReferenceRasterizer()
 
@@ -145,7 +145,7 @@ def test_the_state_of_grid_and_network_is_part_of_the_digest():
 @pytest.mark.parametrize("in_steps", [True, False])
 @pytest.mark.parametrize("kept", [True, False])
 def test_what_training_forecasts_for_a_sample_is_what_is_predicted(in_steps, kept, monkeypatch):
-    monkeypatch.setattr("sw_hac.model.PLACES_LIMIT", 1 << 30 if kept else 0)
+    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
     model = make(in_steps=in_steps)
     rows, drawn = torch.tensor([7, 3, 250, 20]), torch.tensor([3, 1])
     parameters = [*model.mlp_grid.parameters(), *model.grid.parameters()]

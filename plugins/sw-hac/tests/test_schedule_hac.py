@@ -9,8 +9,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.tasks import TaskContext
 from sw_hac.config import HACConfig
-from sw_hac.method import HAC
-from sw_hac.stage import HACStage
+from sw_hac.method import HAC, HACStage
 
 PAPER = """\
 Pre   | update lr                    | range(30000)

@@ -11,24 +11,20 @@ from sw_reference.testing.raster_scenes import RasterCase, draw_scene
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from splatwizard_core.api import SH, RasterOptions
-from sw_rasterizers import shared_colors as module
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
 from sw_rasterizers.segments import Segments
 from sw_rasterizers.shared_colors import shared_colors
 from sw_rasterizers.variants import IndexedRasterizer
 
 needs_kernels = pytest.mark.skipif(MODULE.available() is not None, reason=str(MODULE.available()))
-WAYS = [pytest.param("kernel", marks=needs_kernels), "blocks"]
+ON_CPU = pytest.param("cpu", marks=needs_kernels)
+DEVICES = [
+    ON_CPU,
+    pytest.param("cuda", marks=[
+        pytest.mark.cuda, pytest.mark.skipif(unavailable_on_cuda() is not None, reason=str(unavailable_on_cuda()))
+    ]),
+]  # fmt: skip
 N, M = 500, 9
-
-
-@pytest.fixture
-def shade(request, monkeypatch):
-    """The kernel of the CPU, or on the CPU too what other devices do, in blocks of 64."""
-    if request.param == "blocks":
-        monkeypatch.setattr(module, "BLOCK", 64)
-        monkeypatch.setattr(module, "_OnCpu", module._InBlocks)
-    return shared_colors
 
 
 def inputs(degree, *, stored=None, with_dc=False, dtype=torch.float64, n=N):
@@ -44,7 +40,16 @@ def inputs(degree, *, stored=None, with_dc=False, dtype=torch.float64, n=N):
     return leaves, SH(codebook=book, dc=dc, indices=indices, active_degree=degree), means, center
 
 
-@pytest.mark.parametrize("shade", WAYS, indirect=True)
+def on(device, leaves, sh, means, center):
+    """The same on another device, in float32 where that is a GPU."""
+    if device == "cpu":
+        return leaves, sh, means, center
+    book, means, *dc = [x.detach().to(device, torch.float32).requires_grad_(True) for x in leaves]
+    moved = SH(codebook=book, dc=dc[0] if dc else None, indices=sh.indices.to(device), active_degree=sh.active_degree)
+    return [book, means, *dc], moved, means, center.to(device, torch.float32)
+
+
+@pytest.mark.parametrize("device", DEVICES)
 @pytest.mark.parametrize(
     ("degree", "stored", "with_dc"),
     [
@@ -53,25 +58,31 @@ def inputs(degree, *, stored=None, with_dc=False, dtype=torch.float64, n=N):
         (2, 2, False),
         (3, 3, False),
         (1, 3, False),
+        (0, 1, True),
         (1, 1, True),
         (2, 3, True),
         (3, 3, True),
     ],
 )
 @pytest.mark.parametrize("clamp", [True, False])
-def test_values_and_gradients_are_those_of_gathered_coefficients(shade, degree, stored, with_dc, clamp):
+def test_values_and_gradients_are_those_of_gathered_coefficients(device, degree, stored, with_dc, clamp):
     leaves, sh, means, center = inputs(degree, stored=stored, with_dc=with_dc)
     weights = torch.randn(N, 3, generator=torch.Generator().manual_seed(9), dtype=torch.float64)
     expected = sh_colors(sh, center, means, clamp=clamp)
-    found = shade(sh, Segments(sh.indices, M), means, center, clamp=clamp)
-    torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
-    assert bool((expected == 0).any()) == clamp  # the clamp acts
     wanted = torch.autograd.grad((expected * weights).sum(), leaves, allow_unused=True)
-    gradients = torch.autograd.grad((found * weights).sum(), leaves)
+    own_leaves, own_sh, own_means, own_center = on(device, leaves, sh, means, center)
+    found = shared_colors(own_sh, Segments(own_sh.indices, M), own_means, own_center, clamp=clamp)
+    atol = 1e-12 if device == "cpu" else 1e-4
+    torch.testing.assert_close(found.double().cpu(), expected, rtol=atol, atol=atol)
+    assert bool((expected == 0).any()) == clamp  # the clamp acts
+    gradients = torch.autograd.grad((found * weights.to(found)).sum(), own_leaves)
     for gradient, right in zip(gradients, wanted, strict=True):
-        torch.testing.assert_close(
-            gradient, torch.zeros_like(gradient) if right is None else right, rtol=1e-10, atol=1e-12
-        )
+        own = gradient.double().cpu()
+        aim = torch.zeros_like(own) if right is None else right
+        if device == "cpu":
+            torch.testing.assert_close(own, aim, rtol=1e-10, atol=1e-12)
+        else:  # relative: a colour that is nearly 0 may be clamped on one device alone
+            assert float((own - aim).norm()) <= 1e-3 * float(aim.norm())
     assert not gradients[0][4].any()
 
 
@@ -92,23 +103,23 @@ def test_the_kernel_in_float32_agrees_and_repeats_to_the_bit_with_any_number_of_
         assert all(torch.equal(a, b) for a, b in zip(results[0], other, strict=True))
 
 
-@pytest.mark.parametrize("shade", WAYS, indirect=True)
-def test_a_mean_in_the_camera_that_nobody_sees_spoils_no_gradient(shade):
-    leaves, sh, means, center = inputs(2)
+@pytest.mark.parametrize("device", DEVICES)
+def test_a_mean_in_the_camera_that_nobody_sees_spoils_no_gradient(device):
+    leaves, sh, means, center = on(device, *inputs(2))
     with torch.no_grad():
         means[7] = center
-    colors = shade(sh, Segments(sh.indices, M), means, center, clamp=True)
-    seen = torch.ones(N, 1, dtype=torch.float64)
+    colors = shared_colors(sh, Segments(sh.indices, M), means, center, clamp=True)
+    seen = torch.ones(N, 1).to(colors)
     seen[7] = 0
     gradients = torch.autograd.grad(colors, leaves, seen.expand(N, 3).contiguous())
     assert all(bool(torch.isfinite(each).all()) for each in gradients)
     assert not gradients[1][7].any()
 
 
-@pytest.mark.parametrize("shade", WAYS, indirect=True)
-def test_no_gaussians_and_no_gradient(shade):
-    leaves, sh, means, center = inputs(3, n=0)
-    found = shade(sh, Segments(sh.indices, M), means, center, clamp=True)
+@pytest.mark.parametrize("device", DEVICES)
+def test_no_gaussians_and_no_gradient(device):
+    leaves, sh, means, center = on(device, *inputs(3, n=0))
+    found = shared_colors(sh, Segments(sh.indices, M), means, center, clamp=True)
     assert found.shape == (0, 3)
     assert not torch.autograd.grad(found.sum(), leaves)[0].any()
 
@@ -143,17 +154,21 @@ def test_a_render_and_its_gradient_make_no_coefficients_of_each_gaussian():
 
 @pytest.mark.cuda
 @pytest.mark.skipif(unavailable_on_cuda() is not None, reason=str(unavailable_on_cuda()))
-def test_blocks_on_cuda_repeat_to_the_bit_and_agree_with_the_cpu(monkeypatch):
-    monkeypatch.setattr(module, "BLOCK", 4096)
-    leaves, sh, means, center = inputs(3, dtype=torch.float32, n=20_000)
-    here = shared_colors(sh, Segments(sh.indices, M), means, center, clamp=True)
+@pytest.mark.parametrize("rows", [1, M, 5000])
+def test_the_kernels_on_cuda_repeat_to_the_bit_and_agree_with_the_cpu(rows):
+    """Entries with all users, with many runs of users, with a few of one run."""
+    leaves, sh, means, center = inputs(3, dtype=torch.float32, n=20_011)
+    g = torch.Generator().manual_seed(rows)
+    book = torch.randn(rows, 16, 3, generator=g).requires_grad_(True)
+    sh = SH(codebook=book, indices=torch.randint(rows, (len(means),), generator=g), active_degree=3)
+    leaves[0] = book
+    here = shared_colors(sh, Segments(sh.indices, rows), means, center, clamp=True)
     wanted = [here, *torch.autograd.grad(here.square().sum(), leaves)]
-    there = [each.detach().cuda().requires_grad_(True) for each in leaves]
-    on_gpu = SH(codebook=there[0], indices=sh.indices.cuda(), active_degree=3)
+    there, on_gpu, its_means, its_center = on("cuda", leaves, sh, means, center)
     runs = []
     for _ in range(2):
-        colors = shared_colors(on_gpu, Segments(on_gpu.indices, M), there[1], center.cuda(), clamp=True)
+        colors = shared_colors(on_gpu, Segments(on_gpu.indices, rows), its_means, its_center, clamp=True)
         runs.append([colors, *torch.autograd.grad(colors.square().sum(), there)])
     for a, b, right in zip(*runs, wanted, strict=True):
         assert torch.equal(a, b)
-        torch.testing.assert_close(a.cpu(), right, rtol=1e-3, atol=1e-2)
+        assert float((a.cpu() - right).norm()) <= 1e-3 * float(right.norm())

@@ -14,7 +14,7 @@ from sw_reference.testing.rasterizer_checks import checks_for
 from splatwizard_core.api import SH, CapabilityError, Feature, RasterOptions, ShapeError
 from splatwizard_core.tooling import NegotiatedRasterizer, load_plugins
 from sw_rasterizers.native import MODULE, unavailable_on_cuda
-from sw_rasterizers.segments import Segments, Tables
+from sw_rasterizers.segments import Tables
 from sw_rasterizers.variants import AccelRasterizer, DepthRasterizer, IndexedRasterizer
 
 needs_kernels = pytest.mark.skipif(MODULE.available() is not None, reason=str(MODULE.available()))
@@ -101,45 +101,111 @@ def test_the_sensitivity_pass_adds_up_magnitudes_per_view(device):
         assert float(expected.norm()) > 0
 
 
-@pytest.mark.parametrize(
-    "device", ["cpu", pytest.param("cuda", marks=[pytest.mark.cuda, DEVICES[1].marks[1]])]
-)  # fmt: skip
-def test_sums_over_equal_indices_are_those_of_a_loop_and_repeat_to_the_bit(device):
-    generator = torch.Generator().manual_seed(2)
-    indices = torch.randint(0, 7, (5000,), generator=generator)
-    indices[indices == 3] = 4  # one row that nobody asks for
-    values = torch.randn(5000, 4, 3, generator=generator)
-    expected = torch.zeros(7, 4, 3, dtype=torch.float64)
-    for i, row in enumerate(indices.tolist()):
-        expected[row] += values[i].double()
-    segments = Segments(indices.to(device), 7)
-    sums = [segments.sum(values.to(device)).cpu() for _ in range(3)]
-    torch.testing.assert_close(sums[0].double(), expected, rtol=1e-5, atol=1e-3)  # float32 sums of 800 values
-    assert torch.equal(sums[0], sums[1])
-    assert torch.equal(sums[0], sums[2])
-    assert not sums[0][3].any()
+def shared(n=6000, rows=7, **changed):
+    """Gaussians whose shapes are rows of a table, with leaves that want gradients."""
+    g, cam = draw_scene(RasterCase("shared", n=n, width=40, height=30, geometry="scales"), 3, torch.float32)
+    index = torch.randint(rows, (n,), generator=torch.Generator().manual_seed(2))
+    index[index == 3] = 4  # a row that nobody asks for
+    g.scales, g.quats, g.geom_indices = g.scales[:rows].clone(), g.quats[:rows].clone(), index
+    g.scale_factors = torch.linspace(0.5, 2, n)
+    g = replace(g, **changed)
+    for leaf in (g.scales, g.quats, g.scale_factors):
+        if leaf is not None:
+            leaf.requires_grad_(True)
+    return g, cam
+
+
+@needs_kernels
+@pytest.mark.parametrize("rows", [7, 1500, 6000])
+def test_sums_over_shared_shapes_repeat_to_the_bit_with_any_number_of_threads(rows):
+    g, cam = shared(rows=rows)
+    runs, threads = [], torch.get_num_threads()
+    for count in (1, 2, 3, 1):
+        torch.set_num_threads(count)
+        image = IndexedRasterizer().render(g, cam, RasterOptions()).image
+        runs.append(torch.autograd.grad(image.square().sum(), [g.scales, g.quats, g.scale_factors]))
+    torch.set_num_threads(threads)
+    for other in runs[1:]:
+        assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
+    assert not runs[0][0][3].any()
+    assert runs[0][0].any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("without", [None, "scale_factors", "geom_indices"])
+def test_values_and_gradients_are_those_of_gathered_inputs(device, without):
+    g, cam = shared(n=600, rows=600 if without == "geom_indices" else 7, **({without: None} if without else {}))
+    g = cast_inputs(g, torch.float32, device)
+    leaves = [x.requires_grad_(True) for x in (g.scales, g.quats, g.scale_factors, g.means) if x is not None]
+    found, wanted = (
+        IndexedRasterizer().render(each, cam.to(device), RasterOptions()).image for each in (g, g.gathered())
+    )
+    torch.testing.assert_close(found, wanted, rtol=0, atol=1e-4)  # the product with a factor may be rounded otherwise
+    weights = torch.randn(found.shape, generator=torch.Generator().manual_seed(1)).to(device)
+    gradients = [torch.autograd.grad((image * weights).sum(), leaves) for image in (found, wanted)]
+    for one, right in zip(*gradients, strict=True):
+        assert float((one - right).norm() / right.norm()) <= 1e-3
+
+
+@needs_kernels
+def test_shapes_are_never_gathered(monkeypatch):
+    g, cam = shared()
+    monkeypatch.setattr(type(g), "gathered", None)
+    image = IndexedRasterizer().render(g, cam, RasterOptions()).image
+    assert torch.autograd.grad(image.sum(), g.scales)[0].shape == (7, 3)
+
+
+@needs_kernels
+def test_only_the_factors_may_want_a_gradient():
+    g, cam = shared()
+    image = IndexedRasterizer().render(g, cam, RasterOptions()).image
+    (both,) = torch.autograd.grad(image.sum(), g.scale_factors, retain_graph=True)
+    g.scales, g.quats = g.scales.detach(), g.quats.detach()
+    image = IndexedRasterizer().render(g, cam, RasterOptions()).image
+    (alone,) = torch.autograd.grad(image.sum(), g.scale_factors)
+    assert torch.equal(alone, both)
+    assert alone.any()
+
+
+@needs_kernels
+def test_no_user_leaves_a_gradient_of_zeros():
+    g, cam = shared(n=0, geom_indices=torch.zeros(0, dtype=torch.int64), scales=torch.ones(3, 3),
+                    quats=torch.ones(3, 4))  # fmt: skip
+    image = IndexedRasterizer().render(g, cam, RasterOptions()).image
+    gradients = torch.autograd.grad(image.sum(), [g.scales, g.quats])
+    assert [list(x.shape) for x in gradients] == [[3, 3], [3, 4]]
+    assert not any(bool(x.any()) for x in gradients)
+
+
+@needs_kernels
+def test_an_index_outside_the_table_is_refused_by_number_also_when_it_is_changed_later():
+    g, cam = shared(n=20)
+    rasterizer = IndexedRasterizer()
+    rasterizer.render(g, cam, RasterOptions())
+    g.geom_indices[5] = 7
+    for act in (
+        lambda: rasterizer.render(g, cam, RasterOptions()),
+        lambda: rasterizer.visible_filter(g, cam),
+    ):
+        with pytest.raises(ShapeError, match="to 7, the codebook has 7 rows"):
+            act()
+    g.geom_indices[5] = -1
+    with pytest.raises(ShapeError, match="from -1 to"):
+        rasterizer.render(g, cam, RasterOptions())
 
 
 def test_changed_indices_are_sorted_again():
-    table = torch.arange(3.0)[:, None].requires_grad_()
-    indices, lookup = torch.tensor([0, 0, 1]), Tables().lookup
-    lookup(table, indices).sum().backward()
-    assert table.grad.flatten().tolist() == [2, 1, 0]
-    table.grad = None
+    tables, indices = Tables(), torch.tensor([0, 0, 1])
+    assert tables.segments(indices, 3).offsets.tolist() == [0, 2, 3, 3]
+    assert tables.segments(indices, 3) is tables.segments(indices, 3)
     indices[0] = 2
-    lookup(table, indices).sum().backward()
-    assert table.grad.flatten().tolist() == [1, 1, 1]
+    assert tables.segments(indices, 3).order.tolist() == [1, 2, 0]
+    assert tables.segments(indices, 3).offsets.tolist() == [0, 1, 2, 3]
 
 
-def test_no_user_leaves_a_gradient_of_zeros():
-    table = torch.ones(3, 2, requires_grad=True)
-    Tables().lookup(table, torch.zeros(0, dtype=torch.int64)).sum().backward()
-    assert torch.equal(table.grad, torch.zeros(3, 2))
-
-
-def test_an_index_outside_the_codebook_is_refused_by_number():
-    with pytest.raises(ShapeError, match="from -1 to 4, the codebook has 4 rows"):
-        Tables().lookup(torch.zeros(4, 2), torch.tensor([0, 4, -1]))
+def test_indices_of_another_type_are_refused():
+    with pytest.raises(ShapeError, match=r"must be int64, got torch\.int32"):
+        Tables().segments(torch.zeros(2, dtype=torch.int32), 1)
 
 
 @needs_kernels

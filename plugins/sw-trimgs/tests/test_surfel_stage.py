@@ -12,13 +12,14 @@ from splatwizard_core.errors import BitstreamError, ConfigError, EmptyModel, Use
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
+from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers
 from sw_trimgs.normals import smooth_pixels
-from sw_trimgs.surfel_config import Trim2DGSConfig
+from sw_trimgs.surfel_config import SurfaceTuning, Trim2DGSConfig
 from sw_trimgs.surfel_method import Trim2DGS, Trim2DGSScratch
-from sw_trimgs.surfel_stage import smooth_disagreement, within_masks
+from sw_trimgs.surfel_stage import smooth_surface, within_masks
 
 SHORT = {
     "iterations": 10, "densify.interval": 2, "densify.stop": 10, "densify.reset_interval": 0, "trim.interval": 4,
@@ -126,17 +127,20 @@ def test_both_losses_are_on_from_the_first_step(train):
 
 
 def test_the_normal_term_is_that_of_2dgs_away_from_edges(start, toy, rasterizer):
-    from sw_gaussians.surface_losses import maps_for, normal_disagreement
+    from sw_gaussians.surface_losses import add_surface_losses, maps_for, normal_disagreement
 
     camera = toy.scene.train[0].camera
     options = RasterOptions(**maps_for(distortion=False, normals=True, depth_ratio=0.0))
     with torch.no_grad():
         drawn = rasterizer.render(start.gaussians(camera, rasterizer), camera, options)
     whole = normal_disagreement(drawn, camera, 0.0)
-    assert float(smooth_disagreement(drawn, camera, 0.0, 0.0, 1)) == pytest.approx(float(whole.mean()))
-    mask = smooth_pixels(drawn.depth["expected"], 0.5, 1)
+    assert torch.equal(smooth_surface(drawn, 0.0, SurfaceTuning(edge_threshold=0.0)), torch.ones_like(whole))
+    mask = smooth_surface(drawn, 0.0, SurfaceTuning(edge_threshold=0.5, erosion=1))
+    assert torch.equal(mask, smooth_pixels(drawn.depth["expected"], 0.5, 1))
     assert 0 < float(mask.mean()) < 1
-    assert float(smooth_disagreement(drawn, camera, 0.0, 0.5, 1)) == pytest.approx(float((mask * whole).mean()))
+    pack = add_surface_losses(LossPack(torch.tensor(2.0), {}), drawn, camera, 0.0, normals=0.5, mask=mask)
+    assert float(pack.parts["normals"]) == pytest.approx(float((mask * whole).mean()))
+    assert float(pack.total) == pytest.approx(2 + 0.5 * float((mask * whole).mean()))
 
 
 def test_surfels_are_trimmed_and_split(train):
@@ -232,3 +236,9 @@ def test_from_scratch_it_trains_and_trims(plugins, toy, rasterizer):
     assert ["normals" in each for each in parts] == [False] * 4 + [True] * 4
     assert {"scale_split", "trimmed", "cloned"} <= seen
     assert model.surface == Surface(0.0, 100.0, 0.05)
+
+
+def test_configurations_from_before_the_normal_term_keep_their_identity(plugins):
+    for cls in (Trim2DGS, Trim2DGSScratch):
+        assert "normal_term" not in preset(plugins, cls, "paper").config.identity()["surface"]
+        assert preset(plugins, cls, "quick").config.identity()["surface"]["normal_term"] == "paper"

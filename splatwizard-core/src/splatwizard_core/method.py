@@ -27,6 +27,7 @@ class Method:
     version         of its file layout: a decoder refuses other versions than it knows
     Config          its hyper-parameters
     PRESETS         preset name -> values by dotted key; "paper" (the defaults) and "quick" always exist
+    BY_DATASET      family of data sets -> values that preset "paper" has for its scenes, keys of the scene included
     RATES           rate point name -> values by dotted key, r1 the smallest file
     DEFAULT_RATE    the rate point that `--rate default` means
     """
@@ -35,6 +36,7 @@ class Method:
     version: ClassVar[int] = 1
     Config: ClassVar[type[OptimizationParams]] = OptimizationParams
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {}, "quick": {}}
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = {"r1": {}}
     DEFAULT_RATE: ClassVar[str] = "r1"
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from splatwizard_native import lend
 
 MODULES = {
-    "plugins.manager": "load_plugins",
+    "plugins.manager": "PluginManager load_plugins",
     "plugins.check": "Check State",
     "plugins.kernels": "declared_modules",
     "plugins.registry": "Entry",
@@ -17,24 +17,27 @@ MODULES = {
     "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
     "runs.lock": "directory_lock",
     "runs.config": "ResolvedConfig resolve",
-    "runs.directory": "RunRequest",
+    "runs.directory": "RunRequest run_directory",
+    "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
+    "runs.training": "cached_directory",
     "runs.run": "run train_in",
     "runs.decode": "open_model",
     "runs.session": "Session",
     "runs.device": "choose_device",
-    "runs.measure": "opener",
+    "runs.measure": "open_subject",
     "scene.loading": "load_scene",
     "scene.locate": "DATA_VARIABLE",
     "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
     "coding.container": "decoded_limit",
-    "evaluation.evaluate": "png_names render_options render_view save_png suggested_rasterizers",
+    "evaluation.evaluate": "png_names render_view save_png",
     "evaluation.metrics": "MetricInfo short_reason",
     "errors": "RunLockedError",
     "rendering.negotiation": "NegotiatedRasterizer",
     "cli.options": (
-        "config_option console debug_option device_option images_option json_option options print_facts print_json "
-        "print_table say scene_option set_option"
+        "config_option console debug_option device_option geometry_option images_option init_option json_option "
+        "methods_option options preset_option print_facts print_json print_table rates_option repeats_option say "
+        "scene_option seeds_option set_option"
     ),
     "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",

@@ -13,8 +13,7 @@ import pytest
 from splatwizard_core.cli.main import main
 from splatwizard_core.cli.streams import ended_like_ctrl_c
 from splatwizard_core.coding.container import ContainerWriter
-from splatwizard_core.training.interrupt import InterruptGuard
-from splatwizard_native import track
+from splatwizard_native import InterruptGuard, track
 
 SW = f"{shlex.quote(sys.executable)} -m splatwizard_core"
 

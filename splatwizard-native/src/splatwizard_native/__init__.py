@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from splatwizard_native.fused.adam import adam_steps as adam_steps
     from splatwizard_native.fused.photometric import Padding as Padding
     from splatwizard_native.fused.photometric import photometric as photometric
+    from splatwizard_native.interrupt import InterruptGuard as InterruptGuard
     from splatwizard_native.machine import describe_machine as describe_machine
     from splatwizard_native.memory import MemoryMeter as MemoryMeter
     from splatwizard_native.memory import peak_rss_bytes as peak_rss_bytes
@@ -71,6 +72,7 @@ MODULES = {
     "lending": "lend",
     "fused.adam": "AdamUpdate adam_steps",
     "fused.photometric": "Padding photometric",
+    "interrupt": "InterruptGuard",
     "machine": "describe_machine",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",

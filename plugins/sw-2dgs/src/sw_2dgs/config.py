@@ -1,9 +1,12 @@
 """Hyper-parameters of 2DGS, by default those of the authors' code; what it chooses by data set is unset here."""
 
+from typing import Any
+
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
 from sw_gaussians.config import Densify, GaussianTraining
 from sw_gaussians.start import Rotation
+from sw_gaussians.surface_losses import NormalTerm, identity_before_terms
 
 from splatwizard_core.api import InputFile, Params
 
@@ -22,6 +25,9 @@ class SurfaceTraining(Params):
     )
     lambda_normal: float | None = Field(
         None, ge=0, description="weight of the normal consistency; unset: by data set (0.05, NeRF Synthetic 0)"
+    )
+    normal_term: NormalTerm = Field(
+        "code", description="form of the normal loss: of the authors' code, or paper: an empty pixel costs nothing"
     )
     dist_after: int = Field(3_000, ge=0, description="last step without the distortion loss")
     normal_after: int = Field(7_000, ge=0, description="last step without the normal loss")
@@ -44,3 +50,6 @@ class TwoDGSConfig(Choosing, GaussianTraining):
     )
     surface: SurfaceTraining = Field(SurfaceTraining(), description="losses of the surface")
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+    def identity(self) -> dict[str, Any]:
+        return identity_before_terms(super().identity())

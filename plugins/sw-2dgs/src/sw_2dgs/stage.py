@@ -9,17 +9,17 @@ from typing import TYPE_CHECKING
 
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import logit
-from sw_gaussians.surface_losses import distortion_loss, maps_for, normal_disagreement
+from sw_gaussians.surface_losses import add_surface_losses, maps_for
 from sw_gaussians.surfels import Surface, SurfelModel
 from sw_gaussians.tasks import PruneAndDensify
 
-from splatwizard_core.api import ConfigError, LossPack, RasterOptions
+from splatwizard_core.api import ConfigError, RasterOptions
 from sw_2dgs.datasets import OTHER, surface_of
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from splatwizard_core.api import RenderResult, SplatModel, StageContext, View
+    from splatwizard_core.api import LossPack, RenderResult, SplatModel, StageContext, View
     from sw_2dgs.config import TwoDGSConfig
 
 log = logging.getLogger(__name__)
@@ -92,13 +92,8 @@ class TwoDGSStage(ThreeDGSStage):
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         pack = super().loss(model, view, result, background, step)
-        total, parts = pack.total, dict(pack.parts)
         distortion, normals = self.weights(step)
-        if distortion > 0:
-            parts["distortion"] = distortion_loss(result)
-            total = total + distortion * parts["distortion"]
-        if normals > 0:
-            camera = view.camera.to(result.image.device)
-            parts["normals"] = normal_disagreement(result, camera, self.surface.depth_ratio).mean()
-            total = total + normals * parts["normals"]
-        return LossPack(total, {name: part.detach() for name, part in parts.items()})
+        return add_surface_losses(
+            pack, result, view.camera, self.surface.depth_ratio,
+            distortion=distortion, normals=normals, term=self.settings.normal_term,
+        )  # fmt: skip

@@ -82,6 +82,8 @@ class AnchorSplats(SplatModel):
 
     ROW_LABEL = "anchors"
     NETWORKS: tuple[str, ...] = ("mlp_opacity", "mlp_cov", "mlp_color")
+    COUNTS_MASKED = False
+    """Whether statistics see the opacity that a masked Gaussian would have."""
 
     mlp_opacity: nn.Sequential
     mlp_cov: nn.Sequential
@@ -139,13 +141,14 @@ class AnchorSplats(SplatModel):
             camera.center.to(a.positions), a.positions, a.features, a.offsets, a.scales, a.masks,
             (self.mlp_opacity, self.mlp_cov, self.mlp_color),
         )  # fmt: skip
+        seen = found.alphas if self.COUNTS_MASKED else found.all_opacities
         return GaussianInputs(
             means=found.means,
             opacities=found.opacities,
             scales=found.scales,
             quats=found.quats,
             colors=found.colors,
-            extras={**a.extras, "anchors": AnchorSelection(rows, found.all_opacities, found.drawn)},
+            extras={**a.extras, "anchors": AnchorSelection(rows, seen, found.drawn)},
         )
 
 

@@ -19,6 +19,7 @@ from sw_anchors.row_parts import EXACT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
+from sw_codecs.entropy.conditional_mixture import ConditionalMixture, RowMixture
 from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
@@ -45,9 +46,12 @@ class AttributeCoder:
     def __init__(self, count: int, shape: AnchorShape, mode: str) -> None:
         """Of `count` anchors, in mode "exact" or "float" of the entropy model `conditional-gaussian`."""
         self.coder = ConditionalGaussian(mode)
+        self.mixtures = ConditionalMixture(mode)
         self.rows = self.coder.blocks(count, max(shape.widths))
 
-    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+    def code(
+        self, block: Block, context: RowContext | RowMixture, step: Tensor, present: Tensor | None = None
+    ) -> Tensor:
         """Code one block; its integers [n,C] int64, 0 where they are not in the file.
 
         context     distributions of its numbers, in the units of the mode
@@ -67,11 +71,17 @@ class AttributeEncoder(AttributeCoder):
         self._coded: dict[str, list[bytes]] = {name: [] for name in sections}
         self._round = SteRound()
 
-    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+    def code(
+        self, block: Block, context: RowContext | RowMixture, step: Tensor, present: Tensor | None = None
+    ) -> Tensor:
         values = self._values[block.group][block.rows, block.columns].double()
         symbols, _ = self._round.encode(values, step, mean=self._centres[block.group])
         symbols = symbols if present is None else symbols * present
-        self._coded[block.section].append(self.coder.encode(symbols.numpy(), context, present))
+        if isinstance(context, RowMixture):
+            coded = self.mixtures.encode(symbols.numpy(), context, present)
+        else:
+            coded = self.coder.encode(symbols.numpy(), context, present)
+        self._coded[block.section].append(coded)
         return symbols
 
     def write(self, writer: ContainerWriter) -> None:
@@ -95,10 +105,16 @@ class AttributeDecoder(AttributeCoder):
             name: self.coder.split(reader.section(name), len(self.rows)) for name in sections
         }
 
-    def code(self, block: Block, context: RowContext, step: Tensor, present: Tensor | None = None) -> Tensor:
+    def code(
+        self, block: Block, context: RowContext | RowMixture, step: Tensor, present: Tensor | None = None
+    ) -> Tensor:
         """Raises BitstreamError for damage."""
         with self._reader.decoding(block.section):
-            symbols = torch.from_numpy(self.coder.decode(next(self._coded[block.section]), context, present))
+            data = next(self._coded[block.section])
+            if isinstance(context, RowMixture):
+                symbols = torch.from_numpy(self.mixtures.decode(data, context, present))
+            else:
+                symbols = torch.from_numpy(self.coder.decode(data, context, present))
         self._found[block.group][block.rows, block.columns] = (symbols * step).to(torch.float32)
         return symbols
 
@@ -121,14 +137,25 @@ class ExactNetwork:
     """
 
     def __init__(
-        self, network: nn.Sequential, shape: AnchorShape, base_steps: Sequence[float], *, step_offset: int = 0
+        self,
+        network: nn.Sequential,
+        shape: AnchorShape,
+        base_steps: Sequence[float],
+        *,
+        step_offset: int = 0,
+        further: int = 0,
     ) -> None:
-        """step_offset  added to round(4096 (1 + tanh t)) of a step logit t.
+        """Take the weights as they are in the file.
+
+        step_offset added to round(4096 (1 + tanh t)) of a step logit t
+        further     outputs that follow those of the shape, in units of 1
 
         Raises ValueError if the network cannot be evaluated exactly.
         """
         units = [1 / base for base, width in zip(base_steps, shape.widths, strict=True) for _ in range(2 * width)]
-        self._network = IntegerMlp.from_module(network, output_scale=np.array([*units, 1.0, 1.0, 1.0]))
+        self._network = IntegerMlp.from_module(
+            network, output_scale=np.array([*units, *[1.0] * (len(GROUPS) + further)])
+        )
         self._shape, self._base_steps, self._step_offset = shape, tuple(base_steps), step_offset
 
     def __call__(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> dict[str, RowContext]:
@@ -137,7 +164,14 @@ class ExactNetwork:
         features    places of some rows -> int64 [rows, inputs] with 12 fractional bits; each row on its own
         width       the most numbers that a row has while they are looked up
         """
-        outputs = by_parts(lambda part: self._network(features(part)), places, width, EXACT_NUMBERS)
+        return self.read(self.outputs(places, features, width))
+
+    def outputs(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> Tensor:
+        """Outputs of the network, int64 [n, sum(shape.outputs) + further]; arguments as of a call."""
+        return by_parts(lambda part: self._network(features(part)), places, width, EXACT_NUMBERS)
+
+    def read(self, outputs: Tensor) -> dict[str, RowContext]:
+        """Distributions by group that outputs [n, sum(shape.outputs)] stand for."""
         parts = torch.split(outputs, self._shape.outputs, dim=1)
         multipliers = torch.from_numpy(ConditionalGaussian.step_multipliers(parts[6], self._step_offset))
         return {

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -98,6 +98,9 @@ class CodedAnchors(AnchorModel):
     mask_logits: nn.Parameter
     bounds: Tensor
 
+    HAS_FIXED_FORM: ClassVar[bool] = True
+    """Whether `sw_anchors.fixed_step` computes what a training step of this class does."""
+
     def __init__(
         self,
         anchors: Tensor,
@@ -158,9 +161,13 @@ class CodedAnchors(AnchorModel):
         if kept is None or any(
             a is not b if isinstance(a, Tensor) else a != b for a, b in zip(kept[0], state, strict=True)
         ):
-            codes = position_codes(self.anchors, self.bounds)
-            kept = self._lattice = (state, codes, coded_positions(codes, self.bounds))
+            kept = self._lattice = (state, *self.lattice_places())
         return kept[1], kept[2]
+
+    def lattice_places(self) -> tuple[Tensor, Tensor]:
+        """Codes [N,3] of the anchors on the 16-bit lattice, and where they are taken to be [N,3]."""
+        codes = position_codes(self.anchors, self.bounds)
+        return codes, coded_positions(codes, self.bounds)
 
     # Masks
 

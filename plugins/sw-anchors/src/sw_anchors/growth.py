@@ -69,6 +69,7 @@ def adjust_anchors(
     levels: int = 3,
     init_factor: int = 16,
     hierarchy: int = 4,
+    subvoxel: bool = False,
 ) -> GrowthReport:
     """Add anchors where offsets have high gradients, remove those that stay transparent.
 
@@ -78,7 +79,8 @@ def adjust_anchors(
     grad_threshold  mean gradient of an offset at level 0, NDC units (`>=`); doubles with each level
     min_opacity     an anchor goes if its summed opacity is below this, mean over views
     levels, init_factor, hierarchy
-                    level n has cells of voxel_size * init_factor / hierarchy^n
+                    level n has cells of init_factor // hierarchy^n voxels
+    subvoxel        take levels with cells below a voxel too, of init_factor / hierarchy^n voxels; else there are none
 
     Raises EmptyModel if nothing is left.
     """
@@ -91,7 +93,11 @@ def adjust_anchors(
     for level in range(levels):
         if level > 0 and model.num_rows == before:
             break  # Paper: every level by itself; authors' code: nothing grows if level 0 added nothing. We follow it.
-        size = model.voxel_size * init_factor / hierarchy**level
+        # Divided in integers as in the authors' code: a level of no whole voxels grows nothing.
+        voxels = init_factor / hierarchy**level if subvoxel else init_factor // hierarchy**level
+        if not voxels:
+            break
+        size = model.voxel_size * voxels
         draw = torch.rand(mean.shape, generator=generator).to(mean)
         chosen = eligible & (mean >= grad_threshold * 2**level) & (draw > 0.5 ** (level + 1))
         at, offset = torch.nonzero(chosen, as_tuple=True)

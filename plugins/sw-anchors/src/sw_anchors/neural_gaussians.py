@@ -24,6 +24,7 @@ class NeuralGaussians:
 
     means, opacities, scales, quats, colors     [M,...] as in GaussianInputs; differentiable
     all_opacities   [V,k] in (-1,1), no gradient
+    alphas          [V,k] the same before masks
     drawn           [M] int64, which of the V * k they are
     """
 
@@ -33,6 +34,7 @@ class NeuralGaussians:
     quats: Tensor
     colors: Tensor
     all_opacities: Tensor
+    alphas: Tensor
     drawn: Tensor
 
 
@@ -116,8 +118,10 @@ class _Spawn(torch.autograd.Function):
             quats, norms, color, *last,
         )  # fmt: skip
         ctx.widths, ctx.everything = [len(w) for w in first], everything
-        ctx.mark_non_differentiable(opacities, drawn)
-        return means, flat.clone() if everything else picked(flat), sizes, quats, color, opacities, drawn
+        unmasked = alpha.detach()
+        ctx.mark_non_differentiable(opacities, unmasked, drawn)
+        chosen = flat.clone() if everything else picked(flat)
+        return means, chosen, sizes, quats, color, opacities, unmasked, drawn
 
     @staticmethod
     @once_differentiable

@@ -47,6 +47,7 @@ class AnchorGrowth(Params):
     levels: int = Field(3, ge=1, le=8, description="cell sizes at which anchors appear")
     init_factor: int = Field(16, ge=1, description="size of the coarsest cells, voxels")
     hierarchy: int = Field(4, ge=1, description="ratio of cell sizes from level to level")
+    subvoxel: bool = Field(False, description="levels with cells below a voxel grow too (authors: they do not)")
 
 
 class AnchorLoss(Params):

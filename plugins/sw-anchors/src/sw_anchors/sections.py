@@ -64,14 +64,18 @@ def kept_geometry(model: CodedAnchors) -> tuple[AnchorGeometry, Tensor]:
 
 def add_geometry(writer: ContainerWriter, geometry: AnchorGeometry) -> None:
     """Add the sections `anchors` and `masks`, and the header values num_anchors, num_gaussians and num_offsets."""
-    masks = geometry.masks.numpy()
-    writer.static["num_anchors"], writer.static["num_offsets"] = map(int, masks.shape)
-    writer.static["num_gaussians"] = int(masks.sum())
     writer.require("coder", "octree")
     bounds = geometry.bounds.numpy().astype("<f4").tobytes()
     writer.add("anchors", bounds + Octree().encode(geometry.codes.numpy(), BITS))
+    add_masks(writer, geometry.masks)
+
+
+def add_masks(writer: ContainerWriter, masks: Tensor) -> None:
+    """Add the section `masks` and the header values num_anchors, num_gaussians and num_offsets; masks [N,k] bool."""
+    writer.static["num_anchors"], writer.static["num_offsets"] = map(int, masks.shape)
+    writer.static["num_gaussians"] = int(masks.sum())
     writer.require("entropy model", "bernoulli")
-    writer.add("masks", Bernoulli().encode(masks.reshape(-1)))
+    writer.add("masks", Bernoulli().encode(masks.numpy().reshape(-1)))
 
 
 def read_geometry(reader: ContainerReader, *, bytes_per_anchor: int) -> AnchorGeometry:
@@ -81,19 +85,38 @@ def read_geometry(reader: ContainerReader, *, bytes_per_anchor: int) -> AnchorGe
 
     Raises BitstreamError.
     """
-    n = reader.integer("num_anchors", low=0, high=(1 << 32) - 1)
-    k = reader.integer("num_offsets", low=1, high=64)
-    gaussians = reader.integer("num_gaussians", low=n, high=n * k)
-    reader.allow(n * bytes_per_anchor, f"a model of {n:,} anchors")
+    n, k, gaussians = read_counts(reader, bytes_per_anchor=bytes_per_anchor)
     with reader.decoding("anchors") as data:
-        bounds = torch.from_numpy(np.frombuffer(data[:BOUNDS_BYTES], "<f4").astype(np.float32).reshape(2, 3))
-        if not bool(torch.isfinite(bounds).all() and (bounds[0] <= bounds[1]).all()):
-            raise BitstreamError("the bounds of the anchors are not finite or end before they start")
+        bounds = read_bounds(data)
         codes = torch.from_numpy(Octree(max_points=n).decode(data[BOUNDS_BYTES:]))
         if codes.shape != (n, 3):
             raise BitstreamError(f"holds {len(codes):,} anchors, header says {n:,}")
         if n and not 0 <= int(codes.min()) <= int(codes.max()) <= TOP:
             raise BitstreamError(f"an anchor leaves the lattice of {BITS} bits")
+    return AnchorGeometry(bounds, codes, read_masks(reader, n, k, gaussians))
+
+
+def read_counts(reader: ContainerReader, *, bytes_per_anchor: int) -> tuple[int, int, int]:
+    """Header values num_anchors, num_offsets and num_gaussians. Raises BitstreamError."""
+    n = reader.integer("num_anchors", low=0, high=(1 << 32) - 1)
+    k = reader.integer("num_offsets", low=1, high=64)
+    gaussians = reader.integer("num_gaussians", low=n, high=n * k)
+    reader.allow(n * bytes_per_anchor, f"a model of {n:,} anchors")
+    return n, k, gaussians
+
+
+def read_bounds(data: bytes | memoryview) -> Tensor:
+    """[2,3] float32 at the start of a section. Raises BitstreamError unless they are finite and in order."""
+    if len(data) < BOUNDS_BYTES:
+        raise BitstreamError("ends within the bounds of the anchors")
+    bounds = torch.from_numpy(np.frombuffer(data[:BOUNDS_BYTES], "<f4").astype(np.float32).reshape(2, 3))
+    if not bool(torch.isfinite(bounds).all() and (bounds[0] <= bounds[1]).all()):
+        raise BitstreamError("the bounds of the anchors are not finite or end before they start")
+    return bounds
+
+
+def read_masks(reader: ContainerReader, n: int, k: int, gaussians: int) -> Tensor:
+    """[n,k] bool from the section `masks`, `gaussians` of them set, at least one a row. Raises BitstreamError."""
     with reader.decoding("masks") as data:
         symbols = Bernoulli().decode(data, n * k)
         masks = torch.from_numpy(symbols.reshape(n, k) > 0)
@@ -101,7 +124,7 @@ def read_geometry(reader: ContainerReader, *, bytes_per_anchor: int) -> AnchorGe
             raise BitstreamError(f"keeps {int(masks.sum()):,} Gaussians, header says {gaussians:,}")
         if not bool(masks.any(dim=1).all()):
             raise BitstreamError("an anchor has no Gaussian")
-    return AnchorGeometry(bounds, codes, masks)
+    return masks
 
 
 def add_networks(writer: ContainerWriter, networks: Mapping[str, nn.Module], weights: WeightType) -> None:

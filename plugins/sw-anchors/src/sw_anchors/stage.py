@@ -121,7 +121,7 @@ class AnchorStage(Stage):
         report = adjust_anchors(
             model, optimizer, step=step, generator=self.growth_draws, interval=self.steps(growth.interval),
             success=growth.success, grad_threshold=growth.grad_threshold, min_opacity=growth.min_opacity,
-            levels=growth.levels, init_factor=growth.init_factor, hierarchy=growth.hierarchy,
+            levels=growth.levels, init_factor=growth.init_factor, hierarchy=growth.hierarchy, subvoxel=growth.subvoxel,
         )  # fmt: skip
         if log is not None:
             log.scalar("grown", report.grown)
@@ -136,15 +136,19 @@ class AnchorStage(Stage):
         """Further terms of the loss, weighted, by name."""
         return {}
 
+    def mean_volume(self, result: RenderResult) -> Tensor:
+        """Mean product of the scales of what is drawn, scalar; differentiable."""
+        known: Tensor | None = result.extras.get("volume")
+        if known is not None:
+            return known
+        assert result.inputs.scales is not None
+        return mean_product(result.inputs.scales)
+
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        settings, inputs = self.opt.loss, result.inputs
+        settings = self.opt.loss
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
-        volume = result.extras.get("volume")
-        if volume is None:
-            assert inputs.scales is not None
-            volume = mean_product(inputs.scales)
-        terms = {"volume": settings.volume * volume, **self.extra_loss(model, result, step)}
+        terms = {"volume": settings.volume * self.mean_volume(result), **self.extra_loss(model, result, step)}
         total = sum(terms.values(), start=found.total)
         return LossPack(total, found.parts | {name: term.detach() for name, term in terms.items()})
 
@@ -165,7 +169,8 @@ class CodedAnchorStage(AnchorStage):
         model = super().begin(context)
         assert isinstance(model, CodedAnchors)
         model.noise = context.generator("noise")
-        model.fixed = FixedDecoder() if self.opt.graphs and model.device.type == "cuda" else None
+        fits = self.opt.graphs and model.HAS_FIXED_FORM and model.device.type == "cuda"
+        model.fixed = FixedDecoder() if fits else None
         return model
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
@@ -174,9 +179,12 @@ class CodedAnchorStage(AnchorStage):
         return super().finish(model, scene)
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
-        lr, rates = self.opt.lr, super().learning_rates(step)
-        masks = self.decay(step, lr.masks_init, lr.masks_final) * self.extent
-        return {"offsets": rates["offsets"], "mask_logits": masks, **rates}
+        rates = super().learning_rates(step)
+        return {"offsets": rates["offsets"], "mask_logits": self.mask_rate(step) * self.extent, **rates}
+
+    def mask_rate(self, step: int) -> float:
+        """Learning rate of the mask logits over the scene extent."""
+        return self.decay(step, self.opt.lr.masks_init, self.opt.lr.masks_final)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         super().register_pre_task(scheduler, ppl, opt)

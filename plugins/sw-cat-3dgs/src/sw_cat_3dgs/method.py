@@ -10,7 +10,7 @@ from sw_cat_3dgs import codec
 from sw_cat_3dgs.config import CatConfig
 from sw_cat_3dgs.context import CatContext, ContextShape
 from sw_cat_3dgs.model import CatAnchors
-from sw_cat_3dgs.presets import PRESETS, RATES
+from sw_cat_3dgs.presets import BY_DATASET, PRESETS, RATES
 from sw_cat_3dgs.stage import CatStage
 
 if TYPE_CHECKING:
@@ -31,6 +31,7 @@ class Cat3DGS(Method):
     version: ClassVar[int] = 1
     Config = CatConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = BY_DATASET
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
     DEFAULT_RATE: ClassVar[str] = "r6"
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from splatwizard_core.api import BitstreamError, GaussianModel, SplatwizardError
-from sw_chimerags.model import DEGREE, LOWER, TENSORS, MaskedGaussians
+from sw_chimerags.model import DEGREE, LOWER, MaskedGaussians
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager, VectorCoder
@@ -78,7 +78,7 @@ def encode(
 def _arrays(model: MaskedGaussians) -> Arrays:
     """The tensors and the importance on the host; float16 will hold their values."""
     found: Arrays = {}
-    for name in TENSORS:
+    for name in GaussianModel.RAW:
         array = getattr(model, name).detach().float().cpu().numpy()
         if not np.isfinite(array).all():
             rows = int((~np.isfinite(array)).reshape(len(array), -1).any(1).sum())
@@ -143,14 +143,14 @@ def decode(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
     xyz = reader.text("xyz", choices=POSITIONS)
     coder = plugins.vector_coders.load(reader.text("vq", choices=plugins.vector_coders.names))(plugins)
     groups = [_read_group(group, n, reader, plugins, coder, xyz) for group, n in (("sh2", total - on), ("sh3", on))]
-    tensors = [torch.cat([group[i] for group in groups]) for i in range(len(TENSORS))]
+    tensors = [torch.cat([group[i] for group in groups]) for i in range(len(GaussianModel.RAW))]
     return GaussianModel(*tensors, active_sh_degree=DEGREE)
 
 
 def _read_group(
     group: str, n: int, reader: ContainerReader, plugins: PluginManager, coder: VectorCoder, xyz: str
 ) -> list[Tensor]:
-    """The tensors of a group in the order of TENSORS; bands that it lacks are zero."""
+    """The tensors of a group in the order of RAW; bands that it lacks are zero."""
     rest = np.zeros((n, GROUPS["sh3"], 3), np.float32)
     if n == 0:
         vectors, attributes, means = np.zeros((0, 3 + 3 * GROUPS[group])), np.zeros((0, 8)), np.zeros((0, 3))

@@ -20,8 +20,6 @@ LOWER = 8
 """Coefficients of SH degrees 1 and 2 in `sh_rest`; the 7 behind them are degree 3."""
 DEGREE = 3
 
-TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
-
 
 class MaskQuantizer(Protocol):
     """The quantizer `ste-mask`: 0 or 1 ahead, the sigmoid's gradient back."""
@@ -52,10 +50,10 @@ class MaskedGaussians(ScoredGaussians):
     def of(cls, model: GaussianModel, *, quantizer: MaskQuantizer, init: float) -> MaskedGaussians:
         """Copies of a model's Gaussians; SH bands that it lacks are zero. Raises UserInputError for surfels."""
         refuse_surfels(model, "method chimerags")
-        tensors = [getattr(model, name).detach().clone() for name in TENSORS]
+        tensors = [getattr(model, name).detach().clone() for name in cls.RAW]
         rest = model.sh_rest.new_zeros(model.num_rows, (DEGREE + 1) ** 2 - 1, 3)
         rest[:, : model.sh_rest.shape[1]] = model.sh_rest.detach()
-        tensors[TENSORS.index("sh_rest")] = rest
+        tensors[cls.RAW.index("sh_rest")] = rest
         return cls(*tensors, quantizer=quantizer, init=init)
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:

@@ -12,8 +12,16 @@ if TYPE_CHECKING:
     from splatwizard_core import api
     from sw_codecs.arrays import byte_planes, deflate, packed_bits
     from sw_codecs.coders import arithmetic, huffman
-    from sw_codecs.context import channel_ar, hash_grid, integer_mlp, spatial_ar, triplane
-    from sw_codecs.entropy import bernoulli, categorical, columns, conditional, gaussian_exact, mixture
+    from sw_codecs.context import channel_ar, channel_mixture, hash_grid, integer_mlp, spatial_ar, triplane
+    from sw_codecs.entropy import (
+        bernoulli,
+        categorical,
+        columns,
+        conditional,
+        conditional_mixture,
+        gaussian_exact,
+        mixture,
+    )
     from sw_codecs.models import codecs, raht_codec
     from sw_codecs.positions import octree
     from sw_codecs.quantizers import (
@@ -33,10 +41,11 @@ if TYPE_CHECKING:
     ]  # fmt: skip
     ENTROPY_MODELS: list[Callable[..., api.EntropyModel]] = [
         columns.Columns, categorical.Categorical, bernoulli.Bernoulli, gaussian_exact.GaussianExact,
-        mixture.Mixture, conditional.ConditionalGaussian,
+        mixture.Mixture, conditional.ConditionalGaussian, conditional_mixture.ConditionalMixture,
     ]  # fmt: skip
     CONTEXT_MODELS: list[Callable[..., api.ContextModel]] = [
         integer_mlp.IntegerMlp, triplane.Triplane, spatial_ar.SpatialAr, channel_ar.ChannelAr, hash_grid.MixedHashGrid,
+        channel_mixture.ChannelMixture,
     ]  # fmt: skip
     ENTROPY_CODERS: list[Callable[..., api.EntropyCoder]] = [
         arithmetic.RangeCoder, arithmetic.RansCoder, huffman.HuffmanCoder,
@@ -80,6 +89,8 @@ def register_entropy_models(registry: Registry[Any]) -> None:
                  summary="weighted Gaussians or Laplacians, counts in the file")  # fmt: skip
     registry.add("conditional-gaussian", "sw_codecs.entropy.conditional:ConditionalGaussian",
                  summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
+    registry.add("conditional-mixture", "sw_codecs.entropy.conditional_mixture:ConditionalMixture",
+                 summary="the same with two predicted Gaussians and their weights")  # fmt: skip
 
 
 @hookimpl
@@ -92,6 +103,8 @@ def register_context_models(registry: Registry[Any]) -> None:
                  summary="integers of a plane from their causal neighbours, coded along wavefronts")  # fmt: skip
     registry.add("channel-ar", "sw_codecs.context.channel_ar:ChannelAr",
                  summary="channels in slices, each from the slices before it")  # fmt: skip
+    registry.add("channel-mixture", "sw_codecs.context.channel_mixture:ChannelMixture",
+                 summary="a second Gaussian for each channel, from the slices before it")  # fmt: skip
     registry.add("hash-grid", "sw_codecs.context.hash_grid:MixedHashGrid",
                  summary="learned signs on grids of many resolutions, looked up by position")  # fmt: skip
 

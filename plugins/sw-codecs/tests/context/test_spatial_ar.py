@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.context import wavefront
 from sw_codecs.context.spatial_ar import SpatialAr
-from sw_codecs.context.wavefront import NEIGHBORS
+from sw_codecs.context.plane_fields import NEIGHBORS, Field
 from sw_codecs.entropy.exact_tables import exact_tables
 
 
@@ -74,7 +74,7 @@ def test_any_values_come_back(channels, height, width, seed, spread):
 def test_what_is_decoded_together_does_not_matter():
     """The integers of a network are those of each row alone."""
     networks, plane = exact_networks(), drawn(3, 4, 9, 9)
-    field = wavefront._Field(3, (4, 9, 9))
+    field = Field(3, (4, 9, 9))
     field.fill(plane)
     rows = torch.from_numpy(field.neighbors(1, np.arange(81)))
     together = networks[1](rows)

@@ -13,7 +13,7 @@ from splatwizard_core.errors import BitstreamError, SplatwizardError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
-from sw_codecs.models.raht_codec import COLUMNS, PARAMETERS, Raht
+from sw_codecs.models.raht_codec import COLUMNS, Raht
 from sw_codecs.models.raht_gaussians import CHANNELS, RahtGaussians, codebook_of, settled_copy
 from sw_codecs.models.raht_settings import RahtOptions, RahtSettings
 from sw_codecs.positions import morton
@@ -62,7 +62,7 @@ def drawn(settled):
 
 def close(found, drawn, atol=1e-5):
     """Whether two models are equal up to the rounding of float32 sums; a rotation has two quaternions."""
-    for name in PARAMETERS:
+    for name in GaussianModel.RAW:
         a, b = getattr(found, name).detach(), getattr(drawn, name).detach()
         if name == "quats":
             b = b * torch.where((a * b).sum(1, keepdim=True) < 0, -1.0, 1.0)
@@ -194,7 +194,7 @@ def test_fewer_gaussians_make_a_smaller_file(plugins):
     model = model_of(1500)
     sizes = []
     for kept in (1500, 1200, 900, 600):
-        some = GaussianModel(*(getattr(model, name).detach()[:kept] for name in PARAMETERS))
+        some = GaussianModel(*(getattr(model, name).detach()[:kept] for name in GaussianModel.RAW))
         sizes.append(len(written(plugins, some).to_bytes()))
     assert sizes == sorted(sizes, reverse=True)
 

@@ -1,4 +1,4 @@
-"""The native module of training Gaussians: sparse Adam on the CPU, gradient statistics on CUDA."""
+"""The native module of training Gaussians: sparse Adam on the CPU, statistics and normals on CUDA."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ GAUSSIANS = NativeModule(
     sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
     kernels=("kernels/sparse_adam.cpp",),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/statistics.cu",),
+    cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/disagreement.cu"),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
     seconds=10,
-    without="sparse Adam and the gradient statistics run on torch operations: the same numbers, slower",
+    without="sparse Adam, gradient statistics and normal losses run on torch operations: the same numbers, slower",
 )

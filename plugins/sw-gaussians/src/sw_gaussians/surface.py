@@ -50,6 +50,16 @@ def surface_depth(depth: Mapping[str, Tensor], depth_ratio: float) -> Tensor:
 def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     """Return the normals of the surface that a depth map describes, [3,H,W] in the world frame, towards the camera.
 
+    depth   [1,H,W] camera z, world units; 0 = no surface
+
+    Those of `camera_normals`, turned.
+    """
+    return world_normals(camera_normals(depth, camera), camera)
+
+
+def camera_normals(depth: Tensor, camera: Camera) -> Tensor:
+    """Return the normals of the surface that a depth map describes, [3,H,W] in the camera's frame, towards it.
+
     The normal of a pixel is the cross product of the differences of its neighbours' points, below minus above and
     right minus left; points are those of pixel centres (the published code takes corners, which tilts a plane
     of tilt t by 0.5 / f sin^2 t).
@@ -78,7 +88,7 @@ def depth_normals(depth: Tensor, camera: Camera) -> Tensor:
     # No division by an epsilon: where nothing was hit its gradient would be huge.
     flat = squared > 0
     unit = torch.where(flat, crossed * torch.rsqrt(torch.where(flat, squared, 1.0)), 0.0)
-    normals[:, 1:-1, 1:-1] = world_normals(unit, camera)
+    normals[:, 1:-1, 1:-1] = unit
     return normals
 
 

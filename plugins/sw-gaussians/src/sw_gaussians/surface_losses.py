@@ -5,13 +5,28 @@ Source: 2D Gaussian Splatting (arXiv 2403.17888), section 5.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from splatwizard_core.api import Camera, RenderResult
-from sw_gaussians.surface import depth_modes, depth_normals, surface_depth, world_normals
+from splatwizard_core.api import Camera, LossPack, RenderResult
+from sw_gaussians.native import GAUSSIANS
+from sw_gaussians.surface import camera_normals, depth_modes, surface_depth
+
+NormalTerm = Literal["code", "paper"]
+"""Form of the normal loss, see `normal_disagreement`."""
+
+
+def identity_before_terms(content: dict[str, Any]) -> dict[str, Any]:
+    """Return a configuration's identity without `surface.normal_term` where that is the code's.
+
+    Runs and trained scenes of before the key existed stay what they are.
+    """
+    if content["surface"]["normal_term"] == "code":
+        del content["surface"]["normal_term"]
+    return content
 
 
 def maps_for(*, distortion: bool, normals: bool, depth_ratio: float) -> dict[str, Any]:
@@ -37,11 +52,15 @@ def distortion_loss(result: RenderResult) -> Tensor:
     return result.distortion.mean()
 
 
-def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float) -> Tensor:
-    """Return [1,H,W], 1 - n . (A n_surf): how far drawn normals are from those of the depth map, 0 .. 2.
+def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float, term: NormalTerm = "code") -> Tensor:
+    """Return [1,H,W], how far drawn normals are from those of the depth map, 0 .. 2.
 
-    n is the sum of the weighted normals of the surfels, n_surf that of the depth map, A the opacity of the pixel
-    without gradient. Pixels that show nothing, and the border, are 1; the loss is the mean over all pixels.
+    n is the sum of the weighted normals of the surfels, n_surf that of the depth map, A the opacity of the pixel:
+
+    code    1 - n . (A n_surf) without the gradient of A, as in the authors' code: 1 where nothing is shown, so that the
+            loss falls as surfels cover an empty background, which costs nothing where their colour is that of it
+    paper   A - n . n_surf, which is the sum of w (1 - n . n_surf) over the surfels of a ray: 0 where
+            nothing is shown and wherever normals agree; A has its gradient. The border counts nothing
 
     depth_ratio     0..1, see `surface_depth`
 
@@ -49,7 +68,70 @@ def normal_disagreement(result: RenderResult, camera: Camera, depth_ratio: float
     """
     if result.normals is None or result.alpha is None:
         raise ValueError("the normal loss needs RasterOptions(normals=True, alpha=True) and the depths")
-    surface = depth_normals(surface_depth(result.depth, depth_ratio), camera) * result.alpha.detach()
-    agreement = (world_normals(result.normals, camera) * surface).sum(dim=0, keepdim=True)
+    depth, alpha, normals = surface_depth(result.depth, depth_ratio), result.alpha.detach(), result.normals
+    if term == "paper":
+        without = _disagreement(depth, normals, torch.ones_like(alpha), camera)  # 1 - n . n_surf; 1: there is no n_surf
+        return torch.where(without == 1, 0.0, without - (1 - result.alpha))
+    return _disagreement(depth, normals, alpha, camera)
+
+
+def _disagreement(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    if depth.is_cuda and depth.dtype == torch.float32 and GAUSSIANS.has_cuda():
+        lens = (camera.fx, camera.fy, camera.cx, camera.cy)
+        found: Tensor = _Disagreement.apply(depth, normals, alpha, lens)  # type: ignore[no-untyped-call]
+        return found
+    return disagreement_in_torch(depth, normals, alpha, camera)
+
+
+def disagreement_in_torch(depth: Tensor, normals: Tensor, alpha: Tensor, camera: Camera) -> Tensor:
+    """Return what `normal_disagreement` does of a depth [1,H,W], normals [3,H,W] of the camera's frame and alpha.
+
+    An angle is the same in any frame: nothing is turned to the world's.
+    """
+    agreement = (normals * camera_normals(depth, camera) * alpha).sum(dim=0, keepdim=True)
     disagreement: Tensor = torch.ones_like(agreement) - agreement
     return disagreement
+
+
+def add_surface_losses(
+    loss: LossPack,
+    result: RenderResult,
+    camera: Camera,
+    depth_ratio: float,
+    *,
+    distortion: float = 0.0,
+    normals: float = 0.0,
+    term: NormalTerm = "code",
+    mask: Tensor | None = None,
+) -> LossPack:
+    """Return `loss` with the weighted losses of the surface, which stand unweighted among its parts.
+
+    distortion, normals     weights; a loss of weight 0 is neither computed nor named
+    term                    form of the normal loss
+    mask                    [1,H,W] 0..1, factor of the normal loss of each pixel; None: all count. The mean is over all
+    """
+    total, terms = loss.total, {}
+    if distortion > 0:
+        terms["distortion"] = distortion_loss(result)
+        total = total + distortion * terms["distortion"]
+    if normals > 0:
+        found = normal_disagreement(result, camera.to(result.image.device), depth_ratio, term)
+        terms["normals"] = (found if mask is None else mask * found).mean()
+        total = total + normals * terms["normals"]
+    return LossPack(total, {name: part.detach() for name, part in {**loss.parts, **terms}.items()})
+
+
+class _Disagreement(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, depth: Tensor, normals: Tensor, alpha: Tensor, lens: tuple[float, ...]) -> Tensor:
+        tensors = depth.contiguous(), normals.contiguous(), alpha.contiguous()
+        ctx.save_for_backward(*tensors)
+        ctx.lens = lens
+        found: Tensor = torch.ops.splatwizard_gaussians.disagreement(*tensors, lens)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        found = torch.ops.splatwizard_gaussians.disagreement_backward(grad.contiguous(), *ctx.saved_tensors, ctx.lens)
+        return *found, None, None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -82,16 +83,13 @@ def mesh(
     pieces, mesh.json says how it was made. --set takes scene keys, keys of the run (raster.prefer, ...), and
     metrics.mesh.KEY, which options win over.
     """
-    from splatwizard_core.api import SplatwizardError, Subject
+    from splatwizard_core.api import SplatwizardError
     from splatwizard_core.tooling import (
-        Session,
-        choose_device,
+        NegotiatedRasterizer,
         file_sha256,
         load_plugins,
-        opener,
-        render_options,
-        say,
-        suggested_rasterizers,
+        open_session,
+        open_subject,
     )
     from sw_geometry.files import write_files
     from sw_geometry.metrics import build_from_model
@@ -109,22 +107,17 @@ def mesh(
     except Open3DMissing as error:
         raise SplatwizardError(str(error)) from error  # nothing is wrong with what was asked: status 1
 
-    plugins = load_plugins()
-    session = Session(plugins, choose_device(chosen.ppl.device, plugins), say)
+    session = open_session(chosen, load_plugins())
     setup.device = session.device
-    opened = opener(path, session)()
-    loaded = session.scene(chosen)
-    opened.model.check_finite()
-    opened.model.prepare()
-    raster = session.rasterizer(chosen, suggested_rasterizers(opened.raster))
-    drawing = render_options(opened.raster, loaded.background.to(session.device))
-    subject = Subject(opened.model, loaded, raster, drawing, setup, opened.static)
-    parameters = resolve(settings, loaded, stated(opened.model, opened.static))
+    subject = replace(open_subject(path, session, chosen), setup=setup)
+    assert isinstance(subject.rasterizer, NegotiatedRasterizer)  # a session has no other
+    loaded = subject.scene
+    parameters = resolve(settings, loaded, stated(subject.model, subject.static))
     built = build_from_model(subject, parameters, settings.max_memory)
     scores, culled = _measured(subject, parameters, settings, built, units=units, asked=chamfer)
     facts = {
         **built.facts, "model": path.name, "sha256": file_sha256(path), "scene": loaded.name,
-        "rasterizers": dict(raster.choices), **({"chamfer": scores} if scores else {}),
+        "rasterizers": dict(subject.rasterizer.choices), **({"chamfer": scores} if scores else {}),
     }  # fmt: skip
     files = write_files(target, built, loaded, facts, culled)
     if as_json:

@@ -5,18 +5,25 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import Method, SceneError
-from sw_codecs.context.hash_grid import MixedHashGrid
+from sw_anchors.dataset_values import BY_DATASET
+from sw_anchors.grid_anchors import GridAnchors
+from sw_anchors.grid_stage import GridStage
+
+from splatwizard_core.api import Method
 from sw_hac import codec
 from sw_hac.config import HACConfig
-from sw_hac.model import HACAnchors
 from sw_hac.presets import PRESETS, RATES
-from sw_hac.stage import HACStage
 
 if TYPE_CHECKING:
     import torch
 
     from splatwizard_core.api import ContainerReader, ContainerWriter, Scene, SplatModel, Stage
+
+
+class HACStage(GridStage):
+    """One stage of 30,000 steps."""
+
+    name = "hac"
 
 
 class HAC(Method):
@@ -29,31 +36,19 @@ class HAC(Method):
     version: ClassVar[int] = 1
     Config = HACConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = BY_DATASET
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
     DEFAULT_RATE: ClassVar[str] = "r4"
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Put an anchor into every voxel with a start point of the scene."""
-        if scene.points is None or len(scene.points) == 0:
-            raise SceneError(
-                f"scene '{scene.name}' has no start points: HAC needs SfM points or random ones", path=scene.path
-            )
-        c: HACConfig = self.config
-        grid = MixedHashGrid(
-            c.grid.space, c.grid.planes, features=c.grid.features, log2_space=c.grid.log2_space,
-            log2_planes=c.grid.log2_planes, generator=generator,
-        )  # fmt: skip
-        return HACAnchors.from_points(
-            scene.points, voxel_size=c.voxel_size, num_offsets=c.num_offsets, feature_dim=c.feature_dim,
-            hidden=c.hidden, margin=c.margin, sample=c.rate_term.sample, base_steps=c.steps.triple,
-            generator=generator, grid=grid, grid_hidden=c.grid.hidden, in_steps=c.rate_term.units == "steps",
-        )  # fmt: skip
+        return GridAnchors.of_scene(scene, self.config, generator)
 
     def stages(self) -> Sequence[Stage]:
         return [HACStage(self.config)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
-        if not isinstance(model, HACAnchors):
+        if not isinstance(model, GridAnchors):
             raise TypeError(f"hac encodes its own anchors, not a {type(model).__name__}")
         codec.encode(model, writer, self.config.codec.settings)
 

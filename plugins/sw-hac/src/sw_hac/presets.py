@@ -27,6 +27,7 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
         "growth.interval": 50,
         "growth.grad_threshold": 4e-4,
         "growth.init_factor": 2,
+        "growth.subvoxel": True,
         "phases.quantized": 600,
         "phases.rebound": 899,
         "phases.entropy": 900,

@@ -27,7 +27,6 @@ def some_gaussians(seed: int = 0) -> GaussianModel:
     model = gaussians_from_points(points)
     generator = torch.Generator().manual_seed(seed)
     rows = torch.randperm(model.num_rows, generator=generator)[:SOME]
-    names = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
-    tensors = {name: getattr(model, name).detach()[rows] for name in names}
+    tensors = {name: getattr(model, name).detach()[rows] for name in model.RAW}
     moved = {name: x + 0.1 * torch.randn(x.shape, generator=generator) for name, x in tensors.items()}
     return GaussianModel.from_tensors(**moved)

@@ -161,7 +161,7 @@ def _arrays(model: GaussianModel) -> dict[str, NDArray[np.float32]]:
     """The six tensors on the host. Raises SplatwizardError for what cannot be written."""
     refuse_surfels(model, "codec vectree")
     arrays = {}
-    for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats"):
+    for name in model.RAW:
         arrays[name] = array = getattr(model, name).detach().float().cpu().numpy()
         # float16 clamps infinities; positions are kept as they are.
         bad = ~np.isfinite(array) if name == "means" else np.isnan(array)

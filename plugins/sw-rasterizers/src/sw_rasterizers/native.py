@@ -15,6 +15,7 @@ MODULE = NativeModule(
         "csrc/binding_cuda.cpp",
         "csrc/binding_scores_cuda.cpp",
         "csrc/binding_surfel_cuda.cpp",
+        "csrc/binding_shared_cuda.cpp",
     ),
     kernels=(
         "csrc/cpu/blend_backward.cpp",
@@ -48,6 +49,7 @@ MODULE = NativeModule(
         "csrc/cuda/project.cu",
         "csrc/cuda/emit.cu",
         "csrc/cuda/shade.cu",
+        "csrc/cuda/shared_colors.cu",
     ),
     # Neither changes a result: no caller reads errno, no one traps floating-point exceptions. Without them square
     # roots and selections stay scalar. Nothing of -ffast-math is needed, the packs are vectors as written.

@@ -13,7 +13,7 @@ from splatwizard_core.api import Camera, GradBuffer
 from sw_rasterizers.native import MODULE
 
 INPUTS = (
-    "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features",
+    "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features", "scale_factors",
 )  # fmt: skip
 """Differentiable inputs in the order in which the ops take them and return their gradients."""
 
@@ -58,6 +58,7 @@ class Call:
     """Everything of one call that is not a tensor to differentiate by, and where its by-products go.
 
     camera          18 numbers: R, tau, fx, fy, cx, cy, near, far
+    geom_indices    [N] int64, rows of scales and quats, none outside: the kernels do not look
     seconds         stage -> seconds, filled by the forward and by the backward pass
     counts          visible Gaussians, (splat, tile) pairs, evaluated and blended pixel-splat pairs (-1 unless counted),
                     inputs that are not finite
@@ -70,6 +71,7 @@ class Call:
     scale_modifier: float
     eps2d: float
     flags: Flag
+    geom_indices: Tensor | None = None
     visible: Tensor | None = None
     background: Tensor | None = None
     grad2d: GradBuffer | None = None
@@ -116,7 +118,7 @@ class _Rasterize(torch.autograd.Function):
             image = means.new_zeros(_channels(tensors, call.flags), call.height, call.width)
         wanted = [*ctx.needs_input_grad[2:], call.grad2d is not None, call.absgrad2d is not None]
         found, seconds = torch.ops.sw_rasterizers.render_backward(
-            *tensors, call.visible, call.background, *call.settings(), stored, image.contiguous(),
+            *tensors, call.geom_indices, call.visible, call.background, *call.settings(), stored, image.contiguous(),
             _nonempty(alpha), _nonempty(median), wanted,
         )  # fmt: skip
         call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
@@ -153,7 +155,7 @@ class _Project(torch.autograd.Function):
         tensors = [stored.pop(0) if present else None for present in ctx.present]
         wanted = [*ctx.needs_input_grad[2:], call.grad2d is not None, call.absgrad2d is not None]
         found, seconds = torch.ops.sw_rasterizers.project_backward(
-            *tensors, *call.settings(), flags, rows.contiguous(), wanted
+            *tensors, call.geom_indices, *call.settings(), flags, rows.contiguous(), wanted
         )
         call.seconds.update(zip(BACKWARD_STAGES[1:], seconds, strict=False))
         return _hand_out(call, found, wanted)
@@ -201,7 +203,7 @@ def _hand_out(call: Call, found: list[Tensor], wanted: list[bool]) -> tuple[Tens
 
 def _draw(call: Call, tensors: list[Tensor | None]) -> _Drawn:
     image, radii, alpha, median, saved, call.counts, seconds = torch.ops.sw_rasterizers.render(
-        *tensors, call.visible, call.background, *call.settings()
+        *tensors, call.geom_indices, call.visible, call.background, *call.settings()
     )
     call.seconds.update(zip(FORWARD_STAGES, seconds, strict=False))  # on CUDA only if counting
     return _Drawn(image, radii, alpha, median, saved)
@@ -258,10 +260,14 @@ def visible_radii(
     cov3d: Tensor | None,
     visible: Tensor | None,
     cam: Camera,
+    *,
+    scale_factors: Tensor | None = None,
+    geom_indices: Tensor | None = None,
 ) -> Tensor:
     """Radii [N] int32 from geometry alone; 0 = culled. No gradient."""
     MODULE.load()
-    geometry = [None if x is None else x.detach().contiguous() for x in (means, scales, quats, cov3d, visible)]
+    tensors = (means, scales, quats, cov3d, scale_factors, geom_indices, visible)
+    geometry = [None if x is None else x.detach().contiguous() for x in tensors]
     found: Tensor = torch.ops.sw_rasterizers.visible_radii(
         *geometry, camera_numbers(cam), cam.width, cam.height, 1.0, 0.3
     )

@@ -1,8 +1,8 @@
-"""Rows of a table, looked up by index, with a gradient that is summed in a fixed order on every device."""
+"""Who reads which row of a table: indices checked once, and sorted once where sums over the readers need an order."""
 
 from __future__ import annotations
 
-from typing import Any
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -12,7 +12,7 @@ from splatwizard_core.api import ShapeError
 
 
 class Segments:
-    """Rows of a table that N indices ask for, sorted once so that sums over equal indices have an order.
+    """Rows of a table that N indices ask for; sorted when first needed, so that sums over equal ones have an order.
 
     indices     [N] int64, each in 0 .. rows - 1
     rows        M, length of the table
@@ -21,52 +21,35 @@ class Segments:
     """
 
     def __init__(self, indices: Tensor, rows: int) -> None:
+        if indices.dtype != torch.int64:
+            raise ShapeError(f"codebook indices must be int64, got {indices.dtype}")
         if indices.numel() and not 0 <= int(indices.min()) <= int(indices.max()) < rows:
             raise ShapeError(
                 f"codebook indices run from {int(indices.min())} to {int(indices.max())}, the codebook has {rows} rows"
             )
-        self.indices = indices
-        ordered, self.order = torch.sort(indices, stable=True)  # [N], [N]
-        self.offsets = torch.searchsorted(ordered, torch.arange(rows + 1, device=indices.device))  # [M+1]
+        self.indices = indices.contiguous()
+        self.rows = rows
 
-    def sum(self, values: Tensor) -> Tensor:
-        """[M, ...]: for each row of the table the sum of the `values` [N, ...] that ask for it, in index order."""
-        if not len(self.order):
-            return values.new_zeros(len(self.offsets) - 1, *values.shape[1:])
-        flat = values.index_select(0, self.order).flatten(1)
-        sums = torch.segment_reduce(flat, "sum", offsets=self.offsets, axis=0, unsafe=True)
-        return sums.view(-1, *values.shape[1:])
+    @cached_property
+    def order(self) -> Tensor:
+        """[N] int64: the askers, those of row 0 first, each row's in index order."""
+        return torch.sort(self.indices, stable=True).indices
 
-
-class _Lookup(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, table: Tensor, segments: Segments) -> Tensor:
-        ctx.segments = segments
-        return table.index_select(0, segments.indices)
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None]:
-        return ctx.segments.sum(grad), None
+    @cached_property
+    def offsets(self) -> Tensor:
+        """[M+1] int64: where each row's askers begin in `order`."""
+        users = torch.arange(self.rows + 1, device=self.indices.device)
+        return torch.searchsorted(self.indices[self.order], users)
 
 
 class Tables:
-    """Looks up rows of tables; indices that come again unchanged, as at every training step, are sorted once."""
+    """Knows the segments of indices; those that come again unchanged, as at every training step, are looked at once."""
 
     def __init__(self) -> None:
         self._known: WeakIdKeyDictionary = WeakIdKeyDictionary()
 
-    def lookup(self, table: Tensor, indices: Tensor) -> Tensor:
-        """Rows of `table` [M, ...] by `indices` [N] int64: [N, ...], differentiable by the table.
-
-        The gradient of a row is the sum over everyone who asked for it, in the same order in every run, on CUDA too,
-        where torch's own gradient of indexing adds atomically. Raises ShapeError for an index outside.
-        """
-        rows: Tensor = _Lookup.apply(table, self.segments(indices, len(table)))  # type: ignore[no-untyped-call]
-        return rows
-
     def segments(self, indices: Tensor, rows: int) -> Segments:
-        """Indices [N] into a table of so many rows, sorted. Raises ShapeError for an index outside."""
+        """Indices [N] into a table of so many rows. Raises ShapeError for an index outside."""
         if indices.is_inference():
             return Segments(indices, rows)  # without a version: nobody would notice a change
         found = self._known.get(indices)

@@ -66,6 +66,7 @@ class StandardRasterizer:
                 "sh_rest": None if sh is None else sh.rest,
                 "colors": g.colors,
                 "features": g.features,
+                "scale_factors": g.scale_factors,
             },
         )
         colors = 3 if g.colors is None else g.colors.shape[1]
@@ -106,7 +107,10 @@ class StandardRasterizer:
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from means and covariances (opacities and colours are not looked at); 0 = culled."""
         self.info.check_geometry(g)
-        return visible_radii(g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam)
+        return visible_radii(
+            g.means, g.scales, g.quats, g.cov3d, _as_bytes(g.visible), cam,
+            scale_factors=g.scale_factors, geom_indices=g.geom_indices,
+        )  # fmt: skip
 
     @torch.no_grad()
     def accumulate(self, g: GaussianInputs, cams: Iterable[Camera], opt: RasterOptions) -> AccumOutput:
@@ -129,6 +133,7 @@ class StandardRasterizer:
             opt.scale_modifier,
             opt.eps2d,
             flags,
+            geom_indices=None if g.geom_indices is None else g.geom_indices.contiguous(),
             visible=_as_bytes(g.visible),
             background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if watch and opt.grad2d else None,

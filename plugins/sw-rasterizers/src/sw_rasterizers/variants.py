@@ -1,4 +1,4 @@
-"""The standard kernels under the names of the variants that ask for nothing beyond them, and codebooks before them."""
+"""The standard kernels under the names of the variants that ask for nothing beyond them, and with codebooks."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ class DepthRasterizer(StandardRasterizer):
 
 
 class IndexedRasterizer(StandardRasterizer):
-    """Codebooks of colours and of shapes, with a scale factor for each Gaussian, read in front of the kernels.
+    """Codebooks of colours and of shapes, with a scale factor for each Gaussian, read where they are needed.
 
-    Shared SH coefficients are never gathered (`shared_colors`): what a Gaussian gets of its own are a colour and, of
-    its shape, seven numbers. Gradients of codebook rows are sums over their users in a fixed order (`segments`); those
-    of factors and of quaternions are exact. On CUDA the sums of the kernels in front of them are atomic.
-    Source: C3DGS (arXiv 2401.02436).
+    The projection reads scales and quaternions through the index, forward and backward, and `shared_colors` the SH
+    coefficients: what a Gaussian gets of its own is a colour. Gradients of codebook rows are sums over their users: in
+    a fixed order on the CPU, for any number of threads; on CUDA those of shapes are atomic, as are the sums of the
+    kernels in front of them. Source: C3DGS (arXiv 2401.02436).
     """
 
     info = RasterizerInfo.declared(plugin.register_rasterizers, "c3dgs")
@@ -51,7 +51,8 @@ class IndexedRasterizer(StandardRasterizer):
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """As `standard`; `RenderResult.inputs` are the inputs as they came. Raises ShapeError for a wrong index too."""
         self.info.check_request(g, opt)
-        drawn = g.gathered(lookup=self._tables.lookup, colors=False)
+        self._check_shapes(g)
+        drawn = replace(g)
         if g.sh is not None and g.sh.codebook is not None and g.sh.indices is not None:
             segments = self._tables.segments(g.sh.indices, len(g.sh.codebook))
             center = cam.center.to(g.means)
@@ -63,4 +64,10 @@ class IndexedRasterizer(StandardRasterizer):
     def visible_filter(self, g: GaussianInputs, cam: Camera) -> Tensor:
         """Radii [N] int32 from geometry alone; 0 = culled."""
         self.info.check_geometry(g)
-        return super().visible_filter(g.gathered(lookup=self._tables.lookup, colors=False), cam)
+        self._check_shapes(g)
+        return super().visible_filter(g, cam)
+
+    def _check_shapes(self, g: GaussianInputs) -> None:
+        """Raise ShapeError for an index of a shape outside: the kernels do not look."""
+        if g.geom_indices is not None and g.scales is not None:
+            self._tables.segments(g.geom_indices, len(g.scales))

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
-from splatwizard_core.tooling import opener, render_options, render_view, suggested_rasterizers
+from splatwizard_core.tooling import NegotiatedRasterizer, open_subject, render_view
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, RasterOptions, RenderResult, Scene, SplatModel
-    from splatwizard_core.tooling import NegotiatedRasterizer, ResolvedConfig, Session
+    from splatwizard_core.tooling import ResolvedConfig, Session
 
 
 @dataclass(frozen=True)
@@ -46,15 +46,10 @@ class Drawing:
 
 
 def open_drawing(path: Path, session: Session, resolved: ResolvedConfig) -> Drawing:
-    """Open the model of a .swz or .ply, then the scene; choose among rasterizers as the run and the file ask.
+    """Open the model of a .swz or .ply, then the scene, with what draws it.
 
     Raises BitstreamError, PluginError, UserInputError for a file that cannot be opened, SceneError.
     """
-    opened = opener(path, session)()
-    scene = session.scene(resolved)
-    rasterizer = session.rasterizer(resolved, suggested_rasterizers(opened.raster))
-    opened.model.check_finite()
-    with torch.no_grad():
-        opened.model.prepare()
-    options = render_options(opened.raster, scene.background.to(session.device))
-    return Drawing(opened.model, scene, rasterizer, options, session.device)
+    found = open_subject(path, session, resolved)
+    assert isinstance(found.rasterizer, NegotiatedRasterizer)  # a session has no other
+    return Drawing(found.model, found.scene, found.rasterizer, found.options, session.device)

@@ -38,8 +38,8 @@ def command_of(run: Run) -> str | None:
         parts += ["--config", file]
     for key, who in sources.items():
         if who == "--set":
-            parts += ["--seed", _spelled(_value(config, key))] if key == "seed" else [
-                "--set", f"{key}={_spelled(_value(config, key))}"
+            parts += ["--seed", _spelled(value_of(config, key))] if key == "seed" else [
+                "--set", f"{key}={_spelled(value_of(config, key))}"
             ]  # fmt: skip
     return shlex.join(map(clean, parts))
 
@@ -68,7 +68,7 @@ def _scene(run: Run) -> str:
     return run.facts.scene
 
 
-def _value(config: dict[str, Any], key: str) -> object:
+def value_of(config: dict[str, Any], key: str) -> object:
     """Value of a dotted key, in whichever block it stands."""
     for start in (*(config.get(block) for block in BLOCKS), config):
         value: object = start

@@ -1,4 +1,4 @@
-"""Registers the command `sw report`, and makes the tables and pages that `sw run` ends with."""
+"""Registers the commands `sw report` and `sw compare`, and makes the tables and pages that `sw run` ends with."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 @hookimpl
 def register_commands(registry: Registry) -> None:
     registry.add("report", "sw_report.command:report", position=4.7, summary="tables, curves, BD-rates, one HTML page")
+    registry.add("compare", "sw_report.compare:compare", position=4.8, summary="a run beside published figures")
 
 
 @hookimpl

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, CodecChoice
+from sw_gaussians.surface_losses import NormalTerm, identity_before_terms
 
 from splatwizard_core.api import Params
 from sw_trimgs.config import Densify, Trimming, TuneConfig
@@ -23,6 +24,9 @@ class SurfaceTuning(Params):
     )
     lambda_dist: float = Field(100.0, ge=0, description="weight of the distortion, for the authors' scene scale")
     lambda_normal: float = Field(0.05, ge=0, description="weight of the normal consistency")
+    normal_term: NormalTerm = Field(
+        "code", description="form of the normal loss: of the authors' code, or paper: an empty pixel costs nothing"
+    )
     edge_threshold: float = Field(
         0.03, ge=0, description="pixels where the depth changes by more do not count, world units a pixel; 0: all do"
     )
@@ -37,6 +41,9 @@ class Trim2DGSConfig(TuneConfig):
     drop_masked: bool = Field(
         False, description="first drop what lies outside the mask of a view that it is seen in (DTU)"
     )
+
+    def identity(self) -> dict[str, Any]:
+        return identity_before_terms(super().identity())
 
 
 class ScratchSplit(Params):
@@ -64,6 +71,9 @@ class ScratchSurface(Params):
     depth_ratio: float | None = Field(None, ge=0, le=1, description="as of 2dgs; unset: by data set")
     lambda_dist: float = Field(100.0, ge=0, description="weight of the distortion, for the authors' scene scale")
     lambda_normal: float = Field(0.05, ge=0, description="weight of the normal consistency")
+    normal_term: NormalTerm = Field(
+        "code", description="form of the normal loss: of the authors' code, or paper: an empty pixel costs nothing"
+    )
     normal_after: int = Field(7_000, ge=0, description="last step without the normal loss")
     edge_threshold: float = Field(
         0.03, ge=0, description="pixels where the depth changes by more do not count, world units a pixel; 0: all do"
@@ -83,3 +93,6 @@ class ScratchConfig(Choosing):
         {}, description="values of 2dgs by its keys (base.densify.grad_threshold=4e-4), and its preset (base.preset)"
     )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
+
+    def identity(self) -> dict[str, Any]:
+        return identity_before_terms(super().identity())

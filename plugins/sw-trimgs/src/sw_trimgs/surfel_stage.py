@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 import torch
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.surface import surface_depth
-from sw_gaussians.surface_losses import distortion_loss, maps_for, normal_disagreement
+from sw_gaussians.surface_losses import add_surface_losses, maps_for
 from sw_gaussians.surfels import Surface, SurfelModel
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 from sw_gaussians.wrapped_stage import WrappedStage
 
-from splatwizard_core.api import EmptyModel, LossPack, RasterOptions, UserInputError
+from splatwizard_core.api import EmptyModel, RasterOptions, UserInputError
 from sw_trimgs.normals import smooth_pixels
 from sw_trimgs.scale_split import ScaleSplit
 from sw_trimgs.stage import TrimStage
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from splatwizard_core.api import (
-        Camera,
+        LossPack,
         Method,
         OptimizationParams,
         PipelineParams,
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
         StageContext,
         View,
     )
-    from sw_trimgs.surfel_config import ScratchConfig, Trim2DGSConfig
+    from sw_trimgs.surfel_config import ScratchConfig, ScratchSurface, SurfaceTuning, Trim2DGSConfig
 
 SPLIT, TRIM, RESET = 1, 2, 3
 """Priorities within a step, after 2DGS' own density control."""
@@ -80,26 +80,17 @@ class TrimSurfelStage(TrimStage):
         return self._options
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        loss, settings = super().loss(model, view, result, background, step), self.settings
-        total, parts = loss.total, dict(loss.parts)
-        if settings.lambda_dist > 0:
-            parts["distortion"] = distortion_loss(result)
-            total = total + settings.lambda_dist * parts["distortion"]
-        if settings.lambda_normal > 0:
-            camera = view.camera.to(result.image.device)
-            parts["normals"] = smooth_disagreement(
-                result, camera, self.depth_ratio, settings.edge_threshold, settings.erosion
-            )
-            total = total + settings.lambda_normal * parts["normals"]
-        return LossPack(total, {name: part.detach() for name, part in parts.items()})
+        pack, settings = super().loss(model, view, result, background, step), self.settings
+        mask = smooth_surface(result, self.depth_ratio, settings) if settings.lambda_normal > 0 else None
+        return add_surface_losses(
+            pack, result, view.camera, self.depth_ratio,
+            distortion=settings.lambda_dist, normals=settings.lambda_normal, term=settings.normal_term, mask=mask,
+        )  # fmt: skip
 
 
-def smooth_disagreement(
-    result: RenderResult, camera: Camera, depth_ratio: float, edge_threshold: float, erosion: int
-) -> Tensor:
-    """Scalar, the mean over all pixels of 1 - n . (A n_surf), 0 near edges of the depth (`smooth_pixels`)."""
-    mask = smooth_pixels(surface_depth(result.depth, depth_ratio), edge_threshold, erosion)
-    return (mask * normal_disagreement(result, camera, depth_ratio)).mean()
+def smooth_surface(result: RenderResult, depth_ratio: float, settings: SurfaceTuning | ScratchSurface) -> Tensor:
+    """[1,H,W], 1 where the surface has no edge near by and 0 elsewhere, without gradient (`smooth_pixels`)."""
+    return smooth_pixels(surface_depth(result.depth, depth_ratio), settings.edge_threshold, settings.erosion)
 
 
 @torch.no_grad()
@@ -124,12 +115,9 @@ def within_masks(model: SurfelModel, views: Sequence[View]) -> SurfelModel:
         keep &= ~inside | hit
     if not bool(keep.any()):
         raise EmptyModel(0)
-    kept = SurfelModel(*(getattr(model, name).detach()[keep].clone() for name in TENSORS))
+    kept = SurfelModel(*(getattr(model, name).detach()[keep].clone() for name in model.RAW))
     kept.split_seed, kept.active_sh_degree, kept.surface = model.split_seed, model.active_sh_degree, model.surface
     return kept
-
-
-TENSORS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 
 
 def mask_of(view: View) -> Tensor | None:
@@ -212,13 +200,14 @@ class ScratchStage(WrappedStage):
         return self._maps[1]
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
-        loss, weight, surface = (
+        pack, weight, surface = (
             self.inner.loss(model, view, result, background, step),
             self.weight(step),
             self.config.surface,
         )
         if weight == 0:
-            return loss
-        camera = view.camera.to(result.image.device)
-        term = smooth_disagreement(result, camera, self.depth_ratio, surface.edge_threshold, surface.erosion)
-        return LossPack(loss.total + weight * term, loss.parts | {"normals": term.detach()})
+            return pack
+        mask = smooth_surface(result, self.depth_ratio, surface)
+        return add_surface_losses(
+            pack, result, view.camera, self.depth_ratio, normals=weight, term=surface.normal_term, mask=mask
+        )

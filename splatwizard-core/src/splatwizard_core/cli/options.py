@@ -83,6 +83,19 @@ device_option = click.option(
 seed_option = click.option(
     "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
 )
+
+
+class _Seeds(click.IntRange):
+    """A seed, or a comma list of them as a tuple."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        found = [click.IntRange.convert(self, each, param, ctx) for each in str(value).split(",")]  # type: ignore[arg-type]
+        return found[0] if len(found) == 1 else tuple(found)
+
+
+seeds_option = click.option(
+    "--seed", type=_Seeds(min=0), metavar="N[,N]", help="Of every random stream; several make a sweep.  [default: 0]"
+)
 repeats_option = click.option(
     "--repeats", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",
     help="Measure rendering speed N times; the spread goes into the record.",

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         "--preset", metavar="NAME", type=PRESET,
         help="Named values of the method.  [default: paper, or what --config says]",
     ),
-    shared.rate_option, shared.config_option, shared.set_option,
+    shared.scene_option, shared.rate_option, shared.config_option, shared.set_option,
     click.option("--verbose", is_flag=True, help="Also the first and last step and the number of executions."),
     shared.json_option, shared.debug_option,
 )  # fmt: skip

@@ -72,6 +72,7 @@ class Choices:
         """One configuration for every method and rate point; wrong input fails before anything runs."""
         from splatwizard_core.runs.config import rate_points, resolve
         from splatwizard_core.runs.pretrained import checked_start
+        from splatwizard_core.training.keys import dotted
 
         values = self.values()
         found = [
@@ -79,6 +80,11 @@ class Choices:
             for method in map(plugins.methods.load, self.method_names(plugins))
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
+        for each in found:
+            values = dotted(each.config.model_dump() | each.scene_options, "")
+            told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
+            if told and each.rate == found[0].rate:
+                say(f"{each.method}, by data set: {', '.join(told)}")
         return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:

@@ -60,8 +60,9 @@ def ended_like_ctrl_c() -> Iterator[None]:
     So a training that a cluster stops writes a checkpoint first, also where Ctrl-C itself is ignored, as it is for what
     a script starts in the background. What ignores SIGHUP already (`nohup`) goes on so.
     """
-    signals = [signal.SIGTERM, signal.SIGHUP] if threading.current_thread() is threading.main_thread() else []
-    ended = [number for number in signals if signal.getsignal(number) is signal.SIG_DFL]
+    asked = [signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)]  # Windows has no terminal that hangs up
+    main = threading.current_thread() is threading.main_thread()
+    ended = [number for number in {*asked} if main and signal.getsignal(number) is signal.SIG_DFL]
     for number in ended:
         signal.signal(number, signal.default_int_handler)
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -148,27 +147,20 @@ class GaussianInputs:
             held |= {f"sh.{name}": stored for name, stored in vars(self.sh).items()}
         return {name: held[name] for name in _SIZES if held.get(name) is not None}
 
-    def gathered(
-        self,
-        *,
-        geometry: bool = True,
-        colors: bool = True,
-        lookup: Callable[[Tensor, Tensor], Tensor] = _rows_of,
-    ) -> GaussianInputs:
+    def gathered(self, *, geometry: bool = True, colors: bool = True) -> GaussianInputs:
         """A shallow copy in which every Gaussian has its own scales, quaternion and colours; differentiable.
 
         geometry, colors    False leaves the shapes, or the colours, in the form in which they are stored
-        lookup              (table [M,...], indices [N]) -> its rows [N,...]
         """
         g = replace(self)
         if geometry and g.scales is not None and g.quats is not None:
             if g.geom_indices is not None:
-                g.scales, g.quats = lookup(g.scales, g.geom_indices), lookup(g.quats, g.geom_indices)
+                g.scales, g.quats = _rows_of(g.scales, g.geom_indices), _rows_of(g.quats, g.geom_indices)
             if g.scale_factors is not None:
                 g.scales = g.scales * g.scale_factors[:, None]
             g.geom_indices = g.scale_factors = None
         if colors and g.sh is not None and g.sh.codebook is not None and g.sh.indices is not None:
-            rest = lookup(g.sh.codebook, g.sh.indices)
+            rest = _rows_of(g.sh.codebook, g.sh.indices)
             own: dict[str, Tensor] = {"dense": rest} if g.sh.dc is None else {"dc": g.sh.dc, "rest": rest}
             g.sh = SH(**own, active_degree=g.sh.active_degree)
         return g

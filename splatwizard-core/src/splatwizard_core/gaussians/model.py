@@ -35,10 +35,9 @@ class GaussianModel(SplatModel):
 
     NUM_SCALES: int = 3
     """Columns of `log_scales`; a subclass of flat Gaussians (surfels) has 2."""
-    ROWS: tuple[str, ...] = (
-        "means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats",
-        "grad_accum", "denom", "max_radii2d",
-    )  # fmt: skip
+    RAW: tuple[str, ...] = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
+    """The raw parameters of any GaussianModel, in the order of the constructor."""
+    ROWS: tuple[str, ...] = (*RAW, "grad_accum", "denom", "max_radii2d")
 
     means: nn.Parameter
     sh_dc: nn.Parameter

@@ -1,4 +1,4 @@
-"""Configuration of a run: defaults -> preset -> rate point -> file -> --set, every key and value checked."""
+"""Configuration of a run: defaults -> preset -> data set -> rate point -> file -> --set, all checked."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from splatwizard_core.errors import ConfigError, PluginError
 from splatwizard_core.evaluation.metrics import MetricSettings, check_settings
 from splatwizard_core.plugins.manager import PluginManager, load_plugins
 from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.loading import family_of
 from splatwizard_core.scene.locate import is_procedural
 from splatwizard_core.training.keys import block_keys, dotted, field_at, flatten, input_files, set_at, value_at
 from splatwizard_core.training.overrides import apply_overrides, unknown_key
@@ -51,7 +52,7 @@ class ResolvedConfig:
     config                  the method's hyper-parameters
     ppl                     run parameters
     scene                   how the scene is read
-    provenance              dotted key -> "preset 'quick'", "rate 'r2'", a file name or "--set"; absent: the default
+    provenance              dotted key -> "preset 'quick'", "data set 'db'", "rate 'r2'", a file, "--set"; else default
     init                    a .ply that the run starts from in place of a trained scene; empty: none
     pretrained              values by dotted key of the method whose trained scene it starts from, and its "preset"
     metrics                 settings of metrics, group -> key -> value
@@ -237,7 +238,7 @@ def resolve(
     scene: str | None = None,
     plugins: PluginManager | None = None,
 ) -> ResolvedConfig:
-    """Decide every value of a run of `method`: defaults -> preset -> rate point -> file -> sets, the later wins.
+    """Decide every value of a run: defaults -> preset -> data set -> rate point -> file -> sets, the later wins.
 
     preset, rate    names; None: what the file says, else "quick" on a procedural scene and "paper" elsewhere, and the
                     method's DEFAULT_RATE
@@ -267,11 +268,13 @@ def resolve(
     if others:
         raise ConfigError(f"one rate point is needed here, not '{asked}'", key="rate")
 
+    family = family_of(scene_spec, plugins.datasets) if preset == "paper" and method.BY_DATASET else None
     config, ppl, reading = method.Config(), PipelineParams(), SceneParams()
     init, pretrained, settings = "", dict[str, Any](), dict[str, Any]()
     provenance: dict[str, str] = {}
     for source, layer in (
         (f"preset '{preset}'", method.PRESETS[preset]),
+        (f"data set '{family}'", method.BY_DATASET.get(family or "", {})),
         (f"rate '{rate}'", method.RATES[rate]),
         (str(config_file), flatten(method.Config, flatten(PipelineParams, tables))),
         ("--set", sets or {}),

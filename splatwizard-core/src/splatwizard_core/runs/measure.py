@@ -192,3 +192,15 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
     if path.suffix != ".ply":
         import_method(path, session.plugins)  # code is not memory of the model
     return open_file
+
+
+def open_subject(path: Path, session: Session, resolved: ResolvedConfig) -> quality.Subject:
+    """Open the model of a .swz or .ply, then its scene; what draws it is as the run and the file ask."""
+    model, raster, _, static = opener(path, session)()
+    model.check_finite()
+    scene = session.scene(resolved)
+    rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
+    with torch.no_grad():
+        model.prepare()
+    options = quality.render_options(raster, scene.background.to(session.device))
+    return quality.Subject(model, scene, rasterizer, options, MetricSetup(session.device, resolved.metrics), static)

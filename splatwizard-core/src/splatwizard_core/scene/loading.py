@@ -56,6 +56,17 @@ def load_scene(spec: str, options: SceneOptions, plugins: PluginManager) -> Scen
     return scene
 
 
+def family_of(spec: str, families: Families) -> str | None:
+    """Return the name of the family that reads `spec`, without reading it; None where `load_scene` would raise."""
+    named = spec.replace(":", "/").partition("/")[0]
+    if named in families and not os.path.exists(spec):
+        return named
+    try:
+        return _recognise(locate(spec, families)[0], families)
+    except SceneError:
+        return None
+
+
 def _family(families: Families, name: str) -> Dataset:
     target = families.load(name)
     return target() if isinstance(target, type) else target

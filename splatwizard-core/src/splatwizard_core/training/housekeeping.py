@@ -12,10 +12,9 @@ import torch
 
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.training.checkpoint import Checkpoint, normalised
-from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.timing import LoopClock
 from splatwizard_core.training.trainer import StepRecord, Trainer
-from splatwizard_native import preserved_random_states, read_scalars, synchronize, track
+from splatwizard_native import InterruptGuard, preserved_random_states, read_scalars, synchronize, track
 
 if TYPE_CHECKING:
     from splatwizard_core.training.pipeline import TrainingRun

@@ -20,7 +20,6 @@ from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Scene, View
-from splatwizard_core.training.interrupt import InterruptGuard
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
@@ -29,7 +28,14 @@ from splatwizard_core.training.stage import CameraIterator, Stage
 from splatwizard_core.training.task_log import TaskLog
 from splatwizard_core.training.tasks import TaskContext
 from splatwizard_core.training.timing import StageClock
-from splatwizard_native import DeviceMemoryError, Verdict, capture_random_states, out_of_memory, restore_random_states
+from splatwizard_native import (
+    DeviceMemoryError,
+    InterruptGuard,
+    Verdict,
+    capture_random_states,
+    out_of_memory,
+    restore_random_states,
+)
 
 CHECK_EVERY = 32
 """Steps between questions to a GPU whether the losses are finite; each is answered at the next one, so that none is

@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.binary import SteBinary
 
 PRIMES = (1, 2654435761, 805459861)
@@ -200,9 +201,23 @@ class HashGrid(nn.Module):
             raise ValueError("only a binary hash grid is looked up in integers")
         if codes.shape[1:] != (self.dimensions,) or codes.is_floating_point():
             raise ValueError(f"position codes must be integers [n, {self.dimensions}], not {list(codes.shape)}")
+        if codes.device.type == "cpu" and self.dimensions == 3 and self.features <= 16 and EXACT.try_load():
+            found = codes.new_empty(len(codes), self.width, dtype=torch.int64)
+            self._kernel_features(codes.to(torch.int64).contiguous(), (0, 1, 2), found, 0)
+            return found
         signs = torch.where(self.table.detach() >= 0, 1.0, -1.0).to(torch.float64)
         blocks = [self._integer_block(block, signs) for block in codes.to(torch.int64).split(INTEGER_ROWS)]
         return torch.cat(blocks) if blocks else codes.new_zeros(0, self.width, dtype=torch.int64)
+
+    def _kernel_features(self, codes: Tensor, axes: Sequence[int], into: Tensor, column: int) -> None:
+        """Write `integer_features` for some axes of codes int64 [n,3] into columns of `into` from `column` on."""
+        places = torch.arange(self.features)
+        signs = ((self.table.detach() >= 0).to(torch.int32) << places).sum(dim=1).to(torch.int16)
+        order = torch.argsort(self._order)  # buffers hold dense levels first
+        levels = torch.stack([self._last, self._start.to(torch.int64), column + order * self.features])
+        torch.ops.sw_codecs_exact.grid_features(
+            codes, list(axes), signs, self.features, levels, self._dense, self.log2_size, into
+        )
 
     def _integer_block(self, codes: Tensor, signs: Tensor) -> Tensor:
         inside = ((codes >= 0) & (codes <= POSITION_TOP)).all(dim=1)
@@ -372,6 +387,14 @@ class MixedHashGrid(nn.Module):
 
     def integer_features(self, codes: Tensor) -> Tensor:
         """[n,3] 16-bit codes -> [n, width] int64 with 12 fractional bits."""
+        first = self._all()[0]
+        if codes.device.type == "cpu" and first.features <= 16 and EXACT.try_load():
+            codes, column = codes.to(torch.int64).contiguous(), 0
+            found = codes.new_empty(len(codes), self.width)
+            for grid, axes in zip(self._all(), self.AXES, strict=True):
+                grid._kernel_features(codes, axes, found, column)
+                column += grid.width
+            return found
         return torch.cat(
             [grid.integer_features(codes[:, list(axes)]) for grid, axes in zip(self._all(), self.AXES, strict=True)],
             dim=1,

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
+from sw_codecs.exact_native import EXACT
 
 FRACTION = 12
 ACTIVATION_LIMIT = 1 << 20  # 256 in units of 1
@@ -96,8 +97,16 @@ class IntegerMlp:
         """
         if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
             raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
+        if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
+            flat = [each for layer in self._layers for each in layer]
+            outputs: Tensor = torch.ops.sw_codecs_exact.network(inputs.to(torch.int64).contiguous(), flat)
+            return outputs
         rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
         return torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
+
+    def flat(self) -> Tensor:
+        """Integers of all weights and biases, layer by layer, float64 [P]."""
+        return torch.cat([each.reshape(-1) for layer in self._layers for each in layer])
 
     def _evaluate(self, inputs: Tensor) -> Tensor:
         device = self._layers[0][0].device

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from splatwizard_core.api import BitstreamError
 from sw_codecs.context import wavefront
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
-from sw_codecs.context.wavefront import NEIGHBORS
+from sw_codecs.context.plane_fields import NEIGHBORS
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_codecs.entropy.rates import laplace_bits, lower_bound
 
@@ -255,6 +255,11 @@ class ExactSpatialAr:
             self._network = IntegerMlp(weights)
         except ValueError as error:
             raise BitstreamError(f"a spatial model cannot be used: {error}") from error
+
+    @property
+    def flat(self) -> Tensor:
+        """Integers of all weights and biases, layer by layer, float64 [1058]: what the compiled kernel takes."""
+        return self._network.flat()
 
     def __call__(self, neighbors: Tensor) -> tuple[np.ndarray, np.ndarray]:
         """(mean int64 [n] with 12 fractional bits, level 0..63 of the scale) for neighbours int64 [n, 12]."""

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from sw_codecs.context.principal_frame import UNIT, PrincipalFrame
+from sw_codecs.exact_native import EXACT
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Axes (width, height) of the three planes."""
@@ -22,6 +23,8 @@ GAIN = 16
 """Integers of the file are round(GAIN * value)."""
 INTEGER_LIMIT = 1 << 24
 ROWS_AT_ONCE = 1 << 13
+MOST_SCALES = 4
+"""That the kernel of the exact look-up takes."""
 
 
 class PlaneSites(NamedTuple):
@@ -127,6 +130,10 @@ class Triplane(nn.Module):
     def exact_lookup(integers: Sequence[Tensor]) -> Callable[[Tensor], Tensor]:
         """`exact` of one set of planes, as a function of places: to be called often, with few places at once."""
         corners = [plane.flatten(2).transpose(1, 2).contiguous() for plane in integers]  # [3, R*R, C]
+        if _kernel_takes(corners) and EXACT.try_load():
+            small = [each.to(torch.int32) for each in corners]
+            sizes = [plane.shape[-1] for plane in integers]
+            return lambda places: torch.ops.sw_codecs_exact.triplane_features(places.contiguous(), small, sizes)
         return lambda places: _exact_rows(integers, corners, places)
 
 
@@ -175,6 +182,10 @@ class _Sampled(torch.autograd.Function):
                 table.index_add_(0, index.reshape(-1), weighted)
             found.append(table.view(k, h, w, channels).movedim(3, 1).contiguous())
         return None, None, None, *reversed(found)
+
+
+def _kernel_takes(corners: Sequence[Tensor]) -> bool:
+    return 0 < len(corners) <= MOST_SCALES and all(c.device.type == "cpu" and c.shape[1] for c in corners)
 
 
 def _exact_rows(integers: Sequence[Tensor], corners: Sequence[Tensor], places: Tensor) -> Tensor:

@@ -21,6 +21,7 @@ from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
 from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
+from sw_codecs.entropy.lattice import lattice
 from sw_codecs.entropy.rates import gaussian_bits
 
 BLOCK_SYMBOLS = 1 << 20
@@ -64,7 +65,8 @@ class ConditionalGaussian:
         """
         values, where = _array(symbols), _where(present)
         if self.mode == "exact":
-            return self._exact.encode(values[where].reshape(-1), _integers(context, where, values.shape))
+            there = None if present is None else where
+            return self._exact.encode_rows(values, context.mean, context.scale, context.step, there)
         coded = values[where].reshape(-1)
         if not len(coded):
             return b""
@@ -78,7 +80,8 @@ class ConditionalGaussian:
         found = np.zeros(shape, np.int64)
         try:
             if self.mode == "exact":
-                coded = self._exact.decode(data, _integers(context, where, shape))
+                there = None if present is None else where
+                coded = self._exact.decode_at(data, *lattice(context.mean, context.scale, context.step, there))
             else:
                 coded = self._decode_floats(data, context, where, shape)
         except ValueError as error:

@@ -141,10 +141,7 @@ def lattice(
     model: GaussianModel, settings: QuantizedSettings, sort: Callable[[NDArray[np.int64]], NDArray[np.int64]]
 ) -> tuple[Layout, NDArray[np.int64], NDArray[np.int32]]:
     """Header, grid cells [N,3] in the order of `sort`, and integers of the attributes [N,C] likewise."""
-    arrays = {
-        name: getattr(model, name).detach().cpu().numpy()
-        for name in ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
-    }
+    arrays = {name: getattr(model, name).detach().cpu().numpy() for name in model.RAW}
     keep = arrays["opacity_logits"] >= FAINTEST
     for array in arrays.values():
         # +inf is a legitimate logit (opacity 1); everything else must be finite to be drawn.

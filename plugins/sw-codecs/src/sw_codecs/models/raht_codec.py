@@ -43,7 +43,6 @@ COLUMNS = CHANNELS + 3
 
 HALF_MAX = 65504.0
 MAX_BLOCKS = 4096
-PARAMETERS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 
 
 class Raht:
@@ -162,7 +161,7 @@ def _read(reader: ContainerReader, plugins: PluginManager) -> GaussianModel:
         "opacity_logits": attributes[:, 0], "log_scales": log_scales,
         "quats": torch.from_numpy(exact_quats_of(attributes[:, 1:4].numpy())),
     }  # fmt: skip
-    tensors = {name: values[name].float().contiguous() for name in PARAMETERS}
+    tensors = {name: values[name].float().contiguous() for name in GaussianModel.RAW}
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise BitstreamError(f"{reader.name}: decoded '{name}' is not finite: the file is damaged or hostile")

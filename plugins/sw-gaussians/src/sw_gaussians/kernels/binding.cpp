@@ -55,5 +55,8 @@ TORCH_LIBRARY(splatwizard_gaussians, m) {
   // On CUDA alone, see binding_cuda.cpp.
   m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
         " Tensor(c!) max_radii) -> ()");
+  m.def("disagreement(Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center) -> Tensor");
+  m.def("disagreement_backward(Tensor grad, Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center)"
+        " -> (Tensor, Tensor)");
   m.impl("sparse_adam", c10::DispatchKey::CPU, TORCH_FN(sparse_adam));
 }

@@ -2,11 +2,13 @@
 #ifdef SW_WITH_CUDA
 
 #include <ATen/core/Tensor.h>
+#include <ATen/ops/empty_like.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
 #include <c10/cuda/CUDAStream.h>
 #include <torch/library.h>
 
+#include <tuple>
 #include <utility>
 
 #include "cuda/kernels.h"
@@ -44,10 +46,52 @@ void view_statistics(const at::Tensor& gradients, const at::Tensor& radii, const
   C10_CUDA_KERNEL_LAUNCH_CHECK();
 }
 
+kernels::Surface surface_of(const at::Tensor& depth, const at::Tensor& normals, const at::Tensor& alpha,
+                            c10::ArrayRef<double> lens) {
+  check(depth, "disagreement", "depth");
+  check(normals, "disagreement", "normals");
+  check(alpha, "disagreement", "alpha");
+  TORCH_CHECK(lens.size() == 4, "disagreement: focal_and_center must be fx, fy, cx, cy");
+  TORCH_CHECK(depth.dim() == 3 && depth.size(0) == 1 && alpha.sizes() == depth.sizes() && normals.dim() == 3 &&
+                  normals.size(0) == 3 && normals.size(1) == depth.size(1) && normals.size(2) == depth.size(2) &&
+                  normals.device() == depth.device() && alpha.device() == depth.device(),
+              "disagreement: depth and alpha [1,H,W] and normals [3,H,W] do not fit: ", depth.sizes(), ", ",
+              alpha.sizes(), ", ", normals.sizes());
+  return {depth.const_data_ptr<float>(), normals.const_data_ptr<float>(), alpha.const_data_ptr<float>(),
+          int32_t(depth.size(2)), int32_t(depth.size(1)), float(lens[0]), float(lens[1]), float(lens[2]),
+          float(lens[3])};
+}
+
+at::Tensor disagreement(const at::Tensor& depth, const at::Tensor& normals, const at::Tensor& alpha,
+                        c10::ArrayRef<double> lens) {
+  const kernels::Surface surface = surface_of(depth, normals, alpha, lens);
+  const c10::cuda::CUDAGuard guard(depth.device());
+  at::Tensor found = at::empty_like(depth);
+  kernels::disagreement(surface, found.mutable_data_ptr<float>(), c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return found;
+}
+
+std::tuple<at::Tensor, at::Tensor> disagreement_backward(const at::Tensor& grad, const at::Tensor& depth,
+                                                         const at::Tensor& normals, const at::Tensor& alpha,
+                                                         c10::ArrayRef<double> lens) {
+  const kernels::Surface surface = surface_of(depth, normals, alpha, lens);
+  check(grad, "disagreement", "grad");
+  TORCH_CHECK(grad.sizes() == depth.sizes() && grad.device() == depth.device(), "disagreement: grad does not fit");
+  const c10::cuda::CUDAGuard guard(depth.device());
+  at::Tensor to_depth = at::empty_like(depth), to_normals = at::empty_like(normals);
+  kernels::disagreement_backward(surface, grad.const_data_ptr<float>(), to_depth.mutable_data_ptr<float>(),
+                                 to_normals.mutable_data_ptr<float>(), c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return {to_depth, to_normals};
+}
+
 }  // namespace
 
 TORCH_LIBRARY_IMPL(splatwizard_gaussians, CUDA, m) {
   m.impl("view_statistics", view_statistics);
+  m.impl("disagreement", disagreement);
+  m.impl("disagreement_backward", disagreement_backward);
 }
 
 #endif  // SW_WITH_CUDA

@@ -46,6 +46,8 @@ def check_configuration(entry: Entry, plugins: PluginManager) -> str:
     )
     undescribed = [name for name, field in method.Config.model_fields.items() if not field.description]
     hold(not undescribed, f"no description of {', '.join(undescribed)}", "Field(..., description=unit and meaning)")
+    for family in method.BY_DATASET:
+        resolve(method, ALWAYS[0], scene=f"{family}:{TINY}", plugins=plugins)  # raises for a wrong key or value
     for preset in presets:
         for rate in rates:
             resolved = resolve(method, preset, rate, scene=TINY, plugins=plugins)

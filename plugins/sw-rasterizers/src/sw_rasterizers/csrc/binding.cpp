@@ -121,11 +121,12 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
 std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>, std::vector<double>> render(
     const Tensor& means, const Tensor& opacities, const OptionalTensor& scales, const OptionalTensor& quats,
     const OptionalTensor& cov3d, const OptionalTensor& sh, const OptionalTensor& sh_dc, const OptionalTensor& sh_rest,
-    const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& visible,
-    const OptionalTensor& background, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
+    const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& scale_factors,
+    const OptionalTensor& geom_indices, const OptionalTensor& visible, const OptionalTensor& background, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
     double scale_modifier, double eps2d, int64_t flags) {
   const Inputs in{means,    opacities, scales,     quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
-                  features, visible,   background, sh_degree, scale_modifier, eps2d, flags};
+                  features, visible,   background, sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
+                  geom_indices};
   in.check();
   TORCH_CHECK(camera.size() == 18 && width > 0 && height > 0, "sw_rasterizers: malformed camera");
   auto r = means.scalar_type() == at::kDouble ? render_as<double>(in, camera, width, height)
@@ -179,10 +180,19 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
   }
   out.colors = want(kWantColors, in.colors);
   out.features = want(kWantFeatures, in.features);
+  out.scale_factors = want(kWantScaleFactors, in.scale_factors);
+  Tensor shape_sums;
+  if (g.shape_rows != nullptr && (out.scales != nullptr || out.quats != nullptr)) {
+    shape_sums = make_tensor({shape_groups(g.count, g.shapes), g.shapes, kShapeSums}, real);
+    out.shape_sums = data<S>(shape_sums);
+  }
   const OptionalTensor screen = at::empty({wanted[kWantGrad2d] || wanted[kWantAbsgrad2d] ? g.count : 0, 2}, real);
   out.grad2d = want(kWantGrad2d, screen);
   out.absgrad2d = want(kWantAbsgrad2d, screen);
-  if (g.count > 0) SW_SELECT(project_backward<S>)(view, g, settings, channels, slots, data<S>(sums), out);
+  if (g.count > 0)
+    SW_SELECT(project_backward<S>)(view, g, settings, channels, slots, data<S>(sums), out);
+  else
+    for (const int which : {kWantScales, kWantQuats}) grads[which].zero_();
   seconds.push_back(clock.lap());
   return {std::move(grads), std::move(seconds)};
 }
@@ -190,13 +200,14 @@ std::tuple<std::vector<Tensor>, std::vector<double>> backward_as(
 std::tuple<std::vector<Tensor>, std::vector<double>> render_backward(
     const Tensor& means, const Tensor& opacities, const OptionalTensor& scales, const OptionalTensor& quats,
     const OptionalTensor& cov3d, const OptionalTensor& sh, const OptionalTensor& sh_dc, const OptionalTensor& sh_rest,
-    const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& visible,
-    const OptionalTensor& background, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
+    const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& scale_factors,
+    const OptionalTensor& geom_indices, const OptionalTensor& visible, const OptionalTensor& background, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
     double scale_modifier, double eps2d, int64_t flags, std::vector<Tensor> saved, const Tensor& image_gradient,
     const OptionalTensor& alpha_gradient, const OptionalTensor& median_gradient,
     std::array<bool, kWantedCount> wanted) {
   const Inputs in{means,    opacities, scales,     quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
-                  features, visible,   background, sh_degree, scale_modifier, eps2d, flags};
+                  features, visible,   background, sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
+                  geom_indices};
   in.check();
   TORCH_CHECK(saved.size() == kSavedCount, "sw_rasterizers: the forward pass kept no state for the backward pass");
   return means.scalar_type() == at::kDouble ? backward_as<double>(in, camera, width, height, saved, image_gradient,
@@ -212,12 +223,14 @@ void radii_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int6
 }
 
 Tensor visible_radii(const Tensor& means, const OptionalTensor& scales, const OptionalTensor& quats,
-                     const OptionalTensor& cov3d, const OptionalTensor& visible, at::ArrayRef<double> camera,
+                     const OptionalTensor& cov3d, const OptionalTensor& scale_factors,
+                     const OptionalTensor& geom_indices, const OptionalTensor& visible, at::ArrayRef<double> camera,
                      int64_t width, int64_t height, double scale_modifier, double eps2d) {
   const OptionalTensor none, colors = means;
   const Tensor opacities = at::empty({0}, means.options());
   const Inputs in{means,  opacities, scales,  quats, cov3d, none,           none,  none,
-                  colors, none,      visible, none,  0,     scale_modifier, eps2d, 0};
+                  colors, none,      visible, none,  0,     scale_modifier, eps2d, 0,
+                  3,      scale_factors, geom_indices};
   in.check_geometry();
   Tensor radii = at::empty({means.size(0)}, means.options().dtype(at::kInt).requires_grad(false));
   means.scalar_type() == at::kDouble ? radii_as<double>(in, camera, width, height, radii)
@@ -230,14 +243,16 @@ Tensor visible_radii(const Tensor& means, const OptionalTensor& scales, const Op
 TORCH_LIBRARY(sw_rasterizers, m) {
   m.def(
       "render(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
-      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? visible, Tensor? background, "
+      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? scale_factors, Tensor? geom_indices, "
+      "Tensor? visible, Tensor? background, "
       "float[] camera, int width, int height, int sh_degree, float scale_modifier, float eps2d, int flags) "
       "-> (Tensor image, Tensor radii, Tensor alpha, Tensor median, Tensor[] saved, int[] counts, float[] seconds)");
   m.def(
       "render_backward(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
-      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? visible, Tensor? background, "
+      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? scale_factors, Tensor? geom_indices, "
+      "Tensor? visible, Tensor? background, "
       "float[] camera, int width, int height, int sh_degree, float scale_modifier, float eps2d, int flags, "
-      "Tensor[] saved, Tensor image_gradient, Tensor? alpha_gradient, Tensor? median_gradient, bool[12] wanted) "
+      "Tensor[] saved, Tensor image_gradient, Tensor? alpha_gradient, Tensor? median_gradient, bool[13] wanted) "
       "-> (Tensor[] gradients, float[] seconds)");
   // On CUDA the two halves of render_backward are ops of their own; see binding_cuda.cpp.
   m.def(
@@ -246,12 +261,12 @@ TORCH_LIBRARY(sw_rasterizers, m) {
       "Tensor? median_gradient) -> (Tensor rows, float[] seconds)");
   m.def(
       "project_backward(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
-      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, float[] camera, int width, int height, "
-      "int sh_degree, float scale_modifier, float eps2d, int flags, Tensor drawn, Tensor rows, bool[12] wanted) "
+      "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? scale_factors, Tensor? geom_indices, float[] camera, int width, int height, "
+      "int sh_degree, float scale_modifier, float eps2d, int flags, Tensor drawn, Tensor rows, bool[13] wanted) "
       "-> (Tensor[] gradients, float[] seconds)");
   m.def(
-      "visible_radii(Tensor means, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? visible, float[] camera, "
-      "int width, int height, float scale_modifier, float eps2d) -> Tensor");
+      "visible_radii(Tensor means, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? scale_factors, Tensor? geom_indices, "
+      "Tensor? visible, float[] camera, int width, int height, float scale_modifier, float eps2d) -> Tensor");
 }
 
 TORCH_LIBRARY_IMPL(sw_rasterizers, CPU, m) {

@@ -71,6 +71,7 @@ struct Inputs {
   double scale_modifier, eps2d;
   int64_t flags;
   int64_t scale_columns = 3;  // 2: surfels
+  OptionalTensor scale_factors = {}, geom_indices = {};
 
   void check() const {
     check_geometry();
@@ -113,14 +114,23 @@ struct Inputs {
     const int64_t n = means.size(0);
     TORCH_CHECK(n < std::numeric_limits<int32_t>::max(), "sw_rasterizers: more than 2^31 - 1 Gaussians");
     check_shape("means", means, {n, 3});
-    check_shape("scales", scales, {n, scale_columns});
-    check_shape("quats", quats, {n, 4});
+    const bool shared = geom_indices.has_value() && scales.has_value() && scales->dim() == 2;
+    const int64_t shapes = shared ? scales->size(0) : n;
+    TORCH_CHECK(shapes < std::numeric_limits<int32_t>::max(), "sw_rasterizers: more than 2^31 - 1 shapes");
+    check_shape("scales", scales, {shapes, scale_columns});
+    check_shape("quats", quats, {shapes, 4});
+    check_shape("scale_factors", scale_factors, {n});
+    check_shape("geom_indices", geom_indices, {n});
+    TORCH_CHECK(!geom_indices.has_value() || geom_indices->scalar_type() == at::kLong,
+                "sw_rasterizers: geom_indices must be int64");
+    TORCH_CHECK(!cov3d.has_value() || (!geom_indices.has_value() && !scale_factors.has_value()),
+                "sw_rasterizers: cov3d excludes geom_indices and scale_factors");
     check_shape("cov3d", cov3d, {n, 6});
     check_shape("visible", visible, {n});
     TORCH_CHECK(!visible.has_value() || visible->scalar_type() == at::kByte, "sw_rasterizers: visible must be uint8");
     TORCH_CHECK(cov3d.has_value() != (scales.has_value() && quats.has_value()),
                 "sw_rasterizers: either scales and quats or cov3d is needed");
-    for (const OptionalTensor* t : {&scales, &quats, &cov3d})
+    for (const OptionalTensor* t : {&scales, &quats, &cov3d, &scale_factors})
       TORCH_CHECK(!t->has_value() || (*t)->scalar_type() == type,
                   "sw_rasterizers: all tensors must have the dtype of means, ", type);
   }
@@ -144,6 +154,8 @@ struct Inputs {
     g.features = data<S>(features);
     g.feature_channels = features.has_value() ? int(features->size(1)) : 0;
     g.visible = data<uint8_t>(visible);
+    g.shape_rows = data<int64_t>(geom_indices), g.scale_factors = data<S>(scale_factors);
+    g.shapes = scales.has_value() ? scales->size(0) : 0;
     return g;
   }
 
@@ -172,7 +184,7 @@ struct Inputs {
 // clang-format off
 enum Wanted {  // order of the gradients asked for and returned
   kWantMeans, kWantOpacities, kWantScales, kWantQuats, kWantCov3d, kWantSh, kWantShDc, kWantShRest,
-  kWantColors, kWantFeatures, kWantGrad2d, kWantAbsgrad2d, kWantedCount
+  kWantColors, kWantFeatures, kWantScaleFactors, kWantGrad2d, kWantAbsgrad2d, kWantedCount
 };
 // clang-format on
 

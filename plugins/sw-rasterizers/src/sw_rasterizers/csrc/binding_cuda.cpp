@@ -114,11 +114,13 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
 Rendered render(const Tensor& means, const Tensor& opacities, const OptionalTensor& scales,
                 const OptionalTensor& quats, const OptionalTensor& cov3d, const OptionalTensor& sh,
                 const OptionalTensor& sh_dc, const OptionalTensor& sh_rest, const OptionalTensor& colors,
-                const OptionalTensor& features, const OptionalTensor& visible, const OptionalTensor& background,
+                const OptionalTensor& features, const OptionalTensor& scale_factors,
+                const OptionalTensor& geom_indices, const OptionalTensor& visible, const OptionalTensor& background,
                 at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree, double scale_modifier,
                 double eps2d, int64_t flags) {
   const Inputs in{means,    opacities, scales,     quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
-                  features, visible,   background, sh_degree, scale_modifier, eps2d, flags};
+                  features, visible,   background, sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
+                  geom_indices};
   in.check();
   check_placement(in);
   TORCH_CHECK(camera.size() == 18 && width > 0 && height > 0, "sw_rasterizers: malformed camera");
@@ -174,12 +176,14 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
 std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
     const Tensor& means, const Tensor& opacities, const OptionalTensor& scales, const OptionalTensor& quats,
     const OptionalTensor& cov3d, const OptionalTensor& sh, const OptionalTensor& sh_dc, const OptionalTensor& sh_rest,
-    const OptionalTensor& colors, const OptionalTensor& features, at::ArrayRef<double> camera, int64_t width,
-    int64_t height, int64_t sh_degree, double scale_modifier, double eps2d, int64_t flags, const Tensor& drawn,
+    const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& scale_factors,
+    const OptionalTensor& geom_indices, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
+    double scale_modifier, double eps2d, int64_t flags, const Tensor& drawn,
     const Tensor& row_memory, std::array<bool, kWantedCount> wanted) {
   const OptionalTensor none;
   const Inputs in{means,    opacities, scales, quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
-                  features, none,      none,   sh_degree, scale_modifier, eps2d, flags};
+                  features, none,      none,   sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
+                  geom_indices};
   in.check();
   check_placement(in);
   const auto channels = in.channels();
@@ -197,8 +201,11 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   clock.mark();
 
   std::vector<Tensor> grads(kWantedCount, at::empty({0}, real));
+  const bool shared = geom_indices.has_value();  // then the rows of shapes are summed up, starting at 0
   const auto want = [&](int which, const OptionalTensor& like) {
-    if (wanted[which] && like.has_value()) grads[which] = at::empty(like->sizes(), real);
+    if (wanted[which] && like.has_value())
+      grads[which] = shared && (which == kWantScales || which == kWantQuats) ? at::zeros(like->sizes(), real)
+                                                                             : at::empty(like->sizes(), real);
     return data<float>(grads[which]);
   };
   Gradients<float> out{};
@@ -219,6 +226,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   }
   out.colors = want(kWantColors, in.colors);
   out.features = want(kWantFeatures, in.features);
+  out.scale_factors = want(kWantScaleFactors, in.scale_factors);
   const auto screen = [&](int which) {
     if (wanted[which]) grads[which] = at::empty({n, 2}, real);
     return data<float>(grads[which]);
@@ -233,12 +241,15 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
 }
 
 Tensor visible_radii_on_cuda(const Tensor& means, const OptionalTensor& scales, const OptionalTensor& quats,
-                             const OptionalTensor& cov3d, const OptionalTensor& visible, at::ArrayRef<double> camera,
+                             const OptionalTensor& cov3d, const OptionalTensor& scale_factors,
+                             const OptionalTensor& geom_indices, const OptionalTensor& visible,
+                             at::ArrayRef<double> camera,
                              int64_t width, int64_t height, double scale_modifier, double eps2d) {
   const OptionalTensor none, colors = means;
   const Tensor opacities = at::empty({0}, means.options());
   const Inputs in{means,  opacities, scales,  quats, cov3d, none,           none,  none,
-                  colors, none,      visible, none,  0,     scale_modifier, eps2d, 0};
+                  colors, none,      visible, none,  0,     scale_modifier, eps2d, 0,
+                  3,      scale_factors, geom_indices};
   in.check_geometry();
   check_placement(in);
   const c10::cuda::CUDAGuard guard(means.device());

@@ -25,6 +25,11 @@ struct Gaussians {
   const S* features = nullptr;
   int feature_channels = 0;
   const uint8_t* visible = nullptr;
+  const int64_t* shape_rows = nullptr;   // [N] row of scales and quats, each below `shapes`; null: its own
+  const S* scale_factors = nullptr;      // [N] multiplies the scales, or null
+  int64_t shapes = 0;                    // rows of scales and quats
+
+  SW_HD int64_t shape_of(int64_t n) const { return shape_rows != nullptr ? shape_rows[n] : n; }
 };
 
 struct Settings {
@@ -48,9 +53,19 @@ struct Channels {
 
 template <class S>
 struct Gradients {  // null: not asked for
-  S *means, *opacities, *scales, *quats, *cov3d, *sh_dc, *sh_rest, *colors, *features;
+  S *means, *opacities, *scales, *quats, *cov3d, *sh_dc, *sh_rest, *colors, *features, *scale_factors;
   int64_t sh_dc_stride, sh_rest_stride;
   S *grad2d, *absgrad2d;  // [N][2], NDC units
+  S* shape_sums;          // [shape_groups(N, shapes)][shapes][kShapeSums], on the CPU, where shapes are shared
 };
+
+// Gradients of shared shapes on the CPU: each group of Gaussians, one after the other in index order, adds to sums of
+// its own, and the sums are added in the order of the groups. The number of groups follows from sizes alone, so that
+// the result does not depend on threads; they take 14 bytes a Gaussian, or four times the table where that is more.
+constexpr int kShapeSums = 7;  // scales, quaternion
+inline int64_t shape_groups(int64_t gaussians, int64_t shapes) {
+  const int64_t groups = gaussians / (2 * (shapes > 0 ? shapes : 1));
+  return groups < 4 ? 4 : groups > 64 ? 64 : groups;
+}
 
 }  // namespace sw

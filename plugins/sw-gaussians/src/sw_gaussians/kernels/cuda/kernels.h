@@ -18,4 +18,20 @@ struct Statistics {
 
 void statistics(const Statistics& args, cudaStream_t stream);
 
+// Normals that were drawn beside those of a depth map, both in the camera's frame; all maps [height, width].
+struct Surface {
+  const float* depth;    // camera z, 0 = no surface
+  const float* normals;  // [3, height, width] sums of weighted unit normals
+  const float* alpha;
+  int32_t width, height;
+  float fx, fy, cx, cy;  // pixels
+};
+
+// disagreement = 1 - alpha normals . (unit normal of the depth map); 1 on the border of one pixel
+void disagreement(const Surface& surface, float* disagreement, cudaStream_t stream);
+
+// The derivatives of a loss by depth and normals from that by the disagreement, `grad`.
+void disagreement_backward(const Surface& surface, const float* grad, float* to_depth, float* to_normals,
+                           cudaStream_t stream);
+
 }  // namespace splatwizard::cuda

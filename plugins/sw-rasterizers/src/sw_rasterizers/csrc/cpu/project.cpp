@@ -10,6 +10,7 @@
 #include "kernels.h"
 #include "parallel.h"
 #include "shade.h"
+#include "shape.h"
 #include "tile_list.h"
 
 namespace SW_ARCH {
@@ -36,8 +37,7 @@ struct Projector {
       gather_rows<V, 6>(g.cov3d, 6, rows, in.cov);
       for (const V& x : in.cov) probe += finite_probe(x);
     } else {
-      gather_rows<V, 3>(g.scales, 3, rows, in.scale);
-      gather_rows<V, 4>(g.quats, 4, rows, in.quat);
+      gather_shape<V>(g, rows, in);
       for (const V& x : in.scale) probe += finite_probe(x);
       for (const V& x : in.quat) probe += finite_probe(x);
     }

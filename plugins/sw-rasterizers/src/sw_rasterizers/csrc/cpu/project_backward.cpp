@@ -10,6 +10,7 @@
 #include "kernels.h"
 #include "parallel.h"
 #include "shade.h"
+#include "shape.h"
 
 namespace SW_ARCH {
 namespace {
@@ -27,21 +28,24 @@ struct ChunkBackward {
   int columns;
   const Gradients<S>& out;
 
-  void operator()(int64_t chunk) const {
+  // `shape_sums`: of the chunk's group, where shapes are shared.
+  void operator()(int64_t chunk, S* shape_sums) const {
     const int64_t begin = chunk * kChunk, end = std::min(begin + kChunk, g.count);
     const auto clear = [&](S* base, int64_t stride) {
       if (base != nullptr) std::fill(base + begin * stride, base + end * stride, S(0));
     };
-    clear(out.means, 3), clear(out.opacities, 1), clear(out.scales, 3), clear(out.quats, 4), clear(out.cov3d, 6);
+    clear(out.means, 3), clear(out.opacities, 1), clear(out.cov3d, 6);
+    if (g.shape_rows == nullptr) clear(out.scales, 3), clear(out.quats, 4);
+    clear(out.scale_factors, 1);
     clear(out.colors, channels.colors), clear(out.features, channels.features);
     clear(out.grad2d, 2), clear(out.absgrad2d, 2);
     clear(out.sh_dc, out.sh_dc_stride);
     if (out.sh_dc == nullptr || out.sh_rest != out.sh_dc + 3)
       clear(out.sh_rest, out.sh_rest_stride);  // else one tensor
-    for (int64_t s = begin, stop = begin + slots.per_chunk[chunk]; s < stop; s += L) backward_pack(s, stop);
+    for (int64_t s = begin, stop = begin + slots.per_chunk[chunk]; s < stop; s += L) backward_pack(s, stop, shape_sums);
   }
 
-  void backward_pack(int64_t first, int64_t end) const {
+  void backward_pack(int64_t first, int64_t end, S* shape_sums) const {
     const auto c = [](double value) { return constant<V>(value); };
     const int lanes = int(std::min<int64_t>(end - first, L));
     alignas(64) int32_t rows[L];
@@ -68,8 +72,7 @@ struct ChunkBackward {
     if constexpr (kCov3d) {
       gather_rows<V, 6>(g.cov3d, 6, rows, in.cov);
     } else {
-      gather_rows<V, 3>(g.scales, 3, rows, in.scale);
-      gather_rows<V, 4>(g.quats, 4, rows, in.quat);
+      gather_shape<V>(g, rows, in);
     }
     V opacity;
     gather_rows<V, 1>(g.opacities, 1, rows, &opacity);
@@ -99,8 +102,7 @@ struct ChunkBackward {
     if constexpr (kCov3d) {
       if (out.cov3d != nullptr) scatter_rows<V, 6>(result.cov, out.cov3d, 6, rows, lanes);
     } else {
-      if (out.scales != nullptr) scatter_rows<V, 3>(result.scale, out.scales, 3, rows, lanes);
-      if (out.quats != nullptr) scatter_rows<V, 4>(result.quat, out.quats, 4, rows, lanes);
+      scatter_shape<V>(g, out, shape_sums, rows, lanes, result.scale, result.quat);
     }
     // NDC units: pixel gradient times half the image size.
     const V half_width = c(0.5 * view.width), half_height = c(0.5 * view.height);
@@ -143,6 +145,20 @@ struct ChunkBackward {
   }
 };
 
+// Sums of the groups, in their order, to the gradients of the shared shapes.
+template <class S>
+void add_up_groups(int threads, int64_t groups, int64_t shapes, const Gradients<S>& out) {
+  parallel_dynamic(threads, (shapes + kChunk - 1) / kChunk, [&](int64_t chunk) {
+    for (int64_t m = chunk * kChunk; m < std::min((chunk + 1) * kChunk, shapes); ++m) {
+      S total[kShapeSums] = {};
+      for (int64_t group = 0; group < groups; ++group)
+        for (int k = 0; k < kShapeSums; ++k) total[k] += out.shape_sums[(group * shapes + m) * kShapeSums + k];
+      if (out.scales != nullptr) std::copy_n(total, 3, out.scales + 3 * m);
+      if (out.quats != nullptr) std::copy_n(total + 3, 4, out.quats + 4 * m);
+    }
+  });
+}
+
 template <class V, bool kCov3d>
 void backward_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, const Settings& settings,
                   const Channels& channels, const Slots<Scalar<V>>& slots, const Scalar<V>* sums,
@@ -150,7 +166,19 @@ void backward_all(const View<Scalar<V>>& view, const Gaussians<Scalar<V>>& g, co
   const int columns =
       pair_columns(slots.channels == nullptr, channels.total(), settings.absgrad, settings.median_depth);
   const ChunkBackward<V, kCov3d> backward_chunk{view, g, settings, channels, slots, sums, columns, out};
-  parallel_dynamic(settings.threads, (g.count + kChunk - 1) / kChunk, backward_chunk);
+  const int64_t chunks = (g.count + kChunk - 1) / kChunk;
+  if (out.shape_sums == nullptr) {
+    parallel_dynamic(settings.threads, chunks, [&](int64_t chunk) { backward_chunk(chunk, nullptr); });
+    return;
+  }
+  const int64_t groups = shape_groups(g.count, g.shapes), floats = g.shapes * kShapeSums;
+  parallel_dynamic(settings.threads, groups, [&](int64_t group) {
+    Scalar<V>* sums = out.shape_sums + group * floats;
+    std::fill_n(sums, floats, Scalar<V>(0));
+    for (int64_t chunk = group * chunks / groups; chunk < (group + 1) * chunks / groups; ++chunk)
+      backward_chunk(chunk, sums);
+  });
+  add_up_groups(settings.threads, groups, g.shapes, out);
 }
 
 }  // namespace

@@ -5,28 +5,9 @@
 //   add_to_codebook        dL/dcolour -> dL/dcodebook: for each entry the sum over its users in their order
 #pragma once
 
-#include <cstdint>
-
 #include <splatwizard/dispatch.h>
 
-namespace sw {
-
-template <class S>
-struct SharedColors {
-  int64_t count, entries;
-  const S* means;        // [N][3]
-  const S* dc;           // [N][3] coefficient 0 of each Gaussian, or null
-  const S* codebook;     // [entries][stride]: coefficients from `first` on, three channels each
-  int64_t stride;
-  int first;             // 0, or 1 behind dc
-  const int64_t* rows;   // [N]
-  const S* center;       // [3]
-  int degree;
-  bool clamp;            // negative colours become 0
-  int threads;
-};
-
-}  // namespace sw
+#include "../shared_colors.h"
 
 #define SW_DECLARE_KERNELS(arch)                                                                                      \
   namespace arch {                                                                                                    \

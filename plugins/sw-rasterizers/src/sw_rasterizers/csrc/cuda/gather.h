@@ -33,8 +33,14 @@ __device__ __forceinline__ void load_geometry(const Gaussians<float>& g, int64_t
   if constexpr (kCov3d) {
     load_row<6>(g.cov3d, n, to.cov);
   } else {
-    load_row<3>(g.scales, n, to.scale);
-    load_row<4>(g.quats, n, to.quat);
+    const int64_t shape = g.shape_of(n);
+    load_row<3>(g.scales, shape, to.scale);
+    load_row<4>(g.quats, shape, to.quat);
+    if (g.scale_factors != nullptr) {
+      const float factor = g.scale_factors[n];
+#pragma unroll
+      for (int k = 0; k < 3; ++k) to.scale[k] *= factor;
+    }
   }
 }
 

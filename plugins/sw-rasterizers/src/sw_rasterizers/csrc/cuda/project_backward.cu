@@ -10,6 +10,31 @@ namespace {
 
 constexpr int kThreads = 128, kWarps = kThreads / kWarp;
 
+// From dL/d(scales as drawn) and dL/dquat to what was put in; rows that several Gaussians share start at 0.
+__device__ __forceinline__ void write_shape_gradient(const Gaussians<float>& g, const Gradients<float>& out, int64_t n,
+                                                     bool drawn, GeometryGradient<float>& result) {
+  const int64_t shape = g.shape_of(n);
+  if (g.scale_factors != nullptr) {
+    float own[3];
+    load_row<3>(g.scales, shape, own);
+    if (out.scale_factors != nullptr) out.scale_factors[n] = drawn ? dot3(result.scale, own) : 0.f;
+    const float factor = g.scale_factors[n];
+#pragma unroll
+    for (int k = 0; k < 3; ++k) result.scale[k] = drawn ? result.scale[k] * factor : 0.f;
+  }
+  if (g.shape_rows == nullptr) {
+    if (out.scales != nullptr) store_row<3>(out.scales, n, result.scale);
+    if (out.quats != nullptr) store_row<4>(out.quats, n, result.quat);
+  } else if (drawn) {
+    if (out.scales != nullptr)
+#pragma unroll
+      for (int k = 0; k < 3; ++k) atomicAdd(out.scales + 3 * shape + k, result.scale[k]);
+    if (out.quats != nullptr)
+#pragma unroll
+      for (int k = 0; k < 4; ++k) atomicAdd(out.quats + 4 * shape + k, result.quat[k]);
+  }
+}
+
 template <bool kCov3d>
 __global__ void __launch_bounds__(kThreads)
     project_backward_kernel(View<float> view, Gaussians<float> g, Settings settings, Channels channels,
@@ -87,8 +112,7 @@ __global__ void __launch_bounds__(kThreads)
     if constexpr (kCov3d) {
       if (out.cov3d != nullptr) store_row<6>(out.cov3d, n, result.cov);
     } else {
-      if (out.scales != nullptr) store_row<3>(out.scales, n, result.scale);
-      if (out.quats != nullptr) store_row<4>(out.quats, n, result.quat);
+      write_shape_gradient(g, out, n, drawn, result);
     }
     // NDC units: pixel gradient times half the image size.
     const float half[2] = {0.5f * view.width, 0.5f * view.height};

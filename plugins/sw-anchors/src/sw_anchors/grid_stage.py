@@ -1,15 +1,14 @@
-"""Training stage of HAC: that of all anchor methods with a rate, and three phases."""
+"""Training stage of anchors that a hash grid predicts: that of all anchor methods with a rate, and three phases."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED, AnchorRate
+from sw_anchors.grid_anchors import GridAnchors
+from sw_anchors.grid_params import GridAnchorParams
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
-
-from sw_hac.config import HACConfig
-from sw_hac.model import HACAnchors
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -19,11 +18,10 @@ if TYPE_CHECKING:
     from splatwizard_core.api import OptimizationParams, PipelineParams, RenderResult, Scheduler
 
 
-class HACStage(CodedAnchorStage):
+class GridStage(CodedAnchorStage):
     """Three phases: raw values, noise of fixed steps, noise of predicted steps with the bits in the loss."""
 
-    name = "hac"
-    opt: HACConfig
+    opt: GridAnchorParams
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         lr = self.opt.lr
@@ -42,18 +40,18 @@ class HACStage(CodedAnchorStage):
         if self.opt.rate_term.start == "statistics":
             scheduler.register_task(self.at(phases.entropy), self.start_from_statistics)
 
-    def start_from_statistics(self, model: HACAnchors) -> None:
+    def start_from_statistics(self, model: GridAnchors) -> None:
         """Let the network predict from statistics of the values."""
         model.start_from_statistics()
 
-    def extra_loss(self, model: HACAnchors, result: RenderResult, step: int) -> dict[str, Tensor]:
+    def extra_loss(self, model: GridAnchors, result: RenderResult, step: int) -> dict[str, Tensor]:
         rate: AnchorRate | None = result.extras.get("rate")
         if rate is None:
             return {}
         assert rate.own_bits is not None
         weights = self.opt.rate_term
-        return {
+        terms = {
             "rate": weights.weight * rate.bits,
             "grid": weights.weight * rate.own_bits / (model.num_rows * sum(model.shape.widths)),
-            "masks": weights.masks * model.soft_masks().mean(),
         }
+        return {**terms, "masks": weights.masks * model.soft_masks().mean()} if weights.masks else terms

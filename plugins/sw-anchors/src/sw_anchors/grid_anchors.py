@@ -1,4 +1,4 @@
-"""The model of HAC: anchors, a binary hash grid over their positions, and a network that predicts distributions.
+"""Anchors, a binary hash grid over their positions, and a network that predicts distributions: the model of HAC.
 
 For an anchor at u in [0,1]^3 the network gives mean and deviation of its F features, 6 scales and 3k coordinates of
 offsets, and one number t a group, whose quantiser step is Q0 (1 + tanh t); Q0 = 1, 0.001 and 0.2 as published.
@@ -8,16 +8,21 @@ Source: HAC (arXiv 2403.14530), section 4.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor, nn
+
+from splatwizard_core.api import SceneError
 from sw_anchors.anchors import linear_layers, two_layers
 from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
 from sw_anchors.lattice import TOP
 from sw_anchors.shape import AnchorShape
-from torch import Tensor, nn
-
 from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Scene
+    from sw_anchors.grid_params import GridAnchorParams
 
 SMALLEST_STEP = 1 / 64
 """Of the base step. The published 1 + tanh t can underflow to 0, and the coder's table of steps ends here."""
@@ -26,7 +31,7 @@ PLACES_LIMIT = 1 << 30
 """Bytes that the places of all anchors in the grid may take to be kept, 1,152 an anchor in the published one."""
 
 
-class HACAnchors(CodedAnchors):
+class GridAnchors(CodedAnchors):
     """CodedAnchors with the grid and its network.
 
     grid        hash grid over the box of the anchors, signs
@@ -44,6 +49,7 @@ class HACAnchors(CodedAnchors):
         grid: MixedHashGrid,
         grid_hidden: int,
         in_steps: bool = False,
+        further: int = 0,
         generator: torch.Generator,
         **kwargs: Any,
     ) -> None:
@@ -52,14 +58,39 @@ class HACAnchors(CodedAnchors):
         grid_hidden width of the network behind it
         in_steps    the network gives means and deviations in base steps: scales are some hundredths, which one update
                     of a network that gives them as they are can overturn
+        further     outputs of the network that follow those of `AnchorShape`, for a subclass
         """
         super().__init__(*tensors, generator=generator, **kwargs)
-        widths = self.shape.outputs
+        widths = [*self.shape.outputs, further]
         self.grid = grid.to(self.features)
         self._places: tuple[Tensor, GridPlaces | None] | None = None
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
-        units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0]
+        units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0, 1.0]
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
+
+    @classmethod
+    def of_scene(cls, scene: Scene, config: GridAnchorParams, generator: torch.Generator, **kwargs: Any) -> GridAnchors:
+        """Put an anchor into every voxel with a start point of the scene; kwargs as of the constructor.
+
+        Raises SceneError if there is none.
+        """
+        if scene.points is None or len(scene.points) == 0:
+            raise SceneError(
+                f"scene '{scene.name}' has no start points: anchors need SfM points or random ones", path=scene.path
+            )
+        c = config.grid
+        grid = MixedHashGrid(
+            c.space, c.planes, features=c.features, log2_space=c.log2_space, log2_planes=c.log2_planes,
+            generator=generator,
+        )  # fmt: skip
+        made = cls.from_points(
+            scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets,
+            feature_dim=config.feature_dim, hidden=config.hidden, margin=config.margin,
+            sample=config.rate_term.sample, base_steps=config.steps.triple, generator=generator, grid=grid,
+            grid_hidden=c.hidden, in_steps=config.rate_term.units == "steps", **kwargs,
+        )  # fmt: skip
+        assert isinstance(made, cls)
+        return made
 
     def __getstate__(self) -> dict[str, Any]:
         """A copy works out anew where its anchors lie."""
@@ -90,7 +121,8 @@ class HACAnchors(CodedAnchors):
         # All anchors have noise of their own steps; the rest of the last layer is for the sample.
         widths = self.shape.outputs[:6]
         count = sum(widths)
-        weights, biases = torch.split(last.weight, [count, 3]), torch.split(last.bias, [count, 3])
+        sizes = [count, 3, len(last.bias) - count - 3]
+        weights, biases = torch.split(last.weight, sizes), torch.split(last.bias, sizes)
         steps = torch.tanh(torch.nn.functional.linear(hidden, weights[1], biases[1]))
         steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
 
@@ -104,7 +136,7 @@ class HACAnchors(CodedAnchors):
 
     def predict(self, rows: Tensor) -> AnchorContext:
         features, bits = self._looked_up(tuple(part.index_select(0, rows) for part in self.context_rows()))
-        outputs = self.mlp_grid(features) * self.units
+        outputs = (self.mlp_grid(features) * self.units)[:, : sum(self.shape.outputs)]
         return context_of(outputs, self.shape, self.base_steps, own_bits=bits)
 
     @torch.no_grad()
@@ -129,7 +161,8 @@ class HACAnchors(CodedAnchors):
         found = []
         for values, step in zip(self.raw(rows), self.base_steps, strict=True):
             found += [values.mean(dim=0), values.std(dim=0).clamp(min=step)]
-        last.bias.copy_(torch.cat([*found, last.bias.new_zeros(3)]) / self.units)
+        found.append(last.bias.new_zeros(len(last.bias) - sum(self.shape.outputs[:-1])))
+        last.bias.copy_(torch.cat(found) / self.units)
 
 
 def context_of(

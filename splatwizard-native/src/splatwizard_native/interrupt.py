@@ -11,6 +11,9 @@ from types import FrameType
 
 log = logging.getLogger(__name__)
 
+# Windows has no terminal that hangs up.
+ASKED_TO_END = [n for name in ("SIGINT", "SIGTERM", "SIGHUP") if (n := getattr(signal, name, None)) is not None]
+
 
 class InterruptGuard:
     """While installed, a Ctrl-C inside `with guard.step():` only sets `pending`; a second one, or one outside, raises.
@@ -27,7 +30,7 @@ class InterruptGuard:
 
     def __enter__(self) -> InterruptGuard:
         if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            for number in ASKED_TO_END:
                 if signal.getsignal(number) is signal.default_int_handler:
                     signal.signal(number, self._handle)
                     self._taken.append(number)

@@ -1,0 +1,68 @@
+"""`sw bench --dry-run`: the processes that a plan would start, and about how long they take."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+
+from splatwizard_core.tooling import print_json, print_table, say
+from splatwizard_native import duration
+from sw_bench.cells import Cell, Job, Layout
+from sw_bench.display import SLOTS_UNKNOWN
+from sw_bench.estimates import Estimates
+from sw_bench.executor import Executor
+from sw_bench.index import FILE_NAME, Index
+from sw_bench.plan import Plan
+from sw_bench.state import State
+
+
+def dry_run(
+    plan: Plan,
+    jobs: Sequence[Job],
+    cells: Sequence[Cell],
+    states: Mapping[Cell, State],
+    layout: Layout,
+    executor: Executor | None,
+    *,
+    probe: bool,
+    as_json: bool,
+) -> None:
+    """Print what would run. Nothing is written but into temporary folders."""
+    estimates = Estimates()
+    if (layout.out / FILE_NAME).is_file():
+        index = Index(layout.out)
+        estimates = Estimates(index.durations())
+        index.close()
+    if probe:
+        from sw_bench.probe import probe_into
+
+        probe_into(estimates, jobs)
+    slots = SLOTS_UNKNOWN if executor is None else executor.slots or SLOTS_UNKNOWN
+    left = estimates.left(jobs, [], slots)
+    counts = {state.value: sum(each is state for each in states.values()) for state in State}
+    facts = [
+        {
+            "name": job.name, "command": shlex.join(["sw", *job.words]), "needs": [need.name for need in job.needs],
+            "runs": [{"directory": str(cell.directory), "state": states[cell].value} for cell in job.cells],
+            "seconds": estimates.of(job),
+        }
+        for job in jobs
+    ]  # fmt: skip
+    if as_json:
+        print_json({"out": str(layout.out), "runs": counts, "processes": facts, "at_a_time": slots, "seconds": left})
+        return
+    rows = []
+    for job in jobs:
+        told = sorted({states[cell].value for cell in job.cells}) or ["new"]
+        seconds = estimates.of(job)
+        rows.append([job.name, ", ".join(told), "?" if seconds is None else duration(seconds)])
+    print_table(["process", "state", "about"], rows, right=1)
+    counted = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
+    say(f"{len(cells)} runs of {plan_size(plan)}: {counted}; {len(jobs)} processes, {slots} at a time, "
+        + ("of unknown length" if left is None else f"about {duration(left)} by what was measured"))  # fmt: skip
+
+
+def plan_size(plan: Plan) -> str:
+    """`8 methods x 3 scenes x 2 seeds`."""
+    sizes = {"method": len(plan.methods), "scene": len(plan.scenes), "seed": len(plan.seeds)}
+    return " x ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in sizes.items())

@@ -1,0 +1,74 @@
+"""States of the runs of a plan, read from their run directories: finished, to do, or holding another training."""
+
+from __future__ import annotations
+
+import json
+from enum import Enum
+from pathlib import Path
+
+from splatwizard_core.api import UserInputError
+from splatwizard_core.tooling import FILE_NAME, Choices, PluginManager, Record, read_record
+from sw_bench.cells import Cell, SharedTraining, training_key
+
+CONFIG = "config.toml"
+STEPS = "steps.json"
+
+
+class State(Enum):
+    """State of a run before its process starts."""
+
+    FINISHED = "finished"
+    NEW = "new"
+    BEGUN = "goes on"
+    CHANGED = "changed"
+
+
+def state_of(cell: Cell, plugins: PluginManager, *, geometry: bool = False) -> State:
+    """Return the state of a run.
+
+    geometry    one without measured geometry is not finished
+
+    FINISHED: its record was made with the values that the plan gives it now. BEGUN: its directory holds this
+    training, whole or in part; only values that encode may differ. CHANGED: it holds another training.
+    """
+    record = record_of(cell)
+    if record is not None and not (geometry and record.geometry is None):
+        return State.FINISHED
+    config = cell.directory / CONFIG
+    if not config.exists():
+        return State.NEW
+    try:
+        (before,) = Choices(config_file=str(config)).resolve(plugins)
+    except (UserInputError, ValueError):  # of another release, or damaged: the run itself says what to do
+        return State.BEGUN
+    return State.BEGUN if training_key(before) == cell.training else State.CHANGED
+
+
+def record_of(cell: Cell) -> Record | None:
+    """Return the record of a run if it was made with the values that the plan gives it now."""
+    path = cell.directory / FILE_NAME
+    if not path.exists():
+        return None
+    try:
+        record = read_record(path)
+    except UserInputError:
+        return None
+    return record if record.config_hash == cell.resolved.config_hash() else None
+
+
+def is_trained(directory: Path) -> bool:
+    """Whether a directory says that its training is finished."""
+    try:
+        steps = json.loads((directory / STEPS).read_text("utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(steps, dict) and "train" in steps
+
+
+def is_shared_training_done(shared: SharedTraining) -> bool:
+    """Whether a training for several was finished, and is still there."""
+    try:
+        directory = Path(json.loads(shared.note.read_text("utf-8"))["directory"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
+    return is_trained(directory)

@@ -1,0 +1,287 @@
+"""Entropy model `conditional-mixture`: rows of integers, each under a mixture of two Gaussians that a context predicts.
+
+As `conditional-gaussian`, with a second mean and scale for every number and the logarithm of how much likelier the
+first Gaussian is. Mode `exact` takes integers: each Gaussian selects a shipped count table, and a number is coded under
+the sum of both tables with weights of 8 bits, so that a file decodes on any machine. Mode `float` takes floats, and
+decodes only where they come out the same again. Source: specification of HAC++, exact decode of the mixture.
+
+Layout of a block: u16 version of the tables, u32 CRC-32 of the table file, u32 CRC-32 of the coded integers as i32,
+varint length and range-coded words, then the escapes as Exp-Golomb bits. No coded number, no bytes.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import constriction
+import numpy as np
+import torch
+
+from splatwizard_core.api import BitstreamError
+from sw_codecs.bits import checksum, exp_golomb
+from sw_codecs.bits.packing import ByteReader, write_varint
+from sw_codecs.coders.symbol_stream import guarded
+from sw_codecs.entropy.conditional import Numbers, _array, _where
+from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
+from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _flat_lattice
+from sw_codecs.entropy.rates import gaussian_mass
+
+WIDTHS = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256])
+"""Half-widths of the windows that are coded without an escape."""
+PAD = 2 * int(WIDTHS[-1]) + 1
+AT_ONCE = 1 << 18
+"""Counts that are held together."""
+WEIGHT_BITS = 8
+FLOAT_TOTAL = 1 << 23
+
+
+@dataclass(frozen=True)
+class RowMixture:
+    """Distributions of a block; arrays or CPU tensors.
+
+    mean, scale, second_mean, second_scale      [n,C], as in `RowContext`
+    logit   [n,C] logarithm of how much likelier the first Gaussian is; exact: integers with 12 fractional bits
+    step    [n,1], as in `RowContext`
+    """
+
+    mean: Numbers
+    scale: Numbers
+    second_mean: Numbers
+    second_scale: Numbers
+    logit: Numbers
+    step: Numbers
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Mixtures of n coded numbers: centre int64 [n] and half-width [n] of their windows, and what makes their counts.
+
+    counts  (rows, half-width W) -> float64 [rows, 2 W + 2], all positive: the window, then the escape
+    """
+
+    centre: np.ndarray
+    width: np.ndarray
+    counts: Callable[[np.ndarray, int], np.ndarray]
+
+    def batches(self) -> Iterator[tuple[np.ndarray, int]]:
+        """Rows of one width at a time, ascending, in their order; so many that their counts stay within AT_ONCE."""
+        for width in WIDTHS.tolist():
+            rows = np.flatnonzero(self.width == width)
+            size = max(1, AT_ONCE // (2 * width + 2))
+            for start in range(0, len(rows), size):
+                yield rows[start : start + size], width
+
+
+class ConditionalMixture:
+    """mode: "exact" or "float"; see the module. One object codes any number of blocks."""
+
+    Context = RowMixture
+    MODES = ("exact", "float")
+
+    def __init__(self, mode: str = "exact") -> None:
+        if mode not in self.MODES:
+            raise ValueError(f"mode is '{mode}', must be one of {', '.join(self.MODES)}")
+        self.mode = mode
+
+    def encode(self, symbols: Numbers, context: RowMixture, present: Numbers | None = None) -> bytes:
+        """Bytes of one block.
+
+        symbols     [n,C] integers
+        present     [n,C] bool: others are not coded; None: all are
+
+        Raises ValueError for parameters that are not finite or out of range.
+        """
+        values, where = _array(symbols), _where(present)
+        coded = values[where].reshape(-1).astype(np.int64)
+        if not len(coded):
+            return b""
+        if np.abs(coded).max() >= SYMBOL_LIMIT:
+            raise ValueError("a symbol is beyond 2^30")
+        mixtures = self._rows(context, where, values.shape)
+        coder = constriction.stream.queue.RangeEncoder()
+        negative, magnitudes = [np.empty(0, bool)], [np.empty(0, np.int64)]
+        for rows, width in mixtures.batches():
+            offsets = coded[rows] - mixtures.centre[rows]
+            outside = np.abs(offsets) > width
+            entries = np.where(outside, 2 * width + 1, offsets + width).astype(np.int32)
+            with guarded(ValueError, "entropy coding"):
+                coder.encode(entries, _categorical(), mixtures.counts(rows, width))
+            negative.append(offsets[outside] < 0)
+            magnitudes.append(np.abs(offsets[outside]) - width - 1)
+        words = coder.get_compressed().astype("<u4", copy=False).tobytes()
+        tables = exact_tables()
+        return b"".join([
+            tables.version.to_bytes(2, "little"), tables.crc.to_bytes(4, "little"), _crc(coded).to_bytes(4, "little"),
+            write_varint(len(words)), words,
+            exp_golomb.encode(np.concatenate(negative), np.concatenate(magnitudes)),
+        ])  # fmt: skip
+
+    def decode(self, data: bytes, context: RowMixture, present: Numbers | None = None) -> np.ndarray:
+        """int64 [n,C], 0 where `present` is False. Raises BitstreamError."""
+        shape, where = np.shape(_array(context.mean)), _where(present)
+        found = np.zeros(shape, np.int64)
+        try:
+            mixtures = self._rows(context, where, shape)
+        except ValueError as error:
+            raise BitstreamError(str(error)) from error
+        reader = ByteReader(data)
+        if not len(mixtures.centre):
+            reader.finish()
+            return found
+        exact_tables().check(reader.integer(2), reader.integer(4))
+        crc = reader.integer(4)
+        words = reader.take(reader.varint(reader.left))
+        if len(words) % 4:
+            raise BitstreamError(f"{len(words):,} coded bytes are not whole 32-bit words")
+        coded = self._decode_words(words, mixtures, reader)
+        if _crc(coded) != crc:
+            raise BitstreamError("the decoded symbols do not match their CRC-32: damaged data or a wrong context")
+        found[where] = coded if where is not Ellipsis else coded.reshape(shape)
+        return found
+
+    def bits(self, symbols: Numbers, context: RowMixture, present: Numbers | None = None) -> torch.Tensor:
+        """Bits that `encode` spends on each symbol, float64 [n,C], 0 where `present` is False; no gradient."""
+        values, where = _array(symbols), _where(present)
+        coded = values[where].reshape(-1).astype(np.int64)
+        mixtures = self._rows(context, where, values.shape)
+        bits = np.zeros(len(coded))
+        for rows, width in mixtures.batches():
+            offsets = coded[rows] - mixtures.centre[rows]
+            counts = mixtures.counts(rows, width)
+            over = np.maximum(np.abs(offsets) - width, 0)
+            entries = np.where(over > 0, 2 * width + 1, offsets + width)
+            bits[rows] = np.log2(counts.sum(axis=1) / counts[np.arange(len(rows)), entries])
+            bits[rows] += np.where(over > 0, 2 * (np.floor(np.log2(np.maximum(over, 1))) + 1), 0)
+        found = np.zeros(values.shape)
+        found[where] = bits if where is not Ellipsis else bits.reshape(values.shape)
+        return torch.from_numpy(found)
+
+    def _rows(self, context: RowMixture, where: Any, shape: tuple[int, ...]) -> _Rows:
+        parts = [
+            np.broadcast_to(_array(each), shape)[where].reshape(-1)
+            for each in (context.mean, context.scale, context.second_mean, context.second_scale, context.logit,
+                         context.step)
+        ]  # fmt: skip
+        return _exact_rows(*parts) if self.mode == "exact" else _float_rows(*parts)
+
+    @staticmethod
+    def _decode_words(words: memoryview, mixtures: _Rows, reader: ByteReader) -> np.ndarray:
+        coded, escaped, floors = (
+            np.empty(len(mixtures.centre), np.int64),
+            [np.empty(0, np.int64)],
+            [np.empty(0, np.int64)],
+        )
+        with guarded(BitstreamError, "entropy decoding"):
+            coder = constriction.stream.queue.RangeDecoder(np.frombuffer(words, "<u4").astype(np.uint32, copy=False))
+            for rows, width in mixtures.batches():
+                entries = np.asarray(coder.decode(_categorical(), mixtures.counts(rows, width)), np.int64)
+                coded[rows] = entries - width
+                outside = rows[entries == 2 * width + 1]
+                escaped.append(outside)
+                floors.append(np.full(len(outside), width + 1))
+        where = np.concatenate(escaped)
+        negative, magnitudes = exp_golomb.decode(reader.take(reader.left), len(where))
+        if len(where) and magnitudes.max() >= 2 * SYMBOL_LIMIT:
+            raise BitstreamError("an escaped symbol is beyond 2^30")
+        coded[where] = np.where(negative, -1, 1) * (magnitudes + np.concatenate(floors))
+        coded += mixtures.centre
+        if np.abs(coded).max() >= SYMBOL_LIMIT:
+            raise BitstreamError("a symbol is beyond 2^30: damaged data or a wrong context")
+        return coded
+
+
+@functools.cache
+def _categorical() -> Any:
+    """The library's model of integer counts, one table a symbol."""
+    return constriction.stream.model.Categorical(perfect=False)
+
+
+def _crc(symbols: np.ndarray) -> int:
+    return checksum.crc32(np.ascontiguousarray(symbols, "<i4"))
+
+
+def _widths(reach: np.ndarray) -> np.ndarray:
+    """The smallest half-width that covers each reach, or the largest there is."""
+    return WIDTHS[np.minimum(np.searchsorted(WIDTHS, reach), len(WIDTHS) - 1)]
+
+
+@functools.cache
+def _padded_tables() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(counts of all tables with PAD zeros at each end, index of each table's middle, radius, escape count)."""
+    family = exact_tables().gaussian
+    radius = np.repeat(family.radius, FRACTIONS)
+    zeros = np.zeros(PAD)
+    flat = np.concatenate([part for table in family.tables for part in (zeros, table.counts[:-1], zeros)])
+    sizes = 2 * (radius + PAD) + 1
+    escapes = np.array([table.counts[-1] for table in family.tables])
+    return flat, np.cumsum(sizes) - sizes + PAD + radius, radius, escapes
+
+
+def _exact_rows(
+    mean: np.ndarray, scale: np.ndarray, second_mean: np.ndarray, second_scale: np.ndarray, logit: np.ndarray,
+    step: np.ndarray,
+) -> _Rows:  # fmt: skip
+    """Rules 3 to 5 of the exact mixture, integer arithmetic alone."""
+    n = len(mean)
+    if not np.issubdtype(logit.dtype, np.integer):
+        raise ValueError(f"the logits must be integers, not {logit.dtype}")
+    flat, middle, radius, escapes = _padded_tables()
+    both = [_flat_lattice(IntegerContext(*each, step), n) for each in ((mean, scale), (second_mean, second_scale))]
+    # sigmoid(d) = (1 + tanh(d / 2)) / 2: the table of step multipliers has it.
+    j = np.clip(((logit.astype(np.int64) >> 1) + (1 << 15)) >> 9, 0, 127)
+    top = 1 << WEIGHT_BITS
+    weight = np.clip((exact_tables().multipliers[j] + 16) >> 5, 2, top - 2).astype(np.float64)
+    weights = weight, top - weight
+    centre = np.where(weight >= top // 2, both[0][0], both[1][0])
+    reach = np.zeros(n, np.int64)
+    for middles, number in both:
+        reach = np.maximum(reach, radius[number] + np.abs(middles - centre))
+
+    def counts(rows: np.ndarray, width: int) -> np.ndarray:
+        # A window of a table is copied whole, several times faster than number by number.
+        windows = np.lib.stride_tricks.sliding_window_view(flat, 2 * width + 1)
+        found = np.ones((len(rows), 2 * width + 2))
+        for (middles, number), share in zip(both, weights, strict=True):
+            table = number[rows]
+            most = radius[table] + width + 1  # from there on the window lies outside of the table
+            part = windows[middle[table] - width + np.clip(centre[rows] - middles[rows], -most, most)]
+            part *= share[rows][:, None]
+            found[:, :-1] += part
+            found[:, -1] += share[rows] * escapes[table]
+        return found
+
+    return _Rows(centre, _widths(reach), counts)
+
+
+def _float_rows(
+    mean: np.ndarray, scale: np.ndarray, second_mean: np.ndarray, second_scale: np.ndarray, logit: np.ndarray,
+    step: np.ndarray,
+) -> _Rows:  # fmt: skip
+    """Counts of 2^23 times the mixture's probabilities, in float64."""
+    step = step.astype(np.float64)
+    with np.errstate(all="ignore"):
+        means = [each.astype(np.float64) / step for each in (mean, second_mean)]
+        scales = [np.maximum(each.astype(np.float64) / step, 0.05) for each in (scale, second_scale)]
+        share = 1 / (1 + np.exp(-logit.astype(np.float64)))
+    if not all(np.isfinite(each).all() and np.abs(each).max(initial=0) < SYMBOL_LIMIT for each in (*means, *scales)):
+        raise ValueError("a mean or a scale is not finite, or beyond 2^30 steps")
+    if not np.isfinite(share).all():
+        raise ValueError("a logit is not a number")
+    heavy = np.where(share >= 0.5, means[0], means[1])
+    centre = np.rint(heavy).astype(np.int64)
+    reach = np.max([np.abs(m - centre) + 5 * s for m, s in zip(means, scales, strict=True)], axis=0)
+
+    def counts(rows: np.ndarray, width: int) -> np.ndarray:
+        x = torch.from_numpy((centre[rows][:, None] + np.arange(-width, width + 1)).astype(np.float64))
+        mass = torch.zeros(1, dtype=torch.float64)
+        for m, s, w in zip(means, scales, (share, 1 - share), strict=True):
+            mu, sigma, part = (torch.from_numpy(each[rows])[:, None] for each in (m, s, w))
+            mass = mass + part * gaussian_mass(x, mu, sigma)
+        found = np.ones((len(rows), 2 * width + 2))
+        found[:, :-1] += np.floor(mass.numpy() * FLOAT_TOTAL)
+        return found
+
+    return _Rows(centre, _widths(reach), counts)

@@ -1,0 +1,378 @@
+// Registers the kernels of the exact mode as torch ops; checks what they are handed.
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/zeros.h>
+#include <torch/library.h>
+
+#include <algorithm>
+#include <cstring>
+#include <optional>
+#include <tuple>
+#include <vector>
+
+#include <splatwizard/torch_parallel.h>
+
+#include "kernels.h"
+
+namespace {
+
+using at::Tensor;
+using namespace splatwizard;
+
+void check(const Tensor& tensor, at::ScalarType type, int64_t dims, const char* op, const char* name) {
+  TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type && tensor.dim() == dims && tensor.is_contiguous(), op,
+              ": ", name, " must be a contiguous ", type, " tensor of ", dims, " axes on the CPU, got ",
+              tensor.toString(), tensor.sizes());
+}
+
+Tables tables_of(at::TensorList t, const char* op) {
+  TORCH_CHECK(t.size() == 4, op, ": tables must be shares, first, radius and bucket");
+  for (int i = 0; i < 3; ++i) check(t[i], at::kInt, 1, op, "tables");
+  check(t[3], at::kShort, 2, op, "bucket");
+  TORCH_CHECK(t[1].numel() == 512 && t[2].numel() == 512 && t[3].numel() == 512 * 256, op, ": tables must be 512");
+  return {t[0].const_data_ptr<int32_t>(), t[1].const_data_ptr<int32_t>(), t[2].const_data_ptr<int32_t>(),
+          reinterpret_cast<const uint16_t*>(t[3].const_data_ptr<int16_t>())};
+}
+
+// Where each stream begins, given their sizes [count, 3]; `bytes` must be all of them.
+std::vector<int64_t> offsets_of(const Tensor& sizes, int64_t bytes, const char* op) {
+  std::vector<int64_t> offsets;
+  int64_t at = 0;
+  const int64_t* table = sizes.const_data_ptr<int64_t>();
+  for (int64_t s = 0; s < sizes.size(0); ++s) {
+    const int64_t words = table[3 * s + 1], escapes = table[3 * s + 2];
+    TORCH_CHECK(words >= 0 && escapes >= 0 && words <= bytes - at && escapes <= bytes - at - words, op,
+                ": streams end behind the data");
+    offsets.push_back(at);
+    at += words + escapes;
+  }
+  TORCH_CHECK(at == bytes, op, ": data behind the last stream");
+  return offsets;
+}
+
+// A place for each stream, given how many symbols it has.
+std::vector<int64_t> places_of(const std::vector<int64_t>& counts, int64_t& bytes) {
+  std::vector<int64_t> offsets;
+  bytes = 0;
+  for (const int64_t count : counts) {
+    offsets.push_back(bytes);
+    bytes += most_bytes(count);
+  }
+  return offsets;
+}
+
+// The streams without the room between them.
+Tensor joined(const Tensor& data, const std::vector<int64_t>& offsets, const Tensor& sizes) {
+  const int64_t* table = sizes.const_data_ptr<int64_t>();
+  int64_t bytes = 0;
+  for (size_t s = 0; s < offsets.size(); ++s) bytes += table[3 * s + 1] + table[3 * s + 2];
+  Tensor found = at::empty({bytes}, data.options());
+  uint8_t* to = found.mutable_data_ptr<uint8_t>();
+  const uint8_t* from = data.const_data_ptr<uint8_t>();
+  for (size_t s = 0; s < offsets.size(); ++s) {
+    const auto size = static_cast<size_t>(table[3 * s + 1] + table[3 * s + 2]);
+    if (size > 0) std::memcpy(to, from + offsets[s], size);
+    to += size;
+  }
+  return found;
+}
+
+// (integer parts [m] i32, table numbers [m] i16, status) of the present numbers.
+std::tuple<Tensor, Tensor, int64_t> lattice(const Tensor& mean, const Tensor& scale, const Tensor& multiplier,
+                                            const std::optional<Tensor>& present, const Tensor& thresholds) {
+  const char* op = "lattice";
+  for (const Tensor& each : {mean, scale, multiplier})
+    TORCH_CHECK(each.is_cpu() && each.scalar_type() == at::kLong && each.dim() == 2 && each.size(0) == mean.size(0) &&
+                    (each.size(1) < 2 || each.stride(1) == 1),
+                op, ": mean, scale and multiplier must be int64 [n, columns] on the CPU");
+  TORCH_CHECK(scale.sizes() == mean.sizes() && multiplier.size(1) == 1, op, ": shapes do not fit");
+  check(thresholds, at::kLong, 1, op, "thresholds");
+  TORCH_CHECK(thresholds.numel() == 63, op, ": thresholds must be 63");
+  const int64_t rows = mean.size(0), columns = mean.size(1);
+  std::vector<int64_t> start;
+  int64_t count = rows * columns;
+  if (present.has_value()) {
+    check(*present, at::kBool, 2, op, "present");
+    TORCH_CHECK(present->sizes() == mean.sizes(), op, ": present must be like mean");
+    const bool* there = present->const_data_ptr<bool>();
+    count = 0;
+    start.reserve(static_cast<size_t>(rows));
+    for (int64_t row = 0; row < rows; ++row) {
+      start.push_back(count);
+      int64_t found = 0;
+      for (int64_t c = 0; c < columns; ++c) found += there[row * columns + c];
+      count += found;
+    }
+  }
+  Tensor centre = at::empty({count}, mean.options().dtype(at::kInt));
+  Tensor number = at::empty({count}, mean.options().dtype(at::kShort));
+  const LatticeArgs args{mean.const_data_ptr<int64_t>(),
+                         scale.const_data_ptr<int64_t>(),
+                         multiplier.const_data_ptr<int64_t>(),
+                         mean.stride(0),
+                         scale.stride(0),
+                         multiplier.stride(0),
+                         present.has_value() ? reinterpret_cast<const uint8_t*>(present->const_data_ptr<bool>()) : nullptr,
+                         start.data(),
+                         rows,
+                         columns,
+                         thresholds.const_data_ptr<int64_t>(),
+                         centre.mutable_data_ptr<int32_t>(),
+                         number.mutable_data_ptr<int16_t>()};
+  const int32_t status = SW_SELECT(lattice)(args, torch_parallel());
+  return {centre, number, status};
+}
+
+void check_lattice(const Tensor& centre, const Tensor& number, const char* op) {
+  check(centre, at::kInt, 1, op, "centre");
+  check(number, at::kShort, 1, op, "number");
+  TORCH_CHECK(centre.numel() == number.numel(), op, ": centre and number differ in length");
+}
+
+int64_t streams_of(int64_t symbols) { return (symbols + STREAM - 1) / STREAM; }
+
+// (symbols [n] i32, status) of `data`, whose streams have `sizes` [streams, 3]: CRC-32, bytes of words, of escapes.
+std::tuple<Tensor, int64_t> decode_streams(at::TensorList tables, const Tensor& data, const Tensor& sizes,
+                                           const Tensor& centre, const Tensor& number) {
+  const char* op = "decode_streams";
+  check(data, at::kByte, 1, op, "data");
+  check(sizes, at::kLong, 2, op, "sizes");
+  check_lattice(centre, number, op);
+  const int64_t count = centre.numel();
+  TORCH_CHECK(sizes.size(0) == streams_of(count) && sizes.size(1) == 3, op, ": sizes must be [streams, 3]");
+  const std::vector<int64_t> offsets = offsets_of(sizes, data.numel(), op);
+  Tensor symbols = at::empty({count}, centre.options());
+  const Streams streams{data.const_data_ptr<uint8_t>(), sizes.const_data_ptr<int64_t>(), offsets.data(), sizes.size(0)};
+  const int32_t status = SW_SELECT(decode_streams)(tables_of(tables, op), streams, centre.const_data_ptr<int32_t>(),
+                                                   number.const_data_ptr<int16_t>(), count,
+                                                   symbols.mutable_data_ptr<int32_t>(), torch_parallel());
+  return {symbols, status};
+}
+
+// (data, sizes) as above, of symbols [n] i32.
+std::tuple<Tensor, Tensor> encode_streams(at::TensorList tables, const Tensor& symbols, const Tensor& centre,
+                                          const Tensor& number) {
+  const char* op = "encode_streams";
+  check(symbols, at::kInt, 1, op, "symbols");
+  check_lattice(centre, number, op);
+  const int64_t count = symbols.numel();
+  TORCH_CHECK(centre.numel() == count, op, ": symbols and centre differ in length");
+  std::vector<int64_t> counts;
+  for (int64_t at = 0; at < count; at += STREAM) counts.push_back(std::min(STREAM, count - at));
+  int64_t bytes = 0;
+  const std::vector<int64_t> offsets = places_of(counts, bytes);
+  Tensor data = at::empty({bytes}, symbols.options().dtype(at::kByte));
+  Tensor sizes = at::empty({static_cast<int64_t>(counts.size()), 3}, symbols.options().dtype(at::kLong));
+  const Sinks sinks{data.mutable_data_ptr<uint8_t>(), offsets.data(), sizes.mutable_data_ptr<int64_t>(), sizes.size(0)};
+  SW_SELECT(encode_streams)(tables_of(tables, op), sinks, centre.const_data_ptr<int32_t>(),
+                            number.const_data_ptr<int16_t>(), count, symbols.const_data_ptr<int32_t>(),
+                            torch_parallel());
+  return {joined(data, offsets, sizes), sizes};
+}
+
+// Outputs [n, out] i64 of a network for inputs [n, in] i64; layers: W [out, in] and b [out] f64 in turn.
+Tensor network(const Tensor& inputs, at::TensorList layers) {
+  const char* op = "network";
+  check(inputs, at::kLong, 2, op, "inputs");
+  TORCH_CHECK(layers.size() >= 2 && layers.size() % 2 == 0, op, ": weights and biases must come in pairs");
+  const int64_t tile = SW_SELECT(tile)();
+  int64_t width = inputs.size(1);
+  std::vector<std::vector<double>> packed;
+  std::vector<Layer> found;
+  for (size_t i = 0; i < layers.size(); i += 2) {
+    check(layers[i], at::kDouble, 2, op, "weights");
+    check(layers[i + 1], at::kDouble, 1, op, "biases");
+    const int64_t out = layers[i].size(0);
+    TORCH_CHECK(layers[i].size(1) == width && layers[i + 1].size(0) == out, op, ": layers do not fit");
+    const int64_t tiles = (out + tile - 1) / tile;
+    std::vector<double> weights(static_cast<size_t>(tiles * tile * width)), bias(static_cast<size_t>(tiles * tile));
+    const double *w = layers[i].const_data_ptr<double>(), *b = layers[i + 1].const_data_ptr<double>();
+    for (int64_t o = 0; o < out; ++o) {
+      for (int64_t k = 0; k < width; ++k)
+        weights[static_cast<size_t>((o / tile * width + k) * tile + o % tile)] = w[o * width + k];
+      bias[static_cast<size_t>(o)] = b[o];
+    }
+    packed.push_back(std::move(weights));
+    packed.push_back(std::move(bias));
+    found.push_back({packed[i].data(), packed[i + 1].data(), width, out});
+    width = out;
+  }
+  for (size_t i = 0; i < found.size(); ++i) {
+    found[i].weights = packed[2 * i].data();
+    found[i].bias = packed[2 * i + 1].data();
+  }
+  Tensor outputs = at::empty({inputs.size(0), width}, inputs.options());
+  SW_SELECT(network)(found.data(), static_cast<int64_t>(found.size()), inputs.const_data_ptr<int64_t>(),
+                     inputs.size(0), outputs.mutable_data_ptr<int64_t>(), torch_parallel());
+  return outputs;
+}
+
+// Writes the columns of a grid into out [n, width] i64. signs [entries] i16: bit f is sign f; levels [3, L]: R - 1,
+// first entry and first column, dense levels first.
+void grid_features(const Tensor& codes, at::IntArrayRef axes, const Tensor& signs, int64_t features,
+                   const Tensor& levels, int64_t dense, int64_t log2_size, const Tensor& out) {
+  const char* op = "grid_features";
+  check(codes, at::kLong, 2, op, "codes");
+  check(signs, at::kShort, 1, op, "signs");
+  check(levels, at::kLong, 2, op, "levels");
+  check(out, at::kLong, 2, op, "out");
+  const auto dimensions = static_cast<int>(axes.size());
+  TORCH_CHECK(codes.size(1) == 3 && (dimensions == 2 || dimensions == 3) && levels.size(0) == 3 && features >= 1 &&
+                  features <= 16 && log2_size >= 3 && log2_size <= 30 && out.size(0) == codes.size(0) && dense >= 0 &&
+                  dense <= levels.size(1),
+              op, ": shapes do not fit");
+  GridArgs args{};
+  args.codes = codes.const_data_ptr<int64_t>();
+  for (int d = 0; d < dimensions; ++d) {
+    TORCH_CHECK(axes[static_cast<size_t>(d)] >= 0 && axes[static_cast<size_t>(d)] < 3, op, ": axes must be below 3");
+    args.axes[d] = static_cast<int>(axes[static_cast<size_t>(d)]);
+  }
+  args.dimensions = dimensions;
+  args.signs = reinterpret_cast<const uint16_t*>(signs.const_data_ptr<int16_t>());
+  args.features = static_cast<int>(features);
+  args.levels = levels.size(1);
+  args.last = levels.const_data_ptr<int64_t>();
+  args.start = args.last + args.levels;
+  args.column = args.start + args.levels;
+  args.dense = dense;
+  args.log2_size = log2_size;
+  args.rows = codes.size(0);
+  args.out = out.mutable_data_ptr<int64_t>();
+  args.stride = out.size(1);
+  for (int64_t i = 0; i < args.levels; ++i) {
+    int64_t entries = int64_t{1} << log2_size;
+    if (i < dense) {
+      entries = 1;
+      for (int d = 0; d < dimensions; ++d) entries *= args.last[i] + 1;
+    }
+    TORCH_CHECK(args.last[i] >= 1 && args.last[i] < 1 << 16 && args.start[i] >= 0 &&
+                    args.start[i] + entries <= signs.numel() && args.column[i] >= 0 &&
+                    args.column[i] + features <= args.stride,
+                op, ": level ", i, " does not fit its table");
+  }
+  SW_SELECT(grid_features)(args, torch_parallel());
+}
+
+// [n, scales * 3 * C] i64 of places [n, 3] i64 and planes [3, R * R, C] i32 for each scale.
+Tensor triplane_features(const Tensor& places, at::TensorList planes, at::IntArrayRef sizes) {
+  const char* op = "triplane_features";
+  check(places, at::kLong, 2, op, "places");
+  TORCH_CHECK(places.size(1) == 3 && !planes.empty() && planes.size() <= 4 && planes.size() == sizes.size(), op,
+              ": one to four scales of planes");
+  TriplaneArgs args{};
+  args.places = places.const_data_ptr<int64_t>();
+  args.scales = static_cast<int64_t>(planes.size());
+  args.channels = planes[0].size(2);
+  for (size_t i = 0; i < planes.size(); ++i) {
+    check(planes[i], at::kInt, 3, op, "planes");
+    TORCH_CHECK(sizes[i] >= 1 && planes[i].size(0) == 3 && planes[i].size(1) == sizes[i] * sizes[i] &&
+                    planes[i].size(2) == args.channels,
+                op, ": planes must be [3, R * R, C]");
+    args.planes[i] = planes[i].const_data_ptr<int32_t>();
+    args.size[i] = sizes[i];
+  }
+  args.rows = places.size(0);
+  Tensor out = at::empty({args.rows, args.scales * 3 * args.channels}, places.options());
+  args.out = out.mutable_data_ptr<int64_t>();
+  SW_SELECT(triplane_features)(args, torch_parallel());
+  return out;
+}
+
+// The streams of planes: rows (scale, orientation, first channel, channels), as the file has them.
+struct PlaneTask {
+  std::vector<PlaneStream> streams;
+  std::vector<int64_t> bundles, symbols;
+  PlanesArgs args{};
+
+  PlaneTask(at::TensorList planes, const Tensor& parts, const Tensor& weights, const char* op) {
+    check(parts, at::kLong, 2, op, "parts");
+    TORCH_CHECK(!planes.empty() && planes.size() <= 4 && parts.size(1) == 4, op, ": one to four scales of planes");
+    const int64_t orientations = planes[0].size(0);
+    for (size_t i = 0; i < planes.size(); ++i) {
+      check(planes[i], at::kInt, 4, op, "planes");
+      TORCH_CHECK(planes[i].size(0) == orientations, op, ": scales differ in orientations");
+      args.planes[i] = planes[i].mutable_data_ptr<int32_t>();
+      args.channels[i] = planes[i].size(1);
+      args.height[i] = planes[i].size(2);
+      args.width[i] = planes[i].size(3);
+    }
+    TORCH_CHECK(weights.dim() == 2 && weights.size(0) == orientations &&
+                    weights.size(1) == 1058,
+                op, ": weights must be [orientations, 1058]");
+    check(weights, at::kDouble, 2, op, "weights");
+    args.weights = weights.const_data_ptr<double>();
+    const int64_t* row = parts.const_data_ptr<int64_t>();
+    for (int64_t s = 0; s < parts.size(0); ++s, row += 4) {
+      TORCH_CHECK(row[0] >= 0 && row[0] < static_cast<int64_t>(planes.size()) && row[1] >= 0 && row[1] < orientations &&
+                      row[2] >= 0 && row[3] >= 1 && row[2] + row[3] <= args.channels[row[0]],
+                  op, ": stream ", s, " lies outside the planes");
+      const PlaneStream stream{row[0], row[1], row[2], row[3]};
+      symbols.push_back(stream.channels * args.height[stream.scale] * args.width[stream.scale]);
+      bool joins = false;
+      if (!streams.empty()) {
+        const PlaneStream &last = streams.back(), &first = streams[static_cast<size_t>(bundles.back())];
+        joins = last.scale == stream.scale && last.orientation == stream.orientation &&
+                last.channel + last.channels == stream.channel &&
+                stream.channel + stream.channels - first.channel <= 8;
+      }
+      if (!joins) bundles.push_back(s);
+      streams.push_back(stream);
+    }
+    bundles.push_back(parts.size(0));
+    args.streams = streams.data();
+    args.count = parts.size(0);
+    args.bundle = bundles.data();
+    args.bundles_end = bundles.data() + bundles.size();
+  }
+};
+
+// Fills planes [K, C, H, W] i32 of each scale; the status.
+int64_t decode_planes(at::TensorList tables, const Tensor& data, const Tensor& sizes, at::TensorList planes,
+                      const Tensor& parts, const Tensor& weights) {
+  const char* op = "decode_planes";
+  check(data, at::kByte, 1, op, "data");
+  check(sizes, at::kLong, 2, op, "sizes");
+  TORCH_CHECK(sizes.size(0) == parts.size(0) && sizes.size(1) == 3, op, ": sizes must be [streams, 3]");
+  const PlaneTask task(planes, parts, weights, op);
+  const std::vector<int64_t> offsets = offsets_of(sizes, data.numel(), op);
+  const Streams streams{data.const_data_ptr<uint8_t>(), sizes.const_data_ptr<int64_t>(), offsets.data(), sizes.size(0)};
+  return SW_SELECT(decode_planes)(tables_of(tables, op), streams, task.args, torch_parallel());
+}
+
+// (data, sizes) of planes.
+std::tuple<Tensor, Tensor> encode_planes(at::TensorList tables, at::TensorList planes, const Tensor& parts,
+                                         const Tensor& weights) {
+  const char* op = "encode_planes";
+  const PlaneTask task(planes, parts, weights, op);
+  int64_t bytes = 0;
+  const std::vector<int64_t> offsets = places_of(task.symbols, bytes);
+  Tensor data = at::empty({bytes}, parts.options().dtype(at::kByte));
+  Tensor sizes = at::zeros({parts.size(0), 3}, parts.options());
+  const Sinks sinks{data.mutable_data_ptr<uint8_t>(), offsets.data(), sizes.mutable_data_ptr<int64_t>(), sizes.size(0)};
+  SW_SELECT(encode_planes)(tables_of(tables, op), sinks, task.args, torch_parallel());
+  return {joined(data, offsets, sizes), sizes};
+}
+
+}  // namespace
+
+TORCH_LIBRARY(sw_codecs_exact, m) {
+  m.def("lattice(Tensor mean, Tensor scale, Tensor multiplier, Tensor? present, Tensor thresholds)"
+        " -> (Tensor, Tensor, int)");
+  m.def("decode_streams(Tensor[] tables, Tensor data, Tensor sizes, Tensor centre, Tensor number) -> (Tensor, int)");
+  m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
+  m.def("network(Tensor inputs, Tensor[] layers) -> Tensor");
+  m.def("grid_features(Tensor codes, int[] axes, Tensor signs, int features, Tensor levels, int dense, int log2_size,"
+        " Tensor(a!) out) -> ()");
+  m.def("triplane_features(Tensor places, Tensor[] planes, int[] sizes) -> Tensor");
+  m.def("decode_planes(Tensor[] tables, Tensor data, Tensor sizes, Tensor(a!)[] planes, Tensor parts, Tensor weights)"
+        " -> int");
+  m.def("encode_planes(Tensor[] tables, Tensor[] planes, Tensor parts, Tensor weights) -> (Tensor, Tensor)");
+  m.impl("lattice", c10::DispatchKey::CPU, TORCH_FN(lattice));
+  m.impl("decode_streams", c10::DispatchKey::CPU, TORCH_FN(decode_streams));
+  m.impl("encode_streams", c10::DispatchKey::CPU, TORCH_FN(encode_streams));
+  m.impl("network", c10::DispatchKey::CPU, TORCH_FN(network));
+  m.impl("grid_features", c10::DispatchKey::CPU, TORCH_FN(grid_features));
+  m.impl("triplane_features", c10::DispatchKey::CPU, TORCH_FN(triplane_features));
+  m.impl("decode_planes", c10::DispatchKey::CPU, TORCH_FN(decode_planes));
+  m.impl("encode_planes", c10::DispatchKey::CPU, TORCH_FN(encode_planes));
+}

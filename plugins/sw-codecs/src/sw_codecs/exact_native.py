@@ -1,0 +1,21 @@
+"""The native module of the exact mode: coding of symbols, networks and look-ups in integers, on all cores."""
+
+from __future__ import annotations
+
+from splatwizard_native import NativeModule
+
+EXACT = NativeModule(
+    name="sw_codecs_exact",
+    package="sw_codecs",
+    sources=("exact_kernels/binding.cpp",),
+    kernels=(
+        "exact_kernels/network.cpp",
+        "exact_kernels/planes.cpp",
+        "exact_kernels/streams.cpp",
+        "exact_kernels/lookups.cpp",
+    ),
+    headers=("exact_kernels/*.h",),
+    cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code
+    seconds=15,
+    without="files of anchors decode on torch operations and the library constriction: the same bits, ten times slower",
+)

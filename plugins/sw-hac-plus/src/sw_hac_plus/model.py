@@ -1,0 +1,161 @@
+"""The model of HAC++: anchors on the lattice of voxels, whose features are predicted by the grid and by one another.
+
+Source: HAC++ (arXiv 2501.12255), and published facts about the authors' code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import torch
+from sw_anchors.anchors import AnchorAttributes, linear_layers
+from sw_anchors.coded_anchors import MASK_THRESHOLD, AnchorForecast, AnchorRate
+from sw_anchors.fused_ops import anchor_values, widen
+from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
+from sw_anchors.lattice import position_codes
+from sw_anchors.voxel_lattice import voxel_integers, voxel_positions
+from torch import Tensor, nn
+
+from sw_codecs.context.channel_mixture import ChannelMixture
+from sw_codecs.entropy.rates import gaussian_bits, mixture_bits
+from sw_codecs.quantizers.rounding import add_noise
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, GaussianInputs
+
+SMALLEST_SCALE = 1e-9
+"""Floor of a predicted deviation, as published."""
+
+
+@dataclass(frozen=True)
+class PoolForecast(AnchorForecast):
+    """An AnchorForecast whose sample is drawn from all anchors of the model.
+
+    rows            [S] int64, the sample
+    sample_steps    [S,3] quantiser steps of it; `hidden` is that of the sample too
+    """
+
+    rows: Tensor
+    sample_steps: Tensor
+
+
+class HACPlusAnchors(GridAnchors):
+    """GridAnchors on a lattice of voxels, with a channel context; the rate of any anchor may switch it off.
+
+    channel             second Gaussian of each feature; None: the grid alone predicts, as in HAC
+    anchor_gradient     whether the gradient of all bits of an anchor reaches its masks
+
+    The network behind the grid has F further outputs: logits of the weight of its Gaussian.
+    """
+
+    COUNTS_MASKED = True
+    HAS_FIXED_FORM = False  # its sample is of all anchors, and its masks have a gradient through scales
+
+    def __init__(
+        self, *tensors: Tensor, channel: ChannelMixture | None, anchor_gradient: bool = True, **kwargs: Any
+    ) -> None:
+        """As GridAnchors."""
+        super().__init__(*tensors, further=0 if channel is None else tensors[1].shape[1], **kwargs)
+        self.channel = None if channel is None else channel.to(self.features)
+        self.anchor_gradient = anchor_gradient
+
+    def networks(self) -> dict[str, nn.Module]:
+        return super().networks() | ({} if self.channel is None else {"channel": self.channel})
+
+    def lattice_places(self) -> tuple[Tensor, Tensor]:
+        positions = voxel_positions(voxel_integers(self.anchors, self.voxel_size), self.voxel_size)
+        return position_codes(positions, self.bounds), positions
+
+    # Rendering
+
+    def attributes(self, rows: Tensor) -> AnchorAttributes:
+        found = super().attributes(rows)
+        return dataclasses.replace(found, extras={**found.extras, "masks": found.masks}) if self.training else found
+
+    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
+        """The Gaussians of the anchors `rows` [V]; masks have a gradient through opacities and scales alike."""
+        found = super().decode(camera, rows)
+        if "masks" not in found.extras:
+            return found
+        # Of those drawn all masks are 1; what is masked would be drawn with scale 0, and is left out.
+        masks = found.extras["masks"].reshape(-1).index_select(0, found.extras["anchors"].drawn)
+        return dataclasses.replace(found, scales=found.scales * masks[:, None])
+
+    # Rate
+
+    def forecast(self, rows: Tensor) -> PoolForecast:
+        """Predict steps of the anchors `rows`, and for a sample of all anchors what their bits are counted with."""
+        drawn = self._sample(self.num_rows)
+        both = torch.cat([rows, drawn])
+        features, bits = self._looked_up(tuple(part.index_select(0, both) for part in self.context_rows()))
+        first, last = linear_layers(self.mlp_grid)
+        hidden = torch.relu(first(features))
+        part = slice(self._distributions, self._distributions + 3)
+        steps = torch.tanh(nn.functional.linear(hidden, last.weight[part], last.bias[part]))
+        steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
+        visible, sampled = torch.split(steps, [len(rows), len(drawn)])
+        return PoolForecast(visible, bits, hidden[len(rows) :], self._no_sample, drawn, sampled)
+
+    @property
+    def _distributions(self) -> int:
+        """Outputs of the network before the step logits."""
+        return sum(self.shape.outputs[:-1])
+
+    @staticmethod
+    def _no_sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
+        raise NotImplementedError("the bits of HAC++ are no Gaussian's alone: HACPlusAnchors.rate counts them")
+
+    def rate(self, values: Tensor, steps: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
+        """Estimate the bits a number over a sample of all anchors, under noise of its own.
+
+        Masked anchors and offsets have no bits, but count as numbers. What is drawn in this view is no matter.
+        """
+        assert isinstance(forecast, PoolForecast)
+        if not len(forecast.rows):
+            nothing = self.mask_logits.new_zeros(())
+            return AnchorRate(nothing, nothing.new_zeros(3), nothing, forecast.own_bits)
+        values, masks = anchor_values(
+            forecast.rows, self.features, self.log_scales, self.offsets, self.mask_logits, None, MASK_THRESHOLD
+        )
+        steps = widen(forecast.sample_steps, *self._columns(values))
+        values = add_noise(values, steps, self.uniform(*values.shape))
+        bits = self._bits(values, steps, forecast) * self._shares(masks)
+        by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
+        return AnchorRate(bits.sum() / bits.numel(), by_group, by_group.new_tensor(bits.numel()), forecast.own_bits)
+
+    def _shares(self, masks: Tensor) -> Tensor:
+        """[S,C] factors of the bits: whether the anchor is there, for an offset times its mask; with gradient."""
+        mean = masks.mean(dim=1)
+        there = (mean > 0).to(mean)
+        if self.anchor_gradient:
+            there = mean + (there - mean).detach()  # 1 or 0, with the gradient of the mean
+        widths = self.shape.widths
+        offsets = (there[:, None] * masks)[:, :, None].expand(-1, -1, 3).flatten(1)
+        return torch.cat([there[:, None].expand(-1, widths[0] + widths[1]), offsets], dim=1)
+
+    def _bits(self, values: Tensor, steps: Tensor, forecast: PoolForecast) -> Tensor:
+        """[S,C] bits of noisy values under the grid's Gaussians, of features under the mixture with the channels'."""
+        assert forecast.hidden is not None
+        _, last = linear_layers(self.mlp_grid)
+        outputs = nn.functional.linear(forecast.hidden, last.weight, last.bias) * self.units
+        f, count = self.shape.features, self._distributions
+        parts = torch.split(outputs[:, :count], self.shape.outputs[:-1], dim=1)
+        mean = torch.cat(parts[0::2], dim=1)
+        scale = torch.cat(parts[1::2], dim=1).clamp(min=SMALLEST_SCALE)
+        if self.channel is None:
+            return gaussian_bits(values, mean, scale, steps, p_min=self.smallest_probability)
+        base, logit = self.base_steps[0], outputs[:, count + 3 :]
+        context = torch.cat([parts[0] / base, parts[1] / base, logit], dim=1)
+        second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, context)
+        features = mixture_bits(
+            values[:, :f],
+            torch.stack([logit, second_logit], dim=-1),
+            torch.stack([mean[:, :f], base * second_mean], dim=-1),
+            torch.stack([scale[:, :f], (base * second_scale).clamp(min=SMALLEST_SCALE)], dim=-1),
+            steps[:, :f],
+            p_min=self.smallest_probability,
+        )
+        others = gaussian_bits(values[:, f:], mean[:, f:], scale[:, f:], steps[:, f:], p_min=self.smallest_probability)
+        return torch.cat([features, others], dim=1)
