@@ -1,0 +1,54 @@
+// Registers the ops of grids of real numbers, and their kernels on the CPU.
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/zeros.h>
+#include <torch/library.h>
+
+#include <splatwizard/torch_parallel.h>
+
+#include "binding.h"
+#include "kernels.h"
+
+namespace {
+
+using namespace sw_grid;
+
+at::Tensor lookup(const at::Tensor& x, const at::Tensor& values, at::ArrayRef<double> scales, at::IntArrayRef lasts,
+                  at::IntArrayRef starts, at::IntArrayRef dense, int64_t log2_size) {
+  TORCH_CHECK(x.dim() == 2 && values.dim() == 2, "sw_codecs_grid: x must be [n,2 or 3], values [entries,features]");
+  const int64_t n = x.size(0), axes = x.size(1), features = values.size(1);
+  const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, values.size(0));
+  check(x, "x", x, {n, axes});
+  check(values, "values", x, {values.size(0), features});
+  at::Tensor found = at::empty({n, levels.count * features}, x.options().requires_grad(false));
+  SW_SELECT(grid_lookup)(levels, int(axes), int(features), n, x.const_data_ptr<float>(),
+                         values.const_data_ptr<float>(), found.mutable_data_ptr<float>(),
+                         splatwizard::torch_parallel());
+  return found;
+}
+
+at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t entries, int64_t features,
+                    at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
+                    int64_t log2_size) {
+  TORCH_CHECK(x.dim() == 2 && features > 0, "sw_codecs_grid: x must be [n,2 or 3]");
+  const int64_t n = x.size(0), axes = x.size(1);
+  const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, entries);
+  check(x, "x", x, {n, axes});
+  check(gradient, "gradient", x, {n, levels.count * features});
+  at::Tensor table = at::zeros({entries, features}, x.options().requires_grad(false));
+  SW_SELECT(grid_backward)(levels, int(axes), int(features), n, x.const_data_ptr<float>(),
+                           gradient.const_data_ptr<float>(), table.mutable_data_ptr<float>(),
+                           splatwizard::torch_parallel());
+  return table;
+}
+
+}  // namespace
+
+TORCH_LIBRARY(sw_codecs_grid, m) {
+  m.def("lookup(Tensor x, Tensor values, float[] scales, int[] lasts, int[] starts, int[] dense, int log2_size)"
+        " -> Tensor");
+  m.def("backward(Tensor x, Tensor gradient, int entries, int features, float[] scales, int[] lasts, int[] starts,"
+        " int[] dense, int log2_size) -> Tensor");
+  m.impl("lookup", c10::DispatchKey::CPU, TORCH_FN(lookup));
+  m.impl("backward", c10::DispatchKey::CPU, TORCH_FN(backward));
+}
