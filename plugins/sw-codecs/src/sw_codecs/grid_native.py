@@ -8,10 +8,10 @@ GRID = NativeModule(
     name="sw_codecs_grid",
     package="sw_codecs",
     sources=("grid_kernels/binding.cpp", "grid_kernels/binding_cuda.cpp"),
-    kernels=("grid_kernels/lookup.cpp",),
+    kernels=("grid_kernels/lookup.cpp", "grid_kernels/signs.cpp"),
     headers=("grid_kernels/*.h", "grid_kernels/cuda/*.h"),
-    cuda_sources=("grid_kernels/cuda/lookup.cu",),
+    cuda_sources=("grid_kernels/cuda/lookup.cu", "grid_kernels/cuda/signs.cu"),
     cflags=("-ffp-contract=off",),  # a place is rounded as torch rounds it
     seconds=10,
-    without="hash grids of real numbers are looked up by torch operations: the same numbers, slower",
+    without="hash grids are looked up by torch operations: the same numbers, slower",
 )

@@ -3,6 +3,8 @@
 //   grid_lookup    x [n][axes] -> found [n][levels][features]
 //   grid_backward  dL/dfound -> table [entries][features], which holds zeros before: a level by one thread, its points
 //                  in their order, so that sums are the same for any number of threads
+//   signs_lookup   as grid_lookup, of the signs of a table, whose `axes` axes are some of the `columns` of x; `found`
+//                  and dL/dfound are the first of levels * features columns of rows that are `row` long
 #pragma once
 
 #include <splatwizard/dispatch.h>
@@ -16,6 +18,10 @@
                    const float* table, float* found, const splatwizard::Parallel& parallel);                        \
   void grid_backward(const sw_grid::Levels& levels, int axes, int features, int64_t n, const float* x,              \
                      const float* gradient, float* table, const splatwizard::Parallel& parallel);                   \
+  void signs_lookup(const sw_grid::Signs& at, const float* table, float* found,                                     \
+                    const splatwizard::Parallel& parallel);                                                         \
+  void signs_backward(const sw_grid::Signs& at, const float* gradient, float* table,                                \
+                      const splatwizard::Parallel& parallel);                                                       \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_GRID)
 #undef SW_DECLARE_GRID
