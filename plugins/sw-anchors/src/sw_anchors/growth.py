@@ -34,24 +34,16 @@ def accumulate_anchor_statistics(
     """Add one view to the four statistics of `model`, in place.
 
     selection   `RenderResult.extras["anchors"]`
-    gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d); rows after those
-                of the selection are not looked at
+    gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d)
     radii       [M] pixels; Gaussians with radius 0 do not count
     """
-    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU, and so
-    # would the 0 of `torch.where`.
+    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
     rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
     model.opacity_accum.index_add_(0, rows, selection.opacities.clamp(min=0).sum(dim=1))
     model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
-    norms.masked_fill_(seen == 0, 0)
-    if selection.drawn is None:
-        shape = selection.opacities.shape
-        model.offset_grad_accum.index_add_(0, rows, norms[: shape.numel()].view(shape))
-        model.offset_denom.index_add_(0, rows, seen[: shape.numel()].view(shape))
-        return
     at = selection.offset_index()
-    model.offset_grad_accum.view(-1).index_add_(0, at, norms)
+    model.offset_grad_accum.view(-1).index_add_(0, at, norms.masked_fill_(seen == 0, 0))
     model.offset_denom.view(-1).index_add_(0, at, seen)
 
 
