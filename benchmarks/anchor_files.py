@@ -1,6 +1,6 @@
 """Seconds to encode and to decode anchor files, by part, for each 100,000 anchors.
 
-    python benchmarks/anchor_files.py                               # synthetic anchors of hac and cat-3dgs, 1 and 2 threads
+    python benchmarks/anchor_files.py                               # synthetic anchors, 1 and 2 threads
     python benchmarks/anchor_files.py --anchors 20000 --methods hac --threads 1
     python benchmarks/anchor_files.py out/room/hac/r4/scene.swz     # decode that file
     python benchmarks/anchor_files.py --device cuda --threads 1,2,16  # the model goes to the GPU at the end
@@ -201,7 +201,9 @@ def main() -> None:
     parser.add_argument("--methods", default="hac,cat-3dgs")
     parser.add_argument("--threads", default="1,2")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--clock", choices=("wall", "cpu"), default="wall", help="cpu: of all threads, for a busy machine")
+    parser.add_argument(
+        "--clock", choices=("wall", "cpu"), default="wall", help="cpu: of all threads, for a busy machine"
+    )
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu", help="where the decoded model goes")
     args = parser.parse_args()
     args.thread_counts = [int(each) for each in args.threads.split(",")]

@@ -47,7 +47,8 @@ def test_a_golden_file_decodes_to_the_recorded_parameters(maker, name):
 @pytest.mark.parametrize("name", FACTS)
 def test_todays_encoder_writes_the_same_sections_and_the_same_model(maker, name):
     """If the bytes change on purpose, the old file stays, and a new one is made under a new name (`_v2`)."""
-    fresh, golden = ContainerReader(maker.encoded(name), name), ContainerReader.open(GOLDEN / f"{name}.swz")
+    written = maker.SUPERSEDED.get(name, name)
+    fresh, golden = ContainerReader(maker.encoded(name), name), ContainerReader.open(GOLDEN / f"{written}.swz")
     assert maker.decoded_facts(maker.encoded(name), name)["parameters"] == FACTS[name]["parameters"]
     assert (fresh.method, fresh.version, fresh.static) == (golden.method, golden.version, golden.static)
     assert {s: fresh.section(s) for s in fresh.sections} == {s: golden.section(s) for s in golden.sections}

@@ -9,6 +9,7 @@ import numpy as np
 
 from bitstream_page.building_blocks import (
     RangeWords,
+    RansWords,
     bernoulli_model,
     class_e,
     class_smallest,
@@ -174,7 +175,7 @@ def centre_and_table(mean: int, level: int, m: int) -> tuple[int, int]:
 
 
 def coded_values(
-    words: RangeWords, bits: Iterator[str], tables: ExactTables, family: str, numbers: Sequence[int]
+    words: RangeWords | RansWords, bits: Iterator[str], tables: ExactTables, family: str, numbers: Sequence[int]
 ) -> list[int]:
     """s for each entry of `numbers`, the tables."""
     entries = symbols_by_table(words, tables.tables[family], numbers)
@@ -188,12 +189,22 @@ def coded_values(
     return values
 
 
+def stream_values(
+    words: RansWords, bits: Iterator[str], tables: ExactTables, numbers: Sequence[int], centres: Sequence[int]
+) -> list[int]:
+    """Symbols of a whole stream."""
+    coded = coded_values(words, bits, tables, "gaussian", numbers)
+    check(words.state == 0 and not words.words and not any(bit == "1" for bit in bits), "end of a stream")
+    return [value + centre for value, centre in zip(coded, centres, strict=True)]
+
+
 def exact(
     data: bytes, tables: ExactTables, mean: Sequence[int], scale: Sequence[int], multiplier: Sequence[int]
 ) -> list[int]:
     """`gaussian-exact`."""
     file = Bytes(data)
-    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    version, crc = file.unpack("HI")
+    check(version in (1, 2) and crc == tables.crc, "other tables")
     centres, numbers = [], []
     for mu, sigma, m in zip(mean, scale, multiplier, strict=True):
         level = bisect.bisect_left(tables.thresholds, (max(sigma, 0) << 12) // m)
@@ -202,6 +213,15 @@ def exact(
         numbers.append(number)
 
     found: list[int] = []
+    if version == 2:
+        starts = range(0, len(centres), 1 << 16)
+        sizes = [(file.one("I"), file.varint(), file.varint()) for _ in starts]
+        for start, (crc, length, escapes) in zip(starts, sizes, strict=True):
+            part = slice(start, start + (1 << 16))
+            words, bits = RansWords(file.take(length)), Bytes(file.take(escapes)).bits()
+            values = stream_values(words, bits, tables, numbers[part], centres[part])
+            check(crc_i32(values) == crc, "CRC of a stream")
+            found += values
     while len(found) < len(centres):
         count, _, _, length, crc = file.unpack("IiiII")
         start = len(found)
@@ -211,6 +231,65 @@ def exact(
         values = [value + centre for value, centre in zip(coded, centres[start : start + count], strict=True)]
         check(crc_i32(values) == crc, "CRC of a chunk")
         found += values
+    file.done()
+    return found
+
+
+WIDTHS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256)
+
+
+def mixture_block(data: bytes, tables: ExactTables, numbers: Sequence[Sequence[int]]) -> list[int]:
+    """A block of `conditional-mixture`: two means, two scales, d and m of each number."""
+    if not numbers:
+        check(not data, "bytes of no numbers")
+        return []
+    file = Bytes(data)
+    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    crc = file.one("I")
+    words, bits = RangeWords(file.take(file.varint())), file.bits()
+    windows = []
+    for mu_1, mu_2, sigma_1, sigma_2, d, m in numbers:
+        j = min(max(((d >> 1) + (1 << 15)) >> 9, 0), 127)
+        w = min(max((tables.multipliers[j] + 16) >> 5, 2), 254)
+        parts = []
+        for mu, sigma, share in ((mu_1, sigma_1, w), (mu_2, sigma_2, 256 - w)):
+            level = bisect.bisect_left(tables.thresholds, (max(sigma, 0) << 12) // m)
+            middle, number = centre_and_table(mu, level, m)
+            parts.append((middle, tables.radius["gaussian"][level], tables.tables["gaussian"][number], share))
+        centre = parts[0 if w >= 128 else 1][0]
+        reach = max(radius + abs(middle - centre) for middle, radius, _, _ in parts)
+        width = next((width for width in WIDTHS if width >= reach), WIDTHS[-1])
+        counts = [1] * (2 * width + 2)
+        for middle, radius, table, share in parts:
+            for s in range(-width, width + 1):
+                if abs(centre + s - middle) <= radius:
+                    counts[s + width] += share * table[centre + s - middle + radius]
+            counts[-1] += share * table[-1]
+        windows.append((width, centre, counts))
+    found = [0] * len(windows)
+    order = sorted(range(len(windows)), key=lambda i: windows[i][0])
+    entries = {i: symbols_of(words, windows[i][2], 1)[0] for i in order}
+    for i in order:
+        width, centre, _ = windows[i]
+        s = entries[i] - width
+        if entries[i] == 2 * width + 1:
+            negative, v = escape(bits)
+            s = -(v + width + 1) if negative else v + width + 1
+        found[i] = centre + s
+    check(crc_i32(found) == crc, "CRC of a block")
+    return found
+
+
+def conditional_mixture(
+    section: bytes, tables: ExactTables, c: int, parameters: Sequence[np.ndarray], steps: np.ndarray
+) -> np.ndarray:
+    """`conditional-mixture`: integers [n,C]; `parameters` are the means, the scales and d, [n,C] each."""
+    shape = parameters[0].shape
+    file, found, rows = Bytes(section), np.zeros(shape, np.int64), max(1, (1 << 20) // c)
+    spread = np.stack([*parameters, np.broadcast_to(steps, shape)], axis=-1)
+    for start in range(0, len(found), rows):
+        part = spread[start : start + rows].reshape(-1, 6).tolist()
+        found[start : start + rows] = np.reshape(mixture_block(file.take(file.varint()), tables, part), (-1, shape[1]))
     file.done()
     return found
 

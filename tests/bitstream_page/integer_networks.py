@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bitstream_page.building_blocks import RangeWords, crc_i32
+from bitstream_page.building_blocks import RangeWords, RansWords, crc_i32
 from bitstream_page.entropy_models import ExactTables, centre_and_table, coded_values
 from bitstream_page.fields import Bytes, check
 
@@ -17,7 +17,9 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 NEIGHBORS = [(-2, x) for x in range(-2, 3)] + [(-1, x) for x in range(-2, 3)] + [(0, -2), (0, -1)]
 
 
-def network(layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+def network(
+    layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, inputs: np.ndarray, *, leaky: bool = False
+) -> np.ndarray:
     """A network in integers; `units` of the outputs of the last layer."""
     a = np.clip(inputs, -(1 << 20), 1 << 20)
     for i, (weight, bias) in enumerate(layers):
@@ -26,7 +28,7 @@ def network(layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, 
         c = np.rint(bias.astype(np.float64) * u * 2.0**24).astype(np.int64)
         a = (a @ w.T + c) >> 12
         if i < len(layers) - 1:
-            a = np.clip(a, 0, 1 << 20)
+            a = np.clip(np.where(a < 0, 41 * a >> 12, a), -(1 << 20), 1 << 20) if leaky else np.clip(a, 0, 1 << 20)
     return a
 
 
@@ -107,36 +109,70 @@ def triplane(scales: Sequence[np.ndarray], u: np.ndarray) -> np.ndarray:
     return np.concatenate(found).T
 
 
+def expected(plane: np.ndarray, model: Any, row: int, column: int) -> tuple[int, int]:
+    """I and the number of the table of an integer, from its neighbours in a plane [H,W]."""
+    around = [(row + y, column + x) for y, x in NEIGHBORS]
+    inside = [0 <= y < plane.shape[0] and 0 <= x < plane.shape[1] for y, x in around]
+    seen = [int(plane[at]) if ok else 0 for at, ok in zip(around, inside, strict=True)]
+    mu, t = network(model, np.ones(2), np.array([seen], np.int64) * 4096)[0].tolist()
+    level = min(max((7_215_259_165 - 288_539 * t) >> 28, 0), 63)
+    return centre_and_table(mu, level, 4096)
+
+
 def planes_under_models(
     section: bytes, tables: ExactTables, shapes: Sequence[tuple[int, ...]], models: Sequence[Any]
 ) -> list[np.ndarray]:
     file = Bytes(section)
-    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    version, crc_of_tables = file.unpack("HI")
+    check(version in (1, 2) and crc_of_tables == tables.crc, "other tables")
+    found = [np.zeros(shape, np.int64) for shape in shapes]
+    read = plane_streams if version == 2 else single_stream
+    read(file, tables, found, models)
+    return found
+
+
+def plane_streams(file: Bytes, tables: ExactTables, found: list[np.ndarray], models: Sequence[Any]) -> None:
+    """Version 2, into `found`."""
+    crc, g = file.one("I"), file.varint()
+    streams = [
+        (plane[k, first : first + g], models[k])
+        for plane in found
+        if plane.size
+        for k in range(len(models))
+        for first in range(0, plane.shape[1], g)
+    ]
+    sizes = [(file.varint(), file.varint()) for _ in streams]
+    for (channels, model), (length, escapes) in zip(streams, sizes, strict=True):
+        words, bits = RansWords(file.take(length)), Bytes(file.take(escapes)).bits()
+        _, height, width = channels.shape
+        for w in range(width + 3 * (height - 1)):
+            for row in range(height):
+                if 0 <= w - 3 * row < width:
+                    for plane in channels:
+                        centre, number = expected(plane, model, row, w - 3 * row)
+                        (value,) = coded_values(words, bits, tables, "laplace", [number])
+                        plane[row, w - 3 * row] = value + centre
+        check(words.state == 0 and not words.words and not any(bit == "1" for bit in bits), "end of a stream")
+    file.done()
+    check(crc_i32([v for plane in found for v in plane.reshape(-1).tolist()]) == crc, "CRC of planes")
+
+
+def single_stream(file: Bytes, tables: ExactTables, found: list[np.ndarray], models: Sequence[Any]) -> None:
+    """Version 1, into `found`."""
     crc, escapes, length = file.one("I"), file.varint(), file.varint()
     words, bits, coded = RangeWords(file.take(length)), file.bits(), []
-    found = [np.zeros(shape, np.int64) for shape in shapes]
-    for w in range(max(shape[3] + 3 * (shape[2] - 1) for shape in shapes)):
+    for w in range(max(plane.shape[3] + 3 * (plane.shape[2] - 1) for plane in found)):
         due = [
             (scale, k, c, row, w - 3 * row)
-            for scale, shape in enumerate(shapes)
-            for k, c, row in itertools.product(*(range(length_) for length_ in shape[:3]))
-            if 0 <= w - 3 * row < shape[3]
+            for scale, plane in enumerate(found)
+            for k, c, row in itertools.product(*(range(length_) for length_ in plane.shape[:3]))
+            if 0 <= w - 3 * row < plane.shape[3]
         ]
-        centres, numbers = [], []
-        for scale, k, c, row, column in due:
-            plane = found[scale][k, c]
-            around = [(row + y, column + x) for y, x in NEIGHBORS]
-            inside = [0 <= y < plane.shape[0] and 0 <= x < plane.shape[1] for y, x in around]
-            seen = [int(plane[at]) if ok else 0 for at, ok in zip(around, inside, strict=True)]
-            mu, t = network(models[k], np.ones(2), np.array([seen], np.int64) * 4096)[0].tolist()
-            level = min(max((7_215_259_165 - 288_539 * t) >> 28, 0), 63)
-            centre, number = centre_and_table(mu, level, 4096)
-            centres.append(centre)
-            numbers.append(number)
+        parameters = [expected(found[scale][k, c], models[k], row, column) for scale, k, c, row, column in due]
+        numbers = [number for _, number in parameters]
         values = coded_values(words, bits, tables, "laplace", numbers)
         escapes -= sum(abs(s) > tables.radius["laplace"][n // 8] for s, n in zip(values, numbers, strict=True))
-        for (scale, *at), value, centre in zip(due, values, centres, strict=True):
+        for (scale, *at), value, (centre, _) in zip(due, values, parameters, strict=True):
             found[scale][tuple(at)] = value + centre
             coded.append(value + centre)
     check(escapes == 0 and crc_i32(coded) == crc, "CRC of planes")
-    return found

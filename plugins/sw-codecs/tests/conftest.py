@@ -1,9 +1,14 @@
 """A decoder of bytes that are cut anywhere or changed at any byte raises BitstreamError or still decodes right."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from splatwizard_core.errors import BitstreamError
+from sw_codecs.context import hash_grid, integer_mlp, plane_streams, triplane
+from sw_codecs.entropy import exact_streams, lattice
+from sw_codecs.exact_native import EXACT
 
 
 def _assert_survives_damage(data, decode, expected, *, masks=(0x01, 0x80, 0xFF), truncations=None):
@@ -27,3 +32,17 @@ def _assert_survives_damage(data, decode, expected, *, masks=(0x01, 0x80, 0xFF),
 @pytest.fixture
 def assert_survives_damage():
     return _assert_survives_damage
+
+
+@pytest.fixture
+def kernels(monkeypatch):
+    """Let the exact mode run with its compiled kernels or without: `kernels(False)`."""
+    users = (hash_grid, integer_mlp, plane_streams, triplane, exact_streams, lattice)
+
+    def use(compiled):
+        if compiled:
+            EXACT.load()
+        for module in users:
+            monkeypatch.setattr(module, "EXACT", EXACT if compiled else SimpleNamespace(try_load=lambda: False))
+
+    return use

@@ -68,10 +68,13 @@ CASES = {
         modes,
     ),
     "bernoulli_v1": (lambda: Bernoulli().encode(mixed < 900), lambda d: Bernoulli().decode(d, 300), mixed < 900),
-    "gaussian_exact_v1": (
-        lambda: GaussianExact().encode(residuals, context),
-        lambda d: GaussianExact().decode(d, context),
-        residuals,
+    **dict.fromkeys(
+        ("gaussian_exact_v1", "gaussian_exact_v2"),
+        (
+            lambda: GaussianExact().encode(residuals, context),
+            lambda d: GaussianExact().decode(d, context),
+            residuals,
+        ),
     ),
     "octree_v1": (lambda: Octree().encode(points, 16), Octree().decode, points),
     "byte_planes_v1": (

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import BitstreamError
-from sw_anchors.row_parts import EXACT_NUMBERS, by_parts
+from sw_anchors.row_parts import EXACT_NUMBERS, parts_of
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
@@ -168,7 +168,12 @@ class ExactNetwork:
 
     def outputs(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> Tensor:
         """Outputs of the network, int64 [n, sum(shape.outputs) + further]; arguments as of a call."""
-        return by_parts(lambda part: self._network(features(part)), places, width, EXACT_NUMBERS)
+        outputs = torch.empty(len(places), self._network.outputs, dtype=torch.int64)
+        start = 0
+        for part in parts_of(places, width, EXACT_NUMBERS):
+            self._network(features(part), out=outputs[start : start + len(part)])
+            start += len(part)
+        return outputs
 
     def read(self, outputs: Tensor) -> dict[str, RowContext]:
         """Distributions by group that outputs [n, sum(shape.outputs)] stand for."""

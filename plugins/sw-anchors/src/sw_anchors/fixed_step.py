@@ -98,7 +98,7 @@ def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
         drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
         counted = kept.index_select(0, drawn) * is_drawn
         share = kept.sum() / at.count.clamp(min=1)
-        found_rate = model.rate_of(drawn, values, steps, forecast, masks, counted, share)
+        found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
         rate = [found_rate.bits] + ([] if found_rate.own_bits is None else [found_rate.own_bits])
         rate_counts = found_rate.by_group, found_rate.numbers
     own, scales, shifts = torch.split(values, list(model.shape.widths), dim=1)

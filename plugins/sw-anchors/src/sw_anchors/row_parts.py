@@ -16,13 +16,18 @@ FLOAT_NUMBERS = 1 << 24
 """The same in mode `float`, whose products may: so many that contexts of up to 800 numbers a row are never cut."""
 
 
+def parts_of(rows: Tensor, width: int, numbers: int) -> tuple[Tensor, ...]:
+    """`rows` cut into parts of at most numbers // width rows, where a row has `width` numbers on its way."""
+    return rows.split(max(1, numbers // width))
+
+
 def by_parts(evaluate: Callable[[Tensor], Tensor], rows: Tensor, width: int, numbers: int) -> Tensor:
     """`evaluate(rows)` of a function that treats each row alone, at most numbers // width rows at a time.
 
     rows        [n, ...]
     width       the most numbers a row has on the way through `evaluate`
     """
-    parts = iter(rows.split(max(1, numbers // width)))
+    parts = iter(parts_of(rows, width, numbers))
     first = evaluate(next(parts))
     if len(first) == len(rows):
         return first

@@ -88,7 +88,8 @@ def register_entropy_models(registry: Registry[Any]) -> None:
     registry.add("mixture", "sw_codecs.entropy.mixture:Mixture",
                  summary="weighted Gaussians or Laplacians, counts in the file")  # fmt: skip
     registry.add("conditional-gaussian", "sw_codecs.entropy.conditional:ConditionalGaussian",
-                 summary="blocks of rows with a predicted mean, scale and step; exact or float")  # fmt: skip
+                 summary="blocks of rows with a predicted mean, scale and step; exact or float",
+                 native="sw_codecs.exact_native:EXACT")  # fmt: skip
     registry.add("conditional-mixture", "sw_codecs.entropy.conditional_mixture:ConditionalMixture",
                  summary="the same with two predicted Gaussians and their weights")  # fmt: skip
 
@@ -115,7 +116,7 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="arithmetic coding under a ModelSpec")  # fmt: skip
     registry.add("rans", "sw_codecs.coders.arithmetic:RansCoder", codes="symbols", summary="rANS under a ModelSpec")
     registry.add("huffman", "sw_codecs.coders.huffman:HuffmanCoder", codes="symbols",
-                 summary="Huffman codes from count tables")  # fmt: skip
+                 summary="Huffman codes from count tables", native="sw_codecs.native:CODECS")  # fmt: skip
     registry.add("octree", "sw_codecs.positions.octree:Octree", codes="positions",
                  summary="point positions as octree occupancy")  # fmt: skip
     registry.add("byte-planes", "sw_codecs.arrays.byte_planes:BytePlanes", codes="arrays",

@@ -8,10 +8,10 @@ import torch
 from sw_codecs.context import hash_grid
 from sw_codecs.context.grid_lookup import fits_kernel
 from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
-from sw_codecs.grid_native import GRID
+from sw_codecs.native import CODECS
 
-needs_kernels = pytest.mark.skipif(GRID.available() is not None, reason=str(GRID.available()))
-ON_CUDA = GRID.available(cuda=True)
+needs_kernels = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))
+ON_CUDA = CODECS.available(cuda=True)
 DEVICES = [
     pytest.param("cpu", marks=needs_kernels),
     pytest.param("cuda", marks=[pytest.mark.cuda, pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))]),
@@ -95,9 +95,9 @@ def test_gradients_of_signs_are_the_same_bits_for_any_number_of_threads():
 
 @needs_kernels
 def test_places_and_tables_of_signs_that_do_not_fit_are_refused():
-    GRID.load()
+    CODECS.load()
     levels = ([2.0], [3], [0], [1], 9)
-    look_up, x = torch.ops.sw_codecs_grid.signs_lookup, torch.zeros(2, 3)
+    look_up, x = torch.ops.sw_codecs.signs_lookup, torch.zeros(2, 3)
     for axes, table, found, first, said in (
         ([0, 3], (16, 2), (2, 2), 0, "no axis 3"),
         ([0, 1], (15, 2), (2, 2), 0, "ends at entry 16 of 15"),
@@ -158,7 +158,7 @@ def test_what_has_no_kernel_goes_through_torch():
     ],
 )
 def test_levels_that_do_not_fit_the_table_are_refused(change, said):
-    GRID.load()
+    CODECS.load()
     levels = {"scales": [3.0, 3.0], "lasts": [3, 3], "starts": [0, 64], "dense": [1, 1], "log2_size": 9, **change}
     with pytest.raises(RuntimeError, match=said):
-        torch.ops.sw_codecs_grid.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())
+        torch.ops.sw_codecs.lookup(torch.zeros(1, 3), torch.zeros(128, 2), *levels.values())

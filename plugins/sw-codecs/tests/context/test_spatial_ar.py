@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from splatwizard_core.errors import BitstreamError
-from sw_codecs.context import wavefront
-from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context import spatial_ar
 from sw_codecs.context.plane_fields import NEIGHBORS, Field
+from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.entropy.exact_tables import exact_tables
 
 
@@ -154,8 +154,10 @@ def test_gradients_pull_a_scale_back_into_the_range_of_the_coder():
     assert made.layers[-1].bias.grad[1] > 0
 
 
+@pytest.mark.parametrize("at_once", [1, 2 * 3 * 72, 1 << 20])
 @pytest.mark.parametrize("learn", [True, False])
-def test_all_planes_in_one_node_cost_what_they_cost_one_by_one(learn):
+def test_all_planes_in_one_node_cost_what_they_cost_one_by_one(learn, at_once, monkeypatch):
+    monkeypatch.setattr(spatial_ar, "VALUES_AT_ONCE", at_once)  # one, two and all channels
     g = torch.Generator().manual_seed(0)
     networks = [SpatialAr(g) for _ in range(3)]
     with torch.no_grad():
@@ -163,7 +165,7 @@ def test_all_planes_in_one_node_cost_what_they_cost_one_by_one(learn):
             for parameter in network.parameters():
                 parameter.add_(torch.randn(parameter.shape, generator=g) * 0.2)
             network.layers[-1].weight[1] *= 20  # some scales beyond the coder's
-    planes = [(torch.randn(3, 2, *size, generator=g) * 4).requires_grad_(learn) for size in ((1, 1), (5, 7), (9, 4))]
+    planes = [(torch.randn(3, 3, *size, generator=g) * 4).requires_grad_(learn) for size in ((1, 1), (5, 7), (9, 4))]
     leaves = [*(planes if learn else []), *(p for network in networks for p in network.parameters())]
     found = SpatialAr.joint_bits(networks, planes)
     expected = sum(a.bits(each).sum() for plane in planes for a, each in zip(networks, plane, strict=True))

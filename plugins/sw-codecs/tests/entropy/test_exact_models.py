@@ -9,7 +9,6 @@ from torch import nn
 
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.context.integer_mlp import IntegerMlp, to_fixed
-from sw_codecs.entropy import gaussian_exact
 from sw_codecs.entropy.gaussian_exact import FloatContext, GaussianExact, IntegerContext, step_multipliers
 
 
@@ -109,13 +108,6 @@ def test_step_multipliers_follow_1_plus_tanh():
 def test_step_multipliers_take_no_floats():
     with pytest.raises(ValueError, match="integers"):
         step_multipliers(np.array([0.5]))
-
-
-def test_many_chunks(monkeypatch):
-    monkeypatch.setattr(gaussian_exact, "CHUNK", 1000)
-    mean, scale, symbols = drawn(3500)
-    context = IntegerContext(to_fixed(mean), to_fixed(scale))
-    assert np.array_equal(GaussianExact().decode(GaussianExact().encode(symbols, context), context), symbols)
 
 
 def test_damage_is_found(assert_survives_damage):

@@ -115,7 +115,7 @@ def add_surface_losses(
         terms["distortion"] = distortion_loss(result)
         total = total + distortion * terms["distortion"]
     if normals > 0:
-        found = normal_disagreement(result, camera.to(result.image.device), depth_ratio, term)
+        found = normal_disagreement(result, camera, depth_ratio, term)
         terms["normals"] = (found if mask is None else mask * found).mean()
         total = total + normals * terms["normals"]
     return LossPack(total, {name: part.detach() for name, part in {**loss.parts, **terms}.items()})

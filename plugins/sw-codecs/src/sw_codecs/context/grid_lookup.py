@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from sw_codecs.grid_native import GRID
+from sw_codecs.native import CODECS
 
 if TYPE_CHECKING:
     from sw_codecs.context.hash_grid import HashGrid
 
 MAX_LEVELS = 32
 MAX_FEATURES = 8
-"""`kMaxLevels` and `kMaxFeatures` of grid_kernels/grid.h."""
+"""`kMaxLevels` and `kMaxFeatures` of kernels/grid.h."""
 
 Levels = tuple[list[float], list[int], list[int], list[int], int]
 """Levels of a grid as the ops take them: scales, last vertices, first entries, whether dense; log2_size."""
@@ -29,7 +29,7 @@ def fits_kernel(grid: HashGrid, x: Tensor, values: Tensor) -> bool:
         return False
     if x.requires_grad and torch.is_grad_enabled():
         return False
-    return GRID.has_cuda() if x.is_cuda else x.device.type == "cpu" and GRID.try_load()
+    return CODECS.has_cuda() if x.is_cuda else x.device.type == "cpu" and CODECS.try_load()
 
 
 def lookup(grid: HashGrid, x: Tensor, values: Tensor) -> Tensor:
@@ -59,7 +59,7 @@ def signs_fit_kernel(grids: Sequence[HashGrid], like: Tensor) -> bool:
         return False
     if like.dtype != torch.float32 or any(grid.table.dtype != torch.float32 for grid in grids):
         return False
-    return GRID.has_cuda() if like.is_cuda else like.device.type == "cpu" and GRID.try_load()
+    return CODECS.has_cuda() if like.is_cuda else like.device.type == "cpu" and CODECS.try_load()
 
 
 def look_up_signs(x: Tensor, grids: Sequence[tuple[tuple[int, ...], Levels]], tables: Sequence[Tensor]) -> Tensor:
@@ -72,7 +72,7 @@ def look_up_signs(x: Tensor, grids: Sequence[tuple[tuple[int, ...], Levels]], ta
     found = x.new_empty(len(x), features * sum(len(levels[0]) for _, levels in grids))
     first = 0
     for (axes, levels), table in zip(grids, tables, strict=True):
-        torch.ops.sw_codecs_grid.signs_lookup(x, axes, table, found, first, *levels)
+        torch.ops.sw_codecs.signs_lookup(x, axes, table, found, first, *levels)
         first += features * len(levels[0])
     return found
 
@@ -86,7 +86,7 @@ def add_sign_gradients(
     """
     first, to_features = 0, to_features.contiguous()
     for (axes, levels), table in zip(grids, tables, strict=True):
-        torch.ops.sw_codecs_grid.signs_backward(x, axes, table, to_features, first, *levels)
+        torch.ops.sw_codecs.signs_backward(x, axes, table, to_features, first, *levels)
         first += table.shape[1] * len(levels[0])
 
 
@@ -95,11 +95,11 @@ class _Lookup(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, x: Tensor, grid: HashGrid) -> Tensor:
         ctx.save_for_backward(x)
         ctx.shape, ctx.levels = values.shape, levels_of(grid)
-        found: Tensor = torch.ops.sw_codecs_grid.lookup(x, values.contiguous(), *ctx.levels)
+        found: Tensor = torch.ops.sw_codecs.lookup(x, values.contiguous(), *ctx.levels)
         return found
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
-        return torch.ops.sw_codecs_grid.backward(x, gradient.contiguous(), *ctx.shape, *ctx.levels), None, None
+        return torch.ops.sw_codecs.backward(x, gradient.contiguous(), *ctx.shape, *ctx.levels), None, None

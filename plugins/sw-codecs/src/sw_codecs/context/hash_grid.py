@@ -103,6 +103,7 @@ class HashGrid(nn.Module):
             self.levels.append(Level(scale, resolution, size, start, vertices <= size))
             start += size
         self.table = nn.Parameter(torch.zeros(start, features))
+        self._signs: tuple[tuple[int, int], Tensor] | None = None
         if generator is not None:
             with torch.no_grad():
                 self.table.uniform_(-INITIAL, INITIAL, generator=generator)
@@ -222,13 +223,22 @@ class HashGrid(nn.Module):
 
     def _kernel_features(self, codes: Tensor, axes: Sequence[int], into: Tensor, column: int) -> None:
         """Write `integer_features` for some axes of codes int64 [n,3] into columns of `into` from `column` on."""
-        places = torch.arange(self.features)
-        signs = ((self.table.detach() >= 0).to(torch.int32) << places).sum(dim=1).to(torch.int16)
         order = torch.argsort(self._order)  # buffers hold dense levels first
         levels = torch.stack([self._last, self._start.to(torch.int64), column + order * self.features])
         torch.ops.sw_codecs_exact.grid_features(
-            codes, list(axes), signs, self.features, levels, self._dense, self.log2_size, into
+            codes, list(axes), self._packed_signs(), self.features, levels, self._dense, self.log2_size, into
         )
+
+    def _packed_signs(self) -> Tensor:
+        """[entries] int16: bit f is 1 where number f is not negative; kept as long as the table stays as it is."""
+        table = self.table.detach()
+        key = (table.data_ptr(), self.table._version)
+        if self._signs is None or self._signs[0] != key:
+            found = torch.zeros(len(table), dtype=torch.int32)
+            for f, column in enumerate(table.unbind(1)):
+                found |= (column >= 0).to(torch.int32) << f
+            self._signs = (key, found.to(torch.int16))
+        return self._signs[1]
 
     def _integer_block(self, codes: Tensor, signs: Tensor) -> Tensor:
         inside = ((codes >= 0) & (codes <= POSITION_TOP)).all(dim=1)

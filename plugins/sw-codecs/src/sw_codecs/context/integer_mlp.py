@@ -89,20 +89,28 @@ class IntegerMlp:
         except (KeyError, ValueError) as error:
             raise BitstreamError(f"the context network cannot be used: {error}") from error
 
-    def __call__(self, inputs: Tensor, *, rows: int | None = None) -> Tensor:
+    @property
+    def outputs(self) -> int:
+        """Width of the last layer."""
+        return len(self._layers[-1][1])
+
+    def __call__(self, inputs: Tensor, *, rows: int | None = None, out: Tensor | None = None) -> Tensor:
         """int64 [n, out] with 12 fractional bits, in units of 1 / output_scale.
 
         inputs  [n, in] integers with 12 fractional bits, clamped to +-2^20 (that is 256)
         rows    how many are evaluated at once, None: by the widest layer; the result does not depend on it
+        out     contiguous int64 [n, out] to write into, on the device of the inputs
         """
         if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
             raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
         if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
             flat = [each for layer in self._layers for each in layer]
-            outputs: Tensor = torch.ops.sw_codecs_exact.network(inputs.to(torch.int64).contiguous(), flat)
-            return outputs
+            found = torch.empty(len(inputs), self.outputs, dtype=torch.int64) if out is None else out
+            torch.ops.sw_codecs_exact.network(inputs.to(torch.int64).contiguous(), flat, found)
+            return found
         rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
-        return torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
+        found = torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
+        return found if out is None else out.copy_(found)
 
     def flat(self) -> Tensor:
         """Integers of all weights and biases, layer by layer, float64 [P]."""

@@ -7,8 +7,8 @@
     for each stream: its words, its escapes as Exp-Golomb bits
 
 A stream holds some channels of one plane: no channel hangs on another. Its integers are coded along wavefronts: all
-with the same column + 3 row, row after row, channel after channel. A compiled kernel decodes streams on all cores; without
-one, numpy takes a symbol of each stream at a time.
+with the same column + 3 row, row after row, channel after channel. A compiled kernel decodes streams on all cores;
+without one, numpy takes a symbol of each stream at a time.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from sw_codecs.entropy import exact_streams
 from sw_codecs.entropy.stream_lanes import LaneReader, LaneWriter
 from sw_codecs.exact_native import EXACT
 
-SMALLEST_STREAM = 4096
-"""Integers that a stream has at least, if it could have more: it costs some five bytes."""
+SMALLEST_STREAM = 16_384
+"""Integers that a stream has on average, if it could have more: it costs some eight bytes."""
 MOST_SCALES = 4
 """That the kernel takes."""
 Shape = tuple[int, int, int]
@@ -59,7 +59,7 @@ def decode(data: bytes, shapes: Sequence[Shape], models: Sequence[PlaneModel]) -
     """Inverse of `encode`, int32. Raises BitstreamError."""
     reader = ByteReader(data)
     exact_streams.check_version(reader.integer(2), reader.integer(4))
-    crc, channels = reader.integer(4), reader.varint(max((c for c, _, _ in shapes), default=1))
+    crc, channels = reader.integer(4), reader.varint(max([1, *(c for c, _, _ in shapes)]))
     if channels < 1:
         raise BitstreamError("a stream of no channels")
     count = sum(len(models) * -(-c // channels) for c, h, w in shapes if c * h * w)
@@ -99,11 +99,11 @@ def weights_of(models: Sequence[PlaneModel]) -> Tensor | None:
 
 
 def _channels_of_a_stream(shapes: Sequence[Shape]) -> int:
-    """As few as make streams of 4,096 integers on average, for as many streams as possible."""
+    """As few as make streams of 16,384 integers on average: for as many streams as possible."""
     integers = sum(c * h * w for c, h, w in shapes)
     channels = sum(c for c, h, w in shapes if h * w)
-    most = max((c for c, _, _ in shapes), default=1)
-    return min(max(1, -(-SMALLEST_STREAM * channels // max(integers, 1))), max(most, 1))
+    most = max([1, *(c for c, _, _ in shapes)])
+    return min(max(1, -(-SMALLEST_STREAM * channels // max(integers, 1))), most)
 
 
 def _compiled(shapes: Sequence[Shape], weights: Tensor | None) -> bool:

@@ -129,88 +129,128 @@ _PIECES = tuple(size for out, inputs in _SHAPES for size in (out * inputs, out))
 _PARAMETER_SHAPES = tuple(shape for out, inputs in _SHAPES for shape in ((out, inputs), (out,)))
 
 
+VALUES_AT_ONCE = 1 << 20
+"""Of planes whose bits are computed together: half a gigabyte of layers and derivatives."""
+
+
 class _JointBits(torch.autograd.Function):
     """Planes per scale [K,C,H,W], then weight and bias of each layer of K networks -> bits of all values.
 
-    Products are taken channel by channel: a gradient of a weight is a sum over all values, which a GPU takes in one
-    thread block per product, so that three products of a million values each would leave it idle. Inputs of a layer
-    have a last row of ones, whose weights are the biases: no pass of their own over all values adds or sums them.
+    Derivatives are taken on the way there, some channels at a time: bits are a sum, so backward only scales them. What
+    layers hold, 380 bytes a value, is then there for one part at a time; an anchor has 30 values.
+    The incoming derivative must not be negative, as of a loss that has bits as a term: it decides nothing here about
+    what pulls a probability off its floor.
     """
 
     @staticmethod
     def forward(ctx: Any, scales: int, *tensors: Tensor) -> Tensor:
         planes, parameters = tensors[:scales], tensors[scales:]
         k, channels = planes[0].shape[:2]
-        counts = [plane.shape[2] * plane.shape[3] for plane in planes]
-        weights = _channel_weights(torch.cat([p.reshape(-1) for p in parameters]).view(k, -1), channels)
-        # [K C, inputs + 1, n] of each layer: a column for each value of all scales. The first has fewer inputs.
-        stored = weights[0].new_empty(len(_SHAPES), k * channels, HIDDEN + 1, sum(counts))
-        stored[:, :, HIDDEN] = 1
-        layers = [stored[0, :, HIDDEN - len(NEIGHBORS) :], *stored[1:].unbind(0)]
-        for plane, place in zip(planes, layers[0].split(counts, dim=2), strict=True):
-            _gather_neighbors(plane.flatten(0, 1), place)
-        for weight, inputs, following in zip(weights, layers, layers[1:], strict=False):
-            torch.bmm(weight, inputs, out=following[:, :HIDDEN])
-            following[:, :HIDDEN].relu_()
-        mean, s = torch.bmm(weights[-1], layers[-1]).unbind(1)  # [K C, n]
-
-        offset = torch.cat([plane.flatten(0, 1).flatten(1) for plane in planes], dim=1).sub_(mean)
-        narrowing = torch.exp(0.5 * s.clamp(*_S_RANGE))  # 1 / b
-        away = offset.abs()
-        near, far = (away - 0.5).mul_(narrowing), (away + 0.5).mul_(narrowing)
-        at_near, at_far = near.abs().neg_().exp_().mul_(0.5), (-far).exp_().mul_(0.5)
-        p = torch.where(near >= 0, at_near, 1 - at_near).sub_(at_far)  # as `rates.laplace_mass`
-        ctx.save_for_backward(offset, s, narrowing, near, far, at_near, at_far, p, *layers, *weights)
-        ctx.shapes, ctx.counts = [plane.shape for plane in planes], counts
-        ctx.planes_learn = any(ctx.needs_input_grad[1 : 1 + scales])
-        return -p.clamp_min(P_MIN).log2_().sum()
+        planes_learn, learns = any(ctx.needs_input_grad[1 : 1 + scales]), any(ctx.needs_input_grad)
+        flat = torch.cat([p.reshape(-1) for p in parameters]).view(k, -1)
+        at_once = max(1, VALUES_AT_ONCE // max(1, k * sum(plane.shape[2] * plane.shape[3] for plane in planes)))
+        total, found = flat.new_zeros(()), []
+        for start in range(0, channels, at_once):
+            some = [plane[:, start : start + at_once] for plane in planes]
+            part = _PartBits(some, _channel_weights(flat, some[0].shape[1]))
+            total += part.bits
+            if learns:
+                found.append(part.derivatives(planes_learn=planes_learn))
+        if learns:
+            ctx.save_for_backward(*_joined(found, k))
+        return total
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        offset, s, narrowing, near, far, at_near, at_far, p, *rest = ctx.saved_tensors
-        layers, weights = rest[: len(_SHAPES)], rest[len(_SHAPES) :]
-        k, channels = ctx.shapes[0][:2]
-        # Below its floor a probability still has the gradient that raises it, and a scale out of range that which
-        # brings it back, as in `rates.lower_bound`.
-        slope = grad / p.clamp_min(P_MIN).mul_(-math.log(2))
-        slope *= (p >= P_MIN) | (slope < 0)
-        to_far = slope * at_far
-        to_near = slope.mul_(at_near).neg_()
-        out = torch.stack([to_near + to_far, to_near * near + to_far * far], dim=1)  # [K C, 2, n]
-        to_x, to_s = out.unbind(1)
-        to_x.mul_(narrowing).mul_(offset.sign())
-        own = to_x.clone() if ctx.planes_learn else None
-        to_x.neg_()
-        to_s.mul_(0.5).mul_((s >= _S_RANGE[0]) | (to_s < 0)).mul_((s <= _S_RANGE[1]) | (to_s > 0))
-
-        found = []
-        for i in reversed(range(len(weights))):
-            found.append(torch.bmm(out, layers[i].transpose(1, 2)).unflatten(0, (k, channels)).sum(dim=1))
-            if i > 0:
-                inputs = layers[i][:, :HIDDEN]
-                out = torch.bmm(weights[i][:, :, :-1].transpose(1, 2), out)
-                torch.ops.aten.threshold_backward.grad_input(out, inputs, 0, grad_input=out)
-        pieces = [part.flatten(1) for both in reversed(found) for part in (both[:, :, :-1], both[:, :, -1:])]
-        # Two columns more: then each piece is aligned as the optimizer's kernel asks for (16 bytes).
+        pieces, *to_planes = ctx.saved_tensors
         to_parameters = [
             piece.view(shape)
-            for row in torch.cat([*pieces, pieces[-1]], dim=1)
+            for row in pieces * grad
             for piece, shape in zip(row.split([*_PIECES, 2]), _PARAMETER_SHAPES, strict=False)
         ]
-        if own is None:
-            return None, *[None] * len(ctx.shapes), *to_parameters
-        # The window's last places are no neighbours: rows of zeros, so that `fold` can take the products as they are.
-        rest_of_window = _WINDOW[0] * _WINDOW[1] - len(NEIGHBORS)
-        first = nn.functional.pad(weights[0][:, :, :-1], (0, rest_of_window)).transpose(1, 2)
-        to_planes = []
-        parts = zip(ctx.shapes, out.split(ctx.counts, dim=2), own.split(ctx.counts, dim=1), strict=True)
-        for shape, part, direct in parts:
-            h, w = shape[2:]
-            window = torch.bmm(first, part).view(1, -1, h * w)
-            folded = nn.functional.fold(window, (h + 2, w + 4), _WINDOW)[:, :, 2:, 2:-2]
-            to_planes.append(folded.reshape(shape) + direct.reshape(shape))
-        return None, *to_planes, *to_parameters
+        scales = len(ctx.needs_input_grad) - 1 - len(to_parameters)
+        return None, *([part * grad for part in to_planes] or [None] * scales), *to_parameters
+
+
+def _joined(found: Sequence[tuple[list[Tensor], list[Tensor]]], k: int) -> list[Tensor]:
+    """[K, P + 2] derivatives by all parameters, then those by the planes of each scale, if there are any."""
+    alone = len(found) == 1
+    layers = [each[0] if alone else torch.stack(each).sum(dim=0) for each in zip(*(p for p, _ in found), strict=True)]
+    pieces = [part.flatten(1) for both in layers for part in (both[:, :, :-1], both[:, :, -1:])]
+    # Two columns more: then each piece is aligned as the optimizer's kernel asks for (16 bytes).
+    joined = torch.cat([*pieces, pieces[-1]], dim=1)
+    planes = zip(*(planes for _, planes in found), strict=True)
+    return [joined, *(each[0] if alone else torch.cat(each, dim=1) for each in planes)]
+
+
+class _PartBits:
+    """Bits of some channels of planes [K,C,H,W] a scale, with what their derivatives need.
+
+    Products are taken channel by channel: a gradient of a weight is a sum over all values, which a GPU takes in one
+    thread block per product, so that three products of a million values each would leave it idle. Inputs of a layer
+    have a last row of ones, whose weights are the biases: no pass of their own over all values adds or sums them.
+    """
+
+    def __init__(self, planes: Sequence[Tensor], weights: list[Tensor]) -> None:
+        self.shapes = [plane.shape for plane in planes]
+        k, channels = self.shapes[0][:2]
+        self.counts = [plane.shape[2] * plane.shape[3] for plane in planes]
+        self.weights = weights
+        # [K C, inputs + 1, n] of each layer: a column for each value of all scales. The first has fewer inputs.
+        stored = weights[0].new_empty(len(_SHAPES), k * channels, HIDDEN + 1, sum(self.counts))
+        stored[:, :, HIDDEN] = 1
+        self.layers = [stored[0, :, HIDDEN - len(NEIGHBORS) :], *stored[1:].unbind(0)]
+        for plane, place in zip(planes, self.layers[0].split(self.counts, dim=2), strict=True):
+            _gather_neighbors(plane.flatten(0, 1), place)
+        for weight, inputs, following in zip(weights, self.layers, self.layers[1:], strict=False):
+            torch.bmm(weight, inputs, out=following[:, :HIDDEN])
+            following[:, :HIDDEN].relu_()
+        mean, self.s = torch.bmm(weights[-1], self.layers[-1]).unbind(1)  # [K C, n]
+
+        self.offset = torch.cat([plane.flatten(0, 1).flatten(1) for plane in planes], dim=1).sub_(mean)
+        self.narrowing = torch.exp(0.5 * self.s.clamp(*_S_RANGE))  # 1 / b
+        away = self.offset.abs()
+        self.near, self.far = (away - 0.5).mul_(self.narrowing), (away + 0.5).mul_(self.narrowing)
+        self.at_near, self.at_far = self.near.abs().neg_().exp_().mul_(0.5), (-self.far).exp_().mul_(0.5)
+        # As `rates.laplace_mass`.
+        self.p = torch.where(self.near >= 0, self.at_near, 1 - self.at_near).sub_(self.at_far)
+        self.bits = -self.p.clamp_min(P_MIN).log2_().sum()
+
+    def derivatives(self, *, planes_learn: bool) -> tuple[list[Tensor], list[Tensor]]:
+        """Derivatives of the bits: [K, outputs, inputs + 1] by each layer, and by the planes of each scale, or none."""
+        k, channels = self.shapes[0][:2]
+        # Below its floor a probability still has the gradient that raises it, and a scale out of range that which
+        # brings it back, as in `rates.lower_bound`.
+        slope = 1 / self.p.clamp_min(P_MIN).mul_(-math.log(2))
+        to_far = slope * self.at_far
+        to_near = slope.mul_(self.at_near).neg_()
+        out = torch.stack([to_near + to_far, to_near * self.near + to_far * self.far], dim=1)  # [K C, 2, n]
+        to_x, to_s = out.unbind(1)
+        to_x.mul_(self.narrowing).mul_(self.offset.sign())
+        own = to_x.clone() if planes_learn else None
+        to_x.neg_()
+        to_s.mul_(0.5).mul_((self.s >= _S_RANGE[0]) | (to_s < 0)).mul_((self.s <= _S_RANGE[1]) | (to_s > 0))
+
+        found = []
+        for i in reversed(range(len(self.weights))):
+            found.append(torch.bmm(out, self.layers[i].transpose(1, 2)).unflatten(0, (k, channels)).sum(dim=1))
+            if i > 0:
+                inputs = self.layers[i][:, :HIDDEN]
+                out = torch.bmm(self.weights[i][:, :, :-1].transpose(1, 2), out)
+                torch.ops.aten.threshold_backward.grad_input(out, inputs, 0, grad_input=out)
+        to_planes: list[Tensor] = []
+        if own is not None:
+            # The last places of the window are no neighbours: rows of zeros, so that `fold` takes the products as is.
+            rest_of_window = _WINDOW[0] * _WINDOW[1] - len(NEIGHBORS)
+            first = nn.functional.pad(self.weights[0][:, :, :-1], (0, rest_of_window)).transpose(1, 2)
+            parts = zip(self.shapes, out.split(self.counts, dim=2), own.split(self.counts, dim=1), strict=True)
+            for shape, part, direct in parts:
+                h, w = shape[2:]
+                window = torch.bmm(first, part).view(1, -1, h * w)
+                folded = nn.functional.fold(window, (h + 2, w + 4), _WINDOW)[:, :, 2:, 2:-2]
+                to_planes.append(folded.reshape(shape) + direct.reshape(shape))
+        return found[::-1], to_planes
 
 
 def _channel_weights(flat: Tensor, channels: int) -> list[Tensor]:

@@ -35,18 +35,24 @@ def lattice(
     if not all(np.issubdtype(each.dtype, np.integer) for each in arrays):
         raise ValueError(f"mean, scale and multiplier must be integers, not {', '.join(str(a.dtype) for a in arrays)}")
     there = None if present is None else np.ascontiguousarray(present, bool)
-    if EXACT.try_load():
-        tensors = [torch.from_numpy(np.asarray(each, np.int64)) for each in arrays]
-        if arrays[0].size and not all(each.stride(1) == 1 or each.shape[1] < 2 for each in tensors):
-            tensors = [each.contiguous() for each in tensors]
+    if arrays[0].size and EXACT.try_load():
         centre, number, status = torch.ops.sw_codecs_exact.lattice(
-            *tensors, None if there is None else torch.from_numpy(there), torch.from_numpy(exact_tables().thresholds)
+            *map(_tensor, arrays),
+            None if there is None else torch.from_numpy(there),
+            torch.from_numpy(exact_tables().thresholds),
         )
         if not status:
             return centre.numpy(), number.numpy()
     where = Ellipsis if there is None else there
     flat = [np.broadcast_to(each, arrays[0].shape)[where].reshape(-1) for each in arrays]
     return _flat_lattice(*(each.astype(np.int64) for each in flat))
+
+
+def _tensor(array: np.ndarray) -> Tensor:
+    """int64 [n,C] for the kernel, which asks for rows without gaps; copied only if need be."""
+    array = np.asarray(array, np.int64)
+    rows_whole = array.shape[1] < 2 or array.strides[1] == array.itemsize
+    return torch.from_numpy(array if rows_whole and array.flags.writeable else np.array(array, order="C"))
 
 
 def _flat_lattice(mean: np.ndarray, scale: np.ndarray, m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

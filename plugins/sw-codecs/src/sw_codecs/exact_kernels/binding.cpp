@@ -170,8 +170,8 @@ std::tuple<Tensor, Tensor> encode_streams(at::TensorList tables, const Tensor& s
   return {joined(data, offsets, sizes), sizes};
 }
 
-// Outputs [n, out] i64 of a network for inputs [n, in] i64; layers: W [out, in] and b [out] f64 in turn.
-Tensor network(const Tensor& inputs, at::TensorList layers) {
+// Writes outputs [n, out] i64 of a network for inputs [n, in] i64; layers: W [out, in] and b [out] f64 in turn.
+void network(const Tensor& inputs, at::TensorList layers, const Tensor& outputs) {
   const char* op = "network";
   check(inputs, at::kLong, 2, op, "inputs");
   TORCH_CHECK(layers.size() >= 2 && layers.size() % 2 == 0, op, ": weights and biases must come in pairs");
@@ -201,10 +201,10 @@ Tensor network(const Tensor& inputs, at::TensorList layers) {
     found[i].weights = packed[2 * i].data();
     found[i].bias = packed[2 * i + 1].data();
   }
-  Tensor outputs = at::empty({inputs.size(0), width}, inputs.options());
+  check(outputs, at::kLong, 2, op, "outputs");
+  TORCH_CHECK(outputs.size(0) == inputs.size(0) && outputs.size(1) == width, op, ": outputs do not fit");
   SW_SELECT(network)(found.data(), static_cast<int64_t>(found.size()), inputs.const_data_ptr<int64_t>(),
                      inputs.size(0), outputs.mutable_data_ptr<int64_t>(), torch_parallel());
-  return outputs;
 }
 
 // Writes the columns of a grid into out [n, width] i64. signs [entries] i16: bit f is sign f; levels [3, L]: R - 1,
@@ -360,7 +360,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
         " -> (Tensor, Tensor, int)");
   m.def("decode_streams(Tensor[] tables, Tensor data, Tensor sizes, Tensor centre, Tensor number) -> (Tensor, int)");
   m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
-  m.def("network(Tensor inputs, Tensor[] layers) -> Tensor");
+  m.def("network(Tensor inputs, Tensor[] layers, Tensor(a!) outputs) -> ()");
   m.def("grid_features(Tensor codes, int[] axes, Tensor signs, int features, Tensor levels, int dense, int log2_size,"
         " Tensor(a!) out) -> ()");
   m.def("triplane_features(Tensor places, Tensor[] planes, int[] sizes) -> Tensor");

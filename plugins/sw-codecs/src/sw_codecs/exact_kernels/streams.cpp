@@ -3,6 +3,7 @@
 #include <cstring>
 
 #include "rans.h"
+#include "vectors.h"
 
 namespace SW_ARCH {
 
@@ -116,62 +117,101 @@ int32_t encode_streams(const Tables& tables, const Sinks& sinks, const int32_t* 
 
 namespace {
 
-constexpr int FIRST_BITS = 4 * 34;
+constexpr int BUCKETS = 16 * 34;  // sixteen of each octave below 2^34, which is above the last threshold
+constexpr int COLUMNS = 64;       // of a row, worked out together
 
-// Number of thresholds below the smallest number of each quarter of an octave.
-void first_levels(const int64_t* thresholds, int32_t* first) {
-  for (int i = 0; i < FIRST_BITS; ++i) {
-    const uint64_t bits = (uint64_t{1023 * 4} + static_cast<uint64_t>(i)) << 50;
-    double low;
-    std::memcpy(&low, &bits, 8);
-    int level = 0;
-    while (i > 0 && level < 63 && static_cast<double>(thresholds[level]) < low) ++level;
-    first[i] = level;
+struct Levels {
+  int32_t first[BUCKETS];  // number of thresholds below the smallest number of a bucket
+  double threshold[64];
+
+  explicit Levels(const int64_t* thresholds) {
+    for (int i = 0; i < 63; ++i) threshold[i] = static_cast<double>(thresholds[i]);
+    threshold[63] = 1e300;
+    for (int i = 0; i < BUCKETS; ++i) {
+      const uint64_t bits = (uint64_t{1023 * 16} + static_cast<uint64_t>(i)) << 48;
+      double low;
+      std::memcpy(&low, &bits, 8);
+      first[i] = 0;
+      while (i > 0 && threshold[first[i]] < low) ++first[i];
+    }
   }
+  int32_t of(double ratio) const {
+    uint64_t bits;
+    std::memcpy(&bits, &ratio, 8);
+    int64_t i = static_cast<int64_t>(bits >> 48) - 1023 * 16;
+    i = i < 0 ? 0 : i >= BUCKETS ? BUCKETS - 1 : i;
+    int32_t level = first[i];
+    level += threshold[level] < ratio;  // few buckets have more than one threshold
+    while (threshold[level] < ratio) ++level;
+    return level;
+  }
+};
+
+// Integer parts and table numbers of some columns of a row; what is wrong with them.
+//
+// Quotients are taken in float64: with a dividend below 2^53 and a divisor m, floor of the rounded quotient q is exact
+// as long as q 2^-53 < 1 / m; what is beyond is refused, or far above the last threshold.
+int32_t columns_of(const Levels& levels, const int64_t* mean, const int64_t* scale, int64_t m, int64_t columns,
+                   int32_t* centre, int16_t* number) {
+  constexpr int64_t LIMIT = int64_t{1} << 48, LARGEST_SCALE = int64_t{1} << 36;
+  double eighths[COLUMNS], middle[COLUMNS], ratio[COLUMNS];
+  int64_t wrong = 0;
+  const double divisor = static_cast<double>(m), half = static_cast<double>(m / 2);
+  for (int64_t c = 0; c < columns; ++c) {
+    wrong |= (mean[c] <= -LIMIT) | (mean[c] >= LIMIT) | (scale[c] <= -LIMIT) | (scale[c] >= LIMIT);
+    eighths[c] = static_cast<double>(mean[c]);
+    const int64_t width = scale[c] < 0 ? 0 : scale[c] > LARGEST_SCALE ? LARGEST_SCALE : scale[c];
+    ratio[c] = static_cast<double>(width);
+  }
+  if (wrong) return PARAMETER_WRONG;
+  for (int64_t c = columns; c % LANES; ++c) eighths[c] = ratio[c] = 0;
+  int64_t beyond = 0;
+  for (int64_t c = 0; c < columns; c += LANES) {
+    const Vec e = floor_of((load(eighths + c) * 8.0 + all(half)) / all(divisor));
+    const Vec at = floor_of((e + 4.0) * 0.125);
+    const IntVec far = (at >= all(static_cast<double>(SYMBOL_LIMIT))) | (at <= all(-static_cast<double>(SYMBOL_LIMIT)));
+    for (int l = 0; l < LANES; ++l) beyond |= far[l];
+    store(eighths + c, e + 4.0 - at * 8.0);
+    store(middle + c, at);
+    store(ratio + c, floor_of(load(ratio + c) * 4096.0 / all(divisor)));
+  }
+  if (beyond) return BEYOND_LIMIT;
+  for (int64_t c = 0; c < columns; ++c) {
+    centre[c] = static_cast<int32_t>(middle[c]);
+    number[c] = static_cast<int16_t>(8 * levels.of(ratio[c]) + static_cast<int32_t>(eighths[c]));
+  }
+  return FINE;
 }
 
 }  // namespace
 
-// Quotients are taken in float64: with a dividend below 2^53 and a divisor m, floor of the rounded quotient q is exact
-// as long as q 2^-53 < 1 / m; what is beyond is refused, or far above the last threshold.
 int32_t lattice(const LatticeArgs& a, const Parallel& parallel) {
-  int32_t first[FIRST_BITS];
-  first_levels(a.thresholds, first);
-  double thresholds[64];
-  for (int i = 0; i < 63; ++i) thresholds[i] = static_cast<double>(a.thresholds[i]);
-  constexpr int64_t LIMIT = int64_t{1} << 48, LARGEST_SCALE = int64_t{1} << 36;
+  const Levels levels(a.thresholds);
   std::atomic<int32_t> status{FINE};
   parallel(a.rows, 1024, [&](int64_t begin, int64_t end) {
-    int32_t found = FINE;
+    int32_t centre[COLUMNS], found = FINE;
+    int16_t number[COLUMNS];
     for (int64_t row = begin; row < end; ++row) {
-      const int64_t *mean = a.mean + row * a.mean_stride, *scale = a.scale + row * a.scale_stride;
-      const uint8_t* present = a.present == nullptr ? nullptr : a.present + row * a.columns;
       const int64_t m = a.multiplier[row * a.multiplier_stride];
       if (m < 64 || m > 16384) {
         found = PARAMETER_WRONG;
         continue;
       }
-      const auto divisor = static_cast<double>(m);
-      int64_t at = a.present == nullptr ? row * a.columns : a.start[row];
-      for (int64_t c = 0; c < a.columns; ++c) {
-        if (present != nullptr && !present[c]) continue;
-        int64_t width = scale[c];
-        if (mean[c] <= -LIMIT || mean[c] >= LIMIT || width <= -LIMIT || width >= LIMIT) found = PARAMETER_WRONG;
-        width = width < 0 ? 0 : width > LARGEST_SCALE ? LARGEST_SCALE : width;
-        const double quotient = static_cast<double>(8 * mean[c] + m / 2) / divisor;
-        auto eighths = static_cast<int64_t>(quotient);
-        eighths -= static_cast<double>(eighths) > quotient;
-        const int64_t centre = (eighths + 4) >> 3;
-        if (centre <= -SYMBOL_LIMIT || centre >= SYMBOL_LIMIT) found = found == FINE ? BEYOND_LIMIT : found;
-        const auto ratio = static_cast<double>(static_cast<int64_t>(static_cast<double>(width << 12) / divisor));
-        uint64_t bits;
-        std::memcpy(&bits, &ratio, 8);
-        int64_t index = static_cast<int64_t>(bits >> 50) - 1023 * 4;
-        index = index < 0 ? 0 : index >= FIRST_BITS ? FIRST_BITS - 1 : index;
-        int32_t level = first[index];
-        while (level < 63 && thresholds[level] < ratio) ++level;
-        a.centre[at] = static_cast<int32_t>(centre);
-        a.number[at++] = static_cast<int16_t>(level * 8 + eighths + 4 - 8 * centre);
+      const uint8_t* present = a.present == nullptr ? nullptr : a.present + row * a.columns;
+      int64_t at = present == nullptr ? row * a.columns : a.start[row];
+      for (int64_t c = 0; c < a.columns; c += COLUMNS) {
+        const int64_t n = a.columns - c < COLUMNS ? a.columns - c : COLUMNS;
+        const int32_t now = columns_of(levels, a.mean + row * a.mean_stride + c, a.scale + row * a.scale_stride + c, m,
+                                       n, centre, number);
+        if (now != FINE) {
+          found = now;
+          break;
+        }
+        for (int64_t i = 0; i < n; ++i) {
+          if (present != nullptr && !present[c + i]) continue;
+          a.centre[at] = centre[i];
+          a.number[at++] = number[i];
+        }
       }
     }
     raise(status, found);

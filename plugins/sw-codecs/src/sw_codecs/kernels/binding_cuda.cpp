@@ -18,15 +18,15 @@ using namespace sw_grid;
 
 // Pairs are read and added as one number of eight bytes.
 void check_pairs(const at::Tensor& t, const char* name, int64_t features) {
-  TORCH_CHECK(features > 0 && features <= kMaxFeatures, "sw_codecs_grid: ", features,
+  TORCH_CHECK(features > 0 && features <= kMaxFeatures, "sw_codecs: ", features,
               " features are not offered on CUDA");
-  TORCH_CHECK(features != 2 || reinterpret_cast<uintptr_t>(t.const_data_ptr()) % 8 == 0, "sw_codecs_grid: ", name,
+  TORCH_CHECK(features != 2 || reinterpret_cast<uintptr_t>(t.const_data_ptr()) % 8 == 0, "sw_codecs: ", name,
               " must start at a multiple of 8 bytes; clone() it");
 }
 
 at::Tensor lookup(const at::Tensor& x, const at::Tensor& values, at::ArrayRef<double> scales, at::IntArrayRef lasts,
                   at::IntArrayRef starts, at::IntArrayRef dense, int64_t log2_size) {
-  TORCH_CHECK(x.dim() == 2 && values.dim() == 2, "sw_codecs_grid: x must be [n,2 or 3], values [entries,features]");
+  TORCH_CHECK(x.dim() == 2 && values.dim() == 2, "sw_codecs: x must be [n,2 or 3], values [entries,features]");
   const int64_t n = x.size(0), axes = x.size(1), features = values.size(1);
   const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, values.size(0));
   check(x, "x", x, {n, axes});
@@ -45,7 +45,7 @@ at::Tensor lookup(const at::Tensor& x, const at::Tensor& values, at::ArrayRef<do
 at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t entries, int64_t features,
                     at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
                     int64_t log2_size) {
-  TORCH_CHECK(x.dim() == 2, "sw_codecs_grid: x must be [n,2 or 3]");
+  TORCH_CHECK(x.dim() == 2, "sw_codecs: x must be [n,2 or 3]");
   const int64_t n = x.size(0), axes = x.size(1);
   const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, entries);
   check(x, "x", x, {n, axes});
@@ -92,7 +92,7 @@ void signs_backward(const at::Tensor& x, at::IntArrayRef axes, at::Tensor table,
 
 }  // namespace
 
-TORCH_LIBRARY_IMPL(sw_codecs_grid, CUDA, m) {
+TORCH_LIBRARY_IMPL(sw_codecs, CUDA, m) {
   m.impl("lookup", lookup);
   m.impl("backward", backward);
   m.impl("signs_lookup", signs_lookup);

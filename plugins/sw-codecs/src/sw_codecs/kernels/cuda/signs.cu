@@ -1,4 +1,4 @@
-// Lookup in a grid of signs, and its gradient by the signs: a thread a place and level, as in lookup.cu. Four features,
+// Lookup in a grid of signs, and its gradient by the signs: a thread a place and level, as in grid.cu. Four features,
 // as published, are one load and one atomic sum of sixteen bytes.
 #include "kernels.h"
 

@@ -5,6 +5,8 @@
 //                  in their order, so that sums are the same for any number of threads
 //   signs_lookup   as grid_lookup, of the signs of a table, whose `axes` axes are some of the `columns` of x; `found`
 //                  and dL/dfound are the first of levels * features columns of rows that are `row` long
+//   huffman_decode codes of `n` symbols, bits of a byte from the lowest one -> whether the bytes sufficed.
+//                  counts [trees][size], size >= 2; index [n] below trees. Source: docs/bitstream.md, Huffman codes
 #pragma once
 
 #include <splatwizard/dispatch.h>
@@ -22,6 +24,8 @@
                     const splatwizard::Parallel& parallel);                                                         \
   void signs_backward(const sw_grid::Signs& at, const float* gradient, float* table,                                \
                       const splatwizard::Parallel& parallel);                                                       \
+  bool huffman_decode(const uint8_t* bytes, int64_t length, const float* counts, int64_t trees, int64_t size,       \
+                      const int64_t* index, int64_t n, int32_t* symbols);                                           \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_GRID)
 #undef SW_DECLARE_GRID

@@ -13,16 +13,16 @@ inline Levels levels_of(at::ArrayRef<double> scales, at::IntArrayRef lasts, at::
   const size_t count = scales.size();
   TORCH_CHECK(count > 0 && count <= size_t(kMaxLevels) && lasts.size() == count && starts.size() == count &&
                   dense.size() == count && log2_size >= 0 && log2_size <= 30 && (axes == 2 || axes == 3),
-              "sw_codecs_grid: malformed levels");
+              "sw_codecs: malformed levels");
   Levels levels{};
   levels.count = int(count), levels.mask = (uint32_t(1) << log2_size) - 1;
   for (size_t i = 0; i < count; ++i) {
     TORCH_CHECK(lasts[i] >= 1 && lasts[i] < 1 << 16 && scales[i] > 0 && scales[i] <= double(lasts[i] + 1) &&
                     starts[i] >= 0,
-                "sw_codecs_grid: level ", i, " is out of range");
+                "sw_codecs: level ", i, " is out of range");
     int64_t size = dense[i] ? 1 : int64_t(levels.mask) + 1;
     for (int64_t axis = 0; dense[i] && axis < axes; ++axis) size *= lasts[i] + 1;
-    TORCH_CHECK(starts[i] + size <= entries && entries < int64_t(1) << 31, "sw_codecs_grid: level ", i,
+    TORCH_CHECK(starts[i] + size <= entries && entries < int64_t(1) << 31, "sw_codecs: level ", i,
                 " ends at entry ", starts[i] + size, " of ", entries);
     levels.of[i] = {float(scales[i]), int32_t(lasts[i]), int32_t(starts[i]), int32_t(dense[i] != 0)};
   }
@@ -31,7 +31,7 @@ inline Levels levels_of(at::ArrayRef<double> scales, at::IntArrayRef lasts, at::
 
 inline void check(const at::Tensor& t, const char* name, const at::Tensor& like, at::IntArrayRef shape) {
   TORCH_CHECK(t.scalar_type() == at::kFloat && t.is_contiguous() && t.device() == like.device() && t.sizes() == shape,
-              "sw_codecs_grid: ", name, " must be contiguous float32 ", shape, " on ", like.device(), ", got ",
+              "sw_codecs: ", name, " must be contiguous float32 ", shape, " on ", like.device(), ", got ",
               t.toString(), " ", t.sizes(), " on ", t.device());
 }
 
@@ -42,12 +42,12 @@ inline Signs signs_of(const at::Tensor& x, at::IntArrayRef axes, const at::Tenso
                       at::IntArrayRef dense, int64_t log2_size) {
   TORCH_CHECK(x.dim() == 2 && table.dim() == 2 && features.dim() == 2 && x.size(1) <= 3 && table.size(1) > 0 &&
                   table.size(1) <= kMaxFeatures,
-              "sw_codecs_grid: x must be [n,2 or 3], the table [entries,1 to ", kMaxFeatures, "]");
+              "sw_codecs: x must be [n,2 or 3], the table [entries,1 to ", kMaxFeatures, "]");
   Signs at{};
   at.levels = levels_of(scales, lasts, starts, dense, log2_size, int64_t(axes.size()), table.size(0));
   at.count = x.size(0), at.columns = int(x.size(1)), at.axes = int(axes.size());
   for (size_t i = 0; i < axes.size(); ++i) {
-    TORCH_CHECK(axes[i] >= 0 && axes[i] < x.size(1), "sw_codecs_grid: there is no axis ", axes[i]);
+    TORCH_CHECK(axes[i] >= 0 && axes[i] < x.size(1), "sw_codecs: there is no axis ", axes[i]);
     at.axis[i] = int(axes[i]);
   }
   at.features = int(table.size(1)), at.row = features.size(1), at.x = x.const_data_ptr<float>();
@@ -55,7 +55,7 @@ inline Signs signs_of(const at::Tensor& x, at::IntArrayRef axes, const at::Tenso
   check(table, "table", x, table.sizes());
   check(features, "features", x, {at.count, at.row});
   TORCH_CHECK(first >= 0 && first + int64_t(at.levels.count) * at.features <= at.row,
-              "sw_codecs_grid: features do not fit");
+              "sw_codecs: features do not fit");
   return at;
 }
 
