@@ -6,7 +6,7 @@
 `c3dgs` reads the tables in its kernels; `gathered` is `GaussianInputs.gathered()` in front of `standard`, what any
 rasterizer that reads no tables is given. Each runs in a process of its own. Memory: the most that is there during the
 forward pass, and during the backward pass, above what is there before both (the inputs and their gradients' place are
-not counted), on a CPU of the resident set. Times are the least over --repeats. Last: how far the gradients differ.
+not counted), on a CPU of the resident set. Times are the least over --repeats. Last: the differences of images and gradients.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def measure(way: str, n: int, rows: int, width: int, height: int, device: str, r
 
 
 def differences(n: int, rows: int, width: int, height: int, device: str) -> str:
-    """How far image and gradients of the two ways are apart: largest difference, relative norms."""
+    """Largest difference of the images of the two ways, and relative norms of those of their gradients."""
     camera = orbit_cameras(8, width, height)[0].to(device)
     options = RasterOptions(background=torch.ones(3, device=device))
     found = {}

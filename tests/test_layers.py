@@ -36,7 +36,7 @@ ROOMS = {
     "method": {"training", "coding", "gaussians", "scene", "plugins"},
     "runs": {"method", *BELOW_RUNS},
     "cli": {"runs", "method", *BELOW_RUNS},
-    "steps": {"cli", "runs", "training", "api", "tooling"},
+    "steps": {"cli", "runs", "evaluation", "training", "api", "tooling"},
     "builtin": {"plugins"},
     "__main__": {"cli"},
     # The faces import what they lend when somebody asks for it.
@@ -48,7 +48,7 @@ ROOMS = {
 
 LIBRARIES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference"}
 """Packages that others may import when they declare them."""
-ABOUT_RUNS = {"sw_render", "sw_report", "sw_doctor", "sw_datasets", "sw_metrics", "sw_geometry", "sw_kit"}
+ABOUT_RUNS = {"sw_bench", "sw_render", "sw_report", "sw_doctor", "sw_datasets", "sw_metrics", "sw_geometry", "sw_kit"}
 """Packages that may use `tooling` besides `api`."""
 
 

@@ -102,7 +102,8 @@ def test_a_library_that_is_gone_is_named(everything):
 @pytest.mark.parametrize(
     ("command", "package"),
     [(["report", "out"], "sw-report"), (["doctor"], "sw-doctor"), (["data", "list"], "sw-datasets"),
-     (["render", "x.swz"], "sw-render"), (["run", "--method", "hac"], "sw-hac"),
+     (["render", "x.swz"], "sw-render"), (["bench"], "sw-bench"), (["run", "--scene", "a,b"], "sw-bench"),
+     (["run", "--method", "hac"], "sw-hac"),
      (["info", "mipnerf360/garden"], "sw-datasets")],
 )  # fmt: skip
 def test_the_core_alone_names_the_package_of_what_is_asked_for(core_environment, command, package):

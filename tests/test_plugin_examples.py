@@ -47,8 +47,6 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import Scheduler, build_schedulers
 from sw_codecs import testing
 
-NOT_CALLED = {"register_executors"}
-"""Hooks that nothing calls yet: there is nothing to show."""
 CPU = torch.device("cpu")
 
 
@@ -96,7 +94,7 @@ def model(scene: Scene) -> GaussianModel:
     return ten_gaussians(scene)
 
 
-@pytest.mark.parametrize("hook", sorted(HOOKS - NOT_CALLED))
+@pytest.mark.parametrize("hook", sorted(HOOKS))
 def test_every_hook_has_an_example_that_is_used_here(hook):
     assert f"def {hook}(" in "".join(block for title, block in BLOCKS if title == hook)
     assert callable(globals().get(f"test_{hook}")), f"no test uses the example of {hook}"
@@ -119,7 +117,7 @@ def test_every_block_runs(number, site):
 def test_check_plugin_finds_nothing_wrong(plugins, installed, monkeypatch):
     monkeypatch.setattr("sw_kit.suite.load_plugins", lambda: plugins)
     entries = plugins.provided_by(next(info for info in plugins.plugins if info.key == "theirs"))
-    assert {entry.kind for entry in entries} == {r.kind for r in plugins.registries.values()} - {"executor"}
+    assert {entry.kind for entry in entries} == {r.kind for r in plugins.registries.values()}
     checks = checks_of("sw-theirs", quick=True)
     assert len(checks) > len(entries)
     for check in checks:
@@ -342,6 +340,18 @@ def test_register_checks(plugins, installed):
     found = [Check("radio", "aerial", "missing", "none is plugged in", "buy one")]
     assert plugins.checks.load("radio")() == found
     assert run_registered(plugins.checks.entry("radio")) == found
+
+
+def test_register_executors(plugins, tmp_path):
+    cls = plugins.executors.load("one-by-one")
+    executor = cls(cls.Options(), SimpleNamespace(out=tmp_path, device="cpu"))
+    for number in (0, 3):
+        program = f"import sys; print('number', {number}); sys.exit({number})"
+        executor.start(str(number), [sys.executable, "-c", program], tmp_path / "log")
+    assert sorted(executor.ended(1.0)) == [("0", 0, "here"), ("3", 3, "here")]
+    assert (tmp_path / "log").read_text() == "number 3\nnumber 0\n"
+    executor.stop()
+    assert executor.ended(0.0) == []
 
 
 def test_register_commands(plugins, tmp_path, monkeypatch):

@@ -235,6 +235,65 @@ def exact(
     return found
 
 
+WIDTHS = (4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256)
+
+
+def mixture_block(data: bytes, tables: ExactTables, numbers: Sequence[Sequence[int]]) -> list[int]:
+    """A block of `conditional-mixture`: two means, two scales, d and m of each number."""
+    if not numbers:
+        check(not data, "bytes of no numbers")
+        return []
+    file = Bytes(data)
+    check(file.unpack("HI") == (tables.version, tables.crc), "other tables")
+    crc = file.one("I")
+    words, bits = RangeWords(file.take(file.varint())), file.bits()
+    windows = []
+    for mu_1, mu_2, sigma_1, sigma_2, d, m in numbers:
+        j = min(max(((d >> 1) + (1 << 15)) >> 9, 0), 127)
+        w = min(max((tables.multipliers[j] + 16) >> 5, 2), 254)
+        parts = []
+        for mu, sigma, share in ((mu_1, sigma_1, w), (mu_2, sigma_2, 256 - w)):
+            level = bisect.bisect_left(tables.thresholds, (max(sigma, 0) << 12) // m)
+            middle, number = centre_and_table(mu, level, m)
+            parts.append((middle, tables.radius["gaussian"][level], tables.tables["gaussian"][number], share))
+        centre = parts[0 if w >= 128 else 1][0]
+        reach = max(radius + abs(middle - centre) for middle, radius, _, _ in parts)
+        width = next((width for width in WIDTHS if width >= reach), WIDTHS[-1])
+        counts = [1] * (2 * width + 2)
+        for middle, radius, table, share in parts:
+            for s in range(-width, width + 1):
+                if abs(centre + s - middle) <= radius:
+                    counts[s + width] += share * table[centre + s - middle + radius]
+            counts[-1] += share * table[-1]
+        windows.append((width, centre, counts))
+    found = [0] * len(windows)
+    order = sorted(range(len(windows)), key=lambda i: windows[i][0])
+    entries = {i: symbols_of(words, windows[i][2], 1)[0] for i in order}
+    for i in order:
+        width, centre, _ = windows[i]
+        s = entries[i] - width
+        if entries[i] == 2 * width + 1:
+            negative, v = escape(bits)
+            s = -(v + width + 1) if negative else v + width + 1
+        found[i] = centre + s
+    check(crc_i32(found) == crc, "CRC of a block")
+    return found
+
+
+def conditional_mixture(
+    section: bytes, tables: ExactTables, c: int, parameters: Sequence[np.ndarray], steps: np.ndarray
+) -> np.ndarray:
+    """`conditional-mixture`: integers [n,C]; `parameters` are the means, the scales and d, [n,C] each."""
+    shape = parameters[0].shape
+    file, found, rows = Bytes(section), np.zeros(shape, np.int64), max(1, (1 << 20) // c)
+    spread = np.stack([*parameters, np.broadcast_to(steps, shape)], axis=-1)
+    for start in range(0, len(found), rows):
+        part = spread[start : start + rows].reshape(-1, 6).tolist()
+        found[start : start + rows] = np.reshape(mixture_block(file.take(file.varint()), tables, part), (-1, shape[1]))
+    file.done()
+    return found
+
+
 def conditional(
     section: bytes,
     tables: ExactTables,

@@ -17,7 +17,9 @@ PAIRS = ((0, 1), (0, 2), (1, 2))
 NEIGHBORS = [(-2, x) for x in range(-2, 3)] + [(-1, x) for x in range(-2, 3)] + [(0, -2), (0, -1)]
 
 
-def network(layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, inputs: np.ndarray) -> np.ndarray:
+def network(
+    layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, inputs: np.ndarray, *, leaky: bool = False
+) -> np.ndarray:
     """A network in integers; `units` of the outputs of the last layer."""
     a = np.clip(inputs, -(1 << 20), 1 << 20)
     for i, (weight, bias) in enumerate(layers):
@@ -26,7 +28,7 @@ def network(layers: Sequence[tuple[np.ndarray, np.ndarray]], units: np.ndarray, 
         c = np.rint(bias.astype(np.float64) * u * 2.0**24).astype(np.int64)
         a = (a @ w.T + c) >> 12
         if i < len(layers) - 1:
-            a = np.clip(a, 0, 1 << 20)
+            a = np.clip(np.where(a < 0, 41 * a >> 12, a), -(1 << 20), 1 << 20) if leaky else np.clip(a, 0, 1 << 20)
     return a
 
 

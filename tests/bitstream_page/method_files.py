@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bitstream_page.anchor_files import cat, hac
+from bitstream_page.anchor_files import cat, hac, hac_plus
 from bitstream_page.container import container
 from bitstream_page.entropy_models import ExactTables
 from bitstream_page.fields import check
@@ -20,6 +20,8 @@ def decode(data: bytes, unzstd: Callable[[bytes], bytes], tables: ExactTables) -
     static = header["static"]
     if header["method"] == "hac":
         return hac(static, sections, tables)
+    if header["method"] == "hac-plus":
+        return hac_plus(static, sections, tables)
     if header["method"] == "cat-3dgs":
         return cat(static, sections, tables)
     if header["method"] == "3dgs":

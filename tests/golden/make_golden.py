@@ -121,6 +121,27 @@ SMALL_HAC = {
 }  # fmt: skip
 
 
+def hac_plus_anchors(settings: Mapping[str, Any]) -> SplatModel:
+    """Forty anchors of HAC++ with scattered values and networks, a fifth of the offsets masked."""
+    values = Scattered()
+    points = PointCloud(4 * values(40, 3), 0.5 + values(40, 3) / 2)
+    scene = Scene("scattered", [], [], points, Protocol("test"))
+    model = create_method(load_plugins(), "hac-plus", settings).create_model(scene, torch.Generator())
+    with torch.no_grad():
+        for name, parameter in sorted(model.named_parameters()):
+            if name != "anchors":  # they lie on the lattice
+                parameter.copy_(values(*parameter.shape))
+        model.features.mul_(6)
+        model.log_scales.sub_(4)
+        model.mask_logits.copy_(torch.where(model.mask_logits > -0.4, 1.0, -9.0))
+        model.update_bounds()
+    return model
+
+
+SMALL_HAC_PLUS = {**SMALL_HAC, "channel.slices": [2, 3], "channel.hidden": 4}
+TINY_HAC_PLUS = {**SMALL_HAC_PLUS, "channel.kind": "tiny", "codec.settings.weights": "float16"}
+
+
 def cat_anchors(settings: Mapping[str, Any]) -> SplatModel:
     """Nine anchors of CAT-3DGS with scattered values, planes and networks, a fifth of the offsets masked."""
     values = Scattered()
@@ -259,6 +280,8 @@ CASES: dict[str, Case] = {
         ("hac_half_v1", "hac_half_v2"),
         ("hac", "r1", {**SMALL_HAC, "codec.weights": "float16"}, lambda: hac_anchors(SMALL_HAC)),
     ),
+    "hac_plus_v1": ("hac-plus", "r4", SMALL_HAC_PLUS, lambda: hac_plus_anchors(SMALL_HAC_PLUS)),
+    "hac_plus_tiny_v1": ("hac-plus", "r1", TINY_HAC_PLUS, lambda: hac_plus_anchors(TINY_HAC_PLUS)),
     **dict.fromkeys(
         ("cat_3dgs_refined_v1", "cat_3dgs_refined_v2"), ("cat-3dgs", "r1", SMALL_CAT, lambda: cat_anchors(SMALL_CAT))
     ),

@@ -23,8 +23,9 @@ NAMES = {
         "bernoulli",
         "gaussian-exact",
         "conditional-gaussian",
+        "conditional-mixture",
     },
-    "context_models": {"hash-grid", "integer-mlp", "triplane", "spatial-ar", "channel-ar"},
+    "context_models": {"hash-grid", "integer-mlp", "triplane", "spatial-ar", "channel-ar", "channel-mixture"},
     "coders": {
         "range",
         "rans",

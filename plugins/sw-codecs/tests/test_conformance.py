@@ -45,6 +45,19 @@ def rows_case(n):
     return EntropyCase(symbols, context, context, context)
 
 
+def row_mixtures_case(n):
+    r, rows = rng(), (n + 4) // 5
+    parameters = [r.normal(0, 20, (rows, 5)), r.uniform(0.5, 8, (rows, 5)), r.normal(9, 20, (rows, 5)),
+                  r.uniform(0.5, 8, (rows, 5)), r.normal(0, 2, (rows, 5)), r.uniform(0.5, 1.5, (rows, 1))]  # fmt: skip
+    mean, scale, second_mean, second_scale, logit, step = parameters
+    first = r.random((rows, 5)) < 1 / (1 + np.exp(-logit))
+    values = np.where(first, r.normal(mean, scale), r.normal(second_mean, second_scale))
+    context = PLUGINS.entropy_models.load("conditional-mixture").Context(
+        *(np.rint(4096 * each).astype(np.int64) for each in parameters)
+    )
+    return EntropyCase(np.rint(values / step).astype(np.int64), context, context, context)
+
+
 def columns_case(n):
     rows = (n + 1) // 2
     symbols = np.rint(rng().normal(0, [3, 40], (rows, 2))).astype(np.int64)
@@ -77,6 +90,7 @@ ENTROPY_CASES = {
     "gaussian-exact": gaussian_case,
     "mixture": mixture_case,
     "conditional-gaussian": rows_case,
+    "conditional-mixture": row_mixtures_case,
 }
 """Context and symbols for each entropy model, since these differ; a new model needs one here."""
 
@@ -88,6 +102,7 @@ CONTEXT_INPUTS = {
     "triplane": lambda load: (load(8, multiples=(1, 2)), torch.rand(10, 3)),
     "spatial-ar": lambda load: (load(), torch.zeros(2, 5, 6)),
     "channel-ar": lambda load: (load((2, 2)), torch.randn(10, 4), torch.randn(10, 4), torch.rand(10, 4)),
+    "channel-mixture": lambda load: (load((2, 2), context=3), torch.randn(10, 4), torch.randn(10, 3)),
     "hash-grid": lambda load: (load((6, 10), (10,), features=2, log2_space=8, log2_planes=8), torch.rand(10, 3)),
 }
 

@@ -117,6 +117,7 @@ class Job:
     needs       jobs that must have ended well before
     fresh       discard what the directories hold (once)
     about       label and scene, for estimates
+    trains      its training is not one that it needs
     attempts    starts so far
     """
 
@@ -128,6 +129,7 @@ class Job:
     fresh: bool = False
     attempts: int = 0
     about: tuple[str, str] = ("", "")
+    trains: bool = True
 
     @property
     def log(self) -> str:
@@ -203,11 +205,7 @@ def _resolved(plan: Plan, label: str, scene: str, seed: int, layout: Layout, plu
 
 
 def jobs_of(
-    cells: Sequence[Cell],
-    layout: Layout,
-    plugins: PluginManager,
-    *,
-    is_changed: Callable[[Cell], bool] = lambda cell: False,
+    cells: Sequence[Cell], layout: Layout, plugins: PluginManager, is_changed: Callable[[Cell], bool]
 ) -> list[Job]:
     """Put unfinished cells into processes, what others need first; a training that several need is a job of its own.
 
@@ -231,9 +229,9 @@ def jobs_of(
         job.needs = tuple(shared[each] for each in bases if each in shared)
     made = []
     for group, keys in zip(groups.values(), needs, strict=True):
-        first = group[0]
-        job = run_job(group, fresh=is_changed(first))
+        job = run_job(group, fresh=is_changed(group[0]))
         job.needs = tuple(shared[key] for key in keys if key in shared)
+        job.trains = keys[-1] not in shared
         made.append(job)
     return [*shared.values(), *made]
 

@@ -28,6 +28,9 @@ def main(arguments: list[str]) -> None:
     nowhere = os.open(os.devnull, os.O_RDONLY)
     os.dup2(nowhere, 0)
     os.close(nowhere)
+    for name in ("SIGUSR1", "SIGUSR2"):  # a batch system warns whole groups with them: the owner will say what to do
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     threading.Thread(target=_end_with, args=(owner,), name="owner", daemon=True).start()
     _wait_for_those_before([Path(each) for each in arguments[:split]])
     sys.argv = ["sw", *arguments[split + 1 :]]

@@ -58,7 +58,7 @@ class Lines:
         waiting = {cell for each in sweep.waiting for cell in each.cells}
         self.states |= dict.fromkeys(waiting, "waiting")
         if status == "finished":
-            self.estimates.learn(*job.about, seconds / max(1, len(job.cells)))
+            self.estimates.learn(*job.about, seconds)
         left = self.left(sweep)
         told = {"finished": f"in {duration(seconds)}", "again": f"goes on, as it was {reason}"}.get(status, reason)
         line = f"{self.counted()} {status:9} {job.name}: {told}"

@@ -59,7 +59,7 @@ def dry_run(
     print_table(["process", "state", "about"], rows, right=1)
     counted = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
     say(f"{len(cells)} runs of {plan_size(plan)}: {counted}; {len(jobs)} processes, {slots} at a time, "
-        + ("of unknown length" if left is None else f"about {duration(left)} by what was measured"))  # fmt: skip
+        + ("of unknown length" if left is None else f"about {duration(left)} of training"))  # fmt: skip
 
 
 def plan_size(plan: Plan) -> str:

@@ -11,7 +11,7 @@ from sw_bench.cells import Job
 class Estimates:
     """Seconds of a process by its label and scene, from the nearest that is known.
 
-    known   (label, scene, seconds of one run)
+    known   (label, scene, seconds)
     """
 
     def __init__(self, known: Iterable[tuple[str, str, float]] = ()) -> None:
@@ -20,11 +20,15 @@ class Estimates:
             self.learn(label, scene, seconds)
 
     def learn(self, label: str, scene: str, seconds: float) -> None:
-        """Take in one run."""
+        """Take in one process."""
         self._pairs.setdefault((label, scene), []).append(seconds)
 
+    def knows(self, label: str, scene: str) -> bool:
+        """Whether such a process has been measured."""
+        return (label, scene) in self._pairs
+
     def one(self, label: str, scene: str) -> float | None:
-        """Return the seconds of one run: of that scene, else as the scene differs for other methods; None: unknown."""
+        """Return the seconds on that scene, else on others as scenes differ for other methods; None: unknown."""
         if (label, scene) in self._pairs:
             return statistics.fmean(self._pairs[label, scene])
         mine = {s: statistics.fmean(x) for (name, s), x in self._pairs.items() if name == label}
@@ -39,8 +43,7 @@ class Estimates:
 
     def of(self, job: Job) -> float | None:
         """Return the seconds of a process; None: nothing like it is known."""
-        one = self.one(*job.about)
-        return None if one is None else one * max(1, len(job.cells))
+        return self.one(*job.about)
 
     def left(self, waiting: Sequence[Job], running: Sequence[tuple[Job, float]], slots: int) -> float | None:
         """Return the seconds until all is done on so many places; None while too little is known.

@@ -18,7 +18,7 @@ class Site:
     """Facts that an executor is made with.
 
     out     the output folder, absolute; every machine of an executor sees it under the same name
-    device  cpu or cuda: where the runs will compute
+    device  cpu or cuda: where the runs will compute; for other machines also auto
     """
 
     out: Path

@@ -127,8 +127,8 @@ class Index:
                            (name, *about, runs, status, seconds, place, _now()))  # fmt: skip
 
     def durations(self) -> list[tuple[str, str, float]]:
-        """Return (label, scene, seconds a run) of every process that ended well."""
-        found = self._file.execute("SELECT label, scene, seconds / max(runs, 1) FROM jobs WHERE status = 'finished'")
+        """Return (label, scene, seconds) of every process that ended well."""
+        found = self._file.execute("SELECT label, scene, seconds FROM jobs WHERE status = 'finished'")
         return [(str(label), str(scene), float(seconds)) for label, scene, seconds in found]
 
 

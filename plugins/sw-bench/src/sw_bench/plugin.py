@@ -1,6 +1,14 @@
 """Registers the command `sw bench` and the executors `local` and `slurm`."""
 
+from __future__ import annotations
+
+import sys
+from typing import TYPE_CHECKING
+
 from splatwizard_core.api import Registry, hookimpl
+
+if TYPE_CHECKING:
+    from splatwizard_core.tooling import StartedTraining, TrainingObserver
 
 
 @hookimpl
@@ -15,3 +23,12 @@ def register_executors(registry: Registry) -> None:
                  summary="processes on this machine: one per GPU, or a share of the cores each")  # fmt: skip
     registry.add("slurm", "sw_bench.slurm:SlurmExecutor",
                  summary="jobs of a Slurm cluster, through submitit")  # fmt: skip
+
+
+@hookimpl
+def run_started(training: StartedTraining) -> TrainingObserver | None:
+    # Whoever probes has imported the module; every other command is spared it.
+    probe = sys.modules.get("sw_bench.probe")
+    clock = None if probe is None else probe.Clock.current
+    found: TrainingObserver | None = clock if clock is not None and clock.method == training.method else None
+    return found

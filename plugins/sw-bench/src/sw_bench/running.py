@@ -30,10 +30,11 @@ from sw_bench.executor import Executor, Site
 from sw_bench.index import Index
 from sw_bench.plan import Plan, checked_plan, read_plan
 from sw_bench.results import results, table_of
-from sw_bench.state import State, state_of
+from sw_bench.state import State, changes_of, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
+LOCAL = "local"  # the executor of this machine
 OF_A_PLAN = ("rate", "preset", "images", "init", "config_file", "sets")
 
 
@@ -54,6 +55,8 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
     if given.get("allow_changed_plan"):
         raise click.UsageError("--allow-changed-plan is for one run at a time: leave out further scenes and seeds")
     methods, scenes, seeds = words_of(given["methods"]), scenes_of(given["scene"]), seeds_of(given["seed"])
+    if path is None and not (methods or scenes or seeds):
+        raise click.UsageError("name a PLAN.toml, or what to run by --method, --scene and --seed")
     if path is None:
         plan, text = _plan_of_words(methods, scenes, seeds, given), ""
     else:
@@ -119,17 +122,17 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     changed = [cell for cell in cells if states[cell] is State.CHANGED]
     again = bool(given["rerun_changed"]) or not given.get("resume", True)
     if changed and not again and not given["dry_run"]:
-        raise UserInputError(_about_changed(changed, cells, states, layout))
+        raise UserInputError(_about_changed(changed, cells, states, layout, plugins))
     if not given.get("resume", True):
         states = dict.fromkeys(cells, State.CHANGED)
     elif given["recheck"]:
         states |= {cell: State.BEGUN for cell in cells if states[cell] is State.FINISHED}
     unfinished = [cell for cell in cells if states[cell] is not State.FINISHED]
-    jobs = jobs_of(unfinished, layout, plugins, is_changed=lambda cell: states[cell] is State.CHANGED)
+    jobs = jobs_of(unfinished, layout, plugins, lambda cell: states[cell] is State.CHANGED)
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 
-        executor = None if plan.executor != "local" else make_executor(plan, layout, plugins)
+        executor = None if plan.executor != LOCAL else make_executor(plan, layout, plugins)
         dry_run(plan, jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
         return 0
     executor = make_executor(plan, layout, plugins)
@@ -172,8 +175,9 @@ def make_executor(plan: Plan, layout: Layout, plugins: PluginManager) -> Executo
             raise ConfigError(f"executor '{plan.executor}' has no option '{key}': {hint}", key=key) from None
         reason = first["msg"].removeprefix("Input should be ")
         raise ConfigError(f"bad value {first['input']!r} for option '{key}' of '{plan.executor}': {reason}") from None
-    device = choose_device(plan.device or "auto", plugins)
-    made: Executor = cls(chosen, Site(layout.out, device.type))
+    asked = plan.device or "auto"  # other machines may have what this one lacks
+    device = choose_device(asked, plugins).type if plan.executor == LOCAL else asked
+    made: Executor = cls(chosen, Site(layout.out, device))
     return made
 
 
@@ -209,13 +213,15 @@ def _counts(cells: Sequence[Cell], states: Mapping[Cell, State], jobs: Sequence[
     return f"{len(cells)} runs: {', '.join(parts)}; {len(jobs)} processes to go{places}"
 
 
-def _about_changed(changed: Sequence[Cell], cells: Sequence[Cell], states: Mapping[Cell, State], layout: Layout) -> str:
+def _about_changed(
+    changed: Sequence[Cell], cells: Sequence[Cell], states: Mapping[Cell, State], layout: Layout, plugins: PluginManager
+) -> str:
     """Message about runs whose directories hold another training."""
-    named = ", ".join(cell.name for cell in changed[:NAMED]) + (", ..." if len(changed) > NAMED else "")
+    named = f"{changed[0].name}: {changes_of(changed[0], plugins)}" + ("; ..." if len(changed) > 1 else "")
     kept = sum(state in (State.FINISHED, State.BEGUN) for state in states.values())
     return (
         f"{_shown(layout.out)}: {len(changed)} of {len(cells)} runs were trained with other values ({named}), {kept} "
-        "fit the plan: --rerun-changed discards those and trains them anew, --out elsewhere keeps them"
+        "fit the plan: --rerun-changed discards those and trains them anew, another --out keeps them"
     )
 
 

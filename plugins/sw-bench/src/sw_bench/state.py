@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from enum import Enum
 from pathlib import Path
+from typing import Any
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import FILE_NAME, Choices, PluginManager, Record, read_record
@@ -12,6 +13,7 @@ from sw_bench.cells import Cell, SharedTraining, training_key
 
 CONFIG = "config.toml"
 STEPS = "steps.json"
+MOST_TOLD = 3  # values in a message
 
 
 class State(Enum):
@@ -42,6 +44,23 @@ def state_of(cell: Cell, plugins: PluginManager, *, geometry: bool = False) -> S
     except (UserInputError, ValueError):  # of another release, or damaged: the run itself says what to do
         return State.BEGUN
     return State.BEGUN if training_key(before) == cell.training else State.CHANGED
+
+
+def changes_of(cell: Cell, plugins: PluginManager) -> str:
+    """Return which values of a changed run were others, in a few words: `iterations 600 -> 7000`."""
+    (before,) = Choices(config_file=str(cell.directory / CONFIG)).resolve(plugins)
+    was, now = (_leaves(each.as_dict()) for each in (before, cell.resolved))
+    blocks = ("config.", "pipeline.", "scene.", "pretrained.")
+    keys = [key for key in {**was, **now} if was.get(key) != now.get(key) and key.startswith((*blocks, "init"))]
+    told = [f"{key.removeprefix(key.partition('.')[0] + '.')} {was.get(key)} -> {now.get(key)}" for key in keys]
+    return ", ".join(told[:MOST_TOLD]) + (", ..." if len(told) > MOST_TOLD else "")
+
+
+def _leaves(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return found
 
 
 def record_of(cell: Cell) -> Record | None:

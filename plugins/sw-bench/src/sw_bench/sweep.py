@@ -19,6 +19,7 @@ from sw_bench.state import is_shared_training_done, is_trained, record_of
 LOGS = "logs"
 MOMENT = 0.25  # seconds between two updates of what is shown
 REASON_CHARACTERS = 300
+KILLED = 9  # SIGKILL, which some systems lack
 INTERRUPTED = (130, -signal.SIGINT, -signal.SIGTERM)
 
 
@@ -116,7 +117,7 @@ class Sweep:
             self.watcher.ended(self, job, "finished", "", seconds)
             return
         reason = _reason(self.out / LOGS / job.log, size, status)
-        if (status < 0 or status in INTERRUPTED or status == 128 + signal.SIGKILL) and job.attempts <= self.retries:
+        if (status < 0 or status in INTERRUPTED or status == 128 + KILLED) and job.attempts <= self.retries:
             self.waiting.insert(0, job)  # goes on from its checkpoint
             self.watcher.ended(self, job, "again", reason, seconds)
             return
@@ -142,7 +143,7 @@ def _reason(log: Path, start: int, status: int) -> str:
         return "its machine was lost"
     if status < 0:
         name = signal.Signals(-status).name if -status in signal.valid_signals() else f"signal {-status}"
-        return f"killed by {name}" + (" (the memory may have been full)" if -status == signal.SIGKILL else "")
+        return f"killed by {name}" + (" (the memory may have been full)" if -status == KILLED else "")
     try:
         with open(log, "rb") as file:
             file.seek(max(start, log.stat().st_size - 20_000))

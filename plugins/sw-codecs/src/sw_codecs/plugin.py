@@ -116,7 +116,7 @@ def register_coders(registry: Registry[Any]) -> None:
                  summary="arithmetic coding under a ModelSpec")  # fmt: skip
     registry.add("rans", "sw_codecs.coders.arithmetic:RansCoder", codes="symbols", summary="rANS under a ModelSpec")
     registry.add("huffman", "sw_codecs.coders.huffman:HuffmanCoder", codes="symbols",
-                 summary="Huffman codes from count tables")  # fmt: skip
+                 summary="Huffman codes from count tables", native="sw_codecs.native:CODECS")  # fmt: skip
     registry.add("octree", "sw_codecs.positions.octree:Octree", codes="positions",
                  summary="point positions as octree occupancy")  # fmt: skip
     registry.add("byte-planes", "sw_codecs.arrays.byte_planes:BytePlanes", codes="arrays",

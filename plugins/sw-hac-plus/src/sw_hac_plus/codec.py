@@ -151,6 +151,12 @@ def _read_channel(reader: ContainerReader, features: int) -> ChannelMixture | No
     slices = read_integers(reader, "slices", low=1, high=256, longest=64)
     if sum(slices) != features:
         raise BitstreamError(f"{reader.name}: the slices of the header do not sum to its features", section="header")
-    if kind == "tiny":
-        return ChannelMixture(slices, context=0, hidden=None)
-    return ChannelMixture(slices, context=PARTS * features, hidden=reader.integer("channel_hidden", low=1, high=512))
+    full = kind == "full"
+    context = PARTS * features if full else 0
+    hidden = reader.integer("channel_hidden", low=1, high=512) if full else None
+    numbers = ChannelMixture.count(slices, context=context, hidden=hidden)
+    if 2 * numbers > reader.sections.get("networks", 0):  # float16 at least; before they are made
+        raise BitstreamError(
+            f"{reader.name}: channel networks of {numbers:,} numbers are not there", section="networks"
+        )
+    return ChannelMixture(slices, context=context, hidden=hidden)

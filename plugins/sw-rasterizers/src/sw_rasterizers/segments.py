@@ -1,4 +1,4 @@
-"""Who reads which row of a table: indices checked once, and sorted once where sums over the readers need an order."""
+"""Rows of a table by index: checked once, and sorted once where sums over the readers of a row need an order."""
 
 from __future__ import annotations
 

@@ -12,6 +12,7 @@ from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import FILE_NAME
 from sw_report.configurations import PRESET, configurations, described, differing, seed_of
 from sw_report.facts import RunFacts, clean, read_facts
+from sw_report.sweeps import sweep_notes
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +125,8 @@ def collect(paths: Sequence[Path]) -> Collection:
     runs, by_configuration = _tell_configurations_apart(runs)
     runs, told_apart = _tell_apart(runs)
     notes += by_configuration + told_apart + _protocol_notes(runs)
+    for root in dict.fromkeys(paths):
+        notes += sweep_notes(root, [record for record, under in found.values() if under == root])
     joined = sorted(_seeds_joined(runs), key=_order)
     if len(joined) < len(runs):
         notes.append(OF_SEEDS)

@@ -28,6 +28,11 @@ def _not_empty(_context: click.Context, parameter: click.Parameter, value: str |
     return value
 
 
+def _seeds(text: str) -> int | tuple[int, ...]:
+    first, *more = (click.IntRange(min=0).convert(each, None, None) for each in text.split(","))  # type: ignore[arg-type]
+    return (first, *more) if more else first
+
+
 scene_option = click.option(
     "--scene", metavar="SCENE", type=SCENE,
     help="A folder (the format is detected), `dataset/scene` under $SPLATWIZARD_DATA, or a scene that is made on the "
@@ -48,7 +53,7 @@ methods_option = click.option(
 )  # fmt: skip
 preset_option = click.option(
     "--preset", metavar="NAME", type=PRESET,
-    help="Named values of the method.  [default: paper; quick on a scene that is made on the spot]",
+    help="Named values of the method.  [default: paper; quick on a scene that is made on the spot, or tiny]",
 )  # fmt: skip
 rate_option = click.option(
     "--rate", metavar="NAME", type=RATE,
@@ -81,20 +86,7 @@ device_option = click.option(
     help="Where to compute.  [default: auto, which is CUDA if its kernels can run]",
 )  # fmt: skip
 seed_option = click.option(
-    "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
-)
-
-
-class _Seeds(click.IntRange):
-    """A seed, or a comma list of them as a tuple."""
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        found = [click.IntRange.convert(self, each, param, ctx) for each in str(value).split(",")]  # type: ignore[arg-type]
-        return found[0] if len(found) == 1 else tuple(found)
-
-
-seeds_option = click.option(
-    "--seed", type=_Seeds(min=0), metavar="N[,N]", help="Of every random stream; several make a sweep.  [default: 0]"
+    "--seed", type=_seeds, metavar="N[,N]", help="Of every random stream; several make a sweep.  [default: 0]"
 )
 repeats_option = click.option(
     "--repeats", type=click.IntRange(min=1), default=1, show_default=True, metavar="N",

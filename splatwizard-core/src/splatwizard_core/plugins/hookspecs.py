@@ -86,7 +86,7 @@ def register_importers(registry: Registry) -> None:
 
 @hookspec
 def register_executors(registry: Registry) -> None:
-    """Add executors: where the runs of a sweep happen (local processes, a cluster). Nothing calls them yet."""
+    """Add executors: where the runs of a sweep happen (local processes, a cluster)."""
 
 
 @hookspec

@@ -9,9 +9,11 @@ import numpy as np
 import torch
 
 from splatwizard_core.api import BitstreamError
+from splatwizard_native import NativeBuildError
 from sw_codecs.coders.arithmetic import ChunkedCoder
 from sw_codecs.coders.model_spec import Gaussian, Laplace, ModelSpec, Table, Tables
 from sw_codecs.coders.symbol_stream import guarded
+from sw_codecs.native import CODECS
 
 MAX_TABLES = 4096  # distinct parameter pairs that may be turned into tables
 MAX_ENTRIES = 1 << 24
@@ -33,12 +35,27 @@ class HuffmanCoder(ChunkedCoder):
         if len(payload) % 4:
             raise BitstreamError(f"{len(payload):,} coded bytes are not whole 32-bit words")
         tables, index, low = _as_tables(spec, count)
+        if 2 <= tables.shape[1] <= tables.size <= MAX_ENTRIES and np.isfinite(tables).all() and _has_kernel():
+            # Copies: what torch wraps must be writable.
+            copied = np.array(payload, np.uint8), np.array(tables, np.float32), np.array(index, np.int64)
+            decoded = torch.ops.sw_codecs.huffman_decode(*map(torch.from_numpy, copied))
+            if len(decoded) < count:
+                raise BitstreamError(f"the codes end before {count:,} symbols: truncated data or a wrong model")
+            return np.asarray(decoded.numpy() + np.int32(low), np.int32)
         with guarded(BitstreamError, "Huffman decoding"):
             trees = [constriction.symbol.huffman.DecoderHuffmanTree(table) for table in tables]
             decode = constriction.symbol.QueueDecoder(np.frombuffer(payload, "<u4").astype(np.uint32)).decode_symbol
             which = repeat(trees[0], count) if len(trees) == 1 else map(trees.__getitem__, index.tolist())
             symbols = list(map(decode, which))
         return np.array(symbols, np.int32) + np.int32(low)
+
+
+def _has_kernel() -> bool:
+    """Whether there is a compiled decoder. Compiling one takes longer than a file does without."""
+    try:
+        return CODECS.load_built()
+    except NativeBuildError:
+        return False
 
 
 def _written(tables: np.ndarray, entry: np.ndarray) -> bytes:

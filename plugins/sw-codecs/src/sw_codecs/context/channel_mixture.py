@@ -61,6 +61,17 @@ class ChannelMixture(nn.Module):
             free[1] = scale
             self.first = nn.Parameter(free)
 
+    @staticmethod
+    def count(slices: Sequence[int], *, context: int, hidden: int | None) -> int:
+        """Numbers of all networks, without making them; arguments as of the constructor."""
+        found, start = 0, 0
+        for size in slices:
+            inputs, outputs = start + context, PARTS * size
+            width = hidden or outputs
+            found += (inputs + 1) * width + (width + 1) * outputs if inputs else outputs
+            start += size
+        return found
+
     def part(self, index: int) -> slice:
         """Columns of slice `index`."""
         return slice(self.starts[index], self.starts[index] + self.slices[index])

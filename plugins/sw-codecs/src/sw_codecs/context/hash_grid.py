@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
+from sw_codecs.context.grid_lookup import fits_kernel, lookup
 from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.binary import SteBinary
 
@@ -162,6 +163,8 @@ class HashGrid(nn.Module):
         n, levels = len(x), len(self.levels)
         if n == 0:
             return values.new_zeros(0, self.width)
+        if fits_kernel(self, x, values):
+            return lookup(self, x, values)
         index, weights = self._corners_of(x)
         index, weights = index.view(n * levels, -1), weights.to(values.dtype).view(n * levels, -1)
         found = _WeightedRows.apply(values, index, weights, levels)

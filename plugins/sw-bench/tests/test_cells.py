@@ -1,0 +1,118 @@
+"""From a plan to runs and processes: what each is made with, where it lies, and what is trained once for several."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from sw_bench.cells import Layout, cells_of, jobs_of, prepare, run_job
+from sw_bench.estimates import Estimates
+from sw_bench.plan import checked_plan
+from sw_bench.probe import probe_into
+
+from splatwizard_core.api import ConfigError
+from splatwizard_core.tooling import load_plugins
+
+pytest.importorskip("sw_lightgaussian", reason="the plans need methods that start from a trained scene")
+SHORT = {"iterations": 20, "pretrained.iterations": 20}
+
+
+def planned(tmp_path, *, seed_folders=True, **tables):
+    """Runs and processes of a plan on the smallest scene."""
+    plugins, layout = load_plugins(), Layout(tmp_path, seed_folders)
+    plan = checked_plan({"scenes": ["demo:tiny"], "rates": "r1", "set": SHORT, **tables}, "the test")
+    cells = cells_of(plan, layout, plugins)
+    return cells, jobs_of(cells, layout, plugins, lambda cell: False), layout
+
+
+def test_rate_points_of_one_training_share_a_process(tmp_path):
+    cells, jobs, _ = planned(tmp_path, methods=["3dgs"], rates="all", seeds=[0, 3])
+    assert [len(job.cells) for job in jobs] == [len(cells) // 2] * 2
+    assert [cell.directory for cell in jobs[1].cells][:2] == [
+        tmp_path / "seed-3" / "demo-tiny" / "3dgs" / rate for rate in ("r1", "r2")
+    ]
+    assert jobs[1].words[jobs[1].words.index("--seed") + 1] == "3"
+    assert jobs[1].words[-2:] == ("--rate", "r1,r2,r3,r4,r5,r6")
+
+
+def test_what_methods_start_from_is_trained_once_and_first(tmp_path):
+    _, jobs, _ = planned(tmp_path, methods=["3dgs", "lightgaussian", "mesongs"], seeds=[0, 1])
+    shared = [job for job in jobs if job.shared is not None]
+    assert [job.name for job in shared] == [f"3dgs demo:tiny seed {n} (training for several)" for n in (0, 1)]
+    assert jobs[:2] == shared
+    for job in jobs[2:]:
+        assert job.needs == (shared[job.cells[0].seed],)
+    assert [job.trains for job in jobs[2:4]] == [False, True]  # 3dgs itself takes it as its own
+    for job in shared:
+        assert job.shared is not None
+        assert (job.shared.resolved.method, job.shared.resolved.config.iterations) == ("3dgs", 20)
+
+
+def test_what_one_method_alone_starts_from_it_trains_itself(tmp_path):
+    _, jobs, _ = planned(tmp_path, methods=["lightgaussian"])
+    assert [(job.shared, job.needs, job.trains) for job in jobs] == [(None, (), True)]
+
+
+def test_other_values_of_what_is_started_from_are_another_training(tmp_path):
+    _, jobs, _ = planned(
+        tmp_path, methods=["3dgs", "lightgaussian"], method={"lightgaussian": {"set": {"pretrained.iterations": 30}}}
+    )
+    assert [job.shared for job in jobs] == [None, None]
+
+
+def test_a_variant_has_a_root_of_its_own_and_shares_the_trained_scenes(tmp_path):
+    variant = {"coarse": {"method": "lightgaussian", "set": {"prune.percent": 0.8}}}
+    cells, jobs, layout = planned(tmp_path, methods=["lightgaussian", "coarse"], method=variant)
+    assert [cell.root for cell in cells] == [tmp_path / "seed-0", tmp_path / "seed-0-coarse"]
+    assert [job.shared is not None for job in jobs] == [True, False, False]
+    prepare(jobs, layout)
+    (tmp_path / "seed-0" / ".trained" / "x").mkdir()
+    assert (tmp_path / "seed-0-coarse" / ".trained" / "x").is_dir()
+    assert (tmp_path / "seed-0-coarse" / ".trained").readlink().as_posix() == "../seed-0/.trained"
+    assert jobs[0].shared is not None
+    assert 'method = "3dgs"' in jobs[0].shared.file.read_text()
+    prepare(jobs, layout)  # a second time changes nothing
+
+
+def test_a_single_seed_needs_no_folder_of_its_own(tmp_path):
+    cells, _, _ = planned(tmp_path, seed_folders=False, methods=["3dgs"])
+    assert [cell.directory for cell in cells] == [tmp_path / "demo-tiny" / "3dgs" / "r1"]
+
+
+def test_keys_of_trained_scenes_are_for_the_methods_that_start_from_one(tmp_path):
+    cells, _, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"])
+    assert ["pretrained.iterations=20" in cell.words for cell in cells] == [False, True]
+    with pytest.raises(ConfigError, match="3dgs on demo:tiny: method '3dgs' does not start from a trained scene"):
+        planned(tmp_path, methods=["3dgs"], set={}, method={"3dgs": {"set": {"pretrained.iterations": 5}}})
+
+
+def test_the_same_values_make_the_same_run_and_only_those(tmp_path):
+    (cell,), (other,), (rated,) = (
+        planned(tmp_path, methods=["3dgs"], set=values)[0]
+        for values in ({"iterations": 20}, {"iterations": 21}, {"iterations": 20, "codec.name": "gaussians-zstd"})
+    )
+    again = planned(tmp_path, methods=["3dgs"], set={"iterations": "20"})[0][0]
+    assert (cell.training, cell.resolved.config_hash()) == (again.training, again.resolved.config_hash())
+    assert cell.training != other.training
+    assert cell.training == rated.training
+    assert cell.resolved.config_hash() != rated.resolved.config_hash()
+
+
+def test_names_of_output_files_are_plain(tmp_path):
+    (cell,), _, _ = planned(tmp_path, methods=["3dgs"])
+    assert run_job([replace(cell, scene="../a b/ü")]).log == "3dgs_.._a_b_ü_seed_0_r1.log"
+
+
+@pytest.mark.pipeline
+def test_a_probe_measures_the_first_steps_and_writes_nothing(tmp_path, capsys):
+    _, jobs, _ = planned(tmp_path, methods=["3dgs", "lightgaussian"], set={}, device="cpu")
+    estimates = Estimates()
+    probe_into(estimates, jobs)
+    told = capsys.readouterr().err
+    assert "3dgs (training) on demo:tiny: 2,000 steps of " in told
+    assert "lightgaussian on demo:tiny: " in told
+    by_name = {job.about[0]: estimates.of(job) for job in jobs}
+    assert by_name["3dgs"] == 0.0  # its training is that of the others
+    assert by_name["3dgs (training)"] > 0
+    assert by_name["lightgaussian"] > 0
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,71 @@
+// The kernels on CUDA as torch ops, on the current stream. Compiled only where there is CUDA.
+#ifdef SW_WITH_CUDA
+
+#include <ATen/core/Tensor.h>
+#include <ATen/ops/empty.h>
+#include <ATen/ops/zeros.h>
+#include <c10/cuda/CUDAException.h>
+#include <c10/cuda/CUDAGuard.h>
+#include <c10/cuda/CUDAStream.h>
+#include <torch/library.h>
+
+#include "binding.h"
+#include "cuda/kernels.h"
+
+namespace {
+
+using namespace sw_grid;
+
+// Pairs are read and added as one number of eight bytes.
+void check_pairs(const at::Tensor& t, const char* name, int64_t features) {
+  TORCH_CHECK(features > 0 && features <= sw_grid::cuda::kMaxFeatures, "sw_codecs: ", features,
+              " features are not offered on CUDA");
+  TORCH_CHECK(features != 2 || reinterpret_cast<uintptr_t>(t.const_data_ptr()) % 8 == 0, "sw_codecs: ", name,
+              " must start at a multiple of 8 bytes; clone() it");
+}
+
+at::Tensor lookup(const at::Tensor& x, const at::Tensor& values, at::ArrayRef<double> scales, at::IntArrayRef lasts,
+                  at::IntArrayRef starts, at::IntArrayRef dense, int64_t log2_size) {
+  TORCH_CHECK(x.dim() == 2 && values.dim() == 2, "sw_codecs: x must be [n,2 or 3], values [entries,features]");
+  const int64_t n = x.size(0), axes = x.size(1), features = values.size(1);
+  const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, values.size(0));
+  check(x, "x", x, {n, axes});
+  check(values, "values", x, {values.size(0), features});
+  check_pairs(values, "values", features);
+  const c10::cuda::CUDAGuard guard(x.device());
+  at::Tensor found = at::empty({n, levels.count * features}, x.options().requires_grad(false));
+  if (n > 0)
+    sw_grid::cuda::lookup(levels, int(axes), int(features), n, x.const_data_ptr<float>(),
+                          values.const_data_ptr<float>(), found.mutable_data_ptr<float>(),
+                          c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return found;
+}
+
+at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t entries, int64_t features,
+                    at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
+                    int64_t log2_size) {
+  TORCH_CHECK(x.dim() == 2, "sw_codecs: x must be [n,2 or 3]");
+  const int64_t n = x.size(0), axes = x.size(1);
+  const Levels levels = levels_of(scales, lasts, starts, dense, log2_size, axes, entries);
+  check(x, "x", x, {n, axes});
+  check(gradient, "gradient", x, {n, levels.count * features});
+  const c10::cuda::CUDAGuard guard(x.device());
+  at::Tensor table = at::zeros({entries, features}, x.options().requires_grad(false));
+  check_pairs(table, "the table", features);
+  if (n > 0)
+    sw_grid::cuda::backward(levels, int(axes), int(features), n, x.const_data_ptr<float>(),
+                            gradient.const_data_ptr<float>(), table.mutable_data_ptr<float>(),
+                            c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return table;
+}
+
+}  // namespace
+
+TORCH_LIBRARY_IMPL(sw_codecs, CUDA, m) {
+  m.impl("lookup", lookup);
+  m.impl("backward", backward);
+}
+
+#endif  // SW_WITH_CUDA

@@ -1,0 +1,25 @@
+// The kernels of the CPU, declared once for every instruction set that they are compiled for.
+//
+//   grid_lookup    x [n][axes] -> found [n][levels][features]
+//   grid_backward  dL/dfound -> table [entries][features], which holds zeros before: a level by one thread, its points
+//                  in their order, so that sums are the same for any number of threads
+//   huffman_decode codes of `n` symbols, bits of a byte from the lowest one -> whether the bytes sufficed.
+//                  counts [trees][size], size >= 2; index [n] below trees. Source: docs/bitstream.md, Huffman codes
+#pragma once
+
+#include <splatwizard/dispatch.h>
+#include <splatwizard/parallel.h>
+
+#include "grid.h"
+
+#define SW_DECLARE_GRID(arch)                                                                                       \
+  namespace arch {                                                                                                  \
+  void grid_lookup(const sw_grid::Levels& levels, int axes, int features, int64_t n, const float* x,                \
+                   const float* table, float* found, const splatwizard::Parallel& parallel);                        \
+  void grid_backward(const sw_grid::Levels& levels, int axes, int features, int64_t n, const float* x,              \
+                     const float* gradient, float* table, const splatwizard::Parallel& parallel);                   \
+  bool huffman_decode(const uint8_t* bytes, int64_t length, const float* counts, int64_t trees, int64_t size,       \
+                      const int64_t* index, int64_t n, int32_t* symbols);                                           \
+  }
+SW_FOR_EACH_ARCH(SW_DECLARE_GRID)
+#undef SW_DECLARE_GRID

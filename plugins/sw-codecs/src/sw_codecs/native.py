@@ -1,0 +1,17 @@
+"""The native module of what is coded in floating point or bits: grids of learned numbers, Huffman codes."""
+
+from __future__ import annotations
+
+from splatwizard_native import NativeModule
+
+CODECS = NativeModule(
+    name="sw_codecs",
+    package="sw_codecs",
+    sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
+    kernels=("kernels/grid.cpp", "kernels/huffman.cpp"),
+    headers=("kernels/*.h", "kernels/cuda/*.h"),
+    cuda_sources=("kernels/cuda/grid.cu",),
+    cflags=("-ffp-contract=off",),  # a place is rounded as torch rounds it
+    seconds=10,
+    without="hash grids of real numbers are looked up by torch operations, Huffman codes decoded by a loop: slower",
+)

@@ -1,0 +1,246 @@
+"""The file of HAC++: exact integers on any machine, counted in full, and safe against strangers."""
+
+import copy
+import json
+
+import pytest
+import torch
+from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sw_anchors.attribute_sections import AttributeEncoder
+from sw_anchors.sections import round_networks
+from sw_anchors.shape import GROUPS
+from sw_anchors.voxel_lattice import kept_voxels
+from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.testing.raster_scenes import front_camera
+
+from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.errors import BitstreamError
+from splatwizard_core.rendering.rasterizer import RasterOptions
+from sw_hac_plus import codec, predictors
+from sw_hac_plus.method import HACPlus
+
+RASTERIZER = ReferenceRasterizer()
+FEATURES = ["features.1", "features.2", "features.3"]
+SECTIONS = ["anchors", "masks", "grids", "networks", *FEATURES, "scalings", "offsets"]
+KINDS = ["full", "tiny", "none"]
+
+
+class Recorder(AttributeEncoder):
+    """An encoder that keeps integers and steps, and counts the bits of the tables."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.found, self.bits = {g: [] for g in GROUPS}, 0.0
+
+    def code(self, block, context, step, present=None):
+        symbols = super().code(block, context, step, present)
+        self.found[block.group].append((symbols * step).to(torch.float32))
+        coder = self.mixtures if isinstance(context, predictors.RowMixture) else self.coder
+        self.bits += float(coder.bits(symbols, context, present).sum())
+        return symbols
+
+
+def recorded(model, mode="exact"):
+    """What a walk over the model hands to its encoder, and the geometry."""
+    model = copy.deepcopy(model)
+    model.fold_units()
+    round_networks(model.networks(), "float32")
+    geometry, rows = kept_voxels(model)
+    recorder = Recorder(model, rows, codec.sections(model.channel), mode)
+    with torch.no_grad():
+        codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
+    return recorder, geometry
+
+
+def test_the_header_lists_what_decoding_needs():
+    writer = ContainerWriter("hac-plus", 1)
+    with torch.no_grad():
+        codec.encode(make(n=20), writer, method().config.codec.settings)
+    assert set(writer.required) == {
+        ("coder", "octree"), ("entropy model", "bernoulli"), ("context model", "integer-mlp"),
+        ("context model", "channel-mixture"), ("entropy model", "conditional-mixture"),
+        ("entropy model", "conditional-gaussian"),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_decoder_has_the_encoders_integers_and_values(kind):
+    model = make(channel__kind=kind)
+    data = encoded(model)
+    reader, result = ContainerReader(data), decoded(data)
+    expected = {*SECTIONS, "features"} - set(FEATURES) if kind == "none" else set(SECTIONS)
+    assert set(reader.sections) == expected
+    recorder, geometry = recorded(model)
+    assert torch.equal(result.positions(), geometry.positions)
+    kept = torch.nonzero(model.kept()).squeeze(1)
+    assert {tuple(p) for p in result.positions().tolist()} == {tuple(p) for p in model.positions()[kept].tolist()}
+    assert torch.equal(result.masks, geometry.masks)
+    assert result.counts() == model.counts()
+    for name, blocks in recorder.found.items():
+        assert torch.equal(getattr(result, name).flatten(1), torch.cat(blocks, dim=1))
+    size = sum(reader.sections[name] for name in codec.sections(model.channel))
+    assert 8 * (size - 40 * len(codec.sections(model.channel))) < recorder.bits < 8 * size
+
+
+def test_values_are_within_half_a_step_of_the_models():
+    model = make()
+    result, (_, geometry) = decoded(encoded(model)), recorded(model)
+    _, rows = kept_voxels(model)
+    masks = geometry.masks.repeat_interleave(3, 1)
+    for name, values, base in zip(GROUPS, model.raw(rows), model.base_steps, strict=True):
+        difference = (getattr(result, name).flatten(1) - values).abs()
+        difference = difference * masks if name == "offsets" else difference
+        assert 0 < float(difference.detach().max()) <= base * 1.0001  # steps are below twice the base
+
+
+def test_how_anchors_are_batched_is_no_matter(monkeypatch):
+    """Blocks of rows are part of the format; what is computed at once is not."""
+    data = encoded(make(n=100))
+    monkeypatch.setattr("sw_anchors.attribute_sections.EXACT_NUMBERS", 500)
+    monkeypatch.setattr("sw_codecs.entropy.conditional_mixture.AT_ONCE", 100)
+    assert encoded(make(n=100)) == data
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert decoded(data).digest() == decoded(encoded(make(n=100))).digest()
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_blocks_of_anchors_follow_one_another(monkeypatch):
+    monkeypatch.setattr("sw_codecs.entropy.conditional.BLOCK_SYMBOLS", 12 * 40)
+    model = make(n=200)
+    result, (recorder, _) = decoded(encoded(model)), recorded(model)
+    assert len(recorder.found["scales"]) == 5
+    assert torch.equal(result.scales, torch.cat(recorder.found["scales"]))
+
+
+@pytest.mark.parametrize("n", [0, 1, 6])
+def test_few_anchors_make_a_file(n):
+    result = decoded(encoded(make(n=n)))
+    assert result.num_rows == max(n - 5, 0)
+    with torch.no_grad():
+        RASTERIZER.render(result.gaussians(front_camera(), RASTERIZER), front_camera(), RasterOptions())
+
+
+def test_modes_cost_about_the_same_and_decode_to_about_the_same():
+    model = make(n=1500)
+    exact, floats = encoded(model), encoded(model, codec__settings__mode="float")
+    sizes = [sum(ContainerReader(data).sections[name] for name in FEATURES) for data in (exact, floats)]
+    assert sizes[0] == pytest.approx(sizes[1], rel=0.01)
+    assert torch.equal(decoded(exact).positions(), decoded(floats).positions())
+    # Steps of mode exact come from a table, an eighth apart in their logit.
+    difference = (decoded(exact).features - decoded(floats).features).abs()
+    assert float(difference.detach().mean()) < 0.5
+    with pytest.raises(BitstreamError, match=r"mode 'float' decodes only where it was encoded"):
+        decoded(rewritten(floats, made_on={"device": "x", "torch": "1.0"}))
+
+
+def test_far_positions_come_back():
+    """Integers on both sides of 0 and up to 21 bits an axis."""
+    model = make(n=30)
+    with torch.no_grad():
+        model.anchors[10] = torch.tensor([-1.0, 0, 2]) * 2**19 * 0.01
+        model.anchors[11] = torch.tensor([1.0, 0, 2]) * 2**19 * 0.01
+        model.update_bounds()
+    _, geometry = recorded(model)
+    assert torch.equal(decoded(encoded(model)).positions(), geometry.positions)
+    assert int(geometry.integers.max() - geometry.integers.min()) >= 1 << 20
+    with torch.no_grad():
+        model.anchors[11] *= 5
+    with pytest.raises(ValueError, match=r"more than 2\^21 voxels of 0\.01: train with a larger voxel_size"):
+        encoded(model)
+    with torch.no_grad():
+        model.anchors[11] = model.anchors[12]
+    with pytest.raises(ValueError, match="share a voxel"):
+        encoded(model)
+
+
+def test_encoding_leaves_the_model_alone_and_repeats_itself():
+    model = make(n=50)
+    before = model.digest()
+    assert encoded(model, codec__settings__weights="float16") == encoded(model, codec__settings__weights="float16")
+    assert model.digest() == before
+
+
+def rewritten(data: bytes, sections=None, **static) -> bytes:
+    """A file with other header values and sections, whose checksums are right."""
+    reader = ContainerReader(data)
+    writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
+    writer.static.update({**reader.static, **static})
+    for name in reader.sections:
+        writer.add(name, (sections or {}).get(name, reader.section(name)))
+    return writer.to_bytes()
+
+
+BLOCK = encoded(make(n=40))
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    name=st.sampled_from(SECTIONS), place=st.integers(0, 2**32 - 1), value=st.integers(1, 255),
+    how=st.sampled_from(["flip", "cut", "more"]),
+)  # fmt: skip
+def test_a_damaged_section_is_answered(name, place, value, how):
+    section = bytearray(ContainerReader(BLOCK).section(name))
+    at = place % len(section)
+    if how == "cut":
+        section = section[:at]
+    elif how == "more":
+        section += bytes([value])
+    else:
+        section[at] ^= value
+    try:
+        found = decoded(rewritten(BLOCK, {name: bytes(section)}))
+    except BitstreamError:
+        return
+    # Some bytes are plain numbers: bounds, voxel size, weights. And the last bits of a stream may be any.
+    assert name in ("anchors", "networks") or found.digest() == decoded(BLOCK).digest()
+    assert how == "flip"
+    assert all(bool(torch.isfinite(p).all()) for p in found.parameters())
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("num_anchors", 2**32 - 1), ("num_anchors", -1), ("num_offsets", 5), ("num_gaussians", 0), ("feature_dim", 9),
+        ("feature_dim", 257), ("grid_hidden", 17), ("grid_space", [4096] * 32), ("base_steps", [1, 0, 1]),
+        ("mode", "fast"), ("mode", "float"), ("channel", "huge"), ("channel", None), ("channel", "tiny"),
+        ("channel", "none"), ("slices", [8]), ("slices", [4, 5]), ("slices", [-8, 16]), ("slices", "all"),
+        ("channel_hidden", 7), ("channel_hidden", 513), ("weights", "float16"),
+    ],
+)  # fmt: skip
+def test_header_values_of_a_stranger_are_refused(key, value):
+    with pytest.raises(BitstreamError):
+        decoded(rewritten(BLOCK, **{key: value}))
+
+
+def test_networks_larger_than_the_file_may_stand_for_are_refused_before_they_are_made():
+    values = {"feature_dim": 256, "num_offsets": 1, "channel.slices": [4] * 64, "channel.hidden": 1}
+    data = encoded(make(n=6, **values))
+    with pytest.raises(BitstreamError, match="channel networks of"):
+        decoded(rewritten(data, channel_hidden=512))
+
+
+def test_the_header_is_plain_data_and_later_layouts_are_named():
+    json.dumps(ContainerReader(BLOCK).static)
+    with pytest.raises(BitstreamError, match="layout version 2 is unknown"):
+        HACPlus(PLUGINS, None).decode(ContainerReader(ContainerWriter("hac-plus", 2).to_bytes()))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no GPU")
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_model_on_a_gpu_makes_the_same_file(kind):
+    assert encoded(make(channel__kind=kind).cuda()) == encoded(make(channel__kind=kind))
+
+
+def test_the_order_of_the_models_anchors_is_no_matter():
+    model, shuffled = make(n=40), make(n=40)
+    order = torch.randperm(40, generator=generator(5))
+    with torch.no_grad():
+        for name in ("anchors", "features", "offsets", "log_scales", "mask_logits"):
+            getattr(shuffled, name).copy_(getattr(model, name)[order])
+    assert encoded(shuffled) == encoded(model)

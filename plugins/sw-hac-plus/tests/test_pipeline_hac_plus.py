@@ -1,0 +1,93 @@
+"""HAC++ on the small procedural scene: it learns, its rate prunes, it resumes; its file holds what it learned."""
+
+import pytest
+import torch
+from hac_plus_models import PLUGINS, decoded, method
+from sw_anchors.coded_anchors import ENTROPY
+from sw_kit import short_training
+from sw_kit.short_training import demo, file_of, psnr
+
+from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.training.pipeline import TrainingStopped
+
+pytestmark = pytest.mark.pipeline
+
+STEPS = 160
+SMALL = {
+    "iterations": STEPS, "voxel_size": 0.02, "feature_dim": 8, "num_offsets": 5, "hidden": 16, "grid.hidden": 16,
+    "grid.space": [10, 18], "grid.planes": [18, 34], "grid.features": 2, "grid.log2_space": 9, "grid.log2_planes": 9,
+    "phases.quantized": 30, "phases.rebound": 49, "phases.entropy": 50, "growth.start": 20, "growth.stop": 80,
+    "growth.pause_start": 1000, "growth.pause_end": 1001, "growth.interval": 20, "growth.start_stat": 10,
+    "growth.grad_threshold": 2e-3, "growth.init_factor": 4, "lr.max_steps": STEPS, "lr.features": 0.03,
+    "lr.masks_init": 0.1, "lr.masks_final": 0.1, "lr.grid_final": 1e-3, "lr.mlp_grid_final": 1e-3,
+    "lr.channel_final": 2e-3, "rate_term.start": "statistics", "rate_term.units": "steps", "steps.scales": 0.004,
+    "channel.slices": [4, 4], "channel.hidden": 8, "rate_term.sample": 0.5,
+}  # fmt: skip
+WEIGHTS = (0.001, 0.05)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return demo()
+
+
+@pytest.fixture(scope="module")
+def rasterizer():
+    return NegotiatedRasterizer(PLUGINS, device="cpu")
+
+
+def train(scene, rasterizer, directory=None, stop_after=None, **values):
+    made = method(**{**SMALL, **values})
+    model, losses = short_training.train(made, scene, rasterizer, directory=directory, stop_after=stop_after)
+    return model.eval(), losses, made
+
+
+@pytest.fixture(scope="module")
+def trained(scene, rasterizer):
+    """Weight of the rate -> model, losses, method."""
+    return {weight: train(scene, rasterizer, **{"rate_term.weight": weight}) for weight in WEIGHTS}
+
+
+def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):
+    model, losses, _ = trained[WEIGHTS[0]]
+    assert model.phase == ENTROPY
+    assert psnr(model, scene, rasterizer) > 22
+    assert "rate" not in losses[49]
+    losses = [step["rate"] for step in trained[WEIGHTS[1]][1] if "rate" in step]
+    assert sum(losses[-10:]) < 0.6 * sum(losses[:10])
+
+
+def test_a_larger_weight_prunes_and_gives_a_smaller_file(trained):
+    (_, few), (_, many) = [(weight, trained[weight][0].counts()) for weight in reversed(WEIGHTS)]
+    assert few["num_gaussians"] < 0.9 * many["num_gaussians"]
+    small, large = (ContainerReader(file_of(trained[w][2], trained[w][0])).sections for w in reversed(WEIGHTS))
+    for name in ("features.1", "features.2", "offsets"):
+        assert small[name] < large[name]
+
+
+def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
+    model, _, made = trained[WEIGHTS[0]]
+    data = file_of(made, model)
+    found = decoded(data)
+    assert found.counts() == model.counts()
+    assert psnr(found, scene, rasterizer) > psnr(model, scene, rasterizer) - 0.2
+    reader = ContainerReader(data)
+    size = 8 * sum(reader.sections[name] for name in ("features.1", "features.2", "scalings", "offsets"))
+    model.train()
+    try:
+        with torch.no_grad():
+            rows = torch.arange(2)
+            sampled = [model.attributes(rows).extras["rate"] for _ in range(40)]
+    finally:
+        model.eval()
+    numbers = model.num_rows * (8 + 6 + 15)
+    assert sum(float(rate.bits) for rate in sampled) / 40 * numbers == pytest.approx(size, rel=0.06)
+
+
+def test_an_interrupted_training_ends_as_a_whole_one(scene, rasterizer, tmp_path):
+    short = {"iterations": 40, "phases.quantized": 10, "phases.rebound": 19, "phases.entropy": 20, "growth.stop": 35}
+    whole = train(scene, rasterizer, **short)[0]
+    with pytest.raises(TrainingStopped):
+        train(scene, rasterizer, tmp_path, 25, **short)
+    assert train(scene, rasterizer, tmp_path, **short)[0].digest() == whole.digest()

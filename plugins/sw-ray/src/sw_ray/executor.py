@@ -1,0 +1,116 @@
+"""The executor `ray`: a task of a Ray cluster for each process of a sweep.
+
+All nodes must see the output folder, the scenes and this Python under the same paths. A process that is lost with its
+node is reported so; the sweep starts it again, on another node, from its last checkpoint.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from splatwizard_core.api import UserInputError
+from sw_ray.work import PATIENCE_SECONDS, work
+
+LOST = -1000  # by the contract of executors
+
+
+class RayOptions(BaseModel):
+    """Options of the executor `ray`."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    address: str = Field("auto", description="of the cluster; auto: the one on this machine; local: one is started")
+    cores: int = Field(4, ge=1, description="CPU cores of a process")
+    gpus: float = Field(0, ge=0, description="GPUs of a process; 0.5: two processes on each")
+    memory_gb: float = Field(0, ge=0, description="memory of a process, GB, for Ray's account; 0: any")
+
+
+class RayExecutor:
+    """Runs processes as tasks of Ray."""
+
+    Options = RayOptions
+
+    def __init__(self, options: RayOptions, site: Any) -> None:
+        try:
+            import ray
+        except ImportError:
+            raise UserInputError("executor 'ray' needs Ray: pip install 'sw-ray[ray]'") from None
+        self._ray: Any = ray
+        self._options = options
+        self._tasks: dict[Any, str] = {}
+        self._owns = not ray.is_initialized()
+        if self._owns:
+            address = None if options.address == "local" else options.address
+            try:
+                ray.init(address=address, log_to_driver=False, configure_logging=False)
+            except (ConnectionError, ValueError) as error:
+                told = " ".join(str(error).split())
+                raise UserInputError(
+                    f"no Ray cluster at '{options.address}': start one (`ray start --head`), name it (-o address=...), "
+                    f"or take -o address=local: {told:.200}"
+                ) from None
+        # A process that is lost is started again by the sweep, which counts and tells it.
+        self._remote = ray.remote(max_retries=0)(work).options(
+            num_cpus=options.cores, num_gpus=options.gpus, memory=int(options.memory_gb * 1e9) or None, name="sw-bench"
+        )
+        if not self._fits():
+            asked = f"{options.cores} cores" + (f" and {options.gpus:g} GPUs" if options.gpus else "")
+            self._disconnect()
+            raise UserInputError(
+                f"no node of the Ray cluster has {asked}: set -o cores=N or -o gpus=N to what nodes have"
+            )
+
+    @property
+    def slots(self) -> int | None:
+        """Processes that the cluster has room for now, one at least: nodes come and go."""
+        return max(1, sum(map(self._places, self._nodes())))
+
+    def _nodes(self) -> list[dict[str, float]]:
+        return [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+
+    def _places(self, node: dict[str, float]) -> int:
+        places = int(node.get("CPU", 0) // self._options.cores)
+        return min(places, int(node.get("GPU", 0) / self._options.gpus)) if self._options.gpus else places
+
+    def _fits(self) -> bool:
+        return any(map(self._places, self._nodes()))
+
+    def start(self, ticket: str, command: Sequence[str], log: Path) -> None:
+        """Hand a process to the cluster."""
+        self._tasks[self._remote.remote(list(command), str(log))] = ticket
+
+    def ended(self, timeout: float) -> list[tuple[str, int, str]]:
+        """Return the processes that ended, waiting up to `timeout` seconds for the first."""
+        if not self._tasks:
+            time.sleep(timeout)
+            return []
+        ready, _ = self._ray.wait(list(self._tasks), num_returns=1, timeout=timeout)
+        more, _ = self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=0)
+        return [(self._tasks.pop(task), *self._result(task)) for task in dict.fromkeys([*ready, *more])]
+
+    def _result(self, task: Any) -> tuple[int, str]:
+        try:
+            status, machine = self._ray.get(task)
+        except self._ray.exceptions.RayError as error:
+            return LOST, type(error).__name__
+        return int(status), str(machine)
+
+    def stop(self) -> None:
+        """Cancel all tasks, and wait until their processes have written their checkpoints."""
+        for task in self._tasks:
+            with contextlib.suppress(Exception):  # one that has just ended
+                self._ray.cancel(task, force=False)
+        if self._tasks:
+            self._ray.wait(list(self._tasks), num_returns=len(self._tasks), timeout=PATIENCE_SECONDS)
+        self._tasks.clear()
+        self._disconnect()
+
+    def _disconnect(self) -> None:
+        if self._owns:
+            self._ray.shutdown()
