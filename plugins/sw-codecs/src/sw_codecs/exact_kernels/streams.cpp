@@ -154,32 +154,42 @@ struct Levels {
 int32_t columns_of(const Levels& levels, const int64_t* mean, const int64_t* scale, int64_t m, int64_t columns,
                    int32_t* centre, int16_t* number) {
   constexpr int64_t LIMIT = int64_t{1} << 48, LARGEST_SCALE = int64_t{1} << 36;
-  double eighths[COLUMNS], middle[COLUMNS], ratio[COLUMNS];
-  int64_t wrong = 0;
-  const double divisor = static_cast<double>(m), half = static_cast<double>(m / 2);
-  for (int64_t c = 0; c < columns; ++c) {
-    wrong |= (mean[c] <= -LIMIT) | (mean[c] >= LIMIT) | (scale[c] <= -LIMIT) | (scale[c] >= LIMIT);
-    eighths[c] = static_cast<double>(mean[c]);
-    const int64_t width = scale[c] < 0 ? 0 : scale[c] > LARGEST_SCALE ? LARGEST_SCALE : scale[c];
-    ratio[c] = static_cast<double>(width);
-  }
-  if (wrong) return PARAMETER_WRONG;
-  for (int64_t c = columns; c % LANES; ++c) eighths[c] = ratio[c] = 0;
-  int64_t beyond = 0;
+  double middle[COLUMNS], eighths[COLUMNS], ratio[COLUMNS];
+  IntVec wrong{}, beyond{};
+  const Vec divisor = all(static_cast<double>(m)), half = all(static_cast<double>(m / 2));
   for (int64_t c = 0; c < columns; c += LANES) {
-    const Vec e = floor_of((load(eighths + c) * 8.0 + all(half)) / all(divisor));
+    IntVec means{}, widths{};
+    if (c + LANES <= columns) {
+      means = *reinterpret_cast<const IntLoad*>(mean + c);
+      widths = *reinterpret_cast<const IntLoad*>(scale + c);
+    } else {
+      for (int64_t l = 0; c + l < columns; ++l) {
+        means[l] = mean[c + l];
+        widths[l] = scale[c + l];
+      }
+    }
+    wrong |= (means <= -LIMIT) | (means >= LIMIT) | (widths <= -LIMIT) | (widths >= LIMIT);
+    widths = widths < 0 ? IntVec{} : widths;
+    widths = widths > LARGEST_SCALE ? IntVec{} + LARGEST_SCALE : widths;
+    const Vec e = floor_of((of_integers(means) * 8.0 + half) / divisor);
     const Vec at = floor_of((e + 4.0) * 0.125);
-    const IntVec far = (at >= all(static_cast<double>(SYMBOL_LIMIT))) | (at <= all(-static_cast<double>(SYMBOL_LIMIT)));
-    for (int l = 0; l < LANES; ++l) beyond |= far[l];
+    beyond |= (at >= all(static_cast<double>(SYMBOL_LIMIT))) | (at <= all(-static_cast<double>(SYMBOL_LIMIT)));
     store(eighths + c, e + 4.0 - at * 8.0);
     store(middle + c, at);
-    store(ratio + c, floor_of(load(ratio + c) * 4096.0 / all(divisor)));
+    store(ratio + c, floor_of(of_integers(widths) * 4096.0 / divisor));
   }
-  if (beyond) return BEYOND_LIMIT;
-  for (int64_t c = 0; c < columns; ++c) {
-    centre[c] = static_cast<int32_t>(middle[c]);
-    number[c] = static_cast<int16_t>(8 * levels.of(ratio[c]) + static_cast<int32_t>(eighths[c]));
+  int64_t any_wrong = 0, any_beyond = 0;
+  for (int l = 0; l < LANES; ++l) {
+    any_wrong |= wrong[l];
+    any_beyond |= beyond[l];
   }
+  if (any_wrong) return PARAMETER_WRONG;
+  if (any_beyond) return BEYOND_LIMIT;
+  int32_t level[COLUMNS];
+  for (int64_t c = 0; c < columns; ++c) level[c] = levels.of(ratio[c]);
+  for (int64_t c = 0; c < columns; ++c) centre[c] = static_cast<int32_t>(middle[c]);
+  for (int64_t c = 0; c < columns; ++c)
+    number[c] = static_cast<int16_t>(8 * level[c] + static_cast<int32_t>(eighths[c]));
   return FINE;
 }
 
