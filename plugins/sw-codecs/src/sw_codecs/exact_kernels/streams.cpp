@@ -29,7 +29,7 @@ void order_by_table(const int16_t* number, int64_t n, uint16_t* order, int32_t* 
 }
 
 int32_t decode_one(const Tables& tables, const uint8_t* data, const int64_t* sizes, const int32_t* centre,
-                   const int16_t* number, int64_t n, int32_t* symbols, const Crc& crc) {
+                   const int16_t* number, int64_t n, int32_t* symbols) {
   uint16_t order[STREAM];
   int32_t begin[TABLES + 1];
   order_by_table(number, n, order, begin);
@@ -53,12 +53,11 @@ int32_t decode_one(const Tables& tables, const uint8_t* data, const int64_t* siz
     }
   }
   if (!words.used_up()) return WORDS_LEFT;
-  if (!escapes.used_up()) return ESCAPES_WRONG;
-  return crc.of(symbols, n) == sizes[0] ? FINE : CRC_WRONG;
+  return escapes.used_up() ? FINE : ESCAPES_WRONG;
 }
 
 void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32_t* centre, const int16_t* number,
-                int64_t n, const int32_t* symbols, const Crc& crc) {
+                int64_t n, const int32_t* symbols) {
   uint16_t order[STREAM];
   int32_t begin[TABLES + 1];
   order_by_table(number, n, order, begin);
@@ -81,7 +80,6 @@ void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32
       if (offset > radius || offset < -radius) escapes.beyond(offset, radius);
     }
   }
-  sizes[0] = crc.of(symbols, n);
   sizes[1] = words.bytes;
   sizes[2] = escapes.bytes();
 }
@@ -90,13 +88,12 @@ void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32
 
 int32_t decode_streams(const Tables& tables, const Streams& streams, const int32_t* centre, const int16_t* number,
                        int64_t count, int32_t* symbols, const Parallel& parallel) {
-  static const Crc crc;
   std::atomic<int32_t> status{FINE};
   parallel(streams.count, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
       const int64_t at = s * STREAM, n = count - at < STREAM ? count - at : STREAM;
       raise(status, decode_one(tables, streams.data + streams.offset[s], streams.table + 3 * s, centre + at,
-                               number + at, n, symbols + at, crc));
+                               number + at, n, symbols + at));
     }
   });
   return status;
@@ -104,12 +101,10 @@ int32_t decode_streams(const Tables& tables, const Streams& streams, const int32
 
 int32_t encode_streams(const Tables& tables, const Sinks& sinks, const int32_t* centre, const int16_t* number,
                        int64_t count, const int32_t* symbols, const Parallel& parallel) {
-  static const Crc crc;
   parallel(sinks.count, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
       const int64_t at = s * STREAM, n = count - at < STREAM ? count - at : STREAM;
-      encode_one(tables, sinks.data + sinks.offset[s], sinks.table + 3 * s, centre + at, number + at, n, symbols + at,
-                 crc);
+      encode_one(tables, sinks.data + sinks.offset[s], sinks.table + 3 * s, centre + at, number + at, n, symbols + at);
     }
   });
   return FINE;
