@@ -134,7 +134,7 @@ void check_lattice(const Tensor& centre, const Tensor& number, const char* op) {
 
 int64_t streams_of(int64_t symbols) { return (symbols + STREAM - 1) / STREAM; }
 
-// (symbols [n] i32, status) of `data`, whose streams have `sizes` [streams, 3]: CRC-32, bytes of words, of escapes.
+// (symbols [n] i32, status) of `data`, whose streams have `sizes` [streams, 3]: anything, bytes of words, of escapes.
 std::tuple<Tensor, int64_t> decode_streams(at::TensorList tables, const Tensor& data, const Tensor& sizes,
                                            const Tensor& centre, const Tensor& number) {
   const char* op = "decode_streams";
@@ -165,7 +165,7 @@ std::tuple<Tensor, Tensor> encode_streams(at::TensorList tables, const Tensor& s
   int64_t bytes = 0;
   const std::vector<int64_t> offsets = places_of(counts, bytes);
   Tensor data = at::empty({bytes}, symbols.options().dtype(at::kByte));
-  Tensor sizes = at::empty({static_cast<int64_t>(counts.size()), 3}, symbols.options().dtype(at::kLong));
+  Tensor sizes = at::zeros({static_cast<int64_t>(counts.size()), 3}, symbols.options().dtype(at::kLong));
   const Sinks sinks{data.mutable_data_ptr<uint8_t>(), offsets.data(), sizes.mutable_data_ptr<int64_t>(), sizes.size(0)};
   SW_SELECT(encode_streams)(tables_of(tables, op), sinks, centre.const_data_ptr<int32_t>(),
                             number.const_data_ptr<int16_t>(), count, symbols.const_data_ptr<int32_t>(),
