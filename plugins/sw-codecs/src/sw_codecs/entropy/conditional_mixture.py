@@ -161,7 +161,7 @@ class ConditionalMixture:
 
     def _rows(self, context: RowMixture, where: Any, shape: tuple[int, ...]) -> _Rows:
         parts = [
-            np.require(np.broadcast_to(_array(each), shape)[where].reshape(-1), requirements="W")
+            np.broadcast_to(_array(each), shape)[where].reshape(-1)
             for each in (context.mean, context.scale, context.second_mean, context.second_scale, context.logit,
                          context.step)
         ]  # fmt: skip
