@@ -56,7 +56,11 @@ def offered(line: str, incomplete: str = "") -> list[str]:
         ("bench --method", "3", ["3dgs"]),
         ("bench --executor", "lo", ["local"]),
         ("bench", "plan", ["<file>"]),
-        ("run --set", "re", []),
+        ("run --set", "densify.ab", ["densify.absgrad="]),
+        ("run --method hac,lightgaussian --set", "growth.init", ["growth.init_factor="]),
+        ("run --method nobody --set", "see", ["seed="]),
+        ("eval x.swz --set", "reso", ["resolution="]),
+        ("eval x.swz --set", "densify", []),
     ],
 )
 def test_names_are_completed(line, incomplete, wanted, monkeypatch):
@@ -115,7 +119,8 @@ def test_every_parameter_that_takes_a_word_offers_something_if_it_can():
             by_type = not isinstance(parameter.type, (click.types.StringParamType, click.types.FuncParamType))
             if not wordless and not by_type and parameter._custom_shell_complete is None:
                 silent.append(parameter.name)
-    assert set(silent) == {"images", "sets", "pins", "name", "only", "seed", "given"}  # only the user knows their values
+    # Only the user knows their values.
+    assert set(silent) == {"images", "pins", "name", "only", "seed", "given"}
 
 
 def test_every_option_that_takes_a_value_says_what_holds_without_it():

@@ -1,4 +1,4 @@
-"""Registers the commands `sw report` and `sw compare`, and makes the tables and pages that `sw run` ends with."""
+"""Registers `sw report` and `sw compare`, makes the tables and pages that `sw run` ends with, logs to TensorBoard."""
 
 from __future__ import annotations
 
@@ -7,13 +7,22 @@ from typing import TYPE_CHECKING
 from splatwizard_core.api import Registry, hookimpl
 
 if TYPE_CHECKING:
-    from splatwizard_core.tooling import FinishedRuns
+    from splatwizard_core.tooling import FinishedRuns, StartedTraining, TrainingObserver
 
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
     registry.add("report", "sw_report.command:report", position=4.7, summary="tables, curves, BD-rates, one HTML page")
     registry.add("compare", "sw_report.compare:compare", position=4.8, summary="a run beside published figures")
+
+
+@hookimpl
+def run_started(training: StartedTraining) -> TrainingObserver | None:
+    if not training.log.tensorboard:
+        return None
+    from sw_report.tensorboard_log import TensorBoardLog
+
+    return TensorBoardLog(training.directory / "tensorboard")
 
 
 @hookimpl

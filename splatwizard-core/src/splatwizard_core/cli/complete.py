@@ -1,7 +1,8 @@
-"""Words that the TAB key completes: registered names, rate points, presets, scenes. Imports nothing heavy."""
+"""Words that the TAB key completes: registered names, rate points, presets, scenes; only keys take importing torch."""
 
 from __future__ import annotations
 
+import contextlib
 import os
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
@@ -63,15 +64,34 @@ def _registered(kind: str) -> Iterable[Entry]:
     return load_plugins().registries[kind]
 
 
-def _declared(context: click.Context, field: str) -> list[str]:
-    """Declared values of the methods on the command line, without importing them."""
+def _methods(context: click.Context) -> list[Entry]:
+    """The methods on the command line, else the default one; none where the command takes none."""
+    if not {"method", "methods"} & {each.name for each in context.command.params}:
+        return []
     given = context.params.get("methods") or context.params.get("method") or ()
     named = {name.strip() for text in ([given] if isinstance(given, str) else given) for name in text.split(",")}
-    chosen = [e for e in _registered("method") if (e.name in named if named else e.declared.get("default"))]
-    return [value for entry in chosen for value in entry.declared.get(field, ())]
+    return [e for e in _registered("method") if (e.name in named if named else e.declared.get("default"))]
+
+
+def _declared(context: click.Context, field: str) -> list[str]:
+    """Declared values of these methods, without importing them."""
+    return [value for entry in _methods(context) for value in entry.declared.get(field, ())]
+
+
+def _keys(context: click.Context) -> dict[str, str | None]:
+    """Keys of --set: of these methods, which are imported for it, of the run and of the scene."""
+    from splatwizard_core.training.keys import block_keys
+    from splatwizard_core.training.params import PipelineParams, SceneParams
+
+    found: dict[str, str | None] = {}
+    for entry in _methods(context):
+        with contextlib.suppress(Exception):  # one that is broken offers nothing
+            found |= block_keys(entry.load().Config)
+    return {f"{key}=": told for key, told in (found | block_keys(PipelineParams) | block_keys(SceneParams)).items()}
 
 
 RATE = Word(lambda context: dict.fromkeys([*_declared(context, "rates"), *RATE_ALIASES]))
 PRESET = Word(lambda context: dict.fromkeys(_declared(context, "presets") or COMMON_PRESETS))
+KEY = Word(_keys)
 SCENE = Word(_scenes, "dir")
 SCENE_OR_FILE = Word(_scenes, "file")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from splatwizard_core.cli.complete import PRESET, RATE, SCENE, name_of
+from splatwizard_core.cli.complete import KEY, PRESET, RATE, SCENE, name_of
 from splatwizard_core.cli.paths import OUTPUT_FOLDER
 from splatwizard_core.cli.streams import without_orders
 from splatwizard_core.plugins.guards import prints_to_stderr
@@ -68,7 +68,7 @@ config_option = click.option(
     help="TOML file of values; config.toml of a run directory repeats that run.  [default: none]",
 )  # fmt: skip
 set_option = click.option(
-    "--set", "sets", multiple=True, metavar="KEY=VALUE",
+    "--set", "sets", multiple=True, metavar="KEY=VALUE", type=KEY,
     help="One value, such as iterations=7000 (steps) or resolution=4; repeatable, wins over everything else.",
 )  # fmt: skip
 init_option = click.option(

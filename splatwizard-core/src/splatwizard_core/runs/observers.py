@@ -17,6 +17,7 @@ from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.runs.record import Record
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.training.housekeeping import OnStep
+from splatwizard_core.training.params import LogParams
 from splatwizard_core.training.trainer import StepRecord
 
 if TYPE_CHECKING:
@@ -33,12 +34,14 @@ class StartedTraining:
     directory   the run directory
     scene       with the training views
     rasterizer  draws the model as the training does
+    log         what else the user wants it logged for
     """
 
     method: str
     directory: Path
     scene: Scene
     rasterizer: Rasterizer
+    log: LogParams = field(default_factory=LogParams)
 
 
 class TrainingObserver(Protocol):

@@ -212,7 +212,7 @@ def _train_stages(
     }
     if ppl.eval_every:
         decode_all(scene.test)  # here, so that they do not count as memory of the training
-    started = StartedTraining(resolved.method, directory, scene, rasterizer)
+    started = StartedTraining(resolved.method, directory, scene, rasterizer, ppl.log)
     watching = plugins.hook.run_started(training=started) if watched else []
     cores = CoreTime()
     with watched_by(watching, plugins, session.say) as after_step:

@@ -50,6 +50,12 @@ class RasterParams(Params):
         return {name: value for name, value in handler(self).items() if value is not None}
 
 
+class LogParams(Params):
+    """Programs that a training is logged for besides log.jsonl: observers of `run_started` read it."""
+
+    tensorboard: bool = Field(False, description="write the curves for TensorBoard too, into tensorboard/ of the run")
+
+
 class PipelineParams(Params):
     """Parameters of the run that no method owns (`ppl` in the paper's signature)."""
 
@@ -66,6 +72,11 @@ class PipelineParams(Params):
     clamp_render: bool = Field(False, description="clamp the render to [0,1] before the loss (inria 2024)")
     profile: Literal["none", "stages"] = Field("none", description="stages: time each stage of a step")
     raster: RasterParams = Field(RasterParams(), description="which rasterizers may serve")
+    log: LogParams = Field(LogParams(), description="where else the training is logged")
+
+    @model_serializer(mode="wrap")
+    def _given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in handler(self).items() if key != "log" or self.log != LogParams()}
 
 
 _types = typing.get_type_hints(SceneOptions)
