@@ -36,7 +36,7 @@ ROOMS = {
     "method": {"training", "coding", "gaussians", "scene", "plugins"},
     "runs": {"method", *BELOW_RUNS},
     "cli": {"runs", "method", *BELOW_RUNS},
-    "steps": {"cli", "runs", "training", "api", "tooling"},
+    "steps": {"cli", "runs", "evaluation", "training", "api", "tooling"},
     "builtin": {"plugins"},
     "__main__": {"cli"},
     # The faces import what they lend when somebody asks for it.

@@ -38,7 +38,7 @@ def start(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
                 return 1
             if words[0] == "run":
                 out, method = Path(words[words.index("--out") + 1]), words[words.index("--method") + 1]
-                run = out / "demo-tiny" / method / {"3dgs": "r6", "lightgaussian": "r3", "hac": "r4"}[method]
+                run = out / "demo-tiny" / method / {"3dgs": "r3", "lightgaussian": "r3", "hac": "r4"}[method]
                 run.mkdir(parents=True, exist_ok=True)
                 (run / "metrics.json").write_text("{}")
             else:

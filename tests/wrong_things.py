@@ -173,7 +173,7 @@ def make_models(root: Path) -> None:
 
 
 def make_runs(root: Path) -> None:
-    """run/r6, a run of a few steps, and copies of that directory with one thing wrong: each has no neighbour."""
+    """run/r3, a run of a few steps, and copies of that directory with one thing wrong: each has no neighbour."""
     out = root / "out"
     sets = [f"iterations={STEPS}", "checkpoint_every=1", "keep_checkpoints=9", "raster.prefer=reference"]
     sw("train", "--scene", "demo:tiny", "--out", out, *(word for pair in sets for word in ("--set", pair)))

@@ -3,19 +3,18 @@
 import pytest
 import torch
 from sw_gaussians.surfels import Surface, SurfelModel
+from sw_kit import short_training
+from sw_kit.short_training import demo, file_of, psnr
 
-from splatwizard_core.coding.container import ContainerReader, ContainerWriter
+from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
-from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from sw_2dgs.config import TwoDGSConfig
 from sw_2dgs.method import TwoDGS
 
@@ -37,7 +36,7 @@ PLAN = {
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene("demo:tiny", SceneOptions(init_points=600), load_plugins())
+    return demo()
 
 
 @pytest.fixture(scope="module")
@@ -51,25 +50,12 @@ def method(**values) -> TwoDGS:
 
 
 def train(scene, rasterizer, directory=None, stop_after=None, **values):
-    made = method(**values)
-    return TrainingRun(
-        made.stages(), lambda: made.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-        directory=directory, identity={}, trained={}.__getitem__, stop_after=stop_after,
-    ).train()  # fmt: skip
+    return short_training.train(method(**values), scene, rasterizer, directory=directory, stop_after=stop_after)
 
 
 @torch.no_grad()
 def drawn(model, camera, rasterizer, **options) -> torch.Tensor:
     return rasterizer.render(model.gaussians(camera, rasterizer), camera, RasterOptions(**options))
-
-
-def psnr(model, scene: Scene, rasterizer) -> float:
-    """Mean over the training views, dB."""
-    errors = []
-    for view in scene.train:
-        image = drawn(model, view.camera, rasterizer, background=scene.background).image.clamp(0, 1)
-        errors.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
-    return float(torch.stack(errors).mean())
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +81,8 @@ def test_stopped_and_resumed_equals_one_go(scene, rasterizer, trained, tmp_path)
 
 
 def encoded(model, rate: str) -> bytes:
-    writer = ContainerWriter("2dgs", TwoDGS.version)
     values = {key.replace(".", "__"): value for key, value in TwoDGS.RATES[rate].items()}
-    method(**values).encode(model, writer)
-    return writer.to_bytes()
+    return file_of(method(**values), model)
 
 
 def decoded(data: bytes) -> SurfelModel:

@@ -67,7 +67,22 @@ title = "No scenes"
 name = "truth.zip"
 url = "{address}/truth.zip"
 into = "points"
+
+[dataset.weights]
+title = "Two files that are no archives"
+[[dataset.weights.file]]
+name = "first.pth"
+url = "{address}/first.pth"
+sha256 = "{first}"
+into = "weights"
+plain = true
+[[dataset.weights.file]]
+name = "second.pth"
+url = "{address}/second.pth"
+into = "weights"
+plain = true
 """
+FIRST, SECOND = b"first weights", b"second weights"
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +102,13 @@ def archive(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def site(archive: bytes, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
     with running_site() as running:
-        running.files = {"/lab.zip": archive, "/loose.zip": archive, "/truth.zip": archive}
+        running.files = {
+            "/lab.zip": archive,
+            "/loose.zip": archive,
+            "/truth.zip": archive,
+            "/first.pth": FIRST,
+            "/second.pth": SECOND,
+        }
         running.etags["/lab.zip"] = '"1"'
         yield running
 
@@ -96,7 +117,8 @@ def site(archive: bytes, monkeypatch: pytest.MonkeyPatch) -> Iterator[Site]:
 def data(tmp_path: Path, site: Site, archive: bytes, monkeypatch: pytest.MonkeyPatch) -> Path:
     """$SPLATWIZARD_DATA, with the registry above."""
     registry = tmp_path / "registry.toml"
-    registry.write_text(REGISTRY.format(address=site.address, sha256=hashlib.sha256(archive).hexdigest()))
+    pins = {"sha256": hashlib.sha256(archive).hexdigest(), "first": hashlib.sha256(FIRST).hexdigest()[:8]}
+    registry.write_text(REGISTRY.format(address=site.address, **pins))
     monkeypatch.setenv("SPLATWIZARD_DATA_REGISTRY", str(registry))
     monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path / "data"))
     return tmp_path / "data"
@@ -276,6 +298,23 @@ def test_files_that_are_no_scenes_go_into_their_folder(data: Path, capsys):
     assert states(capsys)["truth"][0] == "present"
     assert main(["data", "fetch", "truth", "-y"]) == 0
     assert "there already: truth/points" in capsys.readouterr().out
+
+
+def test_plain_files_are_kept_as_they_are_and_held_against_the_digits_that_are_known(data: Path, site: Site, capsys):
+    folder = data / "weights" / "weights"
+    assert main(["data", "fetch", "weights", "-y"]) == 0
+    assert sorted(os.listdir(folder)) == ["first.pth", "second.pth"]
+    assert (folder / "first.pth").read_bytes() == FIRST
+    told = capsys.readouterr().out
+    assert "first.pth: 13 bytes" in told
+    assert told.count(": verified") == 1
+    assert states(capsys)["weights"][0] == "present"
+    (folder / "first.pth").unlink()
+    assert states(capsys)["weights"][0] == "partly"
+    site.files["/first.pth"] = b"other weights"
+    assert main(["data", "fetch", "weights", "-y"]) != 0
+    assert "SHA-256 is" in capsys.readouterr().err
+    assert os.listdir(folder) == ["second.pth"]
 
 
 def test_a_scene_that_lacks_something_is_not_written_over(data: Path, site: Site, capsys):

@@ -15,6 +15,7 @@ from sw_geometry.chamfer import Truth, compare
 from sw_geometry.clusters import cluster_of_triangles
 from sw_geometry.depth import DepthView, as_depth_view
 from sw_geometry.fusion import Fusion
+from sw_geometry.legacy import LegacyFusion, works
 from sw_geometry.nearest import to_triangles
 from sw_geometry.open3d_import import import_open3d
 from sw_geometry.parameters import Parameters, resolve
@@ -236,3 +237,37 @@ def test_distances_to_triangles_agree_with_open3d(ball):
     queries = np.random.default_rng(0).normal(size=(2000, 3)) * 0.4
     theirs = caster_of(ball.post).compute_distance(import_open3d().core.Tensor(queries.astype(np.float32))).numpy()
     assert to_triangles(queries, ball.post)[0] == pytest.approx(theirs, abs=2e-6)  # theirs is float32
+
+
+needs_legacy = pytest.mark.skipif(
+    not works(import_open3d()), reason="Open3D 0.20 extracts nothing with its older class"
+)
+
+
+@pytest.mark.skipif(works(import_open3d()), reason="it works with this Open3D")
+def test_where_the_class_does_not_work_it_is_refused_in_one_line():
+    with pytest.raises(CapabilityError, match=r"legacy backend .* pip install 'open3d-cpu<0\.20'"):
+        build([], 0, replace(PARAMETERS, backend="legacy"), label="test")
+
+
+@needs_legacy
+def test_both_backends_make_the_same_sphere(views, ball):
+    """Half a pixel in the principal point, which the two count differently, would make them differ by 0.0012."""
+    older = build(views, len(views), replace(PARAMETERS, backend="legacy"), label="test")
+    assert error(older) == pytest.approx(error(ball), rel=0.1)
+    assert len(older.post) == pytest.approx(len(ball.post), rel=0.02)
+    assert "ScalableTSDFVolume" in older.facts["backend"]
+    assert np.abs(older.post.colors - 0.5).max() < 0.01
+    assert ((older.post.crossed() * older.post.corners.mean(axis=1)).sum(axis=1) > 0).mean() > 0.999
+
+
+@needs_legacy
+def test_it_keeps_what_any_view_saw_and_no_other_rule(views):
+    volume = LegacyFusion(voxel_size=0.05, sdf_trunc=0.2, depth_trunc=5.0)
+    view = views[0]
+    volume.add(np.zeros_like(view.depth), view.color, view.K, view.E)
+    assert (volume.used, volume.skipped) == (0, 1)
+    volume.add(view.depth, view.color, view.K, view.E)
+    assert len(volume.mesh(min_views=1)) > 100
+    with pytest.raises(UserInputError, match="min_views is 2"):
+        volume.mesh(min_views=2)

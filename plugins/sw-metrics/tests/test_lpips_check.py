@@ -2,9 +2,15 @@
 
 import hashlib
 import importlib.metadata
+import importlib.util
+import re
 
+import pytest
+from sw_datasets.downloads.fetch import Job
+from sw_datasets.downloads.registry import parse_registry
 from sw_metrics import lpips_weights
 from sw_metrics.check import check_lpips
+from sw_metrics.perceptual import install_command
 
 from splatwizard_core.plugins import load_plugins
 
@@ -43,4 +49,38 @@ def test_a_package_lpips_that_is_not_installed_is_an_extra(monkeypatch):
 
     monkeypatch.setattr("sw_metrics.perceptual.importlib.metadata.version", absent)
     found = check_lpips()[0]
-    assert (found.state, found.mend) == ("missing", "pip install 'sw-metrics[lpips]'")
+    assert (found.state, found.mend) == ("missing", install_command())
+
+
+@pytest.mark.parametrize(
+    ("version", "command"),
+    [
+        ("2.13.0", "pip install lpips torch==2.13.0 torchvision==0.28.0"),
+        ("2.4.1+cpu", "pip install lpips torch==2.4.1 torchvision==0.19.1"),
+        ("2.14.0a0+git12", "pip install 'sw-metrics[lpips]'"),
+    ],
+)
+def test_the_command_names_the_torchvision_of_the_torch_that_is_there(version, command, monkeypatch):
+    monkeypatch.setattr("sw_metrics.perceptual.torch.__version__", version)
+    assert install_command() == command
+
+
+def test_the_torchvision_that_is_installed_is_the_one_that_would_be_named():
+    told = re.search(r"torchvision==(\S+)", install_command())
+    if told is None or importlib.util.find_spec("torchvision") is None:
+        pytest.skip("a torch of one's own, or no torchvision")
+    assert importlib.metadata.version("torchvision").partition("+")[0] == told[1]
+
+
+def test_sw_data_fetch_knows_the_backbones_and_where_they_are_looked_for(monkeypatch, tmp_path):
+    (dataset,) = parse_registry(load_plugins().downloads.entry("lpips").load()(), "lpips")
+    assert [file.name for file in dataset.files] == [b.file_name for b in lpips_weights.BACKBONES.values()]
+    assert all(file.plain and file.name.endswith(f"-{file.sha256}.pth") for file in dataset.files)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "hub"))
+    monkeypatch.setenv("SPLATWIZARD_DATA", str(tmp_path))
+    assert lpips_weights.find_weights("vgg", None) is None
+    job = Job(dataset, dataset.files[0], ())
+    job.target(tmp_path).mkdir(parents=True)
+    (job.target(tmp_path) / dataset.files[0].name).write_bytes(b"weights")
+    assert job.is_there(tmp_path)
+    assert lpips_weights.find_weights("vgg", None) == job.target(tmp_path) / dataset.files[0].name

@@ -4,7 +4,7 @@ import io
 
 import pytest
 from rich.console import Console
-from sw_report import results
+from sw_report import declared, results
 
 from splatwizard_core.runs.record import read_record
 
@@ -134,3 +134,30 @@ def test_no_speed_is_the_best_where_one_was_disturbed(make_run):
         slow = make_run(method=name, change=of(10.0, contended))
         text = printed([(read_record(path / "metrics.json"), path) for path in (quick, slow)], 200)
         assert rows(text)[0][-1].startswith("*") == marked
+
+
+@pytest.mark.parametrize(
+    ("encoders", "counts", "config", "wanted"),
+    [
+        ([("coder", "range"), ("method", "3dgs")], {"num_gaussians": 10}, {"sh_degree": 3}, 2360),
+        ([("coder", "range")], {"num_gaussians": 10}, {"sh_degree": 0}, 560),
+        ([("coder", "plain")], {"num_gaussians": 10}, {"sh_degree": 3}, None),  # its file is that size
+        ([("coder", "range")], {"num_gaussians": 10, "num_anchors": 1}, {"sh_degree": 3}, None),
+        ([("coder", "range")], {"num_gaussians": 10}, {}, None),
+        ([("coder", "absent")], {"num_gaussians": 10}, {"sh_degree": 3}, None),
+    ],
+)
+def test_float32_bytes_are_those_of_compressed_gaussians(encoders, counts, config, wanted):
+    assert declared.float32_bytes(encoders, counts, config) == wanted
+
+
+def test_the_size_as_float32_is_said_once_unless_a_row_has_it(make_run):
+    def coded_by(coder):
+        part = {"kind": "coder", "name": coder, "distribution": "sw-toy", "version": "0.1"}
+        phases = [{"phase": "encode", "provided_by": [part]}]
+        return lambda c: c.update(phases=phases, config={"config": {"sh_degree": 3}})
+
+    folders = [make_run(rate=rate, change=coded_by(coder)) for rate, coder in (("r1", "range"), ("r2", "plain"))]
+    done = [(read_record(folder / "metrics.json"), folder) for folder in folders]
+    assert printed(done[:1], 160).count("as float32, toy would take about 0.29 MB.") == 1  # 1,234 x 236 bytes
+    assert "would take" not in printed(done, 160)

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from sw_kit import short_training
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
@@ -9,11 +10,7 @@ from splatwizard_core.method import create_method
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.streams import stream
-from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from sw_speedy_splat.method import SpeedySplat
 
 pytestmark = pytest.mark.pipeline
@@ -27,7 +24,7 @@ SHORT = {
 
 @pytest.fixture(scope="module")
 def scene():
-    return load_scene("demo:tiny", SceneOptions(init_points=600), load_plugins())
+    return short_training.demo()
 
 
 @pytest.fixture(scope="module")
@@ -37,11 +34,7 @@ def rasterizer():
 
 def train(scene, rasterizer, directory=None, stop_after=None, **sets):
     method = SpeedySplat(load_plugins(), resolve(SpeedySplat, "quick", sets={**SHORT, **sets}).config)
-    return TrainingRun(
-        method.stages(), lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-        directory=directory, identity={}, trained=lambda name: pytest.fail(f"asked for '{name}'"),
-        stop_after=stop_after,
-    ).train()  # fmt: skip
+    return short_training.train(method, scene, rasterizer, directory=directory, stop_after=stop_after)
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +45,7 @@ def trained(scene, rasterizer):
 def test_it_ends_with_fewer_gaussians_than_3dgs_alone(scene, rasterizer, trained):
     values = {key.removeprefix("base."): value for key, value in SHORT.items() if not key.startswith("prune")}
     plain = create_method(load_plugins(), "3dgs", values, preset="quick")
-    alone = TrainingRun(
-        plain.stages(), lambda: plain.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-        directory=None, identity={}, trained=lambda name: None,
-    ).train()  # fmt: skip
+    alone = short_training.train(plain, scene, rasterizer)
     assert trained.model.num_rows < alone.model.num_rows / 2
     assert all(bool(torch.isfinite(parameter).all()) for parameter in trained.model.parameters())
 
@@ -65,10 +55,7 @@ def test_without_removals_it_is_3dgs_bit_for_bit(scene, rasterizer):
     ours = train(scene, rasterizer, **short, **{"prune.soft": 0.0, "prune.hard": 0.0})
     values = {key.removeprefix("base."): value for key, value in SHORT.items() if not key.startswith("prune")}
     plain = create_method(load_plugins(), "3dgs", {**values, **short}, preset="quick")
-    alone = TrainingRun(
-        plain.stages(), lambda: plain.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-        directory=None, identity={}, trained=lambda name: None,
-    ).train()  # fmt: skip
+    alone = short_training.train(plain, scene, rasterizer)
     assert ours.model.digest() == alone.model.digest()
 
 

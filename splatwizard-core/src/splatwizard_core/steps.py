@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core import api, tooling
-from splatwizard_core.cli.setup import open_training_session
+from splatwizard_core.cli.setup import only, open_training_session
+from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.runs.encode import encode_directory
 from splatwizard_core.runs.measure import Opened, measure, opener
 from splatwizard_core.runs.run import train_only
@@ -21,8 +22,9 @@ def _choices(options: dict[str, Any], **given: Any) -> tooling.Choices:
 
 
 def _training(method: str, scene: str | None, out: str | Path, options: dict[str, Any]) -> Any:
-    resolved = _choices(options, methods=(method,), scene=scene).resolve_one(tooling.load_plugins())
-    return open_training_session([resolved], tooling.load_plugins()), tooling.RunRequest(resolved, Path(out))
+    chosen = _choices(options, methods=(method,), scene=scene)
+    resolved, session = open_training_session(chosen, tooling.load_plugins())
+    return session, tooling.RunRequest(only(resolved), Path(out))
 
 
 def _session(options: dict[str, Any], scene: str | None = None) -> Any:
@@ -71,6 +73,6 @@ def evaluate(source: Opened | str | Path, scene: str | None = None, *, speed: bo
 def render(opened: Opened, view: api.View, **options: Any) -> api.RenderResult:
     """Draw a view: `image` [3,H,W] in 0..1, and the maps that `options`, those of RasterOptions, ask for."""
     session, resolved = _session({"device": opened.model.device.type})
-    rasterizer = session.rasterizer(resolved, tooling.suggested_rasterizers(opened.raster))
-    asked = replace(tooling.render_options(opened.raster, None), **options)
-    return tooling.render_view(opened.model, view.camera.to(session.device), rasterizer, asked)
+    rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(opened.raster))
+    asked = replace(quality.render_options(opened.raster, None), **options)
+    return quality.render_view(opened.model, view.camera.to(session.device), rasterizer, asked)

@@ -382,7 +382,7 @@ def test_ctrl_c_leaves_a_training_that_resumes(tmp_path: Path):
         "--set", "iterations=400", "--set", "checkpoint_every=50",
     ]  # fmt: skip
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    log = tmp_path / "demo-tiny" / "3dgs" / "r6" / "log.jsonl"
+    log = tmp_path / "demo-tiny" / "3dgs" / "r3" / "log.jsonl"
     deadline = time.monotonic() + 120
     while time.monotonic() < deadline and not list(tmp_path.rglob("*.safetensors")):
         time.sleep(0.1)

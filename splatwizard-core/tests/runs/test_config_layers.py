@@ -155,19 +155,50 @@ def test_a_written_file_refuses_another_rate_point_instead_of_ignoring_it(tmp_pa
         resolved(rate="r2", file=file)
 
 
-def test_rate_points_whose_values_are_all_overridden_are_told(monkeypatch: pytest.MonkeyPatch, capsys):
+@pytest.fixture
+def opened(monkeypatch: pytest.MonkeyPatch, capsys):
+    """(choices) -> the configurations of a training session of a scene with 1,000 x 1,000 pixels, and what was said."""
     from splatwizard_core.cli import setup
 
-    session = SimpleNamespace(device="cpu", scene=lambda each: None)
-    monkeypatch.setattr(setup, "open_session", lambda resolved, plugins: session)
-    monkeypatch.setattr("splatwizard_core.runs.device.device_reason", lambda *arguments: "on the CPU")
-    setup.open_training_session([resolved(rate=r) for r in ("r1", "r2", "r3")], None)
-    assert capsys.readouterr().err == "on the CPU\n"
-    setup.open_training_session(
-        [resolved("codec.mode=exact", "codec.bits.means=4", rate=r) for r in ("r1", "r3")], None
+    def open_it(found, side: int = 1000, **chosen):
+        camera = SimpleNamespace(width=side, height=side)
+        scene = SimpleNamespace(train=[SimpleNamespace(camera=camera)])
+        session = SimpleNamespace(device="cpu", scene=lambda each: scene)
+        monkeypatch.setattr(setup, "open_session", lambda resolved, plugins: session)
+        monkeypatch.setattr("splatwizard_core.runs.device.device_reason", lambda *arguments: "on the CPU")
+        monkeypatch.setattr(setup.Choices, "resolve", lambda choices, plugins: found(choices.preset))
+        configurations, _ = setup.open_training_session(setup.Choices(**chosen), None)
+        return configurations, capsys.readouterr().err.splitlines()
+
+    return open_it
+
+
+def test_rate_points_whose_values_are_all_overridden_are_told(opened):
+    _, told = opened(lambda preset: [resolved(rate=r) for r in ("r1", "r2", "r3")])
+    assert told == ["on the CPU"]
+    _, told = opened(lambda preset: [resolved("codec.mode=exact", "codec.bits.means=4", rate=r) for r in ("r1", "r3")])
+    assert told[0].startswith("warning: toy r1, r3: these rate points give the same file")
+    assert told[1:] == ["on the CPU"]
+
+
+@pytest.mark.parametrize(
+    ("side", "sets", "chosen", "preset"),
+    [
+        (100, (), {}, "quick"),
+        (1000, (), {}, "paper"),
+        (100, (), {"preset": "paper"}, "paper"),
+        (100, ("iterations=5",), {}, "paper"),  # who says how long knows what they want
+        (100, (), {"config_file": "config.toml"}, "paper"),
+    ],
+)
+def test_a_tiny_scene_gets_the_quick_plan_unless_something_else_is_asked_for(opened, side, sets, chosen, preset):
+    (found,), told = opened(lambda asked: [resolved(*sets, preset=asked or "paper")], side, **chosen)
+    assert found.preset == preset
+    assert told[:-1] == (
+        ["preset quick: the plan scaled down for 10,000 training pixels (--preset paper runs it in full)"]
+        if preset == "quick"
+        else []
     )
-    warning, _ = capsys.readouterr().err.splitlines()
-    assert warning.startswith("warning: toy r1, r3: these rate points give the same file")
 
 
 def test_rate_points_that_differ_only_in_the_codec_train_alike():

@@ -56,6 +56,8 @@ if TYPE_CHECKING:
     from splatwizard_native.scalars import Verdict as Verdict
     from splatwizard_native.scalars import read_scalars as read_scalars
     from splatwizard_native.settings import cache_root as cache_root
+    from splatwizard_native.strict_json import dump_strict as dump_strict
+    from splatwizard_native.strict_json import load_strict as load_strict
     from splatwizard_native.toolchain import find_compiler as find_compiler
 
 # Imported on first use: who only catches the errors, as every command does, need not wait for the rest.
@@ -80,6 +82,7 @@ MODULES = {
     "random_states": "capture_random_states preserved_random_states restore_random_states seeded",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root",
+    "strict_json": "dump_strict load_strict",
     "toolchain": "find_compiler",
 }
 """Module -> the names that are offered here."""

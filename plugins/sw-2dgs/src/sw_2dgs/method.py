@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from sw_gaussians.method import GaussianMethod
 from sw_gaussians.ply import load_ply
-from sw_gaussians.start import surfels_from_points
+from sw_gaussians.start import start_points, surfels_from_points
 from sw_gaussians.surfels import SurfelModel
 
 from splatwizard_core.api import SceneError
@@ -46,13 +46,9 @@ class TwoDGS(GaussianMethod):
                     path=config.init,
                 )
             return model
-        if scene.points is None or len(scene.points) == 0:
-            raise SceneError(
-                f"scene '{scene.name}' has no start points: 2DGS needs SfM points, random ones, or --set init=FILE.ply",
-                path=scene.path,
-            )
+        points = start_points(scene, "2DGS", instead="--set init=FILE.ply")
         return surfels_from_points(
-            scene.points, generator=generator, max_sh_degree=config.sh_degree, rotation=config.init_rotation
+            points, generator=generator, max_sh_degree=config.sh_degree, rotation=config.init_rotation
         )
 
     def stages(self) -> Sequence[Stage]:

@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from sw_gaussians.method import HEADER_KEY, GaussianMethod
 from sw_gaussians.ply import load_ply
 from sw_gaussians.stage import ThreeDGSStage
-from sw_gaussians.start import gaussians_from_points
+from sw_gaussians.start import gaussians_from_points, start_points
 from sw_gaussians.surfels import refuse_surfels
 
-from splatwizard_core.api import SceneError
 from sw_3dgs.config import MODES, ThreeDGSConfig
 from sw_3dgs.presets import PRESETS, RATES
 
@@ -32,7 +31,9 @@ class ThreeDGS(GaussianMethod):
     Config = ThreeDGSConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
-    DEFAULT_RATE: ClassVar[str] = "r6"  # exact: what the literature calls the size of 3DGS
+    DEFAULT_RATE: ClassVar[str] = (
+        "r3"  # a compressed file, as the other methods write; r6 is what the literature calls the size of 3DGS
+    )
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Gaussians of the .ply that `init` names, else one for each start point of the scene."""
@@ -41,19 +42,8 @@ class ThreeDGS(GaussianMethod):
             model = load_ply(config.init)
             refuse_surfels(model, f"init: {config.init}: method {self.name}")
             return model
-        if scene.points is None or len(scene.points) == 0:
-            raise SceneError(
-                f"scene '{scene.name}' has no start points: 3DGS needs SfM points, random ones, or --set init=FILE.ply",
-                path=scene.path,
-            )
-        if not config.mcmc.enabled:
-            return gaussians_from_points(scene.points, max_sh_degree=config.sh_degree)
-        return gaussians_from_points(
-            scene.points,
-            max_sh_degree=config.sh_degree,
-            opacity=config.mcmc.init_opacity,
-            scale_factor=config.mcmc.init_scale,
-        )
+        points = start_points(scene, "3DGS", instead="--set init=FILE.ply")
+        return gaussians_from_points(points, max_sh_degree=config.sh_degree, **config.mcmc.first_values())
 
     def stages(self) -> Sequence[Stage]:
         return [ThreeDGSStage(self.config)]

@@ -65,6 +65,10 @@ class MCMC(Params):
     init_opacity: float = Field(0.5, gt=0, lt=1, description="opacity at the start")
     init_scale: float = Field(0.1, gt=0, description="scales at the start, times the distance to the neighbours")
 
+    def first_values(self) -> dict[str, float]:
+        """Return the arguments `opacity` and `scale_factor` of `gaussians_from_points`; none where it is off."""
+        return {"opacity": self.init_opacity, "scale_factor": self.init_scale} if self.enabled else {}
+
 
 class Loss(Params):
     """The photometric loss."""

@@ -9,7 +9,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import GaussianModel, PointCloud, SceneError, rgb_to_dc
+from splatwizard_core.api import GaussianModel, PointCloud, Scene, SceneError, rgb_to_dc
 from sw_gaussians.knn import mean_squared_neighbor_distance
 from sw_gaussians.surfels import SurfelModel
 
@@ -24,6 +24,20 @@ Rotation = Literal["uniform4", "haar", "identity"]
 def logit(p: float) -> float:
     """ln(p / (1 - p)), the inverse of the logistic function."""
     return math.log(p / (1 - p))
+
+
+def start_points(scene: Scene, who: str, *, instead: str = "") -> PointCloud:
+    """Return the start points of a scene. Raises SceneError if it has none.
+
+    who         the method that needs them
+    instead     what else would do, for the message
+    """
+    if scene.points is None or len(scene.points) == 0:
+        other = f", or {instead}" if instead else ""
+        raise SceneError(
+            f"scene '{scene.name}' has no start points: {who} needs SfM points or random ones{other}", path=scene.path
+        )
+    return scene.points
 
 
 def gaussians_from_points(

@@ -13,6 +13,7 @@ from splatwizard_core.api import SplatwizardError, track
 from sw_geometry.clusters import largest_clusters
 from sw_geometry.depth import DepthView
 from sw_geometry.fusion import Fusion
+from sw_geometry.legacy import LegacyFusion
 from sw_geometry.mesh import Mesh, canonical
 from sw_geometry.open3d_import import import_open3d
 from sw_geometry.parameters import Parameters
@@ -38,7 +39,7 @@ def build(
     """Fuse views into a mesh, in canonical order: equal views give equal meshes.
 
     total       number of views, for the progress
-    max_memory  GB that the grid may take; None: half of the machine's
+    max_memory  GB that the grid may take; None: half of the machine's. The legacy backend watches no limit
 
     Raises SplatwizardError if there is no surface, UserInputError if memory would not suffice, CapabilityError without
     Open3D.
@@ -47,13 +48,14 @@ def build(
     began = time.perf_counter()
     limit = psutil.virtual_memory().total / 2 if max_memory is None else max_memory * 1e9
     device = "CUDA:0" if open3d.core.cuda.is_available() else "CPU:0"
-    fusion = Fusion(
-        voxel_size=parameters.voxel_size,
-        truncation=parameters.sdf_trunc / parameters.voxel_size,
-        depth_trunc=parameters.depth_trunc,
-        max_bytes=limit,
-        device=device,
-    )
+    fusion: Fusion | LegacyFusion
+    lengths = {"voxel_size": parameters.voxel_size, "depth_trunc": parameters.depth_trunc}
+    if parameters.backend == "legacy":
+        fusion, device = LegacyFusion(**lengths, sdf_trunc=parameters.sdf_trunc), "CPU:0"
+    else:
+        truncation = parameters.sdf_trunc / parameters.voxel_size
+        fusion = Fusion(**lengths, truncation=truncation, max_bytes=limit, device=device)
+    maker = "ScalableTSDFVolume" if parameters.backend == "legacy" else "VoxelBlockGrid"
     with track(label, total=total, unit="views") as bar:
         for view in views:
             fusion.add(view.depth, view.color, view.K, view.E)
@@ -67,7 +69,7 @@ def build(
         )
     facts = {
         **asdict(parameters),
-        "backend": f"open3d {open3d.__version__} VoxelBlockGrid {device}",
+        "backend": f"open3d {open3d.__version__} {maker} {device}",
         "views_used": fusion.used,
         "views_skipped": fusion.skipped,
         "vertices": len(raw.vertices),

@@ -66,6 +66,8 @@ def _depths(_context: click.Context, _parameter: click.Parameter, incomplete: st
     click.option("--units", type=click.Choice(["scene", "mm"]), default="scene", show_default=True,
                  help="DTU: units of the scene's cameras."),
     click.option("--chamfer", is_flag=True, help="Measure the mesh against the scene's truth, or DTU's."),
+    click.option("--backend", type=click.Choice(["tensor", "legacy"]),
+                 help="Class of Open3D that fuses; legacy needs Open3D before 0.20.  [default: tensor]"),
     click.option("--max-memory", type=LENGTH, metavar="GB",
                  help="What the grid may take.  [default: half of the machine's]"),
     click.option("--device", type=click.Choice(["auto", "cpu", "cuda"]),

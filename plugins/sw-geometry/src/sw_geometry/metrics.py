@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from splatwizard_core.api import CapabilityError, MetricResult, MetricSetup, SplatwizardError, Subject
+from splatwizard_core.api import CapabilityError, MetricResult, MetricSetup, SplatwizardError, Subject, UserInputError
 from sw_geometry import chamfer, dtu, dtu_scene
 from sw_geometry.build import Built, build
 from sw_geometry.chamfer import Truth, default_tau
@@ -86,6 +86,8 @@ def mesh_of(subject: Subject) -> Built:
 def build_from_model(subject: Subject, parameters: Parameters, max_memory: float | None) -> Built:
     """Draw the depth of the model from the cameras of its scene and fuse it."""
     if parameters.unbounded:
+        if parameters.backend == "legacy":
+            raise UserInputError("the legacy backend knows bounded scenes only: leave out unbounded or backend")
         from sw_geometry.unbounded import build_unbounded
 
         make = build_unbounded

@@ -29,6 +29,7 @@ class Parameters:
 
     depth_ratio     0: expected depth, 1: median
     focus, radius   the point that the cameras look at, and their smallest distance from it
+    backend         which class of Open3D fuses: tensor or legacy
     """
 
     voxel_size: float
@@ -45,6 +46,7 @@ class Parameters:
     cull: Literal["all", "any", "none"]
     focus: tuple[float, float, float]
     radius: float
+    backend: str = "tensor"
 
 
 def stated(model: object, static: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -84,6 +86,7 @@ def resolve(settings: MeshSettings, scene: Scene, static: Mapping[str, Any]) -> 
         cull=settings.cull or ("all" if is_dtu else "none"),
         focus=(float(focus[0]), float(focus[1]), float(focus[2])),
         radius=radius,
+        backend=settings.backend,
     )
 
 

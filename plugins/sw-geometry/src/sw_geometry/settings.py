@@ -30,6 +30,9 @@ class MeshSettings(BaseModel):
     mask: bool = Field(True, description="pixels outside the masks of the scene show no surface")
     views: Literal["train", "all"] = Field("train", description="views whose depth is fused")
     unbounded: bool = Field(False, description="experimental: contracted space, for scenes with a far background")
+    backend: Literal["tensor", "legacy"] = Field(
+        "tensor", description="Open3D's grid, or its older class, which Open3D 0.20 cannot extract with"
+    )
     max_memory: Positive | None = Field(None, description="GB that the grid may take; half of the machine's")
     cull: Literal["all", "any", "none"] | None = Field(None, description="rule of culling by masks, for DTU")
     tau: Positive | None = Field(None, description="distance within which a point counts as right, units of the scene")

@@ -7,7 +7,7 @@ import importlib
 from splatwizard_core.api import CapabilityError
 from splatwizard_core.tooling import Check, file_sha256
 from sw_metrics.lpips_weights import BACKBONES, find_weights, hub_folder
-from sw_metrics.perceptual import EXTRA, package_version
+from sw_metrics.perceptual import fitting_torchvision, install_command, package_version
 from sw_metrics.torchvision_import import import_torchvision
 
 GROUP = "metrics"
@@ -20,9 +20,10 @@ def check_lpips() -> list[Check]:
         import_torchvision()
         importlib.import_module("lpips")
     except CapabilityError:
-        checks = [Check(GROUP, "LPIPS package", "missing", "lpips is not installed", f"pip install '{EXTRA}'")]
+        checks = [Check(GROUP, "LPIPS package", "missing", "lpips is not installed", install_command())]
     except Exception as error:
-        mend = f"pip install --force-reinstall --no-deps torchvision '{EXTRA}'"
+        _, torchvision = fitting_torchvision() or ("", "torchvision")
+        mend = f"pip install --force-reinstall --no-deps lpips {torchvision}"
         checks = [Check(GROUP, "LPIPS package", "broken", f"{type(error).__name__}: {error}", mend)]
     else:
         checks = [Check(GROUP, "LPIPS package", "ok", f"lpips {version}")]

@@ -1,12 +1,14 @@
 """The ImageNet backbones of LPIPS: where they are looked for, and how a file is read that may be anything.
 
 The package `lpips` ships its learned linear heads, a few kilobytes, and would download the backbone, half a gigabyte.
-Nothing here downloads. A file is looked for under the name that torchvision's own download gives it: in the folder
-that the user names, then in the cache of torch.hub. The last eight digits of the name begin the file's SHA-256.
+No metric downloads; `sw data fetch lpips` does. A file is looked for under the name that torchvision's own download
+gives it: in the folder that the user names, in $SPLATWIZARD_DATA/lpips/weights, where that command puts it, then in the
+cache of torch.hub. The last eight digits of the name begin the file's SHA-256.
 """
 
 from __future__ import annotations
 
+import os
 import warnings
 import zipfile
 from collections.abc import Mapping
@@ -17,54 +19,10 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import CapabilityError, UserInputError
-from splatwizard_core.tooling import file_sha256
+from splatwizard_core.tooling import DATA_VARIABLE, file_sha256
+from sw_metrics.backbones import BACKBONES, FOLDER, INTO, Backbone
 
 MOST_BYTES = 1 << 30  # the largest published one, VGG16 with its classifier, has 553 MB
-
-
-@dataclass(frozen=True)
-class Backbone:
-    """A network whose features LPIPS compares.
-
-    file_name   as torchvision's download is called
-    layers      index in `features` -> (channels out, channels in, kernel size) of each convolution
-    address     where torchvision gets it
-    """
-
-    file_name: str
-    layers: Mapping[int, tuple[int, int, int]]
-
-    @property
-    def address(self) -> str:
-        return f"https://download.pytorch.org/models/{self.file_name}"
-
-    @property
-    def sha256_prefix(self) -> str:
-        return self.file_name.removesuffix(".pth").rpartition("-")[2]
-
-    def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Key in the state dict -> shape, of every tensor that is used."""
-        found: dict[str, tuple[int, ...]] = {}
-        for index, (out, into, kernel) in self.layers.items():
-            found[f"features.{index}.weight"] = (out, into, kernel, kernel)
-            found[f"features.{index}.bias"] = (out,)
-        return found
-
-
-BACKBONES = {
-    "vgg": Backbone(
-        "vgg16-397923af.pth",
-        {
-            0: (64, 3, 3), 2: (64, 64, 3), 5: (128, 64, 3), 7: (128, 128, 3), 10: (256, 128, 3), 12: (256, 256, 3),
-            14: (256, 256, 3), 17: (512, 256, 3), 19: (512, 512, 3), 21: (512, 512, 3), 24: (512, 512, 3),
-            26: (512, 512, 3), 28: (512, 512, 3),
-        },
-    ),
-    "alex": Backbone(
-        "alexnet-owt-7be5be79.pth",
-        {0: (64, 3, 11), 3: (192, 64, 5), 6: (384, 192, 3), 8: (256, 384, 3), 10: (256, 256, 3)},
-    ),
-}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -88,9 +46,10 @@ def hub_folder() -> Path:
 
 
 def find_weights(net: str, folder: Path | None) -> Path | None:
-    """The file of a backbone ("vgg", "alex"): in `folder`, else in the cache of torch.hub; None: in neither."""
-    name = BACKBONES[net].file_name
-    places = ([] if folder is None else [folder]) + [hub_folder()]
+    """The file of a backbone ("vgg", "alex"): in `folder`, where it was fetched, or in torch.hub's cache; else None."""
+    name, data = BACKBONES[net].file_name, os.environ.get(DATA_VARIABLE)
+    fetched = [Path(data).expanduser() / FOLDER / INTO] if data else []
+    places = ([] if folder is None else [folder]) + [*fetched, hub_folder()]
     return next((place / name for place in places if (place / name).is_file()), None)
 
 
@@ -104,8 +63,8 @@ def load_weights(net: str, folder: Path | None) -> Weights:
     backbone = BACKBONES[net]
     if path is None:
         raise CapabilityError(
-            f"weights-missing: {backbone.file_name} is needed: get it from {backbone.address} and name its folder with "
-            "--set metrics.lpips.weights=DIR, or put it into the checkpoints folder of torch.hub",
+            f"weights-missing: {backbone.file_name} is needed: `sw data fetch lpips`, or get it from "
+            f"{backbone.address} and name its folder with --set metrics.lpips.weights=DIR",
             missing=[backbone.file_name],
         )
     try:

@@ -11,6 +11,7 @@ metrics and never share a name. Source: LPIPS (arXiv 1801.03924); specification 
 from __future__ import annotations
 
 import importlib.metadata
+import re
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,7 @@ from sw_metrics.lpips_weights import BACKBONES, Weights, check_folder, find_weig
 from sw_metrics.torchvision_import import import_torchvision
 
 EXTRA = "sw-metrics[lpips]"
+"""What brings `lpips` and torchvision; `install_command` names versions that leave the installed torch as it is."""
 SMALLEST = {"vgg": 16, "alex": 31}  # pixels; below, a pooling layer is left with nothing
 
 
@@ -105,12 +107,30 @@ def _folder(setup: MetricSetup) -> Path | None:
     return setup.read(LpipsSettings, "lpips").weights
 
 
+def fitting_torchvision() -> tuple[str, str] | None:
+    """The torch that is here and its torchvision, as pip takes them; None for a build of one's own.
+
+    torch 2.N.P belongs to torchvision 0.(N + 15).P, which requires just that torch: a later one would bring another.
+    """
+    found = re.fullmatch(r"2\.(\d+)\.(\d+)(\+\w+)?", torch.__version__)
+    if found is None:
+        return None
+    minor, patch = int(found[1]), int(found[2])
+    return f"torch==2.{minor}.{patch}", f"torchvision==0.{minor + 15}.{patch}"
+
+
+def install_command() -> str:
+    """The pip command that brings the packages beside the torch that is here, and replaces nothing."""
+    pair = fitting_torchvision()
+    return f"pip install '{EXTRA}'" if pair is None else f"pip install lpips {' '.join(pair)}"
+
+
 def package_version() -> str:
-    """Version of the installed package `lpips`. Raises CapabilityError that names the extra."""
+    """Version of the installed package `lpips`. Raises CapabilityError that says how to install it."""
     try:
         return importlib.metadata.version("lpips")
     except importlib.metadata.PackageNotFoundError:
-        raise CapabilityError(f"package-missing: LPIPS needs pip install '{EXTRA}'", missing=["lpips"]) from None
+        raise CapabilityError(f"package-missing: LPIPS needs: {install_command()}", missing=["lpips"]) from None
 
 
 def not_available(folder: Path | None) -> str | None:
@@ -123,8 +143,9 @@ def not_available(folder: Path | None) -> str | None:
     if not absent:
         return None
     return (
-        f"LPIPS is not available without its weights, its values will be null: bring {' and '.join(absent)} from "
-        f"{BACKBONES['vgg'].address.rpartition('/')[0]}/ and give --set metrics.lpips.weights=DIR"
+        f"LPIPS is not available without its weights, its values will be null: `sw data fetch lpips`, or bring "
+        f"{' and '.join(absent)} from {BACKBONES['vgg'].address.rpartition('/')[0]}/ and give "
+        "--set metrics.lpips.weights=DIR"
     )
 
 
@@ -149,5 +170,5 @@ def _import_lpips() -> Any:
         import_torchvision()
         import lpips
     except ImportError as error:
-        raise CapabilityError(f"package-missing: LPIPS cannot be imported: {error}: pip install '{EXTRA}'") from error
+        raise CapabilityError(f"package-missing: LPIPS cannot be imported: {error}: {install_command()}") from error
     return lpips

@@ -1,4 +1,4 @@
-"""Registers LPIPS in three forms, PSNR and SSIM in other codes' conventions, and the check of what LPIPS needs."""
+"""Registers LPIPS in three forms, PSNR and SSIM in other codes' conventions, and what brings LPIPS's weights."""
 
 from splatwizard_core.api import Registry, hookimpl
 
@@ -26,6 +26,11 @@ def register_metrics(registry: Registry) -> None:
     registry.add("ssim_reflect", f"{conventions}:ssim_reflect", label="SSIM, mirrored", digits=4, direction="higher",
                  diagnostic=True,
                  summary="ssim of the picture mirrored at its edge, as torchmetrics averages")  # fmt: skip
+
+
+@hookimpl
+def register_downloads(registry: Registry) -> None:
+    registry.add("lpips", "sw_metrics.backbones:downloads", summary="the backbones of LPIPS")
 
 
 @hookimpl

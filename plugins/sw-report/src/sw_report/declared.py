@@ -110,6 +110,23 @@ def uncompressed(encoders: Iterable[tuple[str, str]]) -> str:
     return str(coders.entry(names[0]).declared.get("stores", "")) if len(names) == 1 and names[0] in coders else ""
 
 
+def float32_bytes(encoders: Iterable[tuple[str, str]], counts: Mapping[str, int], config: object) -> int | None:
+    """Bytes that the Gaussians of a compressed file take as float32: what the literature calls the size of 3DGS.
+
+    encoders    (kind, name) of the parts that served the encoding
+    config      the method's values, which hold `sh_degree`
+
+    None where the file is no compressed one, holds something else than explicit Gaussians, or it cannot be told.
+    """
+    coders = load_plugins().coders
+    declared = [coders.entry(name).declared for kind, name in encoders if kind == "coder" and name in coders]
+    whole = [each for each in declared if each.get("codes") == "gaussians"]
+    degree = config.get("sh_degree") if isinstance(config, Mapping) else None
+    if len(whole) != 1 or "stores" in whole[0] or set(counts) != {"num_gaussians"} or degree not in range(4):
+        return None
+    return 4 * (11 + 3 * (degree + 1) ** 2) * counts["num_gaussians"]  # mean, scale, quaternion, opacity; harmonics
+
+
 def rate_settings(method: str, preset: str | None, rate: str | None) -> tuple[set[str], dict[str, Any]]:
     """Keys that a rate point of an installed method sets, and its whole configuration; empty if that cannot be told."""
     try:

@@ -41,13 +41,18 @@ class BdRow:
 
 @dataclass(frozen=True)
 class BdTable:
-    """BD values of all methods against one anchor, by one metric, in one protocol group; `chosen` says why that."""
+    """BD values of all methods against one anchor, by one metric, in one protocol group.
+
+    chosen  why that anchor
+    lower   lower values of the metric are better; gains are turned all the same, so that positive ones are better
+    """
 
     metric: str
     anchor: str
     protocol: str
     rows: list[BdRow]
     chosen: str = ""
+    lower: bool = False
 
 
 def choose_anchor(runs: Sequence[Run], wanted: str | None) -> str | None:
@@ -113,13 +118,19 @@ def _shares_a_range(runs: Sequence[Run], place: tuple[str, str], first: str, sec
 
 
 def bd_metrics(runs: Sequence[Run]) -> list[str]:
-    """Metrics that curves are compared by: all that have a direction and a value, but diagnostic ones."""
-    return ordered_metrics(
+    """Metrics that curves are compared by: all that have a direction and a value, but diagnostic ones.
+
+    Of those over the model, which measure its geometry, the first one alone: the distance of its mesh from the truth.
+    """
+    known = ordered_metrics(
         name
         for run in runs
         for name, metric in run.facts.metrics.items()
         if metric.mean is not None and metric.direction in DIRECTIONS and not run.facts.is_diagnostic(name)
     )
+    of_model = {name for run in runs for name in run.facts.geometry or {}}
+    further = [name for name in known if name in of_model][1:]
+    return [name for name in known if name not in further]
 
 
 def drawn_metrics(runs: Sequence[Run]) -> list[str]:
@@ -150,7 +161,8 @@ def bd_tables(runs: Sequence[Run], anchor: str | None, *, pareto: bool = False, 
                 rows += cells
                 if len(cells) > 1:
                     rows.append(_mean_row(variant, cells, partial))
-            tables.append(BdTable(metric, anchor, ids, rows, chosen))
+            lower = any(run.facts.metrics[metric].direction == "lower" for run in group if metric in run.facts.metrics)
+            tables.append(BdTable(metric, anchor, ids, rows, chosen, lower))
     return tables
 
 
@@ -179,7 +191,11 @@ def curve(runs: Sequence[Run], metric: str) -> tuple[list[float], list[float]]:
 def _compare(
     runs: Sequence[Run], place: tuple[str, str], anchor: str, variant: str, metric: str, pareto: bool
 ) -> BdRow:
-    here = [run for run in runs if run.place == place]
+    here = [run for run in runs if run.place == place and run.variant in (anchor, variant)]
+    voxels = _voxels(here, metric)
+    if len(voxels) > 1:
+        told = f"meshes with voxels of {', '.join(f'{size:.4g}' for size in voxels)} are not compared"
+        return BdRow(variant, place[0], BdCell(None, (), told), BdCell(None, (), told))
     curves = [curve([run for run in here if run.variant == name], metric) for name in (anchor, variant)]
     names, label = (anchor, variant), metric_style(metric).label
     calls = (
@@ -193,6 +209,12 @@ def _compare(
         except UserInputError as error:
             cells.append(BdCell(None, (), str(error).partition(": ")[2] or str(error)))
     return BdRow(variant, place[0], *cells)
+
+
+def _voxels(runs: Sequence[Run], metric: str) -> list[float]:
+    """Voxel sizes of the meshes that a metric of geometry was measured on, which decide how near one can be."""
+    meshes = [((run.facts.geometry or {}).get(metric) or {}).get("mesh") or {} for run in runs]
+    return sorted({float(mesh["voxel_size"]) for mesh in meshes if isinstance(mesh.get("voxel_size"), (int, float))})
 
 
 def _cell(result: BdResult) -> BdCell:

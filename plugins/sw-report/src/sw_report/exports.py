@@ -17,6 +17,7 @@ from sw_report.aggregate import dataset_tables
 from sw_report.blocks import Cell, Table
 from sw_report.configurations import seed_of
 from sw_report.distortion import bd_tables, with_values
+from sw_report.dtu_table import dtu_table
 from sw_report.results_tables import bd_table, means_table, metric_names, runs_table
 from sw_report.runs import Collection, Run, machine
 
@@ -128,13 +129,15 @@ def to_json_lines(runs: Sequence[Run]) -> str:
 
 
 def tables_of(collection: Collection, *, anchor: str | None, partial: bool, pareto: bool) -> list[tuple[str, Table]]:
-    """(title, table): the runs of each scene and protocol, means over data sets, BD values."""
+    """(title, table): the runs of each scene and protocol, means over data sets, DTU's distances, BD values."""
     runs = collection.runs
     found = []
     for place in dict.fromkeys(run.place for run in runs):
         found.append((f"{place[0]}, protocol {place[1]}", runs_table([run for run in runs if run.place == place])))
     for means in dataset_tables(runs, partial=partial):
         found.append((f"{means.title}, protocol {', '.join(means.protocols)}", means_table(means)))
+    if (dtu := dtu_table(runs)) is not None:
+        found.append((dtu.title, dtu))
     for bd in with_values(bd_tables(runs, anchor, pareto=pareto, partial=partial))[0]:
         found.append((f"{numbers.heading(bd.metric)} against {bd.anchor}, protocol {bd.protocol}", bd_table(bd)))
     return found

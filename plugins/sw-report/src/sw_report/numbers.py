@@ -10,6 +10,7 @@ from sw_report.declared import metric_key, metric_style
 MISSING = "–"
 MACHINES = "ᵃᵇᶜᵈᵉᶠᵍʰ"
 """Marks of values that come from different machines; later ones share the last."""
+FLOAT32_NOTE = "as float32, {} would take about {} MB."
 SEEDS_NOTE = "± standard deviation over the seeds (of the sample, n - 1); the value is their mean."
 UNCOMPRESSED_NOTE = "{}: the parameters as they were trained, not compressed."
 SHARED = "†"

@@ -21,6 +21,7 @@ from sw_report.blocks import Part, Section, Table
 from sw_report.commands import commands_table
 from sw_report.declared import metric_style
 from sw_report.distortion import bd_tables, choose_anchor, with_values
+from sw_report.dtu_table import dtu_table
 from sw_report.geometry import geometry_parts
 from sw_report.looks import looks_of
 from sw_report.pictures import (
@@ -185,6 +186,8 @@ def _many_sections(runs: Sequence[Run], options: PageOptions) -> list[Section]:
             curves = plots.mean_charts(table, own, style_of)
             parts += [Part(charts=curves)] if curves is not None else []
         sections.append(Section("means", "Means over scenes", parts, short="Means"))
+    if (dtu := dtu_table(runs)) is not None:
+        sections.append(Section("dtu", "DTU", [Part(table=dtu)]))
     places: dict[tuple[str, str], list[Run]] = {}
     for run in runs:
         places.setdefault(run.place, []).append(run)

@@ -102,8 +102,19 @@ def _stored(record: Record) -> str:
     """Number format of the parameters in the file, where nothing in it is compressed; empty otherwise."""
     from sw_report.declared import uncompressed
 
+    return uncompressed(_encoders(record))
+
+
+def _float32(record: Record) -> int | None:
+    """Bytes of the file's Gaussians as float32, where they are compressed; None where that cannot be told."""
+    from sw_report.declared import float32_bytes
+
+    return float32_bytes(_encoders(record), record.counts, (record.config or {}).get("config"))
+
+
+def _encoders(record: Record) -> list[tuple[str, str]]:
     encoded = (phase for phase in record.phases if phase.phase == "encode")
-    return uncompressed((part.kind, part.name) for phase in encoded for part in phase.provided_by)
+    return [(part.kind, part.name) for phase in encoded for part in phase.provided_by]
 
 
 def _rate(record: Record) -> str:
@@ -171,7 +182,7 @@ def _best(records: Sequence[Record], names: Sequence[str]) -> dict[str, set[int]
 
 def notes(records: Sequence[Record]) -> list[str]:
     """Lines under the table: which times include another training, what is not compressed, why values are missing."""
-    from sw_report.numbers import UNCOMPRESSED_NOTE
+    from sw_report.numbers import FLOAT32_NOTE, UNCOMPRESSED_NOTE
 
     found = []
     before: dict[str, dict[str, None]] = {}
@@ -188,6 +199,9 @@ def notes(records: Sequence[Record]) -> list[str]:
             missing.setdefault(why, {})[record.method] = None
     found += [f"train s of {', '.join(methods)} is not known: {why}" for why, methods in missing.items()]
     found += [UNCOMPRESSED_NOTE.format(name) for name in dict.fromkeys(map(_stored, records)) if name]
+    stored = {record.method for record in records if _stored(record)}  # their table has that size already
+    sizes = {record.method: size for record in records if (size := _float32(record)) and record.method not in stored}
+    found += [FLOAT32_NOTE.format(method, f"{size / 1e6:.2g}") for method, size in sizes.items()]
     found += [f"{', '.join(affected)}: {reason}" for reason, affected in reasons_of_metrics(records).items()]
     return found
 

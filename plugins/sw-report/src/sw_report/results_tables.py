@@ -209,7 +209,8 @@ def bd_table(table: BdTable) -> Table:
     )  # fmt: skip
     return Table(
         f"Against {table.anchor} by {style.heading}", columns(heads, text=("method", "scene")), rows,
-        f"{table.chosen} Rate at equal quality (negative saves), quality at equal rate (positive is better).",
+        f"{table.chosen} Rate at equal quality (negative saves), quality at equal rate (positive is better"
+        f"{': lower values' if table.lower else ''}).",
         list(marks),
     )  # fmt: skip
 

@@ -6,9 +6,8 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from sw_gaussians.method import GaussianMethod
-from sw_gaussians.start import gaussians_from_points
+from sw_gaussians.start import gaussians_from_points, start_points
 
-from splatwizard_core.api import SceneError
 from sw_trimgs.config import FlatConfig, Trim3DGSConfig
 from sw_trimgs.flat import FlatGaussians
 from sw_trimgs.presets import FLAT_PRESETS, PRESETS, RATES
@@ -39,16 +38,10 @@ class Flat3DGS(GaussianMethod):
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
         """Flat Gaussians, one for each start point of the scene, all facing along x. Raises SceneError."""
-        if scene.points is None or len(scene.points) == 0:
-            raise SceneError(
-                f"scene '{scene.name}' has no start points: flat-3dgs needs SfM points or random ones", path=scene.path
-            )
         config: FlatConfig = self.config
-        chain = {"opacity": config.mcmc.init_opacity, "scale_factor": config.mcmc.init_scale}
-        round_ones = gaussians_from_points(
-            scene.points, max_sh_degree=config.sh_degree, **(chain if config.mcmc.enabled else {})
-        )
-        tensors = [getattr(round_ones, name).detach() for name, _ in round_ones.named_parameters()]
+        points = start_points(scene, self.name)
+        round_ones = gaussians_from_points(points, max_sh_degree=config.sh_degree, **config.mcmc.first_values())
+        tensors = [getattr(round_ones, name).detach() for name in round_ones.RAW]
         return FlatGaussians(*tensors, active_sh_degree=0)
 
     def stages(self) -> Sequence[Stage]:

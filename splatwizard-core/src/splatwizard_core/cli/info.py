@@ -72,6 +72,7 @@ def _record_facts(path: Path) -> dict[str, Any]:
         "protocol": record["protocol"]["id"],
         "metrics": {name: mean for name, mean in means.items() if mean is not None},
         "bytes": record["file"]["bytes"],
+        "raster_options": {phase: options for phase, options in record["raster_options"].items() if options},
         "phases": record["phases"],
         "train": _part(record["train"], "steps", "train_s", "with_pretraining_s", "pretraining"),
     }

@@ -53,7 +53,7 @@ methods_option = click.option(
 )  # fmt: skip
 preset_option = click.option(
     "--preset", metavar="NAME", type=PRESET,
-    help="Named values of the method.  [default: paper; quick on a scene that is made on the spot]",
+    help="Named values of the method.  [default: paper; quick on a scene that is made on the spot, or tiny]",
 )  # fmt: skip
 rate_option = click.option(
     "--rate", metavar="NAME", type=RATE,

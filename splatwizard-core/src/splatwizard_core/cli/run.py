@@ -41,8 +41,7 @@ def run(
     if isinstance(chosen.seed, tuple) or ("," in (chosen.scene or "") and not Path(str(chosen.scene)).exists()):
         context = click.get_current_context()
         context.exit(context.invoke(plugins.commands.load("bench"), **context.params))  # sweeps are another package's
-    resolved = chosen.resolve(plugins)
-    session = open_training_session(resolved, plugins)
+    resolved, session = open_training_session(chosen, plugins)
     warn_of_metrics(session, None, resolved[0].metrics, geometry=geometry)
     if chosen.preset is None and any(each.preset == "quick" and each.procedural for each in resolved):
         shared.say("preset quick: the plan scaled down for a procedural scene (--preset paper runs it in full)")

@@ -13,6 +13,8 @@ import click
 from splatwizard_core.cli.options import say
 from splatwizard_core.errors import ConfigError
 
+TINY = 500_000  # pixels of all training pictures: the published plans take half an hour of a CPU for nothing
+
 if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.runs.config import ResolvedConfig
@@ -89,10 +91,7 @@ class Choices:
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
         """The configuration of a command that makes one thing."""
-        found = self.resolve(plugins)
-        if len(found) != 1:
-            raise click.UsageError("this command takes one method and one rate point; `sw run` takes several")
-        return found[0]
+        return only(self.resolve(plugins))
 
     def resolve_without_method(self) -> ResolvedConfig:
         """The configuration of a command that needs no method: how a scene is read, and the keys of a run.
@@ -137,6 +136,13 @@ class Choices:
         return replace(chosen, rate=None, below={k: v for k, v in found if f"{k}.".startswith(keys)})
 
 
+def only(found: Sequence[ResolvedConfig]) -> ResolvedConfig:
+    """The one of them. Raises click.UsageError for several."""
+    if len(found) != 1:
+        raise click.UsageError("this command takes one method and one rate point; `sw run` takes several")
+    return found[0]
+
+
 def takes_choices(function: Callable[..., None]) -> Callable[..., None]:
     """Hand the options of a command that `Choices` knows to its function together, as the argument `chosen`."""
 
@@ -178,19 +184,23 @@ def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
     return session
 
 
-def open_training_session(resolved: Sequence[ResolvedConfig], plugins: PluginManager) -> Session:
-    """The session of trainings, with their scenes loaded: what is wrong with one is told before anything else is.
+def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list[ResolvedConfig], Session]:
+    """The configurations of trainings and their session, the scenes loaded: what is wrong with one is told first.
 
-    Tells where they compute, and why there.
+    A tiny scene gets the preset "quick" where nothing says otherwise. Tells so, and where they compute, and why there.
     """
     from splatwizard_core.runs.device import device_reason
 
+    resolved = chosen.resolve(plugins)
     _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
-    for each in resolved:
-        session.scene(each)
+    free = [chosen.preset is None and "iterations" not in each.provenance for each in resolved]
+    pixels = [sum(view.camera.width * view.camera.height for view in session.scene(each).train) for each in resolved]
+    if chosen.config_file is None and all(free) and max(pixels) < TINY and resolved[0].preset != "quick":
+        resolved = replace(chosen, preset="quick").resolve(plugins)
+        say(f"preset quick: the plan scaled down for {max(pixels):,} training pixels (--preset paper runs it in full)")
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
-    return session
+    return resolved, session
 
 
 def _warn_of_equal_rates(resolved: Sequence[ResolvedConfig]) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import click
 
 from splatwizard_core.cli import options as shared
-from splatwizard_core.cli.setup import Choices, open_training_session, takes_choices
+from splatwizard_core.cli.setup import Choices, only, open_training_session, takes_choices
 from splatwizard_core.plugins import load_plugins
 
 REPORTED = ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdown_s", "pretraining")
@@ -25,9 +25,8 @@ def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, chos
     from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.run import train_only
 
-    resolved = chosen.resolve_one(load_plugins())
-    session = open_training_session([resolved], load_plugins())
-    trained, directory = train_only(session, RunRequest(resolved, out, resume, allow_changed_plan))
+    resolved, session = open_training_session(chosen, load_plugins())
+    trained, directory = train_only(session, RunRequest(only(resolved), out, resume, allow_changed_plan))
     facts = {
         "directory": str(directory),
         "counts": trained.model.counts(),

@@ -32,9 +32,8 @@ import numpy.typing as npt
 
 from splatwizard_core.coding.array_section import pack_array, unpack_array
 from splatwizard_core.coding.requirements import Requirement, dump_requirements, parse_requirements
-from splatwizard_core.coding.strict_json import dump_strict, load_strict
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError
-from splatwizard_native import write_atomic
+from splatwizard_native import dump_strict, load_strict, write_atomic
 
 MAGIC = b"SPWZ"
 VERSION = 1

@@ -79,7 +79,7 @@ def download(
 ) -> Fetched:
     """Download `url` to `target`, going on from what an earlier call left; returns at once if `target` is there.
 
-    sha256      hexadecimal; None: the file stays unverified
+    sha256      hexadecimal, all digits or the first ones; None: the file stays unverified
     size        bytes that it must have, None if unknown
     room_for    size of the file -> bytes that the disk must hold for it in all, such as to unpack it afterwards
     on_notice   gets a sentence when a connection broke, or when the server cannot resume
@@ -102,7 +102,7 @@ def check_file(path: Path, *, sha256: str | None = None, size: int | None = None
     if size is not None and found != size:
         raise FetchError(f"{path}: {found:,} bytes, the registry says {size:,}; {again}")
     digest = sha256_with_progress(path)
-    if sha256 is not None and digest != sha256.lower():
+    if sha256 is not None and not digest.startswith(sha256.lower()):
         raise FetchError(
             f"{path}: SHA-256 is {digest}, pinned is {sha256.lower()}: the file was changed or damaged ({again}), "
             "or the pin is of another one"

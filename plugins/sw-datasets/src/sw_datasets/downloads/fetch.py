@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 
-from splatwizard_core.api import UserInputError
+from splatwizard_core.api import UserInputError, replacing
 from splatwizard_core.tooling import write_json
 from sw_datasets.downloads.download import Fetched
 from sw_datasets.downloads.presence import RECEIPTS, ScenePresence, scene_presence
@@ -35,6 +36,11 @@ class Job:
         """The folder that the scenes, or the archive's content, go to."""
         home = root / self.dataset.folder
         return home if self.file.into is None else home / self.file.into
+
+    def is_there(self, root: Path) -> bool:
+        """Whether what the file brings, where that is no scene, is there already."""
+        place = self.target(root)
+        return (place / self.file.name if self.file.plain else place).exists()
 
 
 @dataclass
@@ -83,8 +89,8 @@ def plan_fetch(root: Path, registry: Mapping[str, DataSet], targets: Sequence[st
                 plan.jobs.append(job)
                 missing = [scene for scene in missing if scene not in held]
             elif file.into is not None:
-                if job.target(root).exists():
-                    plan.present.append(f"{name}/{file.into}")
+                if job.is_there(root):
+                    plan.present.append(f"{name}/{file.name if file.plain else file.into}")
                 else:
                     plan.jobs.append(job)
         if missing:
@@ -98,9 +104,15 @@ def archive_path(root: Path, file: DataFile) -> Path:
 
 
 def unpack_job(root: Path, job: Job, archive: Fetched) -> dict[str, Path]:
-    """Unpack the scenes of a job, with receipts; returns scene (or file) name -> folder. Raises FetchError."""
+    """Unpack the scenes of a job, with receipts; returns scene (or file) name -> where it lies. Raises FetchError."""
     from sw_datasets.downloads.unpack import unpack_scenes, unpack_whole
 
+    if job.file.plain:
+        place = job.target(root)
+        place.mkdir(parents=True, exist_ok=True)
+        with replacing(place / job.file.name) as temporary:
+            shutil.copyfile(archive.path, temporary)
+        return {job.file.name: place / job.file.name}
     if job.file.into is not None:
         done = {job.file.into: unpack_whole(archive.path, job.target(root))}
     else:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import DATA_VARIABLE
-from sw_datasets.downloads.registry import DataSet
+from sw_datasets.downloads.registry import DataFile, DataSet
 from sw_datasets.families import BENCHMARKS
 
 RECEIPTS = ".fetched"
@@ -79,12 +79,16 @@ def dataset_state(root: Path, dataset: DataSet, scenes: list[ScenePresence]) -> 
         states: list[State] = [scene.state for scene in scenes]
     else:
         states = [
-            "present" if file.into is not None and (root / dataset.folder / file.into).is_dir() else "missing"
+            "present" if file.into is not None and _brought(root / dataset.folder / file.into, file) else "missing"
             for file in dataset.files
         ]
     if all(state == "present" for state in states):
         return "present" if states else "missing"
     return "missing" if all(state == "missing" for state in states) else "partly"
+
+
+def _brought(place: Path, file: DataFile) -> bool:
+    return (place / file.name).is_file() if file.plain else place.is_dir()
 
 
 def read_receipt(home: Path, folder: str) -> dict[str, Any] | None:

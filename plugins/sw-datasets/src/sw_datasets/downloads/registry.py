@@ -45,20 +45,22 @@ def _relative(path: str) -> str:
 Name = Annotated[str, StringConstraints(min_length=1, max_length=100), AfterValidator(_folder_name)]
 Relative = Annotated[str, StringConstraints(min_length=1, max_length=200), AfterValidator(_relative)]
 Address = Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$", max_length=2000)]
-Sha256 = Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{64}$")]
+Sha256 = Annotated[str, StringConstraints(to_lower=True, pattern=r"^[0-9a-fA-F]{8,64}$")]
 
 
 class DataFile(BaseModel):
-    """One archive (.zip, .tar, .tar.gz, .tar.bz2, .tar.xz).
+    """One archive (.zip, .tar, .tar.gz, .tar.bz2, .tar.xz), or a plain file.
 
     name        what the file is called
     url         http(s) address; of a page to read if the file is `by_hand`
     size        exact bytes, None if nobody says
     about       a published approximate size and who says so
-    sha256      64 hexadecimal digits; None: what is downloaded stays unverified
+    sha256      64 hexadecimal digits, or as many of the first as its publisher gives, 8 at least; None: what is
+                downloaded stays unverified
     by_hand     no program may fetch it; the user does, and hands it in
     scenes      which scenes of the data set it holds, each in a folder of its name; empty: all of them
     into        for files that are not scenes: unpack everything into this folder of the data set
+    plain       no archive: `into` gets the file itself
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -71,6 +73,7 @@ class DataFile(BaseModel):
     by_hand: bool = False
     scenes: tuple[Name, ...] = ()
     into: Name | None = None
+    plain: bool = False
 
     @property
     def shown_size(self) -> str:
@@ -119,6 +122,8 @@ class DataSet(BaseModel):
                 raise ValueError(f"file '{file.name}' holds scene '{unknown[0]}', which is not one of the data set's")
             if bool(self.scenes) == (file.into is not None):
                 raise ValueError(f"file '{file.name}': 'into' is for data sets without scenes, and needed there")
+            if file.plain and file.into is None:
+                raise ValueError(f"file '{file.name}': a plain file needs 'into'")
         for what, names in (("scene", self.scenes), ("file", [file.name for file in self.files])):
             if len(set(names)) != len(names):
                 raise ValueError(f"a {what} is listed twice")
