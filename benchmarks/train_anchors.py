@@ -22,12 +22,17 @@ from __future__ import annotations
 import argparse
 import collections
 import math
+import os
 import sys
 import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
+
+# A profiler that is taken down and set up again does not survive graphs (torch issue 75504).
+os.environ.setdefault("DISABLE_CUPTI_LAZY_REINIT", "1")
+os.environ.setdefault("TEARDOWN_CUPTI", "0")
 
 import torch
 from torch.profiler import ProfilerActivity, profile, record_function
@@ -109,6 +114,7 @@ class Watch:
     phases: list[Phase]
     window: int
     syncs: bool
+    kernels: int
     losses: collections.deque[torch.Tensor] = field(default_factory=lambda: collections.deque(maxlen=500))
     _since: float = 0.0
     _profile: Any = None
@@ -135,7 +141,8 @@ class Watch:
             self._now()
             self._profile.__exit__(None, None, None)
             phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.num_rows)
-            phase.busy = busy(self._profile) / length
+            phase.busy = sum(t for t, _ in kernel_times(self._profile).values()) / length
+            phase.lines += longest_kernels(self._profile, length, self.kernels)
             self._profile = None
             self._listen(on=self.syncs and self.device.type == "cuda")
             self._since = self._now()
@@ -215,10 +222,20 @@ def report(watched: Any, steps: int, *, cuda: bool, rows: int) -> list[str]:
     return lines
 
 
-def busy(watched: Any) -> float:
-    """Milliseconds in which a GPU computed or copied; kernels of graphs included, which belong to no part."""
-    found = (e for e in watched.events() if str(e.device_type).endswith("CUDA") and not e.name.startswith(SECTION))
-    return float(sum(e.time_range.elapsed_us() for e in found)) / 1e3
+def kernel_times(watched: Any) -> dict[str, tuple[float, int]]:
+    """Milliseconds and launches of each kernel and copy of a GPU; those of graphs included, which belong to no part."""
+    found: dict[str, tuple[float, int]] = {}
+    for event in watched.events():
+        if str(event.device_type).endswith("CUDA") and not event.name.startswith(SECTION):
+            total, count = found.get(event.name, (0.0, 0))
+            found[event.name] = total + event.time_range.elapsed_us() / 1e3, count + 1
+    return found
+
+
+def longest_kernels(watched: Any, steps: int, most: int) -> list[str]:
+    """The kernels that take the most time of a step."""
+    ordered = sorted(kernel_times(watched).items(), key=lambda item: -item[1][0])[:most]
+    return [f"      {t / steps:7.3f} ms {n / steps:6.1f} x {name[:150]}" for name, (t, n) in ordered]
 
 
 def _share(value: float, total: float) -> str:
@@ -317,7 +334,7 @@ def anchors(
         trainer = trainer_of(made.stages()[0], model, scene, resolved.ppl, rasterizer)
         phases = phases_of(method, trainer.stage)
         phases[-1].end = last
-        watch = Watch(session.device, phases, args.window, args.syncs)
+        watch = Watch(session.device, phases, args.window, args.syncs, args.kernels)
         drawn: list[Any] = []
         render = trainer.rasterizer.render
 
@@ -434,6 +451,7 @@ def main() -> None:
     parser.add_argument("--window", type=int, default=20, help="steps that are profiled in each phase")
     parser.add_argument("--baseline-steps", type=int, default=500, help="of 3DGS; 0: none")
     parser.add_argument("--graphs", default="on", help="decode as CUDA graphs: on, off or on,off")
+    parser.add_argument("--kernels", type=int, default=0, help="list so many kernels that take the most time (CUDA)")
     parser.add_argument("--brief", action="store_true", help="no table of parts")
     parser.add_argument("--syncs", action="store_true", help="also which lines wait for the GPU")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cuda" if torch.cuda.is_available() else "cpu")

@@ -6,7 +6,7 @@ import pytest
 import torch
 from sw_anchors import growth
 from sw_anchors.anchors import AnchorAttributes, AnchorModel, AnchorSelection
-from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
+from sw_anchors.growth import _unique_cells, accumulate_anchor_statistics, adjust_anchors
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -349,3 +349,12 @@ def test_anchors_learn_a_picture():
         optimizer.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < losses[0] / 4
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e5, 1e12], ids=["near", "far", "too far for one number"])
+def test_unique_cells_are_those_of_torch_in_its_order(scale):
+    cells = torch.randint(-3, 4, (400, 3), generator=torch.Generator().manual_seed(0)) * scale
+    found, expected = _unique_cells(cells), torch.unique(cells, dim=0, return_inverse=True)
+    assert torch.equal(found[0], expected[0])
+    assert torch.equal(found[1], expected[1])
+    assert [len(each) for each in _unique_cells(cells[:0])] == [0, 0]

@@ -57,18 +57,16 @@ class AnchorSelection:
 
     rows        [V] int64, visible anchors
     opacities   [V,k] in (-1,1), all offsets of the visible anchors, detached
-    drawn       [M] int64, index into the V * k offsets of each Gaussian that was drawn; None: the first V * k
-                Gaussians of the result are all of them, and those with opacity <= 0 were not drawn
+    drawn       [M] int64, index into the V * k offsets of each Gaussian that was drawn
     """
 
     rows: Tensor
     opacities: Tensor
-    drawn: Tensor | None
+    drawn: Tensor
 
     def offset_index(self) -> Tensor:
-        """[M] int64: index into the N * k offsets of the model of each Gaussian in `drawn`."""
+        """[M] int64: index into the N * k offsets of the model."""
         k = self.opacities.shape[1]
-        assert self.drawn is not None
         return self.rows[self.drawn // k] * k + self.drawn % k
 
 

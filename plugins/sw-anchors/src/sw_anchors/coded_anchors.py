@@ -268,7 +268,7 @@ class CodedAnchors(AnchorModel):
             forecast = self.forecast(rows)
             wide = self.widened(forecast.steps)
             values = add_noise(values, wide, self.uniform(*values.shape))
-            extras["rate"] = self.rate(values, wide, forecast, masks)
+            extras["rate"] = self.rate(values, forecast, masks)
         features, scales, offsets = torch.split(values, list(self.shape.widths), dim=1)
         return AnchorAttributes(
             self.positions().index_select(0, rows),
@@ -329,24 +329,23 @@ class CodedAnchors(AnchorModel):
         kept = self.raw(torch.nonzero(self.kept()).squeeze(1))
         return triple(v.double().mean() if v.numel() else v.new_zeros(()).double() for v in kept)
 
-    def rate(self, values: Tensor, steps: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
+    def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
         """Estimate the bits of V anchors by a sample: each is drawn with probability `sample` and counts if it is kept.
 
-        values, steps   [V,C] noisy numbers of all groups, and the quantiser step of each
-        masks           [V,k], with gradient: the bits of a masked offset do not count, its numbers do
+        values  [V,C] noisy numbers of all groups
+        masks   [V,k], with gradient: the bits of a masked offset do not count, its numbers do
         """
         kept = masks.detach().amax(dim=1)
         drawn = self._sample(len(values))
         if not len(drawn):
             nothing = self.mask_logits.new_zeros(())
             return AnchorRate(nothing, nothing.new_zeros(3), nothing, forecast.own_bits)
-        return self.rate_of(drawn, values, steps, forecast, masks, kept.index_select(0, drawn), kept.mean())
+        return self.rate_of(drawn, values, forecast, masks, kept.index_select(0, drawn), kept.mean())
 
     def rate_of(
         self,
         drawn: Tensor,
         values: Tensor,
-        steps: Tensor,
         forecast: AnchorForecast,
         masks: Tensor,
         counted: Tensor,
@@ -359,14 +358,15 @@ class CodedAnchors(AnchorModel):
         """
         hidden = None
         if forecast.hidden is None:
-            x, step, mask = take_rows(drawn, values, steps, masks)
+            x, step, mask = take_rows(drawn, values, forecast.steps, masks)
         else:
-            x, step, mask, hidden = take_rows(drawn, values, steps, masks, forecast.hidden)
+            x, step, mask, hidden = take_rows(drawn, values, forecast.steps, masks, forecast.hidden)
         mean, scale = forecast.sample(drawn, hidden, x)
         # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
         widths = self.shape.widths
         alone = counted[:, None].expand(-1, widths[0] + widths[1])
         factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
+        step = self.widened(step)
         bits = gaussian_bits(x, mean, scale.clamp(min=1e-9), step, p_min=self.smallest_probability) * factors
         numbers = counted.sum() * sum(widths)
         by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]

@@ -1,9 +1,8 @@
 """Decoding of the visible anchors of a training step in tensors of fixed sizes, for CUDA graphs.
 
 How many anchors a view sees differs from step to step. Here their rows are copied into tensors of a capacity, a few of
-which serve all views; rows beyond the count are masked, and all k Gaussians of an anchor are decoded, of which the
-rasterizer leaves out those with opacity <= 0. So no shape depends on a value, and on a GPU the host starts values,
-noise, prediction, rate and the three networks with one call, and their gradients with another.
+which serve all views, and rows beyond the count are masked. So no shape depends on a value, and on a GPU the host
+starts values, noise, prediction, rate and the three networks with one call, and their gradients with another.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ class FixedDecoder:
         self._shared: dict[str, Tensor] = {}
 
     def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor) -> GaussianInputs | None:
-        """Decode the anchors `rows` [V]; Gaussians that are not drawn are marked as not visible.
+        """Decode the anchors `rows` [V]: their Gaussians with opacity > 0.
 
         None where the model has no form for it, or the GPU refused a graph; that is said once.
         """
@@ -72,7 +71,7 @@ class FixedDecoder:
             at.load(model, camera, rows, parts)
         sources = [getattr(model, name) for name in PARAMETERS]
         results, others = _Decoded.found(step, rows, self._watched.learning, sources)
-        return inputs_of(model, rows, (results, others))
+        return inputs_of(at, rows, (results, others))
 
     def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int) -> tuple[FixedStep, FixedRows]:
         key = (*model.step_key(), *(part.shape[1:] for part in parts))

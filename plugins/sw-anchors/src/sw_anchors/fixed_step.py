@@ -1,7 +1,8 @@
 """The decoding of a training step in tensors of one capacity: what it reads, what it computes.
 
-Everything that `CodedAnchors.attributes` and `spawn` do, with masks in place of shapes that depend on values. Nothing
-in `decode_rows` waits for a GPU, draws at random or writes into what it reads.
+Everything that `CodedAnchors.attributes` and `network_outputs` do, with masks in place of shapes that depend on values.
+Nothing in `decode_rows` waits for a GPU, draws at random or writes into what it reads. Gaussians are decoded after it,
+those that are visible alone: they are a tenth of all.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -18,8 +19,9 @@ from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
 from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED, AnchorRate
 from sw_anchors.fused_ops import anchor_values
-from sw_anchors.neural_gaussians import spawn
+from sw_anchors.neural_gaussians import visible_gaussians
 from sw_anchors.step_graphs import Found
+from sw_anchors.view_networks import network_outputs
 
 if TYPE_CHECKING:
     from sw_anchors.coded_anchors import CodedAnchors
@@ -71,11 +73,10 @@ class FixedRows:
 
 
 def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
-    """Decode all C k Gaussians; rows beyond the count have opacity 0 and no gradient.
+    """Compute all that does not depend on which Gaussians are visible; rows beyond the count have masks 0.
 
-    Returns (means, opacities, scales, quats, colors, mean volume of what is visible, then in the entropy phase bits
-    and, if the context has any, own bits of `AnchorRate`), and (visible [C k] bool, opacities [C,k], then by_group and
-    numbers of the rate).
+    Returns (the three outputs of the networks, offsets [C,k,3], scales [C,6], masks [C,k], then in the entropy phase
+    bits and, if the context has any, own bits of `AnchorRate`), and (by_group and numbers of the rate).
     """
     features, log_scales, offsets, logits = at.parameters
     capacity, k = logits.shape
@@ -97,23 +98,15 @@ def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
         drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
         counted = kept.index_select(0, drawn) * is_drawn
         share = kept.sum() / at.count.clamp(min=1)
-        found_rate = model.rate_of(drawn, values, steps, forecast, masks, counted, share)
+        found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
         rate = [found_rate.bits] + ([] if found_rate.own_bits is None else [found_rate.own_bits])
         rate_counts = found_rate.by_group, found_rate.numbers
     own, scales, shifts = torch.split(values, list(model.shape.widths), dim=1)
     # What is not valid may stand at the camera's centre, where a direction is none.
     positions = torch.where(valid[:, None] > 0, at.positions, at.center + 1)
-    found = spawn(
-        at.center, positions, own, shifts.reshape(capacity, k, 3), scales, masks,
-        (model.mlp_opacity, model.mlp_cov, model.mlp_color),
-        drawn=torch.arange(capacity * k, device=values.device),
-    )  # fmt: skip
-    visible = found.all_opacities.view(-1) > 0
-    x, y, z = found.scales.unbind(1)
-    shown = visible.to(values)
-    volume = (x * y * z * shown).sum() / shown.sum().clamp(min=1)
-    results = found.means, found.opacities, found.scales, found.quats, found.colors, volume, *rate
-    return results, (visible, found.all_opacities, *rate_counts)
+    networks = (model.mlp_opacity, model.mlp_cov, model.mlp_color)
+    outputs = network_outputs(at.center, positions, own, networks)
+    return (*outputs, shifts.reshape(capacity, k, 3), scales, masks, *rate), rate_counts
 
 
 def sample_of(draws: Tensor, valid: Tensor, share: float) -> tuple[Tensor, Tensor]:
@@ -139,12 +132,21 @@ def sample_capacity(capacity: int, share: float) -> int:
     return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
 
 
-def inputs_of(model: CodedAnchors, rows: Tensor, found: Found) -> GaussianInputs:
-    """The Gaussians of `decode_rows` for the rasterizer; anchors `rows` are those that were loaded."""
-    (means, opacities, scales, quats, colors, volume, *rate), (visible, all_opacities, *counts) = found
-    extras = {"anchors": AnchorSelection(rows, all_opacities[: len(rows)], None), "volume": volume}
+def inputs_of(at: FixedRows, rows: Tensor, found: Found) -> GaussianInputs:
+    """The Gaussians with opacity > 0, from what `decode_rows` found; anchors `rows` are those that were loaded.
+
+    Waits for the device once, for their number.
+    """
+    (alpha, geometry, color, offsets, scales, masks, *rate), counts = found
+    spawned = visible_gaussians(alpha, geometry, color, at.positions, offsets, scales, masks)
+    extras: dict[str, Any] = {"anchors": AnchorSelection(rows, spawned.all_opacities[: len(rows)], spawned.drawn)}
     if rate:
         extras["rate"] = AnchorRate(rate[0], counts[0], counts[1], rate[1] if len(rate) > 1 else None)
     return GaussianInputs(
-        means=means, opacities=opacities, scales=scales, quats=quats, colors=colors, visible=visible, extras=extras
+        means=spawned.means,
+        opacities=spawned.opacities,
+        scales=spawned.scales,
+        quats=spawned.quats,
+        colors=spawned.colors,
+        extras=extras,
     )

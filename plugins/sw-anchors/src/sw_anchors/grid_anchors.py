@@ -63,7 +63,7 @@ class GridAnchors(CodedAnchors):
         super().__init__(*tensors, generator=generator, **kwargs)
         widths = [*self.shape.outputs, further]
         self.grid = grid.to(self.features)
-        self._places: tuple[Tensor, GridPlaces | None] | None = None
+        self._places: tuple[Tensor, tuple[Tensor, ...]] | None = None
         self.mlp_grid = two_layers(grid.width, grid_hidden, sum(widths), generator).to(self.features)
         units = [step if in_steps else 1.0 for step in self.base_steps for _ in range(2)] + [1.0, 1.0]
         self.register_buffer("units", torch.tensor(units).repeat_interleave(torch.tensor(widths)).to(self.features))
@@ -101,18 +101,19 @@ class GridAnchors(CodedAnchors):
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
     def context_rows(self) -> tuple[Tensor, ...]:
-        """The places of the anchors in the grid, or their codes where places would take too much memory."""
+        """Positions of the anchors in the grid's cube, or their GridPlaces: on a CPU these are kept if they fit."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
-            fits = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
+            x = codes.to(self.features) / TOP
+            kept = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
+            kept = kept and (x.device.type == "cpu" or not self.grid.has_kernel(x))
             self._places = None  # the old ones go before the new ones come
-            self._places = (codes, self.grid.places(codes.to(self.features) / TOP) if fits else None)
-        return self._places[1] or (codes,)
+            self._places = (codes, tuple(self.grid.places(x)) if kept else (x,))
+        return self._places[1]
 
     def _looked_up(self, parts: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
         """Look up features of the grid at rows of `context_rows`; and the bits of its signs."""
-        places = self.grid.places(parts[0].to(self.features) / TOP) if len(parts) == 1 else GridPlaces(*parts)
-        return self.grid.at_places(places)
+        return self.grid.with_bits(parts[0]) if len(parts) == 1 else self.grid.at_places(GridPlaces(*parts))
 
     def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
         features, bits = self._looked_up(parts)

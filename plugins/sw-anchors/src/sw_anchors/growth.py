@@ -5,6 +5,7 @@ Source: Scaffold-GS (arXiv 2312.00109) as used by HAC (arXiv 2403.14530), follow
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -33,24 +34,16 @@ def accumulate_anchor_statistics(
     """Add one view to the four statistics of `model`, in place.
 
     selection   `RenderResult.extras["anchors"]`
-    gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d); rows after those
-                of the selection are not looked at
+    gradients   [M,2] derivative of the loss by the projected centre, NDC units (RenderResult.grad2d)
     radii       [M] pixels; Gaussians with radius 0 do not count
     """
-    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU, and so
-    # would the 0 of `torch.where`.
+    # Every index occurs once, and what was not drawn adds 0: a mask as an index would be waited for on a GPU.
     rows, seen = selection.rows, (radii > 0).to(model.offset_denom)
     model.opacity_accum.index_add_(0, rows, selection.opacities.clamp(min=0).sum(dim=1))
     model.anchor_denom.index_add_(0, rows, model.anchor_denom.new_ones(len(rows)))
     norms = torch.linalg.vector_norm(gradients, dim=1).to(model.offset_grad_accum)
-    norms.masked_fill_(seen == 0, 0)
-    if selection.drawn is None:
-        shape = selection.opacities.shape
-        model.offset_grad_accum.index_add_(0, rows, norms[: shape.numel()].view(shape))
-        model.offset_denom.index_add_(0, rows, seen[: shape.numel()].view(shape))
-        return
     at = selection.offset_index()
-    model.offset_grad_accum.view(-1).index_add_(0, at, norms)
+    model.offset_grad_accum.view(-1).index_add_(0, at, norms.masked_fill_(seen == 0, 0))
     model.offset_denom.view(-1).index_add_(0, at, seen)
 
 
@@ -128,10 +121,29 @@ def _free_cells(points: Tensor, features: Tensor, anchors: Tensor, size: float) 
     points [P,3] and features [P,F] belong together; anchors [N,3]; cells are multiples of `size`, in sorted order.
     """
     wanted, taken = torch.round(points / size), torch.round(anchors / size)
-    cells, index = torch.unique(torch.cat([wanted, taken]), dim=0, return_inverse=True)
+    cells, index = _unique_cells(torch.cat([wanted, taken]))
     own, occupied = index[: len(points)], index[len(points) :]
     pooled = features.new_full((len(cells), features.shape[1]), -torch.inf)
     pooled.scatter_reduce_(0, own[:, None].expand(-1, features.shape[1]), features, "amax")
     free = torch.ones(len(cells), dtype=torch.bool, device=cells.device)
     free[occupied] = False
     return cells[free], pooled[free]
+
+
+def _unique_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """As `torch.unique(cells, dim=0, return_inverse=True)` of whole numbers [n,3], by one number a cell.
+
+    Rows are sorted alike and, on a CPU, fifty times as fast.
+    """
+    if not len(cells):
+        return cells, torch.zeros(0, dtype=torch.int64, device=cells.device)
+    low, high = cells.amin(dim=0).double(), cells.amax(dim=0).double()
+    sizes = (high - low + 1).tolist()
+    if not all(size < 2**53 for size in sizes) or math.prod(sizes) >= 2**62:  # a cell far out, or not finite
+        return torch.unique(cells, dim=0, return_inverse=True)
+    _, rows, columns = (int(size) for size in sizes)
+    x, y, z = (cells.double() - low).to(torch.int64).unbind(1)
+    keys, index = torch.unique((x * rows + y) * columns + z, return_inverse=True)
+    yz = torch.div(keys, columns, rounding_mode="floor")
+    places = torch.stack([torch.div(yz, rows, rounding_mode="floor"), yz % rows, keys % columns], dim=1)
+    return (places.double() + low).to(cells), index

@@ -1,7 +1,6 @@
-"""Neural Gaussians of a view, decoded from anchors by three networks: one node of the graph of derivatives.
+"""Neural Gaussians of a view, from what the networks say of anchors: those with opacity > 0.
 
-A step of training is bound by how many operators the host has to launch, not by what they compute. Written out, this
-was 215 operators forward and backward, each with a node of its own; here it is 90 in one (benchmarks/train_anchors.py).
+In float32 kernels decode each Gaussian, and its gradient, in one pass; torch operations everywhere else.
 """
 
 from __future__ import annotations
@@ -10,8 +9,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from sw_anchors.native import ANCHORS
+from sw_anchors.view_networks import Networks, network_outputs
 
 GEOMETRY = 7
 """Outputs of the covariance network per Gaussian: 3 scale factors, 4 quaternion components."""
@@ -45,56 +47,83 @@ def spawn(
     offsets: Tensor,
     scales: Tensor,
     masks: Tensor | None,
-    networks: tuple[nn.Sequential, nn.Sequential, nn.Sequential],
-    *,
-    drawn: Tensor | None = None,
+    networks: Networks,
 ) -> NeuralGaussians:
     """Decode the Gaussians of V anchors for a camera at `center` [3], which gets no gradient.
 
     positions [V,3], features [V,F], offsets [V,k,3], scales [V,6], masks [V,k] or None: as in AnchorAttributes
-    networks    opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs
-    drawn       [M] int64 ascending, the Gaussians to decode, of the V * k; None: those with opacity > 0, for whose
-                number the device is waited for
+
+    Waits for the device once, for M.
     """
-    parameters = [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
-    found = _Spawn.apply(center, positions, features, offsets, scales, masks, drawn, *parameters)  # type: ignore[no-untyped-call]
-    return NeuralGaussians(*found)
+    outputs = network_outputs(center, positions, features, networks)
+    return visible_gaussians(*outputs, positions, offsets, scales, masks)
 
 
-class _Spawn(torch.autograd.Function):
+def visible_gaussians(
+    alpha: Tensor,
+    geometry: Tensor,
+    color: Tensor,
+    positions: Tensor,
+    offsets: Tensor,
+    scales: Tensor,
+    masks: Tensor | None,
+) -> NeuralGaussians:
+    """Decode the Gaussians of opacity > 0 from `network_outputs`; other arguments, and the wait, as of `spawn`."""
+    opacities = alpha.detach() if masks is None else alpha.detach() * masks.detach()
+    drawn = torch.nonzero(opacities.view(-1) > 0).squeeze(1)  # [M]
+    inputs = (alpha, geometry, color, positions, offsets, scales, masks)
+    node = _ByKernel if _has_kernel(inputs) else _ByTorch
+    found = node.apply(drawn, *inputs)  # type: ignore[no-untyped-call]
+    return NeuralGaussians(*found, opacities, alpha.detach(), drawn)
+
+
+def _has_kernel(inputs: tuple[Tensor | None, ...]) -> bool:
+    if any(t is not None and t.dtype != torch.float32 for t in inputs):
+        return False
+    alpha = inputs[0]
+    assert alpha is not None
+    return ANCHORS.has_cuda() if alpha.is_cuda else alpha.device.type == "cpu" and ANCHORS.try_load()
+
+
+class _ByKernel(torch.autograd.Function):
+    """Means, opacities, scales, quaternions and colours of the Gaussians `drawn`, in one pass each way."""
+
     @staticmethod
-    def forward(
-        ctx: Any,
-        center: Tensor,
-        positions: Tensor,
-        features: Tensor,
-        offsets: Tensor,
-        scales: Tensor,
-        masks: Tensor | None,
-        drawn: Tensor | None,
-        *parameters: Tensor,
-    ) -> tuple[Tensor, ...]:
-        first, last = parameters[0::4], parameters[2::4]
-        k = offsets.shape[1]
-        toward = positions - center
-        distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
-        direction = toward / distance
-        context = torch.cat([features, direction, distance], dim=1)  # [V, F+4]
-        weights = torch.cat(first)
-        hidden = torch.addmm(torch.cat(parameters[1::4]), context, weights.t()).relu_()
-        parts = torch.split(hidden, [len(w) for w in first], dim=1)
-        pre, geometry, color = (
-            torch.addmm(bias, part, weight.t())
-            for bias, part, weight in zip(parameters[3::4], parts, last, strict=True)
+    def forward(ctx: Any, drawn: Tensor, *inputs: Tensor | None) -> tuple[Tensor, ...]:
+        # Offsets and scales may be columns of a matrix: of these a row must be without gaps.
+        gaps = (None, None, None, None, (3, 1), (1,), None)
+        given = tuple(
+            t if t is None or (inner is not None and t.stride()[1:] == inner) else t.contiguous()
+            for t, inner in zip(inputs, gaps, strict=True)
         )
+        ctx.save_for_backward(*given, drawn)
+        return tuple(torch.ops.sw_anchors.spawn(*given, drawn))
 
-        alpha = pre.tanh_()  # [V,k]
-        opacities = alpha if masks is None else alpha * masks
-        flat = opacities.view(-1)
-        drawn = torch.nonzero(flat > 0).squeeze(1) if drawn is None else drawn.detach()  # [M]
-        owner = torch.div(drawn, k, rounding_mode="floor")
-        geometry = geometry.view(-1, GEOMETRY).index_select(0, drawn)
-        color = color.view(-1, 3).index_select(0, drawn).sigmoid_()
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *slopes: Tensor) -> tuple[Tensor | None, ...]:
+        positions_learn, has_masks = ctx.needs_input_grad[4], ctx.saved_tensors[6] is not None
+        contiguous = [slope.contiguous() for slope in slopes]
+        *found, to_masks, to_positions = torch.ops.sw_anchors.spawn_backward(
+            *ctx.saved_tensors, contiguous, positions_learn
+        )
+        to_alpha, to_geometry, to_color, to_offsets, to_scales = found
+        return (
+            None, to_alpha, to_geometry, to_color, to_positions if positions_learn else None, to_offsets, to_scales,
+            to_masks if has_masks else None,
+        )  # fmt: skip
+
+
+class _ByTorch(torch.autograd.Function):
+    """The same in torch operations."""
+
+    @staticmethod
+    def forward(ctx: Any, drawn: Tensor, *inputs: Tensor) -> tuple[Tensor, ...]:
+        alpha, geometry, color, positions, offsets, scales, masks = inputs
+        owner = torch.div(drawn, alpha.shape[1], rounding_mode="floor")  # [M]
+        opacities = (alpha if masks is None else alpha * masks).reshape(-1).index_select(0, drawn)
+        geometry = geometry.reshape(-1, GEOMETRY).index_select(0, drawn)
+        color = color.reshape(-1, 3).index_select(0, drawn).sigmoid_()
         own_scales = scales.index_select(0, owner)  # [M,6]
         own_offsets = offsets.reshape(-1, 3).index_select(0, drawn)
         means = torch.addcmul(positions.index_select(0, owner), own_offsets, own_scales[:, :3])
@@ -104,27 +133,17 @@ class _Spawn(torch.autograd.Function):
         quats = geometry[:, 3:]
         norms = torch.linalg.vector_norm(quats, dim=1, keepdim=True).clamp_min_(_SHORTEST)
         quats = quats / norms
-
-        ctx.save_for_backward(
-            direction, distance, context, weights, hidden, alpha, masks, drawn, own_scales, own_offsets, factors, sizes,
-            quats, norms, color, *last,
-        )  # fmt: skip
-        ctx.widths = [len(w) for w in first]
-        unmasked = alpha.detach()
-        ctx.mark_non_differentiable(opacities, unmasked, drawn)
-        return means, flat.index_select(0, drawn), sizes, quats, color, opacities, unmasked, drawn
+        ctx.save_for_backward(alpha, masks, drawn, own_scales, own_offsets, factors, sizes, quats, norms, color)
+        return means, opacities, sizes, quats, color
 
     @staticmethod
     @once_differentiable
     def backward(
-        ctx: Any, to_means: Tensor, to_opacities: Tensor, to_sizes: Tensor, to_quats: Tensor, to_color: Tensor, *_: Any
+        ctx: Any, to_means: Tensor, to_opacities: Tensor, to_sizes: Tensor, to_quats: Tensor, to_color: Tensor
     ) -> tuple[Tensor | None, ...]:
-        (
-            direction, distance, context, weights, hidden, alpha, masks, drawn, own_scales, own_offsets, factors, sizes,
-            quats, norms, color, *last,
-        ) = ctx.saved_tensors  # fmt: skip
+        alpha, masks, drawn, own_scales, own_offsets, factors, sizes, quats, norms, color = ctx.saved_tensors
         n, k = alpha.shape
-        positions_learn = ctx.needs_input_grad[1]
+        positions_learn = ctx.needs_input_grad[4]
         columns = [
             to_means * own_scales[:, :3],  # of the offsets: 0 to 2
             to_means * own_offsets,  # of the scales: 3 to 8
@@ -140,46 +159,14 @@ class _Spawn(torch.autograd.Function):
         source = torch.cat(columns, dim=1)
         dense = source.new_zeros(n * k, source.shape[1]).index_copy_(0, drawn, source)
         by_anchor = dense.view(n, k, source.shape[1])
-
         to_alpha = by_anchor[:, :, 19]
-        to_masks = to_alpha * alpha if ctx.needs_input_grad[5] else None
-        if masks is not None:
-            to_alpha = to_alpha * masks
-        outputs = (
-            to_alpha * (1 - alpha * alpha),
-            dense[:, 9:16].reshape(n, GEOMETRY * k),
-            dense[:, 16:19].reshape(n, 3 * k),
-        )
-        to_hidden = torch.empty_like(hidden)
-        for part, out, weight in zip(torch.split(to_hidden, ctx.widths, dim=1), outputs, last, strict=True):
-            torch.mm(out, weight, out=part)
-        # In place: fresh memory costs a CPU more than the arithmetic.
-        torch.ops.aten.threshold_backward.grad_input(to_hidden, hidden, 0, grad_input=to_hidden)
-        to_weights = torch.split(torch.mm(to_hidden.t(), context), ctx.widths)
-        to_biases = [part.sum(dim=0) for part in torch.split(to_hidden, ctx.widths, dim=1)]
-        to_parameters: list[Tensor | None] = []
-        for i, (out, part) in enumerate(zip(outputs, torch.split(hidden, ctx.widths, dim=1), strict=True)):
-            to_parameters += [_aligned(to_weights[i]), to_biases[i], torch.mm(out.t(), part), out.sum(dim=0)]
-        to_context = torch.mm(to_hidden, weights)
-
-        to_positions = None
-        if positions_learn:
-            to_direction = to_context[:, -4:-1]
-            along = (to_direction * direction).sum(dim=1, keepdim=True)
-            to_positions = by_anchor[:, :, 20:].sum(dim=1) + (to_direction - direction * along) / distance
-            to_positions += direction * to_context[:, -1:]
         return (
             None,
-            to_positions,
-            to_context[:, :-4],
+            to_alpha if masks is None else to_alpha * masks,
+            dense[:, 9:16].reshape(n, GEOMETRY * k),
+            dense[:, 16:19].reshape(n, 3 * k),
+            by_anchor[:, :, 20:].sum(dim=1) if positions_learn else None,
             dense[:, :3].reshape(n, k, 3),
             by_anchor[:, :, 3:9].sum(dim=1),
-            to_masks,
-            None,
-            *to_parameters,
+            None if masks is None else to_alpha * alpha,
         )
-
-
-def _aligned(part: Tensor) -> Tensor:
-    """The same with the alignment that the optimizer's kernel asks for (16 bytes), which rows of a matrix may lack."""
-    return part if part.data_ptr() % 16 == 0 else part.clone()

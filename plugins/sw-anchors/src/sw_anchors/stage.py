@@ -138,9 +138,6 @@ class AnchorStage(Stage):
 
     def mean_volume(self, result: RenderResult) -> Tensor:
         """Mean product of the scales of what is drawn, scalar; differentiable."""
-        known: Tensor | None = result.extras.get("volume")
-        if known is not None:
-            return known
         assert result.inputs.scales is not None
         return mean_product(result.inputs.scales)
 

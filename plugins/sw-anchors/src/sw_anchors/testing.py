@@ -80,9 +80,8 @@ def _one_step(
     ):
         inputs = model.decode(camera, rows)
     image = rasterizer.render(inputs, camera, RasterOptions(grad2d=True))
-    volume = inputs.extras.get("volume")
     assert inputs.scales is not None
-    found = {"volume": mean_product(inputs.scales) if volume is None else volume}
+    found = {"volume": mean_product(inputs.scales)}
     rate = inputs.extras.get("rate")
     if rate is not None:
         found |= {"bits": rate.bits} | ({} if rate.own_bits is None else {"own bits": 1e-4 * rate.own_bits})

@@ -8,4 +8,5 @@ def register_methods(registry: Registry) -> None:
     registry.add("cat-3dgs", "sw_cat_3dgs.method:Cat3DGS",
                  summary="anchors under a triplane context, autoregressive over channels (Zhan et al. 2025)",
                  presets=["paper", "tandt", "db", "bungee", "quick"],
-                 rates=["r1", "r2", "r3", "r4", "r5", "r6"])  # fmt: skip
+                 rates=["r1", "r2", "r3", "r4", "r5", "r6"],
+                 native="sw_anchors.native:ANCHORS")  # fmt: skip

@@ -8,10 +8,10 @@ CODECS = NativeModule(
     name="sw_codecs",
     package="sw_codecs",
     sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
-    kernels=("kernels/grid.cpp", "kernels/huffman.cpp"),
+    kernels=("kernels/grid.cpp", "kernels/signs.cpp", "kernels/huffman.cpp"),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/grid.cu",),
+    cuda_sources=("kernels/cuda/grid.cu", "kernels/cuda/signs.cu"),
     cflags=("-ffp-contract=off",),  # a place is rounded as torch rounds it
     seconds=10,
-    without="hash grids of real numbers are looked up by torch operations, Huffman codes decoded by a loop: slower",
+    without="hash grids are looked up by torch operations, Huffman codes decoded by a loop: slower",
 )

@@ -7,7 +7,7 @@ import torch
 
 from sw_codecs.context import hash_grid
 from sw_codecs.context.grid_lookup import fits_kernel
-from sw_codecs.context.hash_grid import HashGrid
+from sw_codecs.context.hash_grid import HashGrid, MixedHashGrid
 from sw_codecs.native import CODECS
 
 needs_kernels = pytest.mark.skipif(CODECS.available() is not None, reason=str(CODECS.available()))
@@ -57,6 +57,56 @@ def test_values_and_gradients_are_those_of_torch(dimensions, features, device, m
     torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-5)  # a sum of 8 products
     torch.testing.assert_close(gradient, wanted, rtol=1e-4, atol=1e-4)  # of some hundred on a coarse level
     assert gradient.any()
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("features", [1, 2, 4])
+def test_signs_and_their_gradients_are_those_of_torch(features, device, monkeypatch):
+    grid = MixedHashGrid((6, 9, 34), (10, 66), features=features, log2_space=8, log2_planes=9, generator=generator())
+    with torch.no_grad():
+        for part in grid.grids:
+            part.table.copy_(torch.randn(part.table.shape, generator=generator(1)))
+    grid, x = grid.to(device), places(3).to(device)
+    weights = torch.randn(len(x), grid.width, generator=generator(3)).to(device)
+    assert grid.has_kernel(x)
+    found = []
+    for kernel in (True, False):
+        monkeypatch.setattr(hash_grid, "signs_fit_kernel", lambda *_, kernel=kernel: kernel)
+        features_of, bits = grid.with_bits(x)
+        total = (features_of * weights).sum() + 0.5 * bits
+        found.append((features_of.detach(), bits.detach(), *torch.autograd.grad(total, [p.table for p in grid.grids])))
+    for one, other in zip(*found, strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-4, atol=1e-4)
+        assert bool(one.any())
+    assert bool((found[0][0][2] == 0).all())  # outside the cube
+
+
+@needs_kernels
+def test_gradients_of_signs_are_the_same_bits_for_any_number_of_threads():
+    grid, runs, threads = MixedHashGrid((6, 9), (10, 34), log2_space=8, generator=generator()), [], []
+    for count in (1, 3):
+        threads.append(torch.get_num_threads())
+        torch.set_num_threads(count)
+        features, bits = grid.with_bits(places(3))
+        runs.append(torch.autograd.grad(features.square().sum() + bits, [part.table for part in grid.grids]))
+    torch.set_num_threads(threads[0])
+    assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+@needs_kernels
+def test_places_and_tables_of_signs_that_do_not_fit_are_refused():
+    CODECS.load()
+    levels = ([2.0], [3], [0], [1], 9)
+    look_up, x = torch.ops.sw_codecs.signs_lookup, torch.zeros(2, 3)
+    for axes, table, found, first, said in (
+        ([0, 3], (16, 2), (2, 2), 0, "no axis 3"),
+        ([0, 1], (15, 2), (2, 2), 0, "ends at entry 16 of 15"),
+        ([0, 1], (16, 2), (2, 3), 2, "features do not fit"),
+        ([0, 1], (16, 2), (1, 2), 0, "features must be contiguous"),
+        ([0, 1], (16, 9), (2, 9), 0, "1 to 8"),
+    ):
+        with pytest.raises(RuntimeError, match=said):
+            look_up(x, axes, torch.zeros(table), torch.zeros(found), first, *levels)
 
 
 @needs_kernels

@@ -107,7 +107,7 @@ class HACPlusAnchors(GridAnchors):
     def _no_sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
         raise NotImplementedError("the bits of HAC++ are no Gaussian's alone: HACPlusAnchors.rate counts them")
 
-    def rate(self, values: Tensor, steps: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
+    def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
         """Estimate the bits a number over a sample of all anchors, under noise of its own.
 
         Masked anchors and offsets have no bits, but count as numbers. What is drawn in this view is no matter.

@@ -22,7 +22,15 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 from torch.nn import functional as F  # noqa: N812 (torch's own name for it)
 
-from sw_codecs.context.grid_lookup import fits_kernel, lookup
+from sw_codecs.context.grid_lookup import (
+    Levels,
+    add_sign_gradients,
+    fits_kernel,
+    levels_of,
+    look_up_signs,
+    lookup,
+    signs_fit_kernel,
+)
 from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.binary import SteBinary
 
@@ -357,7 +365,16 @@ class MixedHashGrid(nn.Module):
 
         Not differentiable for x.
         """
-        return self.at_places(self.places(x))
+        if not self.has_kernel(x):
+            return self.at_places(self.places(x))
+        grids = [(axes, levels_of(grid)) for axes, grid in zip(self.AXES, self._all(), strict=True)]
+        tables = [grid.table for grid in self._all()]
+        features, bits = _SignLookup.apply(x.detach().contiguous(), grids, *tables)
+        return features, bits
+
+    def has_kernel(self, x: Tensor) -> bool:
+        """Whether `with_bits` of places like `x` works out their corners by a kernel: then nobody need keep them."""
+        return signs_fit_kernel(self._all(), x)
 
     @property
     def corners(self) -> int:
@@ -482,6 +499,43 @@ class _WeightedRows(torch.autograd.Function):
         return for_values, None, for_weights, None
 
 
+def _bits_of_signs(positive: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """(bits of signs under their own share of ones, as of `rates.mask_bits`; how much dearer a one is), scalars."""
+    ones = positive.sum(dtype=dtype)
+    share = (ones / positive.numel()).clamp(1e-6, 1 - 1e-6)
+    one, zero = -torch.log2(share), -torch.log2(1 - share)  # bits of each
+    return ones * one + (positive.numel() - ones) * zero + 32, one - zero
+
+
+class _SignLookup(torch.autograd.Function):
+    """`_BinaryLookup` of places themselves, by kernels: nothing is kept for a place."""
+
+    @staticmethod
+    def forward(
+        ctx: Any, x: Tensor, grids: list[tuple[tuple[int, ...], Levels]], *tables: Tensor
+    ) -> tuple[Tensor, ...]:
+        table = torch.cat(tables)
+        bits, dearer = _bits_of_signs(table >= 0, table.dtype)
+        ctx.save_for_backward(x, table, dearer)
+        ctx.grids, ctx.sizes = grids, [len(t) for t in tables]
+        return look_up_signs(x, grids, tables), bits
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_features: Tensor, to_bits: Tensor) -> tuple[Tensor | None, ...]:
+        x, table, dearer = ctx.saved_tensors
+        total = torch.zeros_like(table)
+        add_sign_gradients(x, ctx.grids, to_features, total.split(ctx.sizes))
+        return None, None, *_through_signs(total, table, to_bits * dearer).split(ctx.sizes)
+
+
+def _through_signs(total: Tensor, table: Tensor, to_ones: Tensor) -> Tensor:
+    """Gradient of learned numbers from those of their signs, in place, and of the number of positive ones."""
+    total += to_ones / 2  # a sign is twice its bit, less one
+    total *= table.abs() <= 1
+    return total
+
+
 class _BinaryLookup(torch.autograd.Function):
     """Features [n, width] and the bits of all signs, of a MixedHashGrid at GridPlaces: all its grids in one node.
 
@@ -501,12 +555,10 @@ class _BinaryLookup(torch.autograd.Function):
             )
             for i, w in ((space, space_weights), (planes, planes_weights))
         ]
-        ones = positive.sum(dtype=table.dtype)
-        share = (ones / table.numel()).clamp(1e-6, 1 - 1e-6)
-        one, zero = -torch.log2(share), -torch.log2(1 - share)  # bits of each
-        ctx.save_for_backward(space, space_weights, planes, planes_weights, table, one - zero)
+        bits, dearer = _bits_of_signs(positive, table.dtype)
+        ctx.save_for_backward(space, space_weights, planes, planes_weights, table, dearer)
         ctx.sizes = [len(t) for t in tables]
-        return torch.cat(found, dim=1), ones * one + (table.numel() - ones) * zero + 32
+        return torch.cat(found, dim=1), bits
 
     @staticmethod
     @once_differentiable
@@ -519,9 +571,7 @@ class _BinaryLookup(torch.autograd.Function):
             (planes, planes_weights, to_features[:, width:]),
         ):
             _add_weighted_rows(total, index, weights, part.unflatten(1, (index.shape[1], table.shape[1])))
-        total += to_bits * dearer / 2  # a sign is twice its bit, less one
-        total *= table.abs() <= 1
-        return None, None, None, None, *total.split(ctx.sizes)
+        return None, None, None, None, *_through_signs(total, table, to_bits * dearer).split(ctx.sizes)
 
 
 def _add_weighted_rows(total: Tensor, index: Tensor, weights: Tensor, grad: Tensor) -> None:

@@ -42,6 +42,22 @@ at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t ent
   return table;
 }
 
+void signs_lookup(const at::Tensor& x, at::IntArrayRef axes, const at::Tensor& table, at::Tensor found, int64_t first,
+                  at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
+                  int64_t log2_size) {
+  const Signs at = signs_of(x, axes, table, found, first, scales, lasts, starts, dense, log2_size);
+  SW_SELECT(signs_lookup)(at, table.const_data_ptr<float>(), found.mutable_data_ptr<float>() + first,
+                          splatwizard::torch_parallel());
+}
+
+void signs_backward(const at::Tensor& x, at::IntArrayRef axes, at::Tensor table, const at::Tensor& gradient,
+                    int64_t first, at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts,
+                    at::IntArrayRef dense, int64_t log2_size) {
+  const Signs at = signs_of(x, axes, table, gradient, first, scales, lasts, starts, dense, log2_size);
+  SW_SELECT(signs_backward)(at, gradient.const_data_ptr<float>() + first, table.mutable_data_ptr<float>(),
+                            splatwizard::torch_parallel());
+}
+
 // bytes [length] uint8, counts [trees, size] float32 and no NaN, index [n] int64 -> symbols [n] int32, or none if the
 // bytes do not suffice.
 at::Tensor huffman_decode(const at::Tensor& bytes, const at::Tensor& counts, const at::Tensor& index) {
@@ -68,6 +84,13 @@ TORCH_LIBRARY(sw_codecs, m) {
         " -> Tensor");
   m.def("backward(Tensor x, Tensor gradient, int entries, int features, float[] scales, int[] lasts, int[] starts,"
         " int[] dense, int log2_size) -> Tensor");
+  // Features of grids of signs into columns of `found`, and their gradients added to `table`.
+  m.def("signs_lookup(Tensor x, int[] axes, Tensor table, Tensor(a!) found, int first, float[] scales, int[] lasts,"
+        " int[] starts, int[] dense, int log2_size) -> ()");
+  m.def("signs_backward(Tensor x, int[] axes, Tensor(a!) table, Tensor gradient, int first, float[] scales,"
+        " int[] lasts, int[] starts, int[] dense, int log2_size) -> ()");
+  m.impl("signs_lookup", c10::DispatchKey::CPU, TORCH_FN(signs_lookup));
+  m.impl("signs_backward", c10::DispatchKey::CPU, TORCH_FN(signs_backward));
   m.def("huffman_decode(Tensor bytes, Tensor counts, Tensor index) -> Tensor");
   m.impl("huffman_decode", c10::DispatchKey::CPU, TORCH_FN(huffman_decode));
   m.impl("lookup", c10::DispatchKey::CPU, TORCH_FN(lookup));

@@ -18,7 +18,7 @@ using namespace sw_grid;
 
 // Pairs are read and added as one number of eight bytes.
 void check_pairs(const at::Tensor& t, const char* name, int64_t features) {
-  TORCH_CHECK(features > 0 && features <= sw_grid::cuda::kMaxFeatures, "sw_codecs: ", features,
+  TORCH_CHECK(features > 0 && features <= kMaxFeatures, "sw_codecs: ", features,
               " features are not offered on CUDA");
   TORCH_CHECK(features != 2 || reinterpret_cast<uintptr_t>(t.const_data_ptr()) % 8 == 0, "sw_codecs: ", name,
               " must start at a multiple of 8 bytes; clone() it");
@@ -61,11 +61,42 @@ at::Tensor backward(const at::Tensor& x, const at::Tensor& gradient, int64_t ent
   return table;
 }
 
+bool are_fours(const Signs& at, const at::Tensor& table, const float* features) {
+  return at.features == 4 && at.row % 4 == 0 && reinterpret_cast<uintptr_t>(table.const_data_ptr()) % 16 == 0 &&
+         reinterpret_cast<uintptr_t>(features) % 16 == 0;
+}
+
+void signs_lookup(const at::Tensor& x, at::IntArrayRef axes, const at::Tensor& table, at::Tensor found, int64_t first,
+                  at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts, at::IntArrayRef dense,
+                  int64_t log2_size) {
+  const Signs at = signs_of(x, axes, table, found, first, scales, lasts, starts, dense, log2_size);
+  const c10::cuda::CUDAGuard guard(x.device());
+  float* to = found.mutable_data_ptr<float>() + first;
+  if (at.count > 0)
+    sw_grid::cuda::signs_lookup(at, are_fours(at, table, to), table.const_data_ptr<float>(), to,
+                                c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
+void signs_backward(const at::Tensor& x, at::IntArrayRef axes, at::Tensor table, const at::Tensor& gradient,
+                    int64_t first, at::ArrayRef<double> scales, at::IntArrayRef lasts, at::IntArrayRef starts,
+                    at::IntArrayRef dense, int64_t log2_size) {
+  const Signs at = signs_of(x, axes, table, gradient, first, scales, lasts, starts, dense, log2_size);
+  const c10::cuda::CUDAGuard guard(x.device());
+  const float* from = gradient.const_data_ptr<float>() + first;
+  if (at.count > 0)
+    sw_grid::cuda::signs_backward(at, are_fours(at, table, from), from, table.mutable_data_ptr<float>(),
+                                  c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
 }  // namespace
 
 TORCH_LIBRARY_IMPL(sw_codecs, CUDA, m) {
   m.impl("lookup", lookup);
   m.impl("backward", backward);
+  m.impl("signs_lookup", signs_lookup);
+  m.impl("signs_backward", signs_backward);
 }
 
 #endif  // SW_WITH_CUDA

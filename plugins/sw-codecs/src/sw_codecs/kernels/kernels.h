@@ -3,6 +3,8 @@
 //   grid_lookup    x [n][axes] -> found [n][levels][features]
 //   grid_backward  dL/dfound -> table [entries][features], which holds zeros before: a level by one thread, its points
 //                  in their order, so that sums are the same for any number of threads
+//   signs_lookup   as grid_lookup, of the signs of a table, whose `axes` axes are some of the `columns` of x; `found`
+//                  and dL/dfound are the first of levels * features columns of rows that are `row` long
 //   huffman_decode codes of `n` symbols, bits of a byte from the lowest one -> whether the bytes sufficed.
 //                  counts [trees][size], size >= 2; index [n] below trees. Source: docs/bitstream.md, Huffman codes
 #pragma once
@@ -18,6 +20,10 @@
                    const float* table, float* found, const splatwizard::Parallel& parallel);                        \
   void grid_backward(const sw_grid::Levels& levels, int axes, int features, int64_t n, const float* x,              \
                      const float* gradient, float* table, const splatwizard::Parallel& parallel);                   \
+  void signs_lookup(const sw_grid::Signs& at, const float* table, float* found,                                     \
+                    const splatwizard::Parallel& parallel);                                                         \
+  void signs_backward(const sw_grid::Signs& at, const float* gradient, float* table,                                \
+                      const splatwizard::Parallel& parallel);                                                       \
   bool huffman_decode(const uint8_t* bytes, int64_t length, const float* counts, int64_t trees, int64_t size,       \
                       const int64_t* index, int64_t n, int32_t* symbols);                                           \
   }

@@ -1,0 +1,13 @@
+// The same on CUDA: plain pointers and a stream, no torch. Sums of an anchor are atomic.
+#pragma once
+
+#include <cuda_runtime_api.h>
+
+#include "../spawn.h"
+
+namespace sw_anchors::cuda {
+
+void spawn(const Anchors& from, const Gaussians& to, cudaStream_t stream);
+void spawn_backward(const Anchors& from, const Gaussians& slope, const Gradients& to, cudaStream_t stream);
+
+}  // namespace sw_anchors::cuda

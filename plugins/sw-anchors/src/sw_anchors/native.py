@@ -1,0 +1,17 @@
+"""The native module of anchors: the Gaussians that they spawn, and the gradient, on the CPU and on CUDA."""
+
+from __future__ import annotations
+
+from splatwizard_native import NativeModule
+
+ANCHORS = NativeModule(
+    name="sw_anchors",
+    package="sw_anchors",
+    sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
+    kernels=("kernels/spawn.cpp",),
+    headers=("kernels/*.h", "kernels/cuda/*.h"),
+    cuda_sources=("kernels/cuda/spawn.cu",),
+    cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
+    seconds=10,
+    without="anchors are decoded by torch operations: the same numbers, slower",
+)

@@ -1,0 +1,96 @@
+// Lookup in a grid of signs, and its gradient by the signs: a thread a place and level, as in grid.cu. Four features,
+// as published, are one load and one atomic sum of sixteen bytes.
+#include "kernels.h"
+
+namespace sw_grid::cuda {
+namespace {
+
+constexpr int kThreads = 256;
+
+template <int D>
+__device__ __forceinline__ void corners(const Signs& at, int64_t n, int level, int32_t* entries, float* weights) {
+  float place[D];
+#pragma unroll
+  for (int axis = 0; axis < D; ++axis) place[axis] = at.x[n * at.columns + at.axis[axis]];
+  corners_of<D, true>(at.levels.of[level], at.levels.mask, place, entries, weights);
+}
+
+template <int D, bool kFour>
+__global__ void __launch_bounds__(kThreads)
+    lookup_kernel(const __grid_constant__ Signs at, const float* table, float* found) {
+  const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int level = int(blockIdx.y), features = kFour ? 4 : at.features;
+  if (n >= at.count) return;
+  float weights[1 << D];
+  int32_t entries[1 << D];
+  corners<D>(at, n, level, entries, weights);
+  float sums[kFour ? 4 : kMaxFeatures] = {};
+#pragma unroll
+  for (int corner = 0; corner < 1 << D; ++corner) {
+    const float* entry = table + int64_t(entries[corner]) * features;
+    if constexpr (kFour) {
+      const float4 four = *reinterpret_cast<const float4*>(entry);
+      sums[0] += weights[corner] * sign_of(four.x), sums[1] += weights[corner] * sign_of(four.y);
+      sums[2] += weights[corner] * sign_of(four.z), sums[3] += weights[corner] * sign_of(four.w);
+    } else {
+      for (int k = 0; k < features; ++k) sums[k] += weights[corner] * sign_of(entry[k]);
+    }
+  }
+  float* to = found + n * at.row + level * features;
+  if constexpr (kFour)
+    *reinterpret_cast<float4*>(to) = make_float4(sums[0], sums[1], sums[2], sums[3]);
+  else
+    for (int k = 0; k < features; ++k) to[k] = sums[k];
+}
+
+__device__ __forceinline__ void add_four(float* to, float a, float b, float c, float d) {
+#if __CUDA_ARCH__ >= 900
+  atomicAdd(reinterpret_cast<float4*>(to), make_float4(a, b, c, d));
+#else
+  atomicAdd(to, a), atomicAdd(to + 1, b), atomicAdd(to + 2, c), atomicAdd(to + 3, d);
+#endif
+}
+
+template <int D, bool kFour>
+__global__ void __launch_bounds__(kThreads)
+    backward_kernel(const __grid_constant__ Signs at, const float* gradient, float* table) {
+  const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  const int level = int(blockIdx.y), features = kFour ? 4 : at.features;
+  if (n >= at.count) return;
+  const float* from = gradient + n * at.row + level * features;
+  float own[kFour ? 4 : kMaxFeatures];
+  bool any = false;
+  for (int k = 0; k < features; ++k) own[k] = from[k], any |= own[k] != 0.f;
+  if (!any) return;
+  float weights[1 << D];
+  int32_t entries[1 << D];
+  corners<D>(at, n, level, entries, weights);
+#pragma unroll
+  for (int corner = 0; corner < 1 << D; ++corner) {
+    const float weight = weights[corner];
+    if (weight == 0.f) continue;
+    float* entry = table + int64_t(entries[corner]) * features;
+    if constexpr (kFour)
+      add_four(entry, weight * own[0], weight * own[1], weight * own[2], weight * own[3]);
+    else
+      for (int k = 0; k < features; ++k) atomicAdd(entry + k, weight * own[k]);
+  }
+}
+
+dim3 grid_of(const Signs& at) { return {unsigned((at.count + kThreads - 1) / kThreads), unsigned(at.levels.count)}; }
+
+}  // namespace
+
+void signs_lookup(const Signs& at, bool four, const float* table, float* found, cudaStream_t stream) {
+  const auto kernel = at.axes == 2 ? (four ? lookup_kernel<2, true> : lookup_kernel<2, false>)
+                                   : (four ? lookup_kernel<3, true> : lookup_kernel<3, false>);
+  kernel<<<grid_of(at), kThreads, 0, stream>>>(at, table, found);
+}
+
+void signs_backward(const Signs& at, bool four, const float* gradient, float* table, cudaStream_t stream) {
+  const auto kernel = at.axes == 2 ? (four ? backward_kernel<2, true> : backward_kernel<2, false>)
+                                   : (four ? backward_kernel<3, true> : backward_kernel<3, false>);
+  kernel<<<grid_of(at), kThreads, 0, stream>>>(at, gradient, table);
+}
+
+}  // namespace sw_grid::cuda
