@@ -31,7 +31,8 @@ def run(
     """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
 
     Finished steps are not done again; an interrupted run goes on from its last checkpoint. Installed packages make
-    tables and pages of the finished runs; those about several runs go into the folder above theirs.
+    tables and pages of the finished runs; those about several runs go into the folder above theirs. Comma lists of
+    scenes or seeds make a sweep.
     """
     from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
