@@ -38,7 +38,7 @@ MODULES = {
     "cli.options": (
         "config_option console debug_option device_option geometry_option images_option init_option json_option "
         "methods_option options preset_option print_facts print_json print_table rates_option repeats_option say "
-        "scene_option seed_option set_option"
+        "scene_option seeds_option set_option"
     ),
     "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",

@@ -18,7 +18,7 @@ from splatwizard_core.cli.options import rates_option as rates_option
 from splatwizard_core.cli.options import repeats_option as repeats_option
 from splatwizard_core.cli.options import say as say
 from splatwizard_core.cli.options import scene_option as scene_option
-from splatwizard_core.cli.options import seed_option as seed_option
+from splatwizard_core.cli.options import seeds_option as seeds_option
 from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import EXISTING as EXISTING
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE

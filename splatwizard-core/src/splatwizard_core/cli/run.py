@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @shared.options(
     shared.methods_option, shared.scene_option, shared.images_option, shared.rates_option, shared.preset_option,
     shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
-    shared.seed_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
+    shared.seeds_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
     shared.changed_plan_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
