@@ -195,10 +195,11 @@ def test_a_sweep_whose_process_is_killed_goes_on_where_it_was(tmp_path):
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 def test_a_sweep_that_was_killed_three_times_ends_with_the_same_table(tmp_path):
     """Killed at random, its files and scores are those of the sweep that nobody interrupted."""
     assert main(["data", "synth", str(tmp_path / "other"), "--size", "tiny"]) == 0
-    words = ["bench", "--method", "3dgs,lightgaussian,c3dgs", "--scene", f"demo:tiny,{tmp_path / 'other'}"]
+    words = ["bench", "--method", "3dgs,lightgaussian", "--scene", f"demo:tiny,{tmp_path / 'other'}"]
     words += ["--rate", "r1,r2", "--set", "iterations=60", "--set", "pretrained.iterations=60", "-o", "workers=2"]
     words += ["--set", "checkpoint_every=10", "--device", "cpu"]
     rng = random.Random(18)
@@ -212,4 +213,4 @@ def test_a_sweep_that_was_killed_three_times_ends_with_the_same_table(tmp_path):
         _, said = done.communicate()
         assert done.returncode == 0, said
     assert table(tmp_path / "killed") == table(tmp_path / "quiet")
-    assert len(table(tmp_path / "quiet")) == 12
+    assert len(table(tmp_path / "quiet")) == 8

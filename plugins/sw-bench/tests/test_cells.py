@@ -22,7 +22,7 @@ def planned(tmp_path, *, seed_folders=True, **tables):
     plugins, layout = load_plugins(), Layout(tmp_path, seed_folders)
     plan = checked_plan({"scenes": ["demo:tiny"], "rates": "r1", "set": SHORT, **tables}, "the test")
     cells = cells_of(plan, layout, plugins)
-    return cells, jobs_of(cells, layout, plugins, lambda cell: False), layout
+    return cells, jobs_of(cells, layout, plugins), layout
 
 
 def test_rate_points_of_one_training_share_a_process(tmp_path):

@@ -199,14 +199,16 @@ def test_whatever_ends_a_sweep_its_processes_are_stopped_and_its_runs_wait(tmp_p
     assert set(made.states.values()) == {("waiting", "")}
 
 
-def test_a_run_that_discards_what_was_there_does_so_once(tmp_path):
-    job = run_job([cell(tmp_path)], fresh=True)
-    commands = []
-    made = Made(tmp_path, [job], {job.name: [(KILLED, "", ""), (0, "all", "")]}, trained=False)
-    start = made.executor.start
-    made.executor.start = lambda ticket, command, log: (commands.append(command), start(ticket, command, log))
-    made.run()
-    assert ["--fresh" in command for command in commands] == [True, False]
+def test_discarding_a_run_leaves_what_is_not_its_own(tmp_path):
+    from sw_bench.state import discard
+
+    each = cell(tmp_path)
+    discard(each)  # there is nothing yet
+    (each.directory / "checkpoints").mkdir(parents=True)
+    for name in ("metrics.json", "config.toml", "checkpoints/x", "notes.txt"):
+        (each.directory / name).write_text("x")
+    discard(each)
+    assert sorted(path.name for path in each.directory.iterdir()) == [".lock", "notes.txt"]
 
 
 def test_an_index_follows_its_plan(tmp_path):

@@ -17,7 +17,7 @@ MODULES = {
     "runs.observers": "FinishedRun FinishedRuns StartedTraining TrainingObserver",
     "runs.lock": "directory_lock",
     "runs.config": "ResolvedConfig resolve",
-    "runs.directory": "RunRequest run_directory",
+    "runs.directory": "OWN_FILES RunRequest run_directory",
     "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
     "runs.run": "run train_in",
@@ -38,7 +38,7 @@ MODULES = {
     "cli.options": (
         "config_option console debug_option device_option geometry_option images_option init_option json_option "
         "methods_option options preset_option print_facts print_json print_table rates_option repeats_option say "
-        "scene_option seed_option set_option"
+        "scene_option seeds_option set_option"
     ),
     "cli.complete": "SCENE name_of",
     "cli.paths": "EXISTING OUTPUT_FILE OUTPUT_FOLDER existing_file",

@@ -18,7 +18,7 @@ from splatwizard_core.cli.options import rates_option as rates_option
 from splatwizard_core.cli.options import repeats_option as repeats_option
 from splatwizard_core.cli.options import say as say
 from splatwizard_core.cli.options import scene_option as scene_option
-from splatwizard_core.cli.options import seed_option as seed_option
+from splatwizard_core.cli.options import seeds_option as seeds_option
 from splatwizard_core.cli.options import set_option as set_option
 from splatwizard_core.cli.paths import EXISTING as EXISTING
 from splatwizard_core.cli.paths import OUTPUT_FILE as OUTPUT_FILE
@@ -46,6 +46,7 @@ from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import open_model as open_model
 from splatwizard_core.runs.device import choose_device as choose_device
+from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
 from splatwizard_core.runs.directory import RunRequest as RunRequest
 from splatwizard_core.runs.directory import run_directory as run_directory
 from splatwizard_core.runs.lock import directory_lock as directory_lock

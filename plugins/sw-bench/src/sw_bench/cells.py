@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -115,7 +115,6 @@ class Job:
     name        for people, and for the file of its output
     words       of `sw`
     needs       jobs that must have ended well before
-    fresh       discard what the directories hold (once)
     about       label and scene, for estimates
     trains      its training is not one that it needs
     attempts    starts so far
@@ -126,7 +125,6 @@ class Job:
     cells: tuple[Cell, ...] = ()
     needs: tuple[Job, ...] = ()
     shared: SharedTraining | None = None
-    fresh: bool = False
     attempts: int = 0
     about: tuple[str, str] = ("", "")
     trains: bool = True
@@ -139,7 +137,7 @@ class Job:
 
 def training_key(resolved: ResolvedConfig) -> str:
     """Return a key that is equal for equal trainings on the same scene, as the plan names it."""
-    start = repr((resolved.init, sorted(resolved.pretrained.items()), resolved.preset if resolved.pretrained else ""))
+    start = repr((resolved.init, resolved.preset, sorted(resolved.pretrained.items())))  # of what it may start from
     told = f"{resolved.training_hash()} {resolved.absolute_scene} {start}"
     return hashlib.sha256(told.encode()).hexdigest()[:16]
 
@@ -204,16 +202,11 @@ def _resolved(plan: Plan, label: str, scene: str, seed: int, layout: Layout, plu
     ]
 
 
-def jobs_of(
-    cells: Sequence[Cell], layout: Layout, plugins: PluginManager, is_changed: Callable[[Cell], bool]
-) -> list[Job]:
-    """Put unfinished cells into processes, what others need first; a training that several need is a job of its own.
-
-    is_changed  whether the run directory of a cell holds another training, which is to be discarded
-    """
+def jobs_of(cells: Sequence[Cell], layout: Layout, plugins: PluginManager) -> list[Job]:
+    """Put unfinished cells into processes, what others need first; a training that several need is a job of its own."""
     groups: dict[tuple[object, ...], list[Cell]] = {}
     for cell in cells:
-        groups.setdefault((cell.root, cell.label, cell.scene, cell.training, is_changed(cell)), []).append(cell)
+        groups.setdefault((cell.root, cell.label, cell.scene, cell.training), []).append(cell)
     wanted: dict[tuple[int, str], list[ResolvedConfig]] = {}
     needs: list[list[tuple[int, str]]] = []
     for group in groups.values():
@@ -229,20 +222,20 @@ def jobs_of(
         job.needs = tuple(shared[each] for each in bases if each in shared)
     made = []
     for group, keys in zip(groups.values(), needs, strict=True):
-        job = run_job(group, fresh=is_changed(group[0]))
+        job = run_job(group)
         job.needs = tuple(shared[key] for key in keys if key in shared)
         job.trains = keys[-1] not in shared
         made.append(job)
     return [*shared.values(), *made]
 
 
-def run_job(cells: Sequence[Cell], *, fresh: bool = False) -> Job:
+def run_job(cells: Sequence[Cell]) -> Job:
     """Make the job of cells that share a training."""
     first = cells[0]
     rates = ",".join(cell.rate for cell in cells)
     name = f"{first.label} {first.scene} seed {first.seed} {rates}"
     words = ("run", *first.words, "--rate", rates)
-    return Job(name, words, tuple(cells), fresh=fresh, about=(first.label, first.scene))
+    return Job(name, words, tuple(cells), about=(first.label, first.scene))
 
 
 def _bases(resolved: ResolvedConfig, plugins: PluginManager) -> list[ResolvedConfig]:

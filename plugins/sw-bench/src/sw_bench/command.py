@@ -22,7 +22,7 @@ from splatwizard_core.tooling import (
     rates_option,
     repeats_option,
     scene_option,
-    seed_option,
+    seeds_option,
     set_option,
 )
 
@@ -30,7 +30,7 @@ from splatwizard_core.tooling import (
 @click.command(short_help="a sweep of methods, scenes, rate points and seeds")
 @click.argument("plan", metavar="[PLAN.toml]", required=False, type=click.Path(dir_okay=False))
 @options(
-    methods_option, scene_option, rates_option, seed_option, preset_option, images_option, init_option, config_option,
+    methods_option, scene_option, rates_option, seeds_option, preset_option, images_option, init_option, config_option,
     set_option,
     click.option("--out", metavar="DIR", type=click.Path(),
                  help="Root of the run directories, DIR/seed-N/<scene>/<method>/<rate>; the same sweep goes on there.  "

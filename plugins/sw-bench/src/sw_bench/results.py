@@ -61,13 +61,14 @@ def table_of(rows: Sequence[Facts], plugins: PluginManager) -> tuple[list[str], 
     names = sorted({name for row in rows for name in row["means"]} - {"bytes"}, key=lambda n: (order.get(n, 1e9), n))
     several = len({seed for row in rows for seed in row["seeds"]}) > 1
     headings = ["method", "scene", "rate", *(["n"] if several else [])]
-    headings += [infos[name].label if name in infos else name for name in names] + ["MB", ""]
+    remarks = any(map(_remark, rows))
+    headings += [infos[name].label if name in infos else name for name in names] + ["MB", *([""] if remarks else [])]
     lines = []
     for row in rows:
         cells = [row["label"], row["scene"], row["rate"], *([str(len(row["seeds"]))] if several else [])]
         for name in names:
             cells.append(_number(row, name, infos[name].digits if name in infos else 4, 1.0))
-        lines.append([*cells, _number(row, "bytes", 3, 1e-6), _remark(row)])
+        lines.append([*cells, _number(row, "bytes", 3, 1e-6), *([_remark(row)] if remarks else [])])
     return headings, lines
 
 

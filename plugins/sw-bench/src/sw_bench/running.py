@@ -30,7 +30,7 @@ from sw_bench.executor import Executor, Site
 from sw_bench.index import Index
 from sw_bench.plan import Plan, checked_plan, read_plan
 from sw_bench.results import results, table_of
-from sw_bench.state import State, changes_of, state_of
+from sw_bench.state import State, changes_of, discard, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
@@ -128,7 +128,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     elif given["recheck"]:
         states |= {cell: State.BEGUN for cell in cells if states[cell] is State.FINISHED}
     unfinished = [cell for cell in cells if states[cell] is not State.FINISHED]
-    jobs = jobs_of(unfinished, layout, plugins, lambda cell: states[cell] is State.CHANGED)
+    jobs = jobs_of(unfinished, layout, plugins)
     if given["dry_run"]:
         from sw_bench.dry_run import dry_run
 
@@ -142,6 +142,9 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         index = Index(layout.out)
         stack.callback(index.close)
         _begin(index, wanted, cells, states)
+        for cell in unfinished:
+            if states[cell] is State.CHANGED:
+                discard(cell)
         prepare(jobs, layout)
         estimates = Estimates(index.durations())
         finished = [cell for cell in cells if states[cell] is State.FINISHED]

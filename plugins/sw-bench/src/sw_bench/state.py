@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.api import UserInputError
-from splatwizard_core.tooling import FILE_NAME, Choices, PluginManager, Record, read_record
+from splatwizard_core.tooling import FILE_NAME, OWN_FILES, Choices, PluginManager, Record, directory_lock, read_record
+from splatwizard_native import remove_folder
 from sw_bench.cells import Cell, SharedTraining, training_key
 
 CONFIG = "config.toml"
@@ -61,6 +62,18 @@ def _leaves(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in table.items():
         found |= _leaves(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
     return found
+
+
+def discard(cell: Cell) -> None:
+    """Remove what a run has left in its directory, as `--fresh` does; other files stay."""
+    if not cell.directory.exists():
+        return
+    with directory_lock(cell.directory):
+        for path in (cell.directory / name for name in OWN_FILES):
+            if path.is_dir() and not path.is_symlink():
+                remove_folder(path)
+            else:
+                path.unlink(missing_ok=True)
 
 
 def record_of(cell: Cell) -> Record | None:

@@ -89,11 +89,16 @@ class Sweep:
     def _start(self, job: Job) -> None:
         job.attempts += 1
         log = self.out / LOGS / job.log
-        words = [*job.words, *(["--fresh"] if job.fresh else [])]
-        job.fresh = False  # the next start goes on
-        command = [sys.executable, "-m", "sw_bench.child", *(str(cell.directory) for cell in job.cells), "--", *words]
+        command = [
+            sys.executable,
+            "-m",
+            "sw_bench.child",
+            *(str(cell.directory) for cell in job.cells),
+            "--",
+            *job.words,
+        ]
         for cell in job.cells:
-            facts = {"command": shlex.join(["sw", *words]), "log": f"{LOGS}/{job.log}", "attempts": job.attempts}
+            facts = {"command": shlex.join(["sw", *job.words]), "log": f"{LOGS}/{job.log}", "attempts": job.attempts}
             self.index.note(cell, status="running", reason="", **facts)
         size = log.stat().st_size if log.exists() else 0
         ticket = f"{job.name} #{job.attempts}"

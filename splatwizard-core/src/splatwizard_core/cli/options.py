@@ -86,6 +86,9 @@ device_option = click.option(
     help="Where to compute.  [default: auto, which is CUDA if its kernels can run]",
 )  # fmt: skip
 seed_option = click.option(
+    "--seed", type=click.IntRange(min=0), metavar="N", help="Of every random stream.  [default: 0]"
+)
+seeds_option = click.option(
     "--seed", type=_seeds, metavar="N[,N]", help="Of every random stream; several make a sweep.  [default: 0]"
 )
 repeats_option = click.option(

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 @shared.options(
     shared.methods_option, shared.scene_option, shared.images_option, shared.rates_option, shared.preset_option,
     shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
-    shared.seed_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
+    shared.seeds_option, shared.repeats_option, shared.geometry_option, shared.resume_option,
     shared.changed_plan_option, shared.json_option, shared.debug_option,
 )  # fmt: skip
 @takes_choices
@@ -31,7 +31,8 @@ def run(
     """Train, encode, decode in a fresh process, evaluate, report: one scene, any methods and rate points.
 
     Finished steps are not done again; an interrupted run goes on from its last checkpoint. Installed packages make
-    tables and pages of the finished runs; those about several runs go into the folder above theirs.
+    tables and pages of the finished runs; those about several runs go into the folder above theirs. Comma lists of
+    scenes or seeds make a sweep.
     """
     from splatwizard_core.runs.directory import RunRequest
     from splatwizard_core.runs.observers import FinishedRun, FinishedRuns
