@@ -6,8 +6,8 @@
 `c3dgs` reads the tables in its kernels; `gathered` is `GaussianInputs.gathered()` in front of `standard`, what any
 rasterizer that reads no tables is given. Each runs in a process of its own. Memory: the most that is there during the
 forward pass, and during the backward pass, above what is there before both (the inputs and their gradients' place are
-not counted), on a CPU of the resident set. Times are the least over --repeats. Last: how far
-images and gradients are apart.
+not counted), on a CPU of the resident set. Times are the least over --repeats. Last: the differences of images and
+gradients.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ import pytest
 
 from splatwizard_core.errors import BitstreamError
 from sw_codecs.context import hash_grid, integer_mlp, plane_streams, triplane
-from sw_codecs.entropy import exact_streams, lattice
+from sw_codecs.entropy import conditional, exact_streams, lattice
 from sw_codecs.exact_native import EXACT
 
 
@@ -37,7 +37,7 @@ def assert_survives_damage():
 @pytest.fixture
 def kernels(monkeypatch):
     """Let the exact mode run with its compiled kernels or without: `kernels(False)`."""
-    users = (hash_grid, integer_mlp, plane_streams, triplane, exact_streams, lattice)
+    users = (hash_grid, integer_mlp, plane_streams, triplane, conditional, exact_streams, lattice)
 
     def use(compiled):
         if compiled:

@@ -29,6 +29,7 @@ MODULES = {
     "scene.locate": "DATA_VARIABLE",
     "training.pipeline": "TrainingRun TrainingStopped",
     "training.scheduler": "build_schedulers",
+    "training.params": "SceneParams",
     "coding.container": "decoded_limit",
     "evaluation.evaluate": "png_names render_view save_png",
     "evaluation.metrics": "MetricInfo short_reason",

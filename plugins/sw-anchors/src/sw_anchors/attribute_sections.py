@@ -111,11 +111,11 @@ class AttributeDecoder(AttributeCoder):
         """Raises BitstreamError for damage."""
         with self._reader.decoding(block.section):
             data = next(self._coded[block.section])
-            if isinstance(context, RowMixture):
-                symbols = torch.from_numpy(self.mixtures.decode(data, context, present))
-            else:
-                symbols = torch.from_numpy(self.coder.decode(data, context, present))
-        self._found[block.group][block.rows, block.columns] = (symbols * step).to(torch.float32)
+            values = self._found[block.group][block.rows, block.columns]
+            if not isinstance(context, RowMixture):
+                return self.coder.decode_into(values, data, context, step, present)
+            symbols = torch.from_numpy(self.mixtures.decode(data, context, present))
+            values.copy_(symbols * step)
         return symbols
 
     def finish(self) -> None:

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -33,6 +34,24 @@ def test_a_block_comes_back(mode, shape):
     assert np.array_equal(C(mode).decode(codec.encode(symbols, context), context), symbols)
     data = codec.encode(symbols, context, present)
     assert np.array_equal(C(mode).decode(data, context, present), symbols * present)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+@pytest.mark.parametrize("mode", C.MODES)
+@pytest.mark.parametrize("shape", [(300, 7), (1, 1), (0, 7)])
+def test_values_are_written_into_their_place(mode, shape, compiled, kernels):
+    kernels(compiled)
+    symbols, context = block(*shape, mode=mode)
+    there = torch.from_numpy(np.random.default_rng(1).random(shape) < 0.6)
+    step = torch.rand(shape[0], 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64) + 0.01
+    whole = torch.full((shape[0], shape[1] + 2), -7.0)
+    for present in (None, there):
+        data = C(mode).encode(symbols, context, present)
+        found = C(mode).decode_into(whole[:, 1:-1], data, context, step, present)
+        expected = torch.from_numpy(symbols if present is None else symbols * there.numpy())
+        assert torch.equal(found, expected)
+        assert torch.equal(whole[:, 1:-1], (expected * step).to(torch.float32))
+        assert bool((whole[:, [0, -1]] == -7).all())
 
 
 @pytest.mark.parametrize("mode", C.MODES)

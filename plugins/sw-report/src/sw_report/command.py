@@ -10,7 +10,6 @@ import click
 from splatwizard_core.tooling import (
     OUTPUT_FILE,
     OUTPUT_FOLDER,
-    console,
     debug_option,
     name_of,
     options,
@@ -20,7 +19,6 @@ from splatwizard_core.tooling import (
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
-    from sw_report.blocks import Table
     from sw_report.runs import Run
 
 
@@ -101,6 +99,8 @@ def report(
         elif form == "markdown":
             click.echo(exports.to_markdown(tables, collection.notes), nl=False)
         else:
+            from sw_report.printed import print_tables
+
             print_tables(tables, collection.notes)
     elif collection.notes:
         for note in collection.notes:
@@ -113,26 +113,3 @@ def open_scene(run: Run) -> Scene:
 
     resolved = Choices(config_file=str(existing_file(str(run.directory / "config.toml")))).resolve_without_method()
     return load_scene(resolved.scene_spec, resolved.scene, load_plugins())
-
-
-def print_tables(tables: list[tuple[str, Table]], notes: list[str]) -> None:
-    """Print tables as text on stdout."""
-    from rich.markup import escape
-    from rich.table import Table as Drawn
-
-    out = console()
-    for title, table in tables:
-        drawn = Drawn(title=escape(title), title_justify="left")
-        for i, column in enumerate(table.columns):
-            drawn.add_column(escape(column.name), justify="left" if column.text or not i else "right")
-        for row in table.rows:
-            cells = [f"[bold]*{escape(cell.text)}[/bold]" if cell.best else escape(cell.text) for cell in row.cells]
-            drawn.add_row(*cells, end_section=row.emphasis)
-        out.print(drawn)
-        if table.has_best:
-            out.print("* best of its column")
-        for note in table.notes:
-            out.print(escape(note), soft_wrap=True)
-        out.print()
-    for note in notes:
-        out.print(escape(f"note: {note}"), soft_wrap=True)

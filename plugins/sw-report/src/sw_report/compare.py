@@ -26,7 +26,7 @@ def compare(folders: tuple[str, ...], published: bool, own: bool, as_json: bool)
     if not published:
         raise click.UsageError("say what to compare with: --published takes the published figures")
     from sw_report.beside_tables import beside_tables, to_dict
-    from sw_report.command import print_tables
+    from sw_report.printed import print_tables
     from sw_report.runs import collect
 
     collection = collect([Path(folder) for folder in folders])

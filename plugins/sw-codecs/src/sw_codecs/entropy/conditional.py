@@ -23,6 +23,7 @@ from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
 from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
 from sw_codecs.entropy.lattice import lattice
 from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.exact_native import EXACT
 
 BLOCK_SYMBOLS = 1 << 20
 FLOAT_LATTICE = 16  # means and deviations in steps are rounded to 1/16
@@ -87,6 +88,28 @@ class ConditionalGaussian:
         except ValueError as error:
             raise BitstreamError(str(error)) from error
         found[where] = coded if where is not Ellipsis else coded.reshape(shape)
+        return found
+
+    def decode_into(
+        self, values: Tensor, data: bytes, context: RowContext, step: Tensor, present: Tensor | None = None
+    ) -> Tensor:
+        """As `decode`, a tensor; and write integer * step into `values`.
+
+        values      float32 [n,C] on the CPU, may be a part of a larger tensor
+        step        [n,1] float64
+        """
+        if self.mode == "exact" and values.stride(-1) == 1 and EXACT.try_load():
+            there = None if present is None else present.to(torch.bool).contiguous()
+            shown = None if there is None else there.numpy()
+            try:
+                where = lattice(context.mean, context.scale, context.step, shown)
+            except ValueError as error:
+                raise BitstreamError(str(error)) from error
+            symbols = torch.from_numpy(self._exact.decode_at(data, *where))
+            found: Tensor = torch.ops.sw_codecs_exact.put_values(symbols, there, step.contiguous(), values)
+            return found
+        found = torch.from_numpy(self.decode(data, context, present))
+        values.copy_(found * step)
         return found
 
     def bits(self, symbols: Numbers, context: RowContext, present: Numbers | None = None) -> Tensor:

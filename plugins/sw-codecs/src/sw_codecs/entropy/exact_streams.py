@@ -145,7 +145,7 @@ def read_sizes(reader: ByteReader, count: int, *, crc: bool) -> np.ndarray:
 
 
 def write_sizes(sizes: np.ndarray, *, crc: bool) -> bytes:
-    """What `read_sizes` reads."""
+    """Bytes of the sizes, as `read_sizes` takes them."""
     rows = sizes.tolist()
     return b"".join(
         (row[0].to_bytes(4, "little") if crc else b"") + write_varint(row[1]) + write_varint(row[2]) for row in rows

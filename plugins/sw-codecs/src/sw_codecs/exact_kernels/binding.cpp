@@ -77,6 +77,22 @@ Tensor joined(const Tensor& data, const std::vector<int64_t>& offsets, const Ten
   return found;
 }
 
+// Numbers that are present, and the number of the first one of each row, if not all are.
+int64_t starts_of(const std::optional<Tensor>& present, int64_t rows, int64_t columns, std::vector<int64_t>& start,
+                  const char* op) {
+  if (!present.has_value()) return rows * columns;
+  check(*present, at::kBool, 2, op, "present");
+  TORCH_CHECK(present->size(0) == rows && present->size(1) == columns, op, ": present must be [rows, columns]");
+  const bool* there = present->const_data_ptr<bool>();
+  int64_t count = 0;
+  start.reserve(static_cast<size_t>(rows));
+  for (int64_t row = 0; row < rows; ++row) {
+    start.push_back(count);
+    for (int64_t c = 0; c < columns; ++c) count += there[row * columns + c];
+  }
+  return count;
+}
+
 // (integer parts [m] i32, table numbers [m] i16, status) of the present numbers.
 std::tuple<Tensor, Tensor, int64_t> lattice(const Tensor& mean, const Tensor& scale, const Tensor& multiplier,
                                             const std::optional<Tensor>& present, const Tensor& thresholds) {
@@ -90,20 +106,7 @@ std::tuple<Tensor, Tensor, int64_t> lattice(const Tensor& mean, const Tensor& sc
   TORCH_CHECK(thresholds.numel() == 63, op, ": thresholds must be 63");
   const int64_t rows = mean.size(0), columns = mean.size(1);
   std::vector<int64_t> start;
-  int64_t count = rows * columns;
-  if (present.has_value()) {
-    check(*present, at::kBool, 2, op, "present");
-    TORCH_CHECK(present->sizes() == mean.sizes(), op, ": present must be like mean");
-    const bool* there = present->const_data_ptr<bool>();
-    count = 0;
-    start.reserve(static_cast<size_t>(rows));
-    for (int64_t row = 0; row < rows; ++row) {
-      start.push_back(count);
-      int64_t found = 0;
-      for (int64_t c = 0; c < columns; ++c) found += there[row * columns + c];
-      count += found;
-    }
-  }
+  const int64_t count = starts_of(present, rows, columns, start, op);
   Tensor centre = at::empty({count}, mean.options().dtype(at::kInt));
   Tensor number = at::empty({count}, mean.options().dtype(at::kShort));
   const LatticeArgs args{mean.const_data_ptr<int64_t>(),
@@ -168,6 +171,32 @@ std::tuple<Tensor, Tensor> encode_streams(at::TensorList tables, const Tensor& s
                             number.const_data_ptr<int16_t>(), count, symbols.const_data_ptr<int32_t>(),
                             torch_parallel());
   return {joined(data, offsets, sizes), sizes};
+}
+
+// Symbols [m] i32 as integers [n, C] i64, 0 where they are not present; values [n, C] f32 become integer * step.
+Tensor put_values(const Tensor& symbols, const std::optional<Tensor>& present, const Tensor& step,
+                  const Tensor& values) {
+  const char* op = "put_values";
+  check(symbols, at::kInt, 1, op, "symbols");
+  check(step, at::kDouble, 2, op, "step");
+  TORCH_CHECK(values.is_cpu() && values.scalar_type() == at::kFloat && values.dim() == 2 &&
+                  (values.size(1) < 2 || values.stride(1) == 1) && step.size(0) == values.size(0) && step.size(1) == 1,
+              op, ": values must be f32 [n, columns] on the CPU, with a step for each row");
+  std::vector<int64_t> start;
+  const int64_t rows = values.size(0), columns = values.size(1);
+  TORCH_CHECK(starts_of(present, rows, columns, start, op) == symbols.numel(), op, ": another number of symbols");
+  Tensor integers = at::empty({rows, columns}, symbols.options().dtype(at::kLong));
+  const PutArgs args{symbols.const_data_ptr<int32_t>(),
+                     present.has_value() ? reinterpret_cast<const uint8_t*>(present->const_data_ptr<bool>()) : nullptr,
+                     start.data(),
+                     step.const_data_ptr<double>(),
+                     rows,
+                     columns,
+                     values.mutable_data_ptr<float>(),
+                     values.stride(0),
+                     integers.mutable_data_ptr<int64_t>()};
+  SW_SELECT(put_values)(args, torch_parallel());
+  return integers;
 }
 
 // Writes outputs [n, out] i64 of a network for inputs [n, in] i64; layers: W [out, in] and b [out] f64 in turn.
@@ -360,6 +389,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
         " -> (Tensor, Tensor, int)");
   m.def("decode_streams(Tensor[] tables, Tensor data, Tensor sizes, Tensor centre, Tensor number) -> (Tensor, int)");
   m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
+  m.def("put_values(Tensor symbols, Tensor? present, Tensor step, Tensor(a!) values) -> Tensor");
   m.def("network(Tensor inputs, Tensor[] layers, Tensor(a!) outputs) -> ()");
   m.def("grid_features(Tensor codes, int[] axes, Tensor signs, int features, Tensor levels, int dense, int log2_size,"
         " Tensor(a!) out) -> ()");
@@ -370,6 +400,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.impl("lattice", c10::DispatchKey::CPU, TORCH_FN(lattice));
   m.impl("decode_streams", c10::DispatchKey::CPU, TORCH_FN(decode_streams));
   m.impl("encode_streams", c10::DispatchKey::CPU, TORCH_FN(encode_streams));
+  m.impl("put_values", c10::DispatchKey::CPU, TORCH_FN(put_values));
   m.impl("network", c10::DispatchKey::CPU, TORCH_FN(network));
   m.impl("grid_features", c10::DispatchKey::CPU, TORCH_FN(grid_features));
   m.impl("triplane_features", c10::DispatchKey::CPU, TORCH_FN(triplane_features));

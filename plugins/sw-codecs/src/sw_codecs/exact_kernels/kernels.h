@@ -59,6 +59,18 @@ struct LatticeArgs {
   int16_t* number;
 };
 
+// Where decoded symbols go: integers [rows, columns], and their products with a step of each row.
+struct PutArgs {
+  const int32_t* symbols;
+  const uint8_t* present;  // [rows, columns] or null: all
+  const int64_t* start;    // as in LatticeArgs
+  const double* step;      // [rows]
+  int64_t rows, columns;
+  float* values;
+  int64_t stride;  // of values, from row to row
+  int64_t* integers;
+};
+
 struct Layer {
   const double* weights;  // [tiles, inputs, TILE]: outputs in tiles, zeros behind the last one
   const double* bias;     // [tiles * TILE]
@@ -110,6 +122,7 @@ struct PlanesArgs {
                          const int16_t* number, int64_t count, int32_t* symbols, const splatwizard::Parallel&);     \
   int32_t encode_streams(const splatwizard::Tables&, const splatwizard::Sinks&, const int32_t* centre,              \
                          const int16_t* number, int64_t count, const int32_t* symbols, const splatwizard::Parallel&); \
+  void put_values(const splatwizard::PutArgs&, const splatwizard::Parallel&);                                       \
   void network(const splatwizard::Layer* layers, int64_t depth, const int64_t* inputs, int64_t rows, int64_t* out,  \
                const splatwizard::Parallel&);                                                                       \
   void grid_features(const splatwizard::GridArgs&, const splatwizard::Parallel&);                                   \

@@ -219,4 +219,21 @@ int32_t lattice(const LatticeArgs& a, const Parallel& parallel) {
   return status;
 }
 
+void put_values(const PutArgs& a, const Parallel& parallel) {
+  parallel(a.rows, 1024, [&](int64_t begin, int64_t end) {
+    for (int64_t row = begin; row < end; ++row) {
+      const uint8_t* present = a.present == nullptr ? nullptr : a.present + row * a.columns;
+      const int32_t* from = a.symbols + (present == nullptr ? row * a.columns : a.start[row]);
+      float* values = a.values + row * a.stride;
+      int64_t* integers = a.integers + row * a.columns;
+      const double step = a.step[row];
+      for (int64_t c = 0; c < a.columns; ++c) {
+        const int32_t symbol = present == nullptr || present[c] ? *from++ : 0;
+        integers[c] = symbol;
+        values[c] = static_cast<float>(static_cast<double>(symbol) * step);
+      }
+    }
+  });
+}
+
 }  // namespace SW_ARCH
