@@ -29,8 +29,11 @@ def test_fixed_sizes_change_neither_values_nor_gradients():
     check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(0, 1, 120, 255, N))
 
 
-def test_places_that_are_worked_out_anew_are_the_same(monkeypatch):
-    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 0)
+@pytest.mark.parametrize("kept", [True, False])
+def test_without_a_kernel_for_the_grid_it_is_the_same(kept, monkeypatch):
+    monkeypatch.setattr("sw_codecs.context.hash_grid.signs_fit_kernel", lambda *_: False)
+    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
+    assert len(trained().context_rows()) == (4 if kept else 1)
     check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(90,), phases=(ENTROPY,))
 
 
