@@ -1,6 +1,7 @@
 """A training step of HAC in tensors of fixed sizes, as a GPU replays it, equals that on any number of anchors."""
 
 import copy
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -118,6 +119,21 @@ def test_a_copy_and_evaluation_leave_the_fixed_sizes_alone():
     with torch.no_grad():
         model.train().decode(front_camera(), torch.arange(10))
     assert fixed.captures == 0
+
+
+def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(monkeypatch, caplog):
+    def refuse(*_):
+        raise RuntimeError("operation not permitted\nand more")
+
+    monkeypatch.setattr("sw_anchors.fixed_decoder.CapturedStep", refuse)
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 0))
+    monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
+    model = trained().train()
+    model.fixed = FixedDecoder()
+    for _ in range(2):
+        found = model.decode(front_camera(), torch.arange(30))
+        assert found.extras["rate"].bits.requires_grad
+    assert caplog.messages == ["training goes on without CUDA graphs, slower: operation not permitted"]
 
 
 @pytest.fixture(scope="module")
