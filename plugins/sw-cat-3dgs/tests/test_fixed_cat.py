@@ -1,6 +1,7 @@
 """A training step of CAT-3DGS in tensors of fixed sizes, as a GPU replays it, equals that on any number of anchors."""
 
 import copy
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -80,6 +81,17 @@ def test_bits_are_captured_anew_when_planes_are_others_or_others_learn(model):
     assert fixed.captures == 3
     model.train_only("nothing")
     assert not model.plane_bits(1.0).requires_grad
+
+
+def test_a_gpu_that_refuses_graphs_of_the_planes_is_named_once(model, monkeypatch, caplog):
+    def refuse(*_):
+        raise RuntimeError("operation not permitted\nand more")
+
+    monkeypatch.setattr("sw_cat_3dgs.plane_bits.CapturedStep", refuse)
+    monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
+    fixed = FixedPlaneBits()
+    assert all(plane_bits(model, fixed, 1.0)[0] > 0 for _ in range(2))
+    assert caplog.messages == ["the planes' bits go on without CUDA graphs: operation not permitted"]
 
 
 @pytest.mark.cuda

@@ -1,6 +1,7 @@
 """A training step of HAC in tensors of fixed sizes, as a GPU replays it, equals that on any number of anchors."""
 
 import copy
+from contextlib import nullcontext
 
 import pytest
 import torch
@@ -29,8 +30,11 @@ def test_fixed_sizes_change_neither_values_nor_gradients():
     check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(0, 1, 120, 255, N))
 
 
-def test_places_that_are_worked_out_anew_are_the_same(monkeypatch):
-    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 0)
+@pytest.mark.parametrize("kept", [True, False])
+def test_without_a_kernel_for_the_grid_it_is_the_same(kept, monkeypatch):
+    monkeypatch.setattr("sw_codecs.context.hash_grid.signs_fit_kernel", lambda *_: False)
+    monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
+    assert len(trained().context_rows()) == (4 if kept else 1)
     check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(90,), phases=(ENTROPY,))
 
 
@@ -115,6 +119,21 @@ def test_a_copy_and_evaluation_leave_the_fixed_sizes_alone():
     with torch.no_grad():
         model.train().decode(front_camera(), torch.arange(10))
     assert fixed.captures == 0
+
+
+def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(monkeypatch, caplog):
+    def refuse(*_):
+        raise RuntimeError("operation not permitted\nand more")
+
+    monkeypatch.setattr("sw_anchors.fixed_decoder.CapturedStep", refuse)
+    monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 0))
+    monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
+    model = trained().train()
+    model.fixed = FixedDecoder()
+    for _ in range(2):
+        found = model.decode(front_camera(), torch.arange(30))
+        assert found.extras["rate"].bits.requires_grad
+    assert caplog.messages == ["training goes on without CUDA graphs, slower: operation not permitted"]
 
 
 @pytest.fixture(scope="module")

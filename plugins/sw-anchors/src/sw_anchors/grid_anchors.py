@@ -101,12 +101,11 @@ class GridAnchors(CodedAnchors):
         return {name: getattr(self, name) for name in (*self.NETWORKS, "mlp_grid")}
 
     def context_rows(self) -> tuple[Tensor, ...]:
-        """Positions of the anchors in the grid's cube, or their GridPlaces: on a CPU these are kept if they fit."""
+        """Positions of the anchors in the grid's cube; or their GridPlaces, if there is no kernel and they fit."""
         codes = self.codes()
         if self._places is None or self._places[0] is not codes:
             x = codes.to(self.features) / TOP
-            kept = len(codes) * self.grid.place_bytes <= PLACES_LIMIT
-            kept = kept and (x.device.type == "cpu" or not self.grid.has_kernel(x))
+            kept = not self.grid.has_kernel(x) and len(codes) * self.grid.place_bytes <= PLACES_LIMIT
             self._places = None  # the old ones go before the new ones come
             self._places = (codes, tuple(self.grid.places(x)) if kept else (x,))
         return self._places[1]

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor, nn
 
 WARM_UPS = 3
-"""Runs before a capture, in which libraries set themselves up; as torch's own `make_graphed_callables`."""
+"""Runs before a device's first capture, in which libraries set themselves up; as torch's own `make_graphed_callables`.
+Before a later one there is one, which loads what its shapes need."""
 
 Found = tuple[tuple[Tensor, ...], tuple[Tensor, ...]]
 """Results of a computation: those that have a gradient, and others."""
@@ -71,11 +72,12 @@ class CapturedStep:
         stream.wait_stream(current)
         # In this thread, or the engine's own would launch what this one's stream is to record.
         with torch.cuda.stream(stream), torch.enable_grad(), torch.autograd.set_multithreading_enabled(False):
-            for _ in range(WARM_UPS):
+            for _ in range(WARM_UPS if current.device_index not in _WARM else 1):
                 results, _ = compute()
                 slopes = tuple(torch.zeros_like(each) for each in results)
                 differentiate(results, inputs, slopes)
             del results
+            _WARM.add(current.device_index)
             self._slopes = slopes
             torch.cuda.synchronize()
             torch.cuda.empty_cache()  # what the warm-ups took on this stream serves no other
@@ -101,6 +103,9 @@ class CapturedStep:
         torch._foreach_copy_([mine for mine, _ in given], [slope for _, slope in given])
         self._backward.replay()
         return self._grads
+
+
+_WARM: set[int] = set()
 
 
 @functools.cache

@@ -1,4 +1,4 @@
-"""What the three networks of anchors say for a view: one node of the graph of derivatives.
+"""Outputs of the three networks of anchors for a view: one node of the graph of derivatives.
 
 A step of training is bound by how many operators the host has to launch, not by what they compute: the first layers of
 all three are one product, and the gradient is written down (benchmarks/train_anchors.py).

@@ -123,7 +123,7 @@ class HACPlusAnchors(GridAnchors):
         values = add_noise(values, steps, self.uniform(*values.shape))
         bits = self._bits(values, steps, forecast) * self._shares(masks)
         by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
-        return AnchorRate(bits.sum() / bits.numel(), by_group, by_group.new_tensor(bits.numel()), forecast.own_bits)
+        return AnchorRate(bits.sum() / bits.numel(), by_group, by_group.new_full((), bits.numel()), forecast.own_bits)
 
     def _shares(self, masks: Tensor) -> Tensor:
         """[S,C] factors of the bits: whether the anchor is there, for an offset times its mask; with gradient."""
