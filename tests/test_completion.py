@@ -115,7 +115,7 @@ def test_every_parameter_that_takes_a_word_offers_something_if_it_can():
             by_type = not isinstance(parameter.type, (click.types.StringParamType, click.types.FuncParamType))
             if not wordless and not by_type and parameter._custom_shell_complete is None:
                 silent.append(parameter.name)
-    assert set(silent) == {"images", "sets", "pins", "name", "only", "seed", "given"}  # only the user knows their values
+    assert set(silent) == {"images", "sets", "pins", "name", "only", "seed", "given"}  # only users know their values
 
 
 def test_every_option_that_takes_a_value_says_what_holds_without_it():
