@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import argparse
 import collections
-import importlib
+import importlib.util
 import math
 import sys
 import time
@@ -39,17 +39,19 @@ PARTS = {
     "sw_{}.codec:read_geometry": "positions, masks",
     "sw_{}.codec:add_networks": "networks",
     "sw_{}.codec:read_networks": "networks",
-    "sw_{}.codec:_read_grid": "grid",
-    "sw_hac.codec:Bernoulli.encode": "grid",
-    "sw_{}.codec:copy.deepcopy": "copy of the model",
+    "sw_{}.codec:add_grid": "grid",
+    "sw_{}.codec:read_grid": "grid",
+    "sw_{}.codec:settled_copy": "copy of the model",
+    "sw_{}.codec:_settled_context": "copy of the model",
     "sw_{}.codec:SpatialAr.encode": "triplane",
     "sw_{}.codec:SpatialAr.decode": "triplane",
     "sw_{}.codec:CatContext.places": "places",
-    "sw_{}.predictors:ExactPredictor.__call__": "context networks",
-    "sw_{}.predictors:ExactPredictor.first": "context networks",
     "sw_{}.predictors:ExactPredictor.shift": "channel networks",
+    "sw_anchors.attribute_sections:ExactNetwork.outputs": "context networks",
     "sw_anchors.attribute_sections:ConditionalGaussian.encode": "symbols",
-    "sw_anchors.attribute_sections:ConditionalGaussian.decode": "symbols",
+    "sw_anchors.attribute_sections:ConditionalGaussian.decode_into": "symbols",
+    "sw_anchors.attribute_sections:ConditionalMixture.encode": "mixtures",
+    "sw_anchors.attribute_sections:ConditionalMixture.decode": "mixtures",
     "sw_anchors.attribute_sections:SteRound.encode": "rounding",
 }
 """Module and attribute -> part; `{}` is the method."""
@@ -94,6 +96,8 @@ def watching(clock: Clock, method: str) -> Iterator[None]:
     undo = []
     for place, name in PARTS.items():
         module, path = place.format(method.replace("-", "_")).split(":")
+        if importlib.util.find_spec(module) is None:
+            continue
         owner = importlib.import_module(module)
         *steps, leaf = path.split(".")
         for step in steps:

@@ -23,6 +23,7 @@ import statistics
 import subprocess
 import sys
 import tempfile
+import threading
 import zipfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -105,14 +106,18 @@ def waves(jobs: Sequence[Job], plugins: PluginManager) -> list[list[Job]]:
 
 
 def train_all(jobs: Sequence[Job], args: argparse.Namespace) -> list[str]:
-    """Train everything, then pack each seed; returns what went wrong."""
-    plugins, wrong = load_plugins(), []
+    """Train everything, packing a seed anew after each of its jobs; returns what went wrong."""
+    plugins, lock = load_plugins(), threading.Lock()
+
+    def done(job: Job) -> str | None:
+        wrong = job.train(args)
+        with lock:  # whatever ends this command early, what was trained by then is packed
+            pack([each for each in jobs if each.seed == job.seed], args, plugins)
+        return wrong
+
     with ThreadPoolExecutor(args.jobs) as pool:
-        for wave in waves(jobs, plugins):
-            wrong += [each for each in pool.map(lambda job: job.train(args), wave) if each is not None]
-    for seed in sorted({job.seed for job in jobs}):
-        pack([job for job in jobs if job.seed == seed], args, plugins)
-    return wrong
+        found = [each for wave in waves(jobs, plugins) for each in pool.map(done, wave)]
+    return [each for each in found if each is not None]
 
 
 def pack(jobs: Sequence[Job], args: argparse.Namespace, plugins: PluginManager) -> None:

@@ -173,3 +173,12 @@ def test_all_planes_in_one_node_cost_what_they_cost_one_by_one(learn, at_once, m
     for a, b in zip(*(torch.autograd.grad(3 * each, leaves) for each in (found, expected)), strict=True):
         torch.testing.assert_close(a, b, rtol=1e-4, atol=1e-4 * float(b.abs().max()))
         assert a.data_ptr() % 16 == 0
+
+
+def test_a_graph_holds_no_layer_of_the_planes():
+    """Only derivatives by planes and parameters: layers of 30 values an anchor were gigabytes."""
+    networks, planes = [SpatialAr() for _ in range(3)], [torch.zeros(3, 4, 30, 30, requires_grad=True)]
+    kept = []
+    with torch.autograd.graph.saved_tensors_hooks(lambda t: kept.append(t.nbytes) or t, lambda t: t):
+        SpatialAr.joint_bits(networks, planes)
+    assert sum(kept) <= planes[0].nbytes + 3 * 4 * 1100

@@ -81,8 +81,9 @@ SURFEL_PRESETS: Mapping[str, Mapping[str, Any]] = {
         "surface.depth_ratio": 1.0,
         "surface.lambda_dist": 10.0,
     },
-    # Surfels of 2,000 steps are larger than the published factor expects, which would split nearly all of them at once.
-    "quick": {**QUICK_TUNE, "densify.factor": 2.0, **_DEMO_NORMALS},
+    # Surfels of 2,000 steps are larger than the published limits expect, which would split nearly all of them at once:
+    # with those the scene doubles before it is trimmed, and its surface gets less complete.
+    "quick": {**QUICK_TUNE, "densify.factor": 4.0, "densify.size_px": 40, **_DEMO_NORMALS},
 }
 
 SCRATCH_PRESETS: Mapping[str, Mapping[str, Any]] = {

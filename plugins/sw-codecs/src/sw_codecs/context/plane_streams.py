@@ -76,7 +76,7 @@ def decode(data: bytes, shapes: Sequence[Shape], models: Sequence[PlaneModel]) -
     else:
         found = _decoded_in_turn(content, sizes, shapes, models, parts)
     if _crc(found) != crc:
-        exact_streams.refuse_damage(4)
+        raise BitstreamError(exact_streams.CRC_DIFFERS)
     return found
 
 

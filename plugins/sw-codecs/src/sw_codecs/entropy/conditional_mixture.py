@@ -28,10 +28,13 @@ from sw_codecs.entropy.conditional import Numbers, _array, _where
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _flat_lattice
 from sw_codecs.entropy.rates import gaussian_mass
+from sw_codecs.exact_native import EXACT
 
 WIDTHS = np.array([4, 6, 8, 12, 16, 24, 32, 48, 64, 128, 256])
 """Half-widths of the windows that are coded without an escape."""
 PAD = 2 * int(WIDTHS[-1]) + 1
+FAR = 1 << 16
+"""No table reaches as far from its middle."""
 AT_ONCE = 1 << 18
 """Counts that are held together."""
 WEIGHT_BITS = 8
@@ -60,14 +63,65 @@ class _Rows:
     """Mixtures of n coded numbers: centre int64 [n] and half-width [n] of their windows, and what makes their counts.
 
     counts  (rows, half-width W) -> float64 [rows, 2 W + 2], all positive: the window, then the escape
+    exact   what the compiled kernel takes of each number: shifts of the window [n,2] int32, tables [n,2] int16, weight
+            of the first [n] int32; None: it has no such form
     """
 
     centre: np.ndarray
     width: np.ndarray
     counts: Callable[[np.ndarray, int], np.ndarray]
+    exact: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
 
-    def batches(self) -> Iterator[tuple[np.ndarray, int]]:
-        """Rows of one width at a time, ascending, in their order; so many that their counts stay within AT_ONCE."""
+    @functools.cached_property
+    def order(self) -> np.ndarray:
+        """Rows in the order of coding: by ascending width, those of one width in their order."""
+        return np.argsort(self.width.astype(np.uint16), kind="stable")
+
+    def encode(self, entries: np.ndarray) -> bytes:
+        """Range-coded words of entries [n]: 0 .. 2 W, or the escape."""
+        kernel = self._kernel()
+        if kernel is not None:
+            words = torch.ops.sw_codecs_exact.encode_mixtures(*kernel, torch.from_numpy(entries.astype(np.int32)))
+            return bytes(words.numpy().tobytes())
+        coder = constriction.stream.queue.RangeEncoder()
+        with guarded(ValueError, "entropy coding"):
+            for rows, width in self._batches():
+                coder.encode(entries[rows].astype(np.int32), _categorical(), self.counts(rows, width))
+        return bytes(coder.get_compressed().astype("<u4", copy=False).tobytes())
+
+    def decode(self, words: memoryview) -> np.ndarray:
+        """Inverse of `encode`, int64 [n]. Raises BitstreamError for damage that is noticed."""
+        kernel = self._kernel()
+        if kernel is not None:
+            data = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
+            entries, status = torch.ops.sw_codecs_exact.decode_mixtures(*kernel, data)
+            if status:
+                raise BitstreamError("coded words are damaged")
+            return entries.numpy().astype(np.int64)
+        found = np.empty(len(self.centre), np.int64)
+        with guarded(BitstreamError, "entropy decoding"):
+            coder = constriction.stream.queue.RangeDecoder(np.frombuffer(words, "<u4").astype(np.uint32, copy=False))
+            for rows, width in self._batches():
+                found[rows] = coder.decode(_categorical(), self.counts(rows, width))
+        return found
+
+    def bits(self, entries: np.ndarray) -> np.ndarray:
+        """Bits of entries [n], float64."""
+        found = np.empty(len(entries))
+        for rows, width in self._batches():
+            counts = self.counts(rows, width)
+            found[rows] = np.log2(counts.sum(axis=1) / counts[np.arange(len(rows)), entries[rows]])
+        return found
+
+    def _kernel(self) -> tuple[list[torch.Tensor], list[torch.Tensor]] | None:
+        """Arguments of the compiled kernel, if there is one."""
+        if self.exact is None or not EXACT.try_load():
+            return None
+        rows = (self.order.astype(np.int32), self.width.astype(np.int32), *self.exact)
+        return _summed_tables(), [torch.from_numpy(each) for each in rows]
+
+    def _batches(self) -> Iterator[tuple[np.ndarray, int]]:
+        """Rows of one width at a time, in the order of coding; so many that their counts stay within AT_ONCE."""
         for width in WIDTHS.tolist():
             rows = np.flatnonzero(self.width == width)
             size = max(1, AT_ONCE // (2 * width + 2))
@@ -101,22 +155,15 @@ class ConditionalMixture:
         if np.abs(coded).max() >= SYMBOL_LIMIT:
             raise ValueError("a symbol is beyond 2^30")
         mixtures = self._rows(context, where, values.shape)
-        coder = constriction.stream.queue.RangeEncoder()
-        negative, magnitudes = [np.empty(0, bool)], [np.empty(0, np.int64)]
-        for rows, width in mixtures.batches():
-            offsets = coded[rows] - mixtures.centre[rows]
-            outside = np.abs(offsets) > width
-            entries = np.where(outside, 2 * width + 1, offsets + width).astype(np.int32)
-            with guarded(ValueError, "entropy coding"):
-                coder.encode(entries, _categorical(), mixtures.counts(rows, width))
-            negative.append(offsets[outside] < 0)
-            magnitudes.append(np.abs(offsets[outside]) - width - 1)
-        words = coder.get_compressed().astype("<u4", copy=False).tobytes()
+        offsets, width = coded - mixtures.centre, mixtures.width
+        outside = np.abs(offsets) > width
+        words = mixtures.encode(np.where(outside, 2 * width + 1, offsets + width))
+        escaped = mixtures.order[outside[mixtures.order]]
         tables = exact_tables()
         return b"".join([
             tables.version.to_bytes(2, "little"), tables.crc.to_bytes(4, "little"), _crc(coded).to_bytes(4, "little"),
             write_varint(len(words)), words,
-            exp_golomb.encode(np.concatenate(negative), np.concatenate(magnitudes)),
+            exp_golomb.encode(offsets[escaped] < 0, np.abs(offsets[escaped]) - width[escaped] - 1),
         ])  # fmt: skip
 
     def decode(self, data: bytes, context: RowMixture, present: Numbers | None = None) -> np.ndarray:
@@ -136,7 +183,16 @@ class ConditionalMixture:
         words = reader.take(reader.varint(reader.left))
         if len(words) % 4:
             raise BitstreamError(f"{len(words):,} coded bytes are not whole 32-bit words")
-        coded = self._decode_words(words, mixtures, reader)
+        coded = mixtures.decode(words)
+        escaped = mixtures.order[(coded > 2 * mixtures.width)[mixtures.order]]
+        coded -= mixtures.width
+        negative, magnitudes = exp_golomb.decode(reader.take(reader.left), len(escaped))
+        if len(escaped) and magnitudes.max() >= 2 * SYMBOL_LIMIT:
+            raise BitstreamError("an escaped symbol is beyond 2^30")
+        coded[escaped] = np.where(negative, -1, 1) * (magnitudes + mixtures.width[escaped] + 1)
+        coded += mixtures.centre
+        if np.abs(coded).max() >= SYMBOL_LIMIT:
+            raise BitstreamError("a symbol is beyond 2^30: damaged data or a wrong context")
         if _crc(coded) != crc:
             raise BitstreamError("the decoded symbols do not match their CRC-32: damaged data or a wrong context")
         found[where] = coded if where is not Ellipsis else coded.reshape(shape)
@@ -147,50 +203,21 @@ class ConditionalMixture:
         values, where = _array(symbols), _where(present)
         coded = values[where].reshape(-1).astype(np.int64)
         mixtures = self._rows(context, where, values.shape)
-        bits = np.zeros(len(coded))
-        for rows, width in mixtures.batches():
-            offsets = coded[rows] - mixtures.centre[rows]
-            counts = mixtures.counts(rows, width)
-            over = np.maximum(np.abs(offsets) - width, 0)
-            entries = np.where(over > 0, 2 * width + 1, offsets + width)
-            bits[rows] = np.log2(counts.sum(axis=1) / counts[np.arange(len(rows)), entries])
-            bits[rows] += np.where(over > 0, 2 * (np.floor(np.log2(np.maximum(over, 1))) + 1), 0)
+        offsets = coded - mixtures.centre
+        over = np.maximum(np.abs(offsets) - mixtures.width, 0)
+        bits = mixtures.bits(np.where(over > 0, 2 * mixtures.width + 1, offsets + mixtures.width))
+        bits += np.where(over > 0, 2 * (np.floor(np.log2(np.maximum(over, 1))) + 1), 0)
         found = np.zeros(values.shape)
         found[where] = bits if where is not Ellipsis else bits.reshape(values.shape)
         return torch.from_numpy(found)
 
     def _rows(self, context: RowMixture, where: Any, shape: tuple[int, ...]) -> _Rows:
         parts = [
-            np.require(np.broadcast_to(_array(each), shape)[where].reshape(-1), requirements="W")
+            np.broadcast_to(_array(each), shape)[where].reshape(-1)
             for each in (context.mean, context.scale, context.second_mean, context.second_scale, context.logit,
                          context.step)
         ]  # fmt: skip
         return _exact_rows(*parts) if self.mode == "exact" else _float_rows(*parts)
-
-    @staticmethod
-    def _decode_words(words: memoryview, mixtures: _Rows, reader: ByteReader) -> np.ndarray:
-        coded, escaped, floors = (
-            np.empty(len(mixtures.centre), np.int64),
-            [np.empty(0, np.int64)],
-            [np.empty(0, np.int64)],
-        )
-        with guarded(BitstreamError, "entropy decoding"):
-            coder = constriction.stream.queue.RangeDecoder(np.frombuffer(words, "<u4").astype(np.uint32, copy=False))
-            for rows, width in mixtures.batches():
-                entries = np.asarray(coder.decode(_categorical(), mixtures.counts(rows, width)), np.int64)
-                coded[rows] = entries - width
-                outside = rows[entries == 2 * width + 1]
-                escaped.append(outside)
-                floors.append(np.full(len(outside), width + 1))
-        where = np.concatenate(escaped)
-        negative, magnitudes = exp_golomb.decode(reader.take(reader.left), len(where))
-        if len(where) and magnitudes.max() >= 2 * SYMBOL_LIMIT:
-            raise BitstreamError("an escaped symbol is beyond 2^30")
-        coded[where] = np.where(negative, -1, 1) * (magnitudes + np.concatenate(floors))
-        coded += mixtures.centre
-        if np.abs(coded).max() >= SYMBOL_LIMIT:
-            raise BitstreamError("a symbol is beyond 2^30: damaged data or a wrong context")
-        return coded
 
 
 @functools.cache
@@ -218,6 +245,18 @@ def _padded_tables() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     sizes = 2 * (radius + PAD) + 1
     escapes = np.array([table.counts[-1] for table in family.tables])
     return flat, np.cumsum(sizes) - sizes + PAD + radius, radius, escapes
+
+
+@functools.cache
+def _summed_tables() -> list[torch.Tensor]:
+    """The tables as the kernel takes them, see exact_kernels/mixtures.h."""
+    family = exact_tables().gaussian
+    sums = [np.concatenate([[0.0], np.cumsum(table.counts[:-1])]) for table in family.tables]
+    first = np.cumsum([0, *(len(each) for each in sums[:-1])])
+    escapes = np.array([table.counts[-1] for table in family.tables])
+    radius = np.repeat(family.radius, FRACTIONS)
+    arrays = (np.concatenate(sums), escapes.astype(np.float64), first.astype(np.int32), radius.astype(np.int32))
+    return [torch.from_numpy(each) for each in arrays]
 
 
 def _exact_rows(
@@ -253,7 +292,9 @@ def _exact_rows(
             found[:, -1] += share[rows] * escapes[table]
         return found
 
-    return _Rows(centre, _widths(reach), counts)
+    shifts = np.stack([np.clip(centre - middles, -FAR, FAR) for middles, _ in both], axis=1).astype(np.int32)
+    numbers = np.stack([number for _, number in both], axis=1).astype(np.int16)
+    return _Rows(centre, _widths(reach), counts, (shifts, numbers, weight.astype(np.int32)))
 
 
 def _float_rows(

@@ -17,8 +17,7 @@ enum Status : int32_t {
   WORDS_LEFT = 1,      // coded words are left, or the state is not what the encoder began with
   ESCAPES_WRONG = 2,   // escape codes are damaged, too few or too many
   BEYOND_LIMIT = 3,    // a symbol, or the integer part of a mean, is too large
-  CRC_WRONG = 4,
-  PARAMETER_WRONG = 5  // mean, scale or multiplier is out of range
+  PARAMETER_WRONG = 4  // mean, scale or multiplier is out of range
 };
 
 // The 512 tables of a family as shares of 2^24.
@@ -32,7 +31,7 @@ struct Tables {
 // Streams of a payload, one after another: words, then escapes.
 struct Streams {
   const uint8_t* data;
-  const int64_t* table;   // [count, 3]: CRC-32 of the symbols (or nothing), bytes of words, bytes of escapes
+  const int64_t* table;   // [count, 3]: what is no business of the kernels, bytes of words, bytes of escapes
   const int64_t* offset;  // [count] where each begins in `data`
   int64_t count;
 };

@@ -1,4 +1,4 @@
-// rANS words and escape codes of one stream, as docs/bitstream.md has them; and the CRC-32 of symbols.
+// rANS words and escape codes of one stream, as docs/bitstream.md has them.
 //
 // Everything here is static or in SW_ARCH: no function of one instruction set may stand in for that of another.
 #pragma once
@@ -141,33 +141,6 @@ struct EscapeWriter {
     for (int i = length; i >= 0; --i) bit(value >> i & 1);
   }
   int64_t bytes() const { return (at + 7) >> 3; }
-};
-
-// CRC-32 (polynomial 0xEDB88320) of integers as little-endian i32, eight bytes a turn.
-struct Crc {
-  uint32_t step[8][256];
-
-  Crc() {
-    for (uint32_t i = 0; i < 256; ++i) {
-      uint32_t c = i;
-      for (int k = 0; k < 8; ++k) c = c & 1 ? 0xEDB88320u ^ c >> 1 : c >> 1;
-      step[0][i] = c;
-    }
-    for (int t = 1; t < 8; ++t)
-      for (int i = 0; i < 256; ++i) step[t][i] = step[0][step[t - 1][i] & 255] ^ step[t - 1][i] >> 8;
-  }
-  uint32_t of(const int32_t* values, int64_t n) const {
-    uint32_t c = 0xFFFFFFFFu;
-    int64_t i = 0;
-    for (; i + 1 < n; i += 2) {
-      const uint32_t a = c ^ static_cast<uint32_t>(values[i]), b = static_cast<uint32_t>(values[i + 1]);
-      c = step[7][a & 255] ^ step[6][a >> 8 & 255] ^ step[5][a >> 16 & 255] ^ step[4][a >> 24] ^
-          step[3][b & 255] ^ step[2][b >> 8 & 255] ^ step[1][b >> 16 & 255] ^ step[0][b >> 24];
-    }
-    if (i < n)
-      for (int k = 0; k < 4; ++k) c = step[0][(c ^ static_cast<uint32_t>(values[i]) >> (8 * k)) & 255] ^ c >> 8;
-    return ~c;
-  }
 };
 
 }  // namespace SW_ARCH

@@ -29,7 +29,7 @@ void order_by_table(const int16_t* number, int64_t n, uint16_t* order, int32_t* 
 }
 
 int32_t decode_one(const Tables& tables, const uint8_t* data, const int64_t* sizes, const int32_t* centre,
-                   const int16_t* number, int64_t n, int32_t* symbols, const Crc& crc) {
+                   const int16_t* number, int64_t n, int32_t* symbols) {
   uint16_t order[STREAM];
   int32_t begin[TABLES + 1];
   order_by_table(number, n, order, begin);
@@ -53,12 +53,11 @@ int32_t decode_one(const Tables& tables, const uint8_t* data, const int64_t* siz
     }
   }
   if (!words.used_up()) return WORDS_LEFT;
-  if (!escapes.used_up()) return ESCAPES_WRONG;
-  return crc.of(symbols, n) == sizes[0] ? FINE : CRC_WRONG;
+  return escapes.used_up() ? FINE : ESCAPES_WRONG;
 }
 
 void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32_t* centre, const int16_t* number,
-                int64_t n, const int32_t* symbols, const Crc& crc) {
+                int64_t n, const int32_t* symbols) {
   uint16_t order[STREAM];
   int32_t begin[TABLES + 1];
   order_by_table(number, n, order, begin);
@@ -81,7 +80,6 @@ void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32
       if (offset > radius || offset < -radius) escapes.beyond(offset, radius);
     }
   }
-  sizes[0] = crc.of(symbols, n);
   sizes[1] = words.bytes;
   sizes[2] = escapes.bytes();
 }
@@ -90,13 +88,12 @@ void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32
 
 int32_t decode_streams(const Tables& tables, const Streams& streams, const int32_t* centre, const int16_t* number,
                        int64_t count, int32_t* symbols, const Parallel& parallel) {
-  static const Crc crc;
   std::atomic<int32_t> status{FINE};
   parallel(streams.count, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
       const int64_t at = s * STREAM, n = count - at < STREAM ? count - at : STREAM;
       raise(status, decode_one(tables, streams.data + streams.offset[s], streams.table + 3 * s, centre + at,
-                               number + at, n, symbols + at, crc));
+                               number + at, n, symbols + at));
     }
   });
   return status;
@@ -104,12 +101,10 @@ int32_t decode_streams(const Tables& tables, const Streams& streams, const int32
 
 int32_t encode_streams(const Tables& tables, const Sinks& sinks, const int32_t* centre, const int16_t* number,
                        int64_t count, const int32_t* symbols, const Parallel& parallel) {
-  static const Crc crc;
   parallel(sinks.count, 1, [&](int64_t begin, int64_t end) {
     for (int64_t s = begin; s < end; ++s) {
       const int64_t at = s * STREAM, n = count - at < STREAM ? count - at : STREAM;
-      encode_one(tables, sinks.data + sinks.offset[s], sinks.table + 3 * s, centre + at, number + at, n, symbols + at,
-                 crc);
+      encode_one(tables, sinks.data + sinks.offset[s], sinks.table + 3 * s, centre + at, number + at, n, symbols + at);
     }
   });
   return FINE;
@@ -154,32 +149,42 @@ struct Levels {
 int32_t columns_of(const Levels& levels, const int64_t* mean, const int64_t* scale, int64_t m, int64_t columns,
                    int32_t* centre, int16_t* number) {
   constexpr int64_t LIMIT = int64_t{1} << 48, LARGEST_SCALE = int64_t{1} << 36;
-  double eighths[COLUMNS], middle[COLUMNS], ratio[COLUMNS];
-  int64_t wrong = 0;
-  const double divisor = static_cast<double>(m), half = static_cast<double>(m / 2);
-  for (int64_t c = 0; c < columns; ++c) {
-    wrong |= (mean[c] <= -LIMIT) | (mean[c] >= LIMIT) | (scale[c] <= -LIMIT) | (scale[c] >= LIMIT);
-    eighths[c] = static_cast<double>(mean[c]);
-    const int64_t width = scale[c] < 0 ? 0 : scale[c] > LARGEST_SCALE ? LARGEST_SCALE : scale[c];
-    ratio[c] = static_cast<double>(width);
-  }
-  if (wrong) return PARAMETER_WRONG;
-  for (int64_t c = columns; c % LANES; ++c) eighths[c] = ratio[c] = 0;
-  int64_t beyond = 0;
+  double middle[COLUMNS], eighths[COLUMNS], ratio[COLUMNS];
+  IntVec wrong{}, beyond{};
+  const Vec divisor = all(static_cast<double>(m)), half = all(static_cast<double>(m / 2));
   for (int64_t c = 0; c < columns; c += LANES) {
-    const Vec e = floor_of((load(eighths + c) * 8.0 + all(half)) / all(divisor));
+    IntVec means{}, widths{};
+    if (c + LANES <= columns) {
+      means = *reinterpret_cast<const IntLoad*>(mean + c);
+      widths = *reinterpret_cast<const IntLoad*>(scale + c);
+    } else {
+      for (int64_t l = 0; c + l < columns; ++l) {
+        means[l] = mean[c + l];
+        widths[l] = scale[c + l];
+      }
+    }
+    wrong |= (means <= -LIMIT) | (means >= LIMIT) | (widths <= -LIMIT) | (widths >= LIMIT);
+    widths = widths < 0 ? IntVec{} : widths;
+    widths = widths > LARGEST_SCALE ? IntVec{} + LARGEST_SCALE : widths;
+    const Vec e = floor_of((of_integers(means) * 8.0 + half) / divisor);
     const Vec at = floor_of((e + 4.0) * 0.125);
-    const IntVec far = (at >= all(static_cast<double>(SYMBOL_LIMIT))) | (at <= all(-static_cast<double>(SYMBOL_LIMIT)));
-    for (int l = 0; l < LANES; ++l) beyond |= far[l];
+    beyond |= (at >= all(static_cast<double>(SYMBOL_LIMIT))) | (at <= all(-static_cast<double>(SYMBOL_LIMIT)));
     store(eighths + c, e + 4.0 - at * 8.0);
     store(middle + c, at);
-    store(ratio + c, floor_of(load(ratio + c) * 4096.0 / all(divisor)));
+    store(ratio + c, floor_of(of_integers(widths) * 4096.0 / divisor));
   }
-  if (beyond) return BEYOND_LIMIT;
-  for (int64_t c = 0; c < columns; ++c) {
-    centre[c] = static_cast<int32_t>(middle[c]);
-    number[c] = static_cast<int16_t>(8 * levels.of(ratio[c]) + static_cast<int32_t>(eighths[c]));
+  int64_t any_wrong = 0, any_beyond = 0;
+  for (int l = 0; l < LANES; ++l) {
+    any_wrong |= wrong[l];
+    any_beyond |= beyond[l];
   }
+  if (any_wrong) return PARAMETER_WRONG;
+  if (any_beyond) return BEYOND_LIMIT;
+  int32_t level[COLUMNS];
+  for (int64_t c = 0; c < columns; ++c) level[c] = levels.of(ratio[c]);
+  for (int64_t c = 0; c < columns; ++c) centre[c] = static_cast<int32_t>(middle[c]);
+  for (int64_t c = 0; c < columns; ++c)
+    number[c] = static_cast<int16_t>(8 * level[c] + static_cast<int32_t>(eighths[c]));
   return FINE;
 }
 

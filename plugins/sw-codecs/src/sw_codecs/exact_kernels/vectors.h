@@ -39,6 +39,11 @@ inline void store_integers(int64_t* p, Vec x) {
   *reinterpret_cast<IntLoad*>(p) = reinterpret_cast<IntVec>(x + ROUND) - reinterpret_cast<IntVec>(all(ROUND));
 }
 
+// The same the other way: |x| < 2^51.
+inline Vec of_integers(IntVec x) {
+  return reinterpret_cast<Vec>(x + reinterpret_cast<IntVec>(all(ROUND))) - ROUND;
+}
+
 inline Vec clamped(Vec x, double low, double high) {
   x = x < all(low) ? all(low) : x;
   return x > all(high) ? all(high) : x;

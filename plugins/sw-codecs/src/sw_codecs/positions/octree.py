@@ -132,8 +132,9 @@ def _decode_tree(reader: ByteReader, bits: int, distinct: int) -> np.ndarray:
         children = _POPCOUNT[occupancy]
         if children.sum() > distinct:
             raise BitstreamError(f"level {level} has more nodes than the {distinct:,} points that were announced")
-        row, child = np.nonzero(_CHILDREN[occupancy])
-        nodes = (nodes[row] << 3) | child
+        place = np.flatnonzero(_CHILDREN[occupancy])  # in [nodes, 8]: several times as fast as two indices
+        row = place >> 3
+        nodes = (nodes[row] << 3) | (place & 7)
         contexts = (np.minimum(children, CONTEXTS) - 1)[row]
     coded.check(reader.integer(4))
     if len(nodes) != distinct:

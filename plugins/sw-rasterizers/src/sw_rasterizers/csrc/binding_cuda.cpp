@@ -24,10 +24,9 @@ Image image_of(const Inputs& in) {
   return image;
 }
 
-using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
-                            std::vector<double>>;
+}  // namespace
 
-Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int64_t height) {
+sw::cuda::Rendered sw::cuda::render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int64_t height) {
   const c10::cuda::CUDAGuard guard(in.means.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto view = View<float>::from(camera.data(), int(width), int(height));
@@ -110,6 +109,8 @@ Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t w
   }
   return {picture, radii, alpha, median_depth, std::move(saved), std::move(counts), clock.seconds()};
 }
+
+namespace {
 
 Rendered render(const Tensor& means, const Tensor& opacities, const OptionalTensor& scales,
                 const OptionalTensor& quats, const OptionalTensor& cov3d, const OptionalTensor& sh,

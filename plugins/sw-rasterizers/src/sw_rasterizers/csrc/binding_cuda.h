@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <bit>
 #include <limits>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -262,5 +263,10 @@ struct Binned {
     if (count > 0) splat = sorted_values == data<int32_t>(values[0]) ? values[0] : values[1];
   }
 };
+
+// Image, radii, alpha, median depth, state for the backward pass, counts, seconds of the stages; see binding_cuda.cpp.
+using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
+                            std::vector<double>>;
+Rendered render_on_cuda(const Inputs& in, at::ArrayRef<double> camera, int64_t width, int64_t height);
 
 }  // namespace sw::cuda

@@ -3,7 +3,6 @@
 #ifdef SW_WITH_CUDA
 
 #include <ATen/core/Tensor.h>
-#include <ATen/core/dispatch/Dispatcher.h>
 #include <ATen/ops/zeros.h>
 #include <c10/cuda/CUDAException.h>
 #include <c10/cuda/CUDAGuard.h>
@@ -23,13 +22,6 @@ namespace {
 using namespace sw;        // NOLINT: one file
 using namespace sw::cuda;  // NOLINT
 
-using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
-                            std::vector<double>>;
-using Render = Rendered(const Tensor&, const Tensor&, const OptionalTensor&, const OptionalTensor&,
-                        const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
-                        const OptionalTensor&, const OptionalTensor&, const OptionalTensor&, const OptionalTensor&,
-                        at::ArrayRef<double>, int64_t, int64_t, int64_t, double, double, int64_t);
-
 void accumulate_scores(const Tensor& means, const Tensor& opacities, const OptionalTensor& scales,
                        const OptionalTensor& quats, const OptionalTensor& cov3d, const OptionalTensor& sh,
                        const OptionalTensor& sh_dc, const OptionalTensor& sh_rest, const OptionalTensor& colors,
@@ -46,11 +38,12 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
   if (means.size(0) == 0) return;
   const c10::cuda::CUDAGuard guard(means.device());
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
-  static const auto render =
-      c10::Dispatcher::singleton().findSchemaOrThrow("sw_rasterizers::render", "").typed<Render>();
-  const Rendered rendered =
-      render.call(means, opacities, scales, quats, cov3d, sh, sh_dc, sh_rest, colors, none, visible, background, camera,
-                  width, height, sh_degree, scale_modifier, eps2d, (flags | kSave | kForScores) & ~int64_t(kCount));
+  const Inputs drawn{means, opacities, scales,     quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
+                     none,  visible,   background, sh_degree, scale_modifier, eps2d,
+                     (flags | kSave | kForScores) & ~int64_t(kCount)};
+  drawn.check();
+  check_placement(drawn);
+  const Rendered rendered = render_on_cuda(drawn, camera, width, height);
   const std::vector<Tensor>& saved = std::get<4>(rendered);
   TORCH_CHECK(saved.size() == kFlags + 1, "sw_rasterizers: the forward pass kept another state than expected");
   if (saved[kSplat].numel() == 0) return;
