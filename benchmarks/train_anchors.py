@@ -195,7 +195,7 @@ def _named(call: Callable[..., Any], name: str) -> Callable[..., Any]:
 def phases_of(method: str, stage: Any) -> list[Phase]:
     """The phases of a plan, in steps of this run."""
     at, end = stage.opt.phases, stage.iterations
-    if method.startswith("hac"):
+    if method in ("hac", "hac-plus"):
         names = ("full precision", "noise", "entropy")
         starts: tuple[int, ...] = (0, stage.when(at.quantized), stage.when(at.entropy))
     else:
