@@ -18,5 +18,5 @@ EXACT = NativeModule(
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code
     seconds=15,
-    without="files of anchors decode on torch operations and the library constriction: the same bits, five to ten times slower",
+    without="files of anchors decode by torch and the library constriction: the same bits, five to ten times slower",
 )
