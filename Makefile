@@ -1,6 +1,8 @@
-# make demo   set up .venv and run ChimeraGS beside 3DGS, float32 and entropy-coded, on the demo scene; one table
+# make demo   set up .venv and run ChimeraGS beside 3DGS, both compressed, on the demo scene; one table
 # make test   set up .venv and run the default tests (no network, no GPU), TEST_JOBS=2 at a time
 # make test-geometry  the tests that need Open3D (100 MB), which it installs; Debian's libraries: sw doctor names them
+# make test-ray  the tests that need Ray (and submitit, for Slurm), which it installs
+# make docs-site  the pages under docs/ as a site, by mkdocs-material, which it installs
 # make lint   ruff and mypy
 # make bench  speed and memory, as ratios measured in one run
 # make kernels  compile every native module ahead of time
@@ -18,11 +20,11 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-geometry coverage lint format bench kernels docs clean
+.PHONY: demo test test-geometry test-ray docs-site coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
-	$(BIN)/sw run --method 3dgs --rate r2,r6 --scene demo --out $(DEMO_OUT)
+	$(BIN)/sw run --method 3dgs --rate r2,r3 --scene demo --out $(DEMO_OUT)
 	$(BIN)/sw run --method chimerags --scene demo --out $(DEMO_OUT)
 	$(BIN)/sw report $(DEMO_OUT)/demo
 
@@ -33,6 +35,14 @@ test-geometry: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt -e 'plugins/sw-geometry[mesh,unbounded]' --no-build-isolation
 	@$(BIN)/python -c 'from sw_geometry.check import check_open3d as c; x = c()[0]; exit(x.state != "ok" and f"{x.detail}: {x.mend}")'
 	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-geometry $(PYTEST_ARGS)
+
+test-ray: $(VENV)/.ready-dev
+	$(PIP) install -q -c constraints.txt -e 'plugins/sw-ray[ray]' -e 'plugins/sw-bench[slurm]' --no-build-isolation
+	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-ray plugins/sw-bench/tests/test_executors.py $(PYTEST_ARGS)
+
+docs-site: $(VENV)/.ready-dev
+	$(PIP) install -q -c constraints.txt mkdocs-material
+	$(BIN)/python -m mkdocs build
 
 coverage: $(VENV)/.ready-dev
 	$(BIN)/python -m pytest -n $(TEST_JOBS) $(TEST_DIST) --cov --cov-report=term --cov-fail-under=88 $(PYTEST_ARGS)
