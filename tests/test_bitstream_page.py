@@ -134,7 +134,6 @@ def test_it_decodes_the_payload_of_every_coder_and_entropy_model(name):
     decoders = {
         "columns_v1": lambda data: np.transpose(entropy_models.columns(data, *cases.matrix.shape)),
         "categorical_v1": lambda data: entropy_models.categorical(data, 9, 3, cases.categorical.index.tolist()),
-        "mixture_v1": lambda data: np.transpose(entropy_models.density_tables(data, 300, 2)),
         "bernoulli_v1": lambda data: entropy_models.bernoulli(data, 300),
         **dict.fromkeys(
             ("gaussian_exact_v1", "gaussian_exact_v2"), lambda data: entropy_models.exact(data, exact, *contexts)

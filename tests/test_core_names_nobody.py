@@ -17,7 +17,6 @@ OWN = {name for kind in KINDS for name in catalogue()[kind]}
 PLAIN_WORDS = {
     "count": "a word of messages and of rasterizer results",
     "depth": "a field of RenderResult",
-    "mixture": "a word",
     "range": "a form of a plan",
     "columns": "a word of tables",
     "opacity": "a property of a .ply",

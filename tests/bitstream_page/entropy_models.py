@@ -146,27 +146,6 @@ def escape(bits: Iterator[str]) -> tuple[bool, int]:
     return negative, int("1" + "".join(next(bits) for _ in range(zeros)), 2) - 1
 
 
-def density_tables(data: bytes, rows: int, width: int) -> list[list[int]]:
-    """`mixture`: the columns of the matrix."""
-    file = Bytes(data)
-    check(file.unpack("BIH") == (1, rows, width), "head of density tables")
-    crc = file.one("I")
-    spans = [(file.signed(), file.varint()) for _ in range(width)]
-    tables = stored_tables(file, [length + 1 for _, length in spans])
-    chunks = Bytes(file.take(file.varint()))
-    entries = coded_classes(chunks, tables, rows)
-    chunks.done()
-    bits, found = file.bits(), []
-    for (a, length), column in zip(spans, entries, strict=True):
-        values = [a + i for i in column]
-        for row in [row for row, i in enumerate(column) if i == length]:
-            negative, v = escape(bits)
-            values[row] = a - 1 - v if negative else a + length + v
-        found.append(values)
-    check(crc_i64([v for column in found for v in column]) == crc, "CRC of density tables")
-    return found
-
-
 def centre_and_table(mean: int, level: int, m: int) -> tuple[int, int]:
     """I and the number of the table."""
     eighths = (8 * mean + m // 2) // m

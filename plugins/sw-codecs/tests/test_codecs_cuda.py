@@ -10,7 +10,6 @@ from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.context.triplane import Triplane
 from sw_codecs.entropy import rates
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
-from sw_codecs.entropy.mixture import Mixture, MixtureContext
 from sw_codecs.positions.ordering import spatial_order
 
 pytestmark = [
@@ -49,10 +48,7 @@ def test_rates_and_their_gradients_agree():
 
 def test_a_file_from_parameters_on_a_gpu_decodes_without_one():
     torch.manual_seed(2)
-    symbols = np.rint(np.random.default_rng(3).normal(0, 5, (3000, 2))).astype(np.int64)
-    context = MixtureContext(*(torch.tensor(v, device="cuda") for v in ([0.0, 1.0], [-3.0, 3.0], [2.0, 4.0])))
-    assert np.array_equal(Mixture().decode(Mixture().encode(symbols, context), symbols.shape), symbols)
-    few = np.abs(symbols[:, 0]) % 7
+    few = np.abs(np.rint(np.random.default_rng(3).normal(0, 5, 3000)).astype(np.int64)) % 7
     trained = CategoricalContext(7, n=3000, logits=torch.randn(7, device="cuda"))
     assert Categorical().bits(torch.from_numpy(few).cuda(), trained).is_cuda
     assert np.array_equal(Categorical().decode(Categorical().encode(few, trained), CategoricalContext(7, n=3000)), few)

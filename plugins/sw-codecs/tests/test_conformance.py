@@ -75,20 +75,11 @@ def bernoulli_case(n):
     return EntropyCase(rng().random(n) < 0.3, None, None, n)
 
 
-def mixture_case(n):
-    r = rng()
-    symbols = np.rint(np.where(r.random(n) < 0.6, r.normal(-25, 9, n), r.normal(40, 3, n))).astype(np.int64)[:, None]
-    logits, mean, scale = torch.tensor([0.6, 0.4]).log(), torch.tensor([[-25.0, 40.0]]), torch.tensor([[9.0, 3.0]])
-    context = PLUGINS.entropy_models.load("mixture").Context(logits, mean, scale)
-    return EntropyCase(symbols, context, context, symbols.shape)
-
-
 ENTROPY_CASES = {
     "columns": columns_case,
     "categorical": categorical_case,
     "bernoulli": bernoulli_case,
     "gaussian-exact": gaussian_case,
-    "mixture": mixture_case,
     "conditional-gaussian": rows_case,
     "conditional-mixture": row_mixtures_case,
 }

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from sw_codecs.arrays.byte_planes import BytePlanes, FloatDelta
 from sw_codecs.arrays.packed_bits import PackedBits
@@ -18,7 +17,6 @@ from sw_codecs.entropy.bernoulli import Bernoulli
 from sw_codecs.entropy.categorical import Categorical, CategoricalContext
 from sw_codecs.entropy.columns import Columns
 from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
-from sw_codecs.entropy.mixture import Mixture, MixtureContext
 from sw_codecs.positions import morton
 from sw_codecs.positions.octree import Octree
 
@@ -51,8 +49,6 @@ hashes = ((hashes ^ (hashes >> np.uint64(29))) * np.uint64(0xBF58476D1CE4E5B9)).
 # Ascending, both signs, and every kind of float but NaN: 0, -0, a denormal, the largest, an infinity.
 floats = (np.stack([mixed - 2048, i * 3, -i], 1) / 64).astype(np.float32)
 floats[:5, 0] = [0.0, -0.0, 1e-45, 3.4028235e38, -np.inf]
-modes = np.stack([(mixed & 31) - 40 + 30 * (mixed >> 11), np.where(i % 50 == 7, mixed * 10**6 - 2 * 10**9, i % 5)], 1)
-mixture = MixtureContext(torch.zeros(2), torch.tensor([[-25.0, 5.0], [2.0, 2.0]]), torch.tensor([9.0, 1.0]))
 categorical = CategoricalContext(9, index=i % 3, tables=3)
 
 CASES = {
@@ -61,11 +57,6 @@ CASES = {
         lambda: Categorical().encode(symbols, categorical),
         lambda d: Categorical().decode(d, categorical),
         symbols,
-    ),
-    "mixture_v1": (
-        lambda: Mixture().encode(modes, mixture),
-        lambda d: Mixture().decode(d, modes.shape),
-        modes,
     ),
     "bernoulli_v1": (lambda: Bernoulli().encode(mixed < 900), lambda d: Bernoulli().decode(d, 300), mixed < 900),
     **dict.fromkeys(

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
         conditional,
         conditional_mixture,
         gaussian_exact,
-        mixture,
     )
     from sw_codecs.models import codecs, raht_codec
     from sw_codecs.positions import octree
@@ -41,7 +40,7 @@ if TYPE_CHECKING:
     ]  # fmt: skip
     ENTROPY_MODELS: list[Callable[..., api.EntropyModel]] = [
         columns.Columns, categorical.Categorical, bernoulli.Bernoulli, gaussian_exact.GaussianExact,
-        mixture.Mixture, conditional.ConditionalGaussian, conditional_mixture.ConditionalMixture,
+        conditional.ConditionalGaussian, conditional_mixture.ConditionalMixture,
     ]  # fmt: skip
     CONTEXT_MODELS: list[Callable[..., api.ContextModel]] = [
         integer_mlp.IntegerMlp, triplane.Triplane, spatial_ar.SpatialAr, channel_ar.ChannelAr, hash_grid.MixedHashGrid,
@@ -85,8 +84,6 @@ def register_entropy_models(registry: Registry[Any]) -> None:
     registry.add("bernoulli", "sw_codecs.entropy.bernoulli:Bernoulli", summary="masks, stored share of ones")
     registry.add("gaussian-exact", "sw_codecs.entropy.gaussian_exact:GaussianExact",
                  summary="mean and scale per symbol, integers only: decodes on any machine")  # fmt: skip
-    registry.add("mixture", "sw_codecs.entropy.mixture:Mixture",
-                 summary="weighted Gaussians or Laplacians, counts in the file")  # fmt: skip
     registry.add("conditional-gaussian", "sw_codecs.entropy.conditional:ConditionalGaussian",
                  summary="blocks of rows with a predicted mean, scale and step; exact or float",
                  native="sw_codecs.exact_native:EXACT")  # fmt: skip

@@ -106,3 +106,26 @@ def test_the_gradient_of_gaussian_bits_is_that_of_its_parts(grad_below_bound):
     assert float(found.detach().max()) == pytest.approx(19.93, abs=0.01)
     for a, b in zip(*(torch.autograd.grad((each * weights).sum(), leaves) for each in (found, expected)), strict=True):
         torch.testing.assert_close(a, b)
+
+
+def test_a_mixture_sums_to_one_and_is_that_of_scipy():
+    logits, mean, scale = f64(0.5, 0.0, -2.0), f64(-4.0, 1.5, 0.0), f64(0.4, 1.0, 9.0)
+    k = np.arange(-4000, 4001)
+    p = 2 ** -rates.mixture_bits(torch.from_numpy(k * 0.25), logits, mean, scale, 0.25, p_min=1e-300)
+    assert float(p.sum()) == pytest.approx(1, abs=1e-6)
+    near = np.abs(k) < 40
+    expected = sum(
+        w * (stats.norm.cdf(k * 0.25 + 0.125, m, s) - stats.norm.cdf(k * 0.25 - 0.125, m, s))
+        for w, m, s in zip(torch.softmax(logits, 0).numpy(), mean.numpy(), scale.numpy(), strict=True)
+    )
+    np.testing.assert_allclose(p.numpy()[near], expected[near], rtol=1e-8)
+
+
+def test_a_mixture_of_one_is_its_component_and_trains():
+    x = torch.linspace(-6, 6, 31, dtype=torch.float64)
+    one = rates.mixture_bits(x, f64(0.3), f64(0.5), f64(2.0), 0.5)
+    torch.testing.assert_close(one, rates.gaussian_bits(x, 0.5, 2.0, 0.5))
+    arguments = [a.requires_grad_() for a in (x[:4].clone(), f64(0.1, 0.4), f64(0.5, -1.0), f64(2.0, 0.7))]
+    assert torch.autograd.gradcheck(lambda *a: rates.mixture_bits(*a, 0.5), arguments)
+    far = rates.mixture_bits(f64(40.0), f64(0.0, 0.0), f64(0.0, 0.0), f64(1.0, 1.0))
+    assert far.item() == pytest.approx(24)

@@ -64,9 +64,6 @@ def laplace_mass(x: Tensor, mu: Tensor | float, b: Tensor | float, step: Tensor 
     return upper - 0.5 * torch.exp(-far)
 
 
-MASSES = {"gaussian": gaussian_mass, "laplace": laplace_mass}
-
-
 def gaussian_bits(
     x: Tensor,
     mu: Tensor | float,
@@ -143,7 +140,6 @@ def mixture_bits(
     scale: Tensor,
     step: Tensor | float = 1.0,
     *,
-    family: str = "gaussian",
     p_min: float = CODER_FLOOR,
     grad_below_bound: bool = True,
 ) -> Tensor:
@@ -151,10 +147,9 @@ def mixture_bits(
 
     logits, mu, scale   [..., K], the leading axes broadcast with x; K components
     step                a number, or broadcasts with x
-    family              "gaussian" or "laplace"
     """
     width = step[..., None] if isinstance(step, Tensor) and step.ndim else step
-    mass = MASSES[family](x[..., None], mu, scale, width)
+    mass = gaussian_mass(x[..., None], mu, scale, width)
     return bits_of((torch.softmax(logits, -1) * mass).sum(-1), p_min, grad_below_bound)
 
 
