@@ -3,6 +3,10 @@
 Needs a Chromium; skips without one. Screenshots stay in pytest's temporary folder, to be looked at.
 """
 
+import json
+import os
+from pathlib import Path
+
 import pytest
 from headless_chromium import Chromium, find_chromium
 from sw_report.page import PageOptions, write_page
@@ -11,6 +15,7 @@ from sw_report.runs import collect
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(find_chromium() is None, reason="no Chromium is installed")]
 
 PHONE, TABLET, DESKTOP = 390, 768, 1280
+AXE = Path(os.environ.get("SPLATWIZARD_AXE", "node_modules/axe-core/axe.min.js"))
 # Of every text, the contrast with what it stands on, by WCAG 2.1; texts over pictures have a ground of their own.
 CONTRAST = """
 (() => {
@@ -73,6 +78,18 @@ def test_the_page_fits_is_readable_and_asks_for_nothing(browser, pages, tmp_path
         assert browser.ask("[...document.images].every(i => i.naturalWidth > 0)")
         background = browser.ask("getComputedStyle(document.body).backgroundColor")
         assert (sum(map(int, background[4:-1].split(","))) < 200) == (scheme == "dark")
+
+
+@pytest.mark.skipif(not AXE.exists(), reason="no axe-core (npm install axe-core, or SPLATWIZARD_AXE=axe.min.js)")
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [DESKTOP, PHONE])
+def test_axe_finds_nothing_that_keeps_people_out(browser, pages, width, scheme):
+    for page in pages:
+        browser.open(page, width=width, scheme=scheme)
+        browser.ask(AXE.read_text(encoding="utf-8") + "; true")
+        browser.ask("axe.run().then(found => { window.findings = found.violations })")
+        found = json.loads(browser.ask("JSON.stringify(window.findings)"))
+        assert "\n".join(f"{v['id']}: {v['nodes'][0]['html'][:160]}" for v in found) == ""
 
 
 def test_no_column_of_the_results_is_cut_on_a_desktop(browser, make_curve, tmp_path):
