@@ -105,3 +105,8 @@ def test_jupyter_executes_the_notebook(tmp_path):
     nbformat.validate(notebook)
     nbclient.NotebookClient(notebook, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
     assert "image/png" in notebook.cells[-1].outputs[-1]["data"]
+
+
+def test_several_rate_points_are_refused_as_foreseen():
+    with pytest.raises(ConfigError, match="one rate point"):
+        sw.run("3dgs", "demo:tiny", rate="all")

@@ -104,6 +104,19 @@ def test_no_column_of_the_results_is_cut_on_a_desktop(browser, make_curve, tmp_p
     assert browser.ask("(t => t.scrollWidth <= t.clientWidth)(document.querySelector('.sortable').parentElement)")
 
 
+def test_the_names_of_methods_are_read_in_one_piece_on_a_phone(browser, make_curve, tmp_path):
+    def with_lpips(content):
+        for name in ("lpips_vgg_3dgs", "lpips_vgg", "lpips_alex", "l1"):
+            content["metrics"][name] = {"mean": 0.1234, "per_view": [], "direction": "lower"}
+
+    for method in ("trim-2dgs", "3dgs"):
+        make_curve(method, change=with_lpips)
+    write_page(collect([tmp_path / "out"]), tmp_path / "page.html", PageOptions(pictures=False))
+    browser.open(tmp_path / "page.html", width=PHONE)
+    heights = "[...document.querySelectorAll('.sortable tbody th')].map(th => th.getBoundingClientRect().height)"
+    assert max(browser.ask(heights)) < 50  # one line, not a letter a line
+
+
 def test_a_click_on_a_heading_sorts_the_results(browser, make_curve, tmp_path):
     for method, saving in (("toy", 1.0), ("3dgs", 0.5)):
         make_curve(method, saving)

@@ -116,7 +116,7 @@ def test_pictures_have_texts_and_sizes_and_tables_have_headers(kinds):
         assert all(th.get("scope") in ("col", "row") for th in found.all("th"))
         assert all(svg.get("aria-label") or svg.get("aria-hidden") for svg in found.all("svg"))
         scrolls = [d for d in found.all("div") if "scroll" in (d.get("class") or "")]
-        assert all(d.get("tabindex") == "0" and d.get("aria-label") and d.get("role") == "region" for d in scrolls)
+        assert all(d.get("tabindex") == "0" and d.get("aria-label") and d.get("role") == "group" for d in scrolls)
         assert len(scrolls) == len(found.all("table"))
 
 

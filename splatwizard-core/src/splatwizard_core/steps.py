@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core import api, tooling
-from splatwizard_core.cli.setup import only, open_training_session
+from splatwizard_core.cli.setup import open_training_session
 from splatwizard_core.evaluation import evaluate as quality
 from splatwizard_core.runs.encode import encode_directory
 from splatwizard_core.runs.measure import Opened, measure, opener
@@ -24,7 +24,9 @@ def _choices(options: dict[str, Any], **given: Any) -> tooling.Choices:
 def _training(method: str, scene: str | None, out: str | Path, options: dict[str, Any]) -> Any:
     chosen = _choices(options, methods=(method,), scene=scene)
     resolved, session = open_training_session(chosen, tooling.load_plugins())
-    return session, tooling.RunRequest(only(resolved), Path(out))
+    if len(resolved) != 1:
+        raise api.ConfigError("one call trains one method for one rate point; call it once for each", key="rate")
+    return session, tooling.RunRequest(resolved[0], Path(out))
 
 
 def _session(options: dict[str, Any], scene: str | None = None) -> Any:
@@ -65,6 +67,8 @@ def load_scene(scene: str | None = None, **options: Any) -> api.Scene:
 
 def evaluate(source: Opened | str | Path, scene: str | None = None, *, speed: bool = False, **options: Any) -> Any:
     """Measure a file, or what `decode` and `train` return, on the test views: the facts of `sw eval --json`."""
+    if isinstance(source, Opened):
+        options.setdefault("device", source.model.device.type)
     session, resolved = _session(options, scene)
     open_it = (lambda: source) if isinstance(source, Opened) else opener(Path(source), session)
     return measure(session, resolved, open_it, speed=speed)
