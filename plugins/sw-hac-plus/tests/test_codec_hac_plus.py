@@ -109,6 +109,34 @@ def test_how_anchors_are_batched_is_no_matter(monkeypatch):
         torch.set_num_threads(threads)
 
 
+@pytest.mark.parametrize(("mode", "limit"), [("exact", "EXACT_NUMBERS"), ("float", "FLOAT_NUMBERS")])
+def test_channel_networks_are_evaluated_a_few_rows_at_a_time(mode, limit, monkeypatch):
+    """A hidden layer of 512 for every anchor of a block would take gigabytes, whatever the size of the file."""
+    model, seen = make(n=100), []
+    whole, _ = recorded(model, mode)
+    channel = model.channel if mode == "float" else model.channel.exact()
+    plain = type(channel).slice
+
+    def counted(self, index, known, context):
+        seen.append(len(context) * model.channel.width(index))
+        return plain(self, index, known, context)
+
+    monkeypatch.setattr(type(channel), "slice", counted)
+    monkeypatch.setattr(predictors, limit, 600)
+    found, _ = recorded(model, mode)
+    assert len(seen) > len(FEATURES)
+    assert max(seen) <= 600
+    for group in GROUPS:
+        assert torch.allclose(torch.cat(found.found[group], dim=1), torch.cat(whole.found[group], dim=1))
+
+
+def test_decoding_leaves_the_global_generator_alone():
+    data = encoded(make(n=20))
+    before = torch.get_rng_state()
+    decoded(data)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_blocks_of_anchors_follow_one_another(monkeypatch):
     monkeypatch.setattr("sw_codecs.entropy.conditional.BLOCK_SYMBOLS", 12 * 40)
     model = make(n=200)
