@@ -2,6 +2,7 @@
 
 import copy
 import json
+import struct
 
 import pytest
 import torch
@@ -9,7 +10,7 @@ from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sw_anchors.attribute_sections import AttributeEncoder
-from sw_anchors.sections import round_networks
+from sw_anchors.sections import BOUNDS_BYTES, round_networks
 from sw_anchors.shape import GROUPS
 from sw_anchors.voxel_lattice import kept_voxels
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -243,6 +244,13 @@ def test_a_damaged_section_is_answered(name, place, value, how):
 def test_header_values_of_a_stranger_are_refused(key, value):
     with pytest.raises(BitstreamError):
         decoded(rewritten(BLOCK, **{key: value}))
+
+
+def test_a_voxel_size_that_makes_positions_infinite_is_refused():
+    section = bytearray(ContainerReader(BLOCK).section("anchors"))
+    section[BOUNDS_BYTES : BOUNDS_BYTES + 12] = struct.pack("<di", 9e29, (1 << 30) - 1000)
+    with pytest.raises(BitstreamError, match="beyond all finite positions"):
+        decoded(rewritten(BLOCK, {"anchors": bytes(section)}))
 
 
 def test_networks_larger_than_the_file_may_stand_for_are_refused_before_they_are_made():

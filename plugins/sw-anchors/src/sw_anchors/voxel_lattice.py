@@ -123,6 +123,9 @@ def read_voxels(reader: ContainerReader, *, bytes_per_anchor: int) -> VoxelGeome
         integers = torch.from_numpy(points) + torch.tensor(low, dtype=torch.int64)
         if n and int(integers.abs().max()) >= LARGEST:
             raise BitstreamError("an anchor leaves the lattice")
-        codes = position_codes(voxel_positions(integers, voxel_size), bounds)
+        positions = voxel_positions(integers, voxel_size)
+        if not bool(torch.isfinite(positions).all()):
+            raise BitstreamError("the voxel size puts an anchor beyond all finite positions")
+        codes = position_codes(positions, bounds)
     masks = read_masks(reader, n, k, gaussians)
     return VoxelGeometry(bounds, codes, masks, integers, voxel_size)
