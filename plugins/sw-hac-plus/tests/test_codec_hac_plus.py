@@ -17,8 +17,9 @@ from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 from sw_hac_plus import codec, predictors
 from sw_hac_plus.method import HACPlus
 
@@ -185,6 +186,13 @@ def test_far_positions_come_back():
         model.anchors[11] = model.anchors[12]
     with pytest.raises(ValueError, match="share a voxel"):
         encoded(model)
+
+
+@pytest.mark.parametrize("far", [30_000.0, 1e17])
+def test_a_scene_that_no_file_could_hold_is_refused_before_it_is_trained(far):
+    points = PointCloud(torch.tensor([[0.0, 0, 0], [1, 1, 1], [2, 0, 1], [far, 0, 0]]))
+    with pytest.raises(SceneError, match=r"scene 'far': .* 2\^21 voxels of 0\.01: train with a larger voxel_size"):
+        method(voxel_size=0.01).create_model(Scene("far", [], [], points, Protocol("test")), generator(0))
 
 
 def test_encoding_leaves_the_model_alone_and_repeats_itself():
