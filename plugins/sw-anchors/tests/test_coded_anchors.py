@@ -222,3 +222,14 @@ def test_far_values_are_clamped_about_the_mean_of_the_kept():
         found = model.attributes(torch.arange(4)).features[0, 0]
     mean = float(model.features.detach().double().mean())
     assert float(found) == pytest.approx(round(mean) + 15_000)
+
+
+def test_constants_of_the_columns_stay_where_they_are():
+    """A CUDA graph reads them by address, whatever is computed in another dtype meanwhile."""
+    model, like = make(), torch.zeros(1)
+    first, key = (*model._columns(like), model.base_steps_like(like)), model.step_key()
+    assert model._columns(like.double())[1].dtype == torch.float64
+    assert all(a is b for a, b in zip(first, (*model._columns(like), model.base_steps_like(like)), strict=True))
+    model.base_steps = (2.0, 0.001, 0.2)
+    assert model.base_steps_like(like).tolist() == pytest.approx([2.0, 0.001, 0.2])
+    assert model.step_key() != key

@@ -83,9 +83,10 @@ def test_bits_are_captured_anew_when_planes_are_others_or_others_learn(model):
     assert not model.plane_bits(1.0).requires_grad
 
 
-def test_a_gpu_that_refuses_graphs_of_the_planes_is_named_once(model, monkeypatch, caplog):
+@pytest.mark.parametrize("kind", [RuntimeError, torch.cuda.OutOfMemoryError])
+def test_a_gpu_that_refuses_graphs_of_the_planes_is_named_once(kind, model, monkeypatch, caplog):
     def refuse(*_):
-        raise RuntimeError("operation not permitted\nand more")
+        raise kind("operation not permitted\nand more")
 
     monkeypatch.setattr("sw_cat_3dgs.plane_bits.CapturedStep", refuse)
     monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())

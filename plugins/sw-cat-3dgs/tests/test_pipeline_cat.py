@@ -15,6 +15,7 @@ from splatwizard_core.errors import BitstreamError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.streams import stream
 from splatwizard_core.training.pipeline import TrainingStopped
+from sw_cat_3dgs import codec
 from sw_cat_3dgs.estimate import estimated_bits
 from sw_cat_3dgs.method import Cat3DGS
 from sw_codecs.entropy import conditional
@@ -90,6 +91,19 @@ def test_exact_symbols_do_not_depend_on_the_block(method, few, monkeypatch):
         assert few.num_rows > 2 * rows
         monkeypatch.setattr(conditional, "BLOCK_SYMBOLS", 12 * rows)
         assert decoded(encoded(few, method)).digest() == usual
+
+
+@pytest.mark.parametrize(("mode", "threads"), [("exact", 2), ("float", 1)])
+def test_only_floats_are_bound_to_one_thread(method, few, mode, threads, monkeypatch):
+    seen, walk = [], codec.walk
+    monkeypatch.setattr(codec, "walk", lambda *given: (seen.append(torch.get_num_threads()), walk(*given)))
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        decoded(encoded(few, method, codec__settings__mode=mode))
+    finally:
+        torch.set_num_threads(before)
+    assert seen == [threads] * 2
 
 
 def test_float_files_hold_the_same_up_to_their_steps(scene, rasterizer, method, trained):

@@ -1,5 +1,8 @@
 """The plan of CAT-3DGS is the published one, and what trains in which phase is what its table says."""
 
+import hashlib
+import json
+
 import pytest
 import torch
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
@@ -212,3 +215,13 @@ def test_the_registry_declares_presets_and_rates():
     entry = load_plugins().methods.entry("cat-3dgs")
     assert entry.declared["presets"] == list(Cat3DGS.PRESETS)
     assert entry.declared["rates"] == list(Cat3DGS.RATES)
+
+
+@pytest.mark.parametrize(
+    ("preset", "expected"),
+    [("paper", "c0edc8c7e57782f7"), ("bungee", "7cead8f16a407431"), ("quick", "810d897132980540")],
+)
+def test_trainings_of_before_keep_their_identity(preset, expected):
+    """Hashes of a release without the keys `graphs` and `growth.subvoxel`; cells were fractions of voxels then."""
+    content = json.dumps(resolve(Cat3DGS, preset).config.identity(), sort_keys=True)
+    assert hashlib.sha256(content.encode()).hexdigest()[:16] == expected

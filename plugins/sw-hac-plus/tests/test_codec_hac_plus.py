@@ -2,6 +2,7 @@
 
 import copy
 import json
+import struct
 
 import pytest
 import torch
@@ -9,15 +10,16 @@ from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sw_anchors.attribute_sections import AttributeEncoder
-from sw_anchors.sections import round_networks
+from sw_anchors.sections import BOUNDS_BYTES, round_networks
 from sw_anchors.shape import GROUPS
 from sw_anchors.voxel_lattice import kept_voxels
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError
+from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
+from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 from sw_hac_plus import codec, predictors
 from sw_hac_plus.method import HACPlus
 
@@ -109,6 +111,34 @@ def test_how_anchors_are_batched_is_no_matter(monkeypatch):
         torch.set_num_threads(threads)
 
 
+@pytest.mark.parametrize(("mode", "limit"), [("exact", "EXACT_NUMBERS"), ("float", "FLOAT_NUMBERS")])
+def test_channel_networks_are_evaluated_a_few_rows_at_a_time(mode, limit, monkeypatch):
+    """A hidden layer of 512 for every anchor of a block would take gigabytes, whatever the size of the file."""
+    model, seen = make(n=100), []
+    whole, _ = recorded(model, mode)
+    channel = model.channel if mode == "float" else model.channel.exact()
+    plain = type(channel).slice
+
+    def counted(self, index, known, context):
+        seen.append(len(context) * model.channel.width(index))
+        return plain(self, index, known, context)
+
+    monkeypatch.setattr(type(channel), "slice", counted)
+    monkeypatch.setattr(predictors, limit, 600)
+    found, _ = recorded(model, mode)
+    assert len(seen) > len(FEATURES)
+    assert max(seen) <= 600
+    for group in GROUPS:
+        assert torch.allclose(torch.cat(found.found[group], dim=1), torch.cat(whole.found[group], dim=1))
+
+
+def test_decoding_leaves_the_global_generator_alone():
+    data = encoded(make(n=20))
+    before = torch.get_rng_state()
+    decoded(data)
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_blocks_of_anchors_follow_one_another(monkeypatch):
     monkeypatch.setattr("sw_codecs.entropy.conditional.BLOCK_SYMBOLS", 12 * 40)
     model = make(n=200)
@@ -156,6 +186,13 @@ def test_far_positions_come_back():
         model.anchors[11] = model.anchors[12]
     with pytest.raises(ValueError, match="share a voxel"):
         encoded(model)
+
+
+@pytest.mark.parametrize("far", [30_000.0, 1e17])
+def test_a_scene_that_no_file_could_hold_is_refused_before_it_is_trained(far):
+    points = PointCloud(torch.tensor([[0.0, 0, 0], [1, 1, 1], [2, 0, 1], [far, 0, 0]]))
+    with pytest.raises(SceneError, match=r"scene 'far': .* 2\^21 voxels of 0\.01: train with a larger voxel_size"):
+        method(voxel_size=0.01).create_model(Scene("far", [], [], points, Protocol("test")), generator(0))
 
 
 def test_encoding_leaves_the_model_alone_and_repeats_itself():
@@ -215,6 +252,13 @@ def test_a_damaged_section_is_answered(name, place, value, how):
 def test_header_values_of_a_stranger_are_refused(key, value):
     with pytest.raises(BitstreamError):
         decoded(rewritten(BLOCK, **{key: value}))
+
+
+def test_a_voxel_size_that_makes_positions_infinite_is_refused():
+    section = bytearray(ContainerReader(BLOCK).section("anchors"))
+    section[BOUNDS_BYTES : BOUNDS_BYTES + 12] = struct.pack("<di", 9e29, (1 << 30) - 1000)
+    with pytest.raises(BitstreamError, match="beyond all finite positions"):
+        decoded(rewritten(BLOCK, {"anchors": bytes(section)}))
 
 
 def test_networks_larger_than_the_file_may_stand_for_are_refused_before_they_are_made():

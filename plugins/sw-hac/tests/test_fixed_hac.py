@@ -121,19 +121,21 @@ def test_a_copy_and_evaluation_leave_the_fixed_sizes_alone():
     assert fixed.captures == 0
 
 
-def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(monkeypatch, caplog):
+@pytest.mark.parametrize("kind", [RuntimeError, torch.cuda.OutOfMemoryError])
+def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(kind, monkeypatch, caplog):
     def refuse(*_):
-        raise RuntimeError("operation not permitted\nand more")
+        raise kind("operation not permitted\nand more")
 
     monkeypatch.setattr("sw_anchors.fixed_decoder.CapturedStep", refuse)
     monkeypatch.setattr(torch.cuda, "graph_pool_handle", lambda: (0, 0))
     monkeypatch.setattr(torch.cuda, "device", lambda _: nullcontext())
     model = trained().train()
-    model.fixed = FixedDecoder()
+    model.fixed, model.sample = FixedDecoder(), 1.0
     for _ in range(2):
         found = model.decode(front_camera(), torch.arange(30))
         assert found.extras["rate"].bits.requires_grad
     assert caplog.messages == ["training goes on without CUDA graphs, slower: operation not permitted"]
+    assert model.fixed._rows_held() == 0
 
 
 @pytest.fixture(scope="module")

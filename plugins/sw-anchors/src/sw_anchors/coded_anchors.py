@@ -133,7 +133,7 @@ class CodedAnchors(AnchorModel):
         self.sample, self.smallest_probability = sample, smallest_probability
         self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
-        self._groups: tuple[tuple[Any, ...], Tensor, Tensor, Tensor] | None = None
+        self._groups: dict[tuple[Any, ...], Triple] = {}
         self.fixed: FixedDecoder | None = None
 
     def __getstate__(self) -> dict[str, Any]:
@@ -243,7 +243,7 @@ class CodedAnchors(AnchorModel):
 
     def step_key(self) -> tuple[Any, ...]:
         """Plain values that decide which operators a step of training runs."""
-        return self.phase, self.sample, self.smallest_probability, self.noise_factor
+        return self.phase, self.sample, self.smallest_probability, self.noise_factor, tuple(self.base_steps)
 
     def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
         if self.fixed is not None and self.training and torch.is_grad_enabled() and self.features.requires_grad:
@@ -290,19 +290,21 @@ class CodedAnchors(AnchorModel):
 
     def _columns(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """The group of each number of an anchor [C], and the same as zeros and ones [C,3]; kept on the device."""
-        widths = self.shape.widths
-        key = (like.device, like.dtype, *widths)
-        if self._groups is None or self._groups[0] != key:
-            group = torch.arange(3).repeat_interleave(torch.tensor(widths))
-            one_hot = torch.nn.functional.one_hot(group, 3).to(like)
-            self._groups = (key, group.to(like.device), one_hot, like.new_tensor(self.base_steps))
-        return self._groups[1], self._groups[2]
+        return self._constants(like)[:2]
 
     def base_steps_like(self, like: Tensor) -> Tensor:
         """[3] base_steps on the device and in the dtype of `like`: made anew, they would be waited for."""
-        self._columns(like)
-        assert self._groups is not None
-        return self._groups[3]
+        return self._constants(like)[2]
+
+    def _constants(self, like: Tensor) -> Triple:
+        """What `_columns` and `base_steps_like` return. None replaces another: graphs read them where they stand."""
+        widths, steps = self.shape.widths, tuple(self.base_steps)
+        key = (like.device, like.dtype, widths, steps)
+        if key not in self._groups:
+            group = torch.arange(3).repeat_interleave(torch.tensor(widths))
+            one_hot = torch.nn.functional.one_hot(group, 3).to(like)
+            self._groups[key] = (group.to(like.device), one_hot, like.new_tensor(steps))
+        return self._groups[key]
 
     def uniform(self, *shape: int) -> Tensor:
         """Draws of U(0,1) on the model's device."""

@@ -53,19 +53,19 @@ class FixedDecoder:
     def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor) -> GaussianInputs | None:
         """Decode the anchors `rows` [V]: their Gaussians with opacity > 0.
 
-        None where the model has no form for it, or the GPU refused a graph; that is said once.
+        None where the model has no form for it, or the GPU refused a graph or had no memory for it; that is said once.
         """
         parts = model.context_rows() if model.phase == ENTROPY else ()
         if self._failed or parts is None:
             return None
         try:
             step, at = self._prepared(model, parts, capacity_of(len(rows)))
-        except torch.cuda.OutOfMemoryError:
-            raise
         except RuntimeError as error:
             self._failed = True
-            self._drop()
             log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
+        if self._failed:  # beyond the handler, whose error holds what was made until then
+            self._drop()
+            torch.cuda.empty_cache()
             return None
         with torch.no_grad():
             at.load(model, camera, rows, parts)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from pydantic import Field
 
 from splatwizard_core.api import OptimizationParams, Params
@@ -49,6 +51,11 @@ class AnchorGrowth(Params):
     hierarchy: int = Field(4, ge=1, description="ratio of cell sizes from level to level")
     subvoxel: bool = Field(False, description="levels with cells below a voxel grow too (authors: they do not)")
 
+    @property
+    def whole_voxels(self) -> bool:
+        """Whether cells of all levels are whole voxels, so that `subvoxel` changes nothing."""
+        return all(self.init_factor % self.hierarchy**level == 0 for level in range(self.levels))
+
 
 class AnchorLoss(Params):
     """Distortion and regularisers of the loss."""
@@ -74,3 +81,15 @@ class CodedAnchorParams(AnchorParams):
 
     lr: CodedAnchorLearningRates = Field(CodedAnchorLearningRates(), description="step sizes")
     graphs: bool = Field(True, description="on a GPU, start the decoding of a step as a CUDA graph")
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values but `graphs`, which says how and not what is computed.
+
+        `growth.subvoxel` is there only where it says something else than releases of before the key, which had cells
+        of fractions of a voxel: runs and trained scenes of then stay what they are.
+        """
+        content = super().identity()
+        del content["graphs"]
+        if self.growth.subvoxel or self.growth.whole_voxels:
+            del content["growth"]["subvoxel"]
+        return content

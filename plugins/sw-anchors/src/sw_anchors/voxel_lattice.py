@@ -51,6 +51,17 @@ def voxel_positions(integers: Tensor, voxel_size: float) -> Tensor:
     return (integers.to(torch.float64) * voxel_size).to(torch.float32)
 
 
+def check_reach(positions: Tensor, voxel_size: float) -> None:
+    """Raise ValueError if anchors at `positions` [N,3] are more voxels from one another, or from 0, than a file has."""
+    if not len(positions):
+        return
+    places = torch.round(positions.detach().to(torch.float64) / voxel_size)
+    reach = float((places.amax(dim=0) - places.amin(dim=0)).max())
+    if not (reach < 1 << MOST_BITS and float(places.abs().max()) < LARGEST):
+        size = f"2^{MOST_BITS} voxels of {voxel_size:g}"
+        raise ValueError(f"the anchors reach over more than {size}: train with a larger voxel_size")
+
+
 @dataclass(frozen=True)
 class VoxelGeometry(AnchorGeometry):
     """Positions and masks of the anchors of a file, on the CPU; `codes` are those of the hash grid.
@@ -73,15 +84,13 @@ def kept_voxels(model: CodedAnchors) -> tuple[VoxelGeometry, Tensor]:
     Raises ValueError if two of them share a voxel, or they reach over more than 2^21 voxels.
     """
     rows = torch.nonzero(model.kept()).squeeze(1)
+    check_reach(model.anchors[rows], model.voxel_size)
     integers = voxel_integers(model.anchors[rows], model.voxel_size).cpu()
     if len(torch.unique(integers, dim=0)) < len(integers):
         raise ValueError("two anchors share a voxel")
     order = torch.arange(0)
     if len(rows):
         low = integers.amin(dim=0)
-        if int((integers - low).max()) >= 1 << MOST_BITS or int(integers.abs().max()) >= LARGEST:
-            size = f"2^{MOST_BITS} voxels of {model.voxel_size:g}"
-            raise ValueError(f"the anchors reach over more than {size}: train with a larger voxel_size")
         order = morton_order(integers - low)
     integers, rows = integers[order], rows[order.to(rows.device)]
     masks = model.masks(rows).detach().cpu() > 0.5
@@ -123,6 +132,9 @@ def read_voxels(reader: ContainerReader, *, bytes_per_anchor: int) -> VoxelGeome
         integers = torch.from_numpy(points) + torch.tensor(low, dtype=torch.int64)
         if n and int(integers.abs().max()) >= LARGEST:
             raise BitstreamError("an anchor leaves the lattice")
-        codes = position_codes(voxel_positions(integers, voxel_size), bounds)
+        positions = voxel_positions(integers, voxel_size)
+        if not bool(torch.isfinite(positions).all()):
+            raise BitstreamError("the voxel size puts an anchor beyond all finite positions")
+        codes = position_codes(positions, bounds)
     masks = read_masks(reader, n, k, gaussians)
     return VoxelGeometry(bounds, codes, masks, integers, voxel_size)

@@ -66,7 +66,7 @@ def encode(model: CatAnchors, writer: ContainerWriter, config: CatConfig) -> Non
     attributes = AttributeEncoder(model, rows, sections(context.shape), mode)
     predictor = PREDICTORS[mode](context)
     if len(rows):
-        with one_thread():
+        with one_thread() if mode == "float" else torch.no_grad():
             walk(attributes, predictor, context.places(geometry.codes, geometry.bounds), geometry.masks)
     attributes.write(writer)
     if mode == "exact":
@@ -99,7 +99,7 @@ def decode(reader: ContainerReader) -> DecodedAnchors:
     if n:
         with reader.decoding("frame"):
             places = context.places(geometry.codes, geometry.bounds)
-        with one_thread():
+        with one_thread() if mode == "float" else torch.no_grad():
             walk(attributes, predictor, places, geometry.masks)
     attributes.finish()
     return model

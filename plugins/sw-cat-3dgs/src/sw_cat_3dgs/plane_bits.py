@@ -30,7 +30,7 @@ class FixedPlaneBits:
         self._noise = torch.empty(0)
 
     def __call__(self, context: CatContext, share: float, generator: torch.Generator | None) -> Tensor | None:
-        """Estimate the bits; differentiable. None where no graph can be made, which is said once.
+        """Estimate the bits; differentiable. None where no graph can be made or none has room, which is said once.
 
         share       of the channels, as of `triplane_bits`
         generator   of the noise; None: the default one of the device
@@ -64,11 +64,13 @@ class FixedPlaneBits:
         try:
             with torch.cuda.device(planes[0].device):
                 self._step = CapturedStep(compute, self._watched.learning)
-        except torch.cuda.OutOfMemoryError:
-            raise
         except RuntimeError as error:
             self._failed = True
             log.warning("the planes' bits go on without CUDA graphs: %s", str(error).partition("\n")[0])
+        if self._failed:  # beyond the handler, whose error holds what was made until then
+            self._noise, self._watched = torch.empty(0), Watched([])
+            del compute
+            torch.cuda.empty_cache()
 
 
 def _bits(context: CatContext, share: float, noise: Tensor) -> Found:

@@ -1,5 +1,9 @@
 """spatial-ar: causal, decodes along wavefronts what it coded, learns, and costs what it estimates."""
 
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +15,7 @@ from sw_codecs.context import spatial_ar
 from sw_codecs.context.plane_fields import NEIGHBORS, Field
 from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.entropy.exact_tables import exact_tables
+from sw_codecs.exact_native import EXACT
 
 
 def network(seed=0, scale=1.0):
@@ -69,6 +74,36 @@ def test_any_values_come_back(channels, height, width, seed, spread):
     networks, planes = exact_networks(1), [drawn(1, channels, height, width, seed=seed, spread=spread)]
     found = SpatialAr.decode(SpatialAr.encode(planes, networks), [(channels, height, width)], networks)
     assert np.array_equal(found[0], planes[0])
+
+
+MEMORY = """
+import sys, torch
+from pathlib import Path
+from sw_codecs.context.spatial_ar import SpatialAr
+
+def kilobytes(name):
+    return int(Path("/proc/self/status").read_text().split(name)[1].split()[0])
+
+torch.set_num_threads(3)
+networks = [SpatialAr.exact(SpatialAr(torch.Generator().manual_seed(seed)).state()) for seed in range(3)]
+one = SpatialAr.decode(Path(sys.argv[2]).read_bytes(), [(1, 4, 4)], networks)  # the kernel is loaded
+data = Path(sys.argv[1]).read_bytes()
+before = kilobytes("VmRSS:")
+SpatialAr.decode(data, [(1, 700, 700)], networks)
+print((kilobytes("VmHWM:") - before) * 1024)
+"""
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="no peak of a process to read")
+def test_planes_of_one_channel_take_no_more_than_their_size_allows(tmp_path):
+    if not EXACT.try_load():
+        pytest.skip("no compiler: nothing is decoded side by side")
+    networks = [SpatialAr.exact(SpatialAr(torch.Generator().manual_seed(seed)).state()) for seed in range(3)]
+    for name, size in (("large", 700), ("small", 4)):
+        (tmp_path / name).write_bytes(SpatialAr.encode([np.zeros((3, 1, size, size), np.int64)], networks))
+    command = [sys.executable, "-c", MEMORY, str(tmp_path / "large"), str(tmp_path / "small")]
+    found = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert int(found.stdout) < 4 * (4 * 3 * 700 * 700)  # integers of 32 bits
 
 
 def test_what_is_decoded_together_does_not_matter():

@@ -224,7 +224,7 @@ class Choosing(OptimizationParams):
 
     def identity(self) -> dict[str, Any]:
         """Return all values as `OLDER` has them, where the older release could say the same."""
-        content = self.model_dump(mode="json")
+        content = super().identity()
         named = dict(_blocks(self))
         for old, moved in self.OLDER.items():
             if old in named:

@@ -159,4 +159,4 @@ def _read_channel(reader: ContainerReader, features: int) -> ChannelMixture | No
         raise BitstreamError(
             f"{reader.name}: channel networks of {numbers:,} numbers are not there", section="networks"
         )
-    return ChannelMixture(slices, context=context, hidden=hidden)
+    return ChannelMixture(slices, context=context, hidden=hidden, generator=torch.Generator())

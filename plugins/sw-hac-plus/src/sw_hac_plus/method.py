@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from splatwizard_core.api import ConfigError, Method
+from sw_anchors.voxel_lattice import check_reach
+
+from splatwizard_core.api import ConfigError, Method, SceneError
 from sw_codecs.context.channel_mixture import PARTS, ChannelMixture
 from sw_hac_plus import codec
 from sw_hac_plus.config import HACPlusConfig
@@ -34,12 +36,20 @@ class HACPlus(Method):
     DEFAULT_RATE: ClassVar[str] = "r4"
 
     def create_model(self, scene: Scene, generator: torch.Generator) -> SplatModel:
-        """Put an anchor into every voxel with a start point of the scene."""
+        """Put an anchor into every voxel with a start point of the scene.
+
+        Raises SceneError if there is none, or if they reach over more voxels than a file has.
+        """
         config: HACPlusConfig = self.config
-        return HACPlusAnchors.of_scene(
+        model = HACPlusAnchors.of_scene(
             scene, config, generator, channel=self.channel(generator),
             anchor_gradient=config.rate_term.anchor_gradient,
         )  # fmt: skip
+        try:
+            check_reach(model.anchors, model.voxel_size)  # now, not after the training
+        except ValueError as error:
+            raise SceneError(f"scene '{scene.name}': {error}", path=scene.path) from None
+        return model
 
     def channel(self, generator: torch.Generator) -> ChannelMixture | None:
         """The channel context. Raises ConfigError if its slices do not make up the features."""

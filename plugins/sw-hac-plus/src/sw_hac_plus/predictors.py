@@ -14,11 +14,11 @@ from sw_anchors.float_mode import Mode, one_thread
 from sw_anchors.grid_anchors import context_of
 from sw_anchors.grid_predictors import BlockPrediction, row_width
 from sw_anchors.lattice import TOP
-from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
+from sw_anchors.row_parts import EXACT_NUMBERS, FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from torch import Tensor, nn
 
-from sw_codecs.context.channel_mixture import PARTS, ChannelMixture
+from sw_codecs.context.channel_mixture import PARTS, ChannelMixture, ExactChannelMixture
 from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_codecs.entropy.conditional import RowContext
 from sw_codecs.entropy.conditional_mixture import RowMixture
@@ -52,7 +52,7 @@ class ExactPredictor:
         """Raises ValueError if a network cannot be evaluated exactly."""
         self._grid, self._shape = grid, shape
         self._network = ExactNetwork(network, shape, base_steps, further=shape.features)
-        self._channel = channel.exact()
+        self._channel, self._width = channel.exact(), channel.width
 
     def first(self, codes: Tensor) -> FirstPrediction:
         """Predict for anchors at `codes` [n,3] of the hash grid."""
@@ -66,7 +66,7 @@ class ExactPredictor:
 
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
         """Mixtures of slice `index`, once the features before it are `known`."""
-        mean, scale, logit = self._channel.slice(index, known, first.context).chunk(PARTS, dim=1)
+        mean, scale, logit = _second(self._channel, index, known, first.context, self._width(index), EXACT_NUMBERS)
         grid, _ = first.groups["features"]
         return RowMixture(
             grid.mean[:, columns], grid.scale[:, columns], mean, scale, first.logit[:, columns] - logit, grid.step
@@ -110,7 +110,8 @@ class FloatPredictor:
     def mixture(self, index: int, columns: slice, first: FirstPrediction, known: Tensor) -> RowMixture:
         """Mixtures of slice `index`, once the features before it are `known`."""
         with one_thread():
-            mean, scale, logit = self._channel.slice(index, known, first.context).chunk(PARTS, dim=1)
+            width = self._channel.width(index)
+            mean, scale, logit = _second(self._channel, index, known, first.context, width, FLOAT_NUMBERS)
         (grid, _), base = first.groups["features"], self._base_steps[0]
         return RowMixture(
             grid.mean[:, columns], grid.scale[:, columns], (base * mean).clamp(-1e6, 1e6),
@@ -120,6 +121,16 @@ class FloatPredictor:
     def known(self, symbols: Tensor, first: FirstPrediction) -> Tensor:
         """Decoded features as the networks take them."""
         return (symbols * first.groups["features"][1] / self._base_steps[0]).to(torch.float32)
+
+
+def _second(
+    channel: ChannelMixture | ExactChannelMixture, index: int, known: Tensor, context: Tensor, width: int, numbers: int
+) -> tuple[Tensor, ...]:
+    """Means, scales and logits of slice `index`; of as many rows at once as `width` leaves room for in `numbers`."""
+    outputs = by_parts(
+        lambda rows: channel.slice(index, known[rows], context[rows]), torch.arange(len(known)), width, numbers
+    )
+    return outputs.chunk(PARTS, dim=1)
 
 
 Predictor = ExactPredictor | FloatPredictor

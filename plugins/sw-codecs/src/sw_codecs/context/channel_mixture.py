@@ -76,6 +76,11 @@ class ChannelMixture(nn.Module):
         """Columns of slice `index`."""
         return slice(self.starts[index], self.starts[index] + self.slices[index])
 
+    def width(self, index: int) -> int:
+        """Most numbers that a row has on its way through `slice`."""
+        outputs = PARTS * self.slices[index]
+        return max(self.starts[index] + self.context, self.hidden or outputs, outputs)
+
     def forward(self, values: Tensor, context: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Second (mean, scale, logit) [n, F] of all channels; scales may be negative.
 

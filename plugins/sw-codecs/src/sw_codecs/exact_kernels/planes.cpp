@@ -53,18 +53,20 @@ const double* layer(const double* weights, const Group* in, Group* out, bool las
 }
 
 // Planes of the channels of a bundle, channels innermost, within a border of zeros; integers times 4096 as float32.
+// Cells are not padded: of few channels that would be many times the planes. Lanes beyond the channels read what
+// follows, and nobody reads those.
 struct Field {
-  int64_t height, width, lanes, stride;
+  int64_t height, width, channels, lanes, stride;
   Scratch<float> cells;
   int64_t around[NEIGHBORS];
 
-  Field(int64_t h, int64_t w, int64_t channels)
-      : height(h), width(w), lanes((channels + SIDE - 1) / SIDE * SIDE), stride((w + 4) * lanes),
-        cells((h + 2) * stride) {
-    for (int64_t i = 0; i < (h + 2) * stride; ++i) cells[i] = 0;
-    for (int n = 0; n < NEIGHBORS; ++n) around[n] = DOWN[n] * stride + RIGHT[n] * lanes;
+  Field(int64_t h, int64_t w, int64_t c)
+      : height(h), width(w), channels(c), lanes((c + SIDE - 1) / SIDE * SIDE), stride((w + 4) * c),
+        cells((h + 2) * stride + SIDE) {
+    for (int64_t i = 0; i < (h + 2) * stride + SIDE; ++i) cells[i] = 0;
+    for (int n = 0; n < NEIGHBORS; ++n) around[n] = DOWN[n] * stride + RIGHT[n] * channels;
   }
-  float* at(int64_t row, int64_t column) const { return cells.data + (row + 2) * stride + (column + 2) * lanes; }
+  float* at(int64_t row, int64_t column) const { return cells.data + (row + 2) * stride + (column + 2) * channels; }
   static float context(int64_t value) {
     return static_cast<float>((value < -256 ? -256 : value > 256 ? 256 : value) * 4096);
   }
