@@ -131,6 +131,24 @@ def test_sw_run_with_several_scenes_or_seeds_is_a_sweep(monkeypatch, capsys, tmp
     assert given["resume"] is False
 
 
+def test_several_seeds_of_a_configuration_file_take_its_method_scene_and_rate(monkeypatch, capsys, tmp_path):
+    from splatwizard_core.tooling import Choices, load_plugins
+
+    chosen = Choices(methods=("lightgaussian",), scene="demo:tiny", rate="r2", sets=("iterations=3",))
+    (tmp_path / "config.toml").write_text(chosen.resolve(load_plugins())[0].toml())
+    words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out")]
+    asked = []
+    monkeypatch.setattr("sw_bench.running.bench_plan", lambda wanted, given: asked.append(wanted) or 0)
+    assert main(["run", *words, "--seed", "0,1"]) == 0
+    assert (asked[0].plan.methods, asked[0].plan.scenes, asked[0].plan.rates) == (
+        ("lightgaussian",), ("demo:tiny",), None
+    )  # fmt: skip
+    monkeypatch.undo()
+    assert main(["bench", *words, "--seed", "0,1", "--dry-run", "--no-probe", "--json"]) == 0
+    (_, first, *_), out = json.loads(capsys.readouterr().out)["processes"], tmp_path / "out"
+    assert [run["directory"] for run in first["runs"]] == [str(out / "seed-1" / "demo-tiny" / "lightgaussian" / "r2")]
+
+
 @pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("words", "told"),

@@ -81,6 +81,7 @@ class Plan(Values):
     methods     names, or names of tables [method.NAME]
     seeds       of every random stream
     device      auto, cpu or cuda
+    rates       None: what `config` says, else the default of each method
     config      a file for `--config` of every run
     init        a .ply for `--init` of every run
     repeats     measurements of the rendering speed
@@ -92,7 +93,6 @@ class Plan(Values):
     methods: tuple[str, ...] = Field(min_length=1)
     scenes: tuple[str, ...] = Field(min_length=1)
     seeds: tuple[int, ...] = Field((0,), min_length=1)
-    rates: str | None = "default"
     device: str | None = None
     config: str | None = None
     init: str | None = None

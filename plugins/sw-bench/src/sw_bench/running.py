@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from splatwizard_core.api import ConfigError, UserInputError
 from splatwizard_core.tooling import (
     OUTPUT_FOLDER,
+    Choices,
     PluginManager,
     choose_device,
     directory_lock,
@@ -55,7 +56,7 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
     if given.get("allow_changed_plan"):
         raise click.UsageError("--allow-changed-plan is for one run at a time: leave out further scenes and seeds")
     methods, scenes, seeds = words_of(given["methods"]), scenes_of(given["scene"]), seeds_of(given["seed"])
-    if path is None and not (methods or scenes or seeds):
+    if path is None and not (methods or scenes or seeds or given["config_file"]):
         raise click.UsageError("name a PLAN.toml, or what to run by --method, --scene and --seed")
     if path is None:
         plan, text = _plan_of_words(methods, scenes, seeds, given), ""
@@ -78,13 +79,17 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
 
 
 def _plan_of_words(methods: list[str], scenes: list[str], seeds: list[int], given: Mapping[str, Any]) -> Plan:
-    plugins = load_plugins()
+    plugins, file = load_plugins(), given["config_file"]
     default = {"methods": plugins.methods.default, "scenes": plugins.datasets.default}
+    if file is not None:
+        said = Choices(methods=tuple(methods), config_file=file)
+        default["methods"] = said.method_names(plugins)[0]
+        default["scenes"] = default["scenes"] if scenes else said.resolve(plugins)[0].scene_spec
     content: dict[str, Any] = {
         "methods": methods or [name for name in [default["methods"]] if name],
         "scenes": scenes or [name for name in [default["scenes"]] if name],
-        "seeds": seeds or [0], "rates": given["rate"] or "default", "preset": given["preset"],
-        "images": given["images"], "init": given["init"], "config": given["config_file"], "set": _pairs(given["sets"]),
+        "seeds": seeds or [0], "rates": given["rate"], "preset": given["preset"],
+        "images": given["images"], "init": given["init"], "config": file, "set": _pairs(given["sets"]),
     }  # fmt: skip
     return checked_plan(content, "the command")
 
