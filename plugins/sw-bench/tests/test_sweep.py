@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from sw_bench import display, results, sweep
+from sw_bench import results, state, sweep
 from sw_bench.cells import Cell, Job, SharedTraining, run_job
 from sw_bench.display import Lines
 from sw_bench.estimates import Estimates
@@ -88,7 +88,7 @@ def records(monkeypatch):
         made = (each.directory / "made").exists()
         return SimpleNamespace(file=SimpleNamespace(bytes=7), metrics={}) if made else None
 
-    for module in (sweep, display, results):
+    for module in (sweep, state, results):
         monkeypatch.setattr(module, "record_of", record_of)
 
 
@@ -142,6 +142,36 @@ def test_after_a_failed_rate_point_the_others_of_its_training_are_made(tmp_path)
     }
     made = Made(tmp_path, [job], script).run()
     assert made.states == {"r1": ("finished", ""), "r2": ("failed", "r2 does not decode"), "r3": ("finished", "")}
+
+
+def finished_before(tmp_path, *rates):
+    """Runs whose records are there."""
+    cells = [cell(tmp_path, rate=rate) for rate in rates]
+    for each in cells:
+        each.directory.mkdir(parents=True)
+        for name in ("made", "metrics.json"):
+            (each.directory / name).write_text("before")
+    return cells
+
+
+def test_a_finished_run_that_cannot_be_done_again_has_failed(tmp_path):
+    job = run_job(finished_before(tmp_path, "r1"))
+    made = Made(tmp_path, [job], {job.name: [(1, "", "error: no picture")]}).run()
+    assert made.states == {"r1": ("failed", "no picture")}
+    assert "failed" in made.lines[-1]
+    assert list(made.sweep.failed.values()) == ["no picture"]
+    (row,) = results.results(made.cells, made.index)
+    assert (row["seeds"], row["failed"], row["waiting"]) == ([0], {"0": "no picture"}, [])
+
+
+def test_of_finished_runs_in_one_process_the_one_that_fails_is_found(tmp_path):
+    job = run_job(finished_before(tmp_path, "r1", "r2", "r3"))
+    script = {
+        "a demo seed 0 r1,r2,r3": [(1, "none", "error: no picture")],
+        "a demo seed 0 r2": [(1, "none", "error: no picture")],
+    }
+    made = Made(tmp_path, [job], script).run()
+    assert made.states == {"r1": ("finished", ""), "r2": ("failed", "no picture"), "r3": ("finished", "")}
 
 
 def test_a_training_that_fails_is_not_tried_for_every_rate_point(tmp_path):

@@ -156,10 +156,11 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         say(_counts(cells, states, jobs, executor))
         try:
             with _display(cells, finished, estimates) as display:
-                Sweep(layout.out, jobs, executor, index, display, retries=given["retries"]).run()
+                sweep = Sweep(layout.out, jobs, executor, index, display, retries=given["retries"])
+                sweep.run()
         finally:
             rows = results(cells, index)
-        failed = any(row["failed"] for row in rows)
+        failed = bool(sweep.failed)
         if given["as_json"]:
             print_json({"out": str(layout.out), "runs": rows})
         else:

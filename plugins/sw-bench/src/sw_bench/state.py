@@ -88,6 +88,17 @@ def record_of(cell: Cell) -> Record | None:
     return record if record.config_hash == cell.resolved.config_hash() else None
 
 
+def stamp_of(cell: Cell) -> tuple[int, int] | None:
+    """Return what changes whenever the record of a run is written; None: there is no record of these values."""
+    if record_of(cell) is None:
+        return None
+    try:
+        facts = (cell.directory / FILE_NAME).stat()
+    except OSError:
+        return None
+    return facts.st_mtime_ns, facts.st_ino
+
+
 def is_trained(directory: Path) -> bool:
     """Whether a directory says that its training is finished."""
     try:
