@@ -105,6 +105,19 @@ def test_a_plan_with_other_values_discards_nothing_unasked(swept, capsys):
 
 
 @pytest.mark.pipeline
+def test_a_part_of_a_plan_leaves_the_rest_of_the_index(swept, capsys):
+    folder, _ = swept
+    words = [str(folder / "plan.toml"), "--out", str(folder / "out"), "--scene", "demo:tiny"]
+    assert main(["bench", *words]) == 0
+    told = capsys.readouterr()
+    assert "not in the plan any more" not in told.err
+    assert "spoilt" not in told.out
+    with index_of(folder / "out") as index:
+        rows = {Path(row["scene"]).name: row["status"] for row in index.execute("SELECT * FROM runs")}
+    assert rows == {"demo:tiny": "finished", "spoilt": "failed"}
+
+
+@pytest.mark.pipeline
 def test_a_damaged_index_is_told(swept, capsys):
     folder, _ = swept
     (folder / "other").mkdir()

@@ -43,12 +43,21 @@ OF_A_PLAN = ("rate", "preset", "images", "init", "config_file", "sets")
 class Wanted:
     """The plan of a command.
 
+    plan    of the whole sweep
+    layout  places of its runs
     text    of the file; empty: the options of the command
+    part    the methods, scenes and seeds of it that are to run; None: all
     """
 
     plan: Plan
     layout: Layout
     text: str
+    part: Plan | None = None
+
+    def has(self, cell: Cell) -> bool:
+        """Whether a run of the plan is to run."""
+        part = self.part or self.plan
+        return cell.label in part.methods and cell.scene in part.scenes and cell.seed in part.seeds
 
 
 def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
@@ -58,6 +67,7 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
     methods, scenes, seeds = words_of(given["methods"]), scenes_of(given["scene"]), seeds_of(given["seed"])
     if path is None and not (methods or scenes or seeds or given["config_file"]):
         raise click.UsageError("name a PLAN.toml, or what to run by --method, --scene and --seed")
+    part = None
     if path is None:
         plan, text = _plan_of_words(methods, scenes, seeds, given), ""
     else:
@@ -65,8 +75,8 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
         if useless is not None:
             option = {"config_file": "config", "sets": "set"}.get(useless, useless)
             raise click.UsageError(f"--{option} stands in the plan, {path}: put it there, or leave the plan out")
-        whole, text = read_plan(path)
-        plan = whole.part(methods, scenes, seeds)
+        plan, text = read_plan(path)
+        part = plan.part(methods, scenes, seeds)
     changes = {
         "device": given["device"] or plan.device, "executor": given["executor"] or plan.executor,
         "geometry": given["geometry"] or plan.geometry, "options": {**plan.options, **_pairs(given["given"])},
@@ -75,7 +85,7 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
     plan = plan.model_copy(update=changes)
     out = given["out"] or plan.out or ("out" if path is None else f"out/{Path(path).stem}")
     OUTPUT_FOLDER.convert(out, None, None)
-    return Wanted(plan, Layout(Path(out).resolve(), path is not None or len(plan.seeds) > 1), text)
+    return Wanted(plan, Layout(Path(out).resolve(), path is not None or len(plan.seeds) > 1), text, part)
 
 
 def _plan_of_words(methods: list[str], scenes: list[str], seeds: list[int], given: Mapping[str, Any]) -> Plan:
@@ -122,7 +132,10 @@ def _pairs(words: Sequence[str]) -> dict[str, Any]:
 def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     """Run a plan, or print what it would run; return the exit status: 1 if a run failed."""
     plugins, plan, layout = load_plugins(), wanted.plan, wanted.layout
-    cells = cells_of(plan, layout, plugins)
+    planned = cells_of(plan, layout, plugins)
+    cells = [cell for cell in planned if wanted.has(cell)]
+    if not cells:
+        raise ConfigError("this part of the plan leaves no run: every one is skipped")
     states = {cell: state_of(cell, plugins, geometry=plan.geometry) for cell in cells}
     changed = [cell for cell in cells if states[cell] is State.CHANGED]
     again = bool(given["rerun_changed"]) or not given.get("resume", True)
@@ -138,7 +151,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         from sw_bench.dry_run import dry_run
 
         executor = None if plan.executor != LOCAL else make_executor(plan, layout, plugins)
-        dry_run(plan, jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
+        dry_run(jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
         return 0
     executor = make_executor(plan, layout, plugins)
     layout.out.mkdir(parents=True, exist_ok=True)
@@ -146,7 +159,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         stack.enter_context(directory_lock(layout.out, say=say))
         index = Index(layout.out)
         stack.callback(index.close)
-        _begin(index, wanted, cells, states)
+        _begin(index, wanted, planned, states)
         for cell in unfinished:
             if states[cell] is State.CHANGED:
                 discard(cell)
@@ -190,9 +203,9 @@ def make_executor(plan: Plan, layout: Layout, plugins: PluginManager) -> Executo
     return made
 
 
-def _begin(index: Index, wanted: Wanted, cells: Sequence[Cell], states: Mapping[Cell, State]) -> None:
-    """Bring the index to the plan, and say what it no longer has."""
-    gone = index.plan(cells)
+def _begin(index: Index, wanted: Wanted, planned: Sequence[Cell], states: Mapping[Cell, State]) -> None:
+    """Bring the index to the whole plan and the states of what is to run, and say what it no longer has."""
+    gone = index.plan(planned)
     if gone:
         named = ", ".join(gone[:NAMED]) + (", ..." if len(gone) > NAMED else "")
         say(f"{len(gone)} runs of before are not in the plan any more, and stay where they are: {named}")
