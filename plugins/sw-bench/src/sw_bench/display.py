@@ -58,7 +58,7 @@ class Lines:
         if status == "finished":
             self.estimates.learn(*job.about, seconds)
         left = self.left(sweep)
-        told = {"finished": f"in {duration(seconds)}", "again": f"goes on, as it was {reason}"}.get(status, reason)
+        told = {"finished": f"in {duration(seconds)}", "again": f"goes on: {reason}"}.get(status, reason)
         line = f"{self.counted()} {status:9} {job.name}: {told}"
         self.tell(line + (f" · about {duration(left)} left" if left is not None and status == "finished" else ""))
 

@@ -166,6 +166,9 @@ def _reason(log: Path, start: int, status: int) -> str:
     """One line why a process failed: its last error message, or the signal that ended it."""
     if status == LOST:
         return "its machine was lost"
+    if status == 130:
+        return "interrupted"
+    status = -KILLED if status == 128 + KILLED else status  # as a shell tells it
     if status < 0:
         name = signal.Signals(-status).name if -status in signal.valid_signals() else f"signal {-status}"
         return f"killed by {name}" + (" (the memory may have been full)" if -status == KILLED else "")
