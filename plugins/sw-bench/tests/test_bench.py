@@ -162,6 +162,18 @@ def test_several_seeds_of_a_configuration_file_take_its_method_scene_and_rate(mo
     assert [run["directory"] for run in first["runs"]] == [str(out / "seed-1" / "demo-tiny" / "lightgaussian" / "r2")]
 
 
+def test_options_of_an_executor_may_be_in_a_table(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("sw_bench.running.bench_plan", lambda wanted, given: asked.append(wanted) or 0)
+    (tmp_path / "plan.toml").write_text(
+        'methods = ["3dgs"]\nscenes = ["demo"]\n[options]\ncores = 2\nextra = { constraint = "a", qos = "low" }\n'
+    )
+    assert main(["bench", str(tmp_path / "plan.toml"), "-o", "extra.constraint=v100", "-o", "extra.mail-type=END"]) == 0
+    assert asked[0].plan.options == {
+        "cores": 2, "extra": {"constraint": "v100", "qos": "low", "mail-type": "END"}
+    }  # fmt: skip
+
+
 @pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("words", "told"),
@@ -174,6 +186,7 @@ def test_several_seeds_of_a_configuration_file_take_its_method_scene_and_rate(mo
         ("--scene demo:tiny --executor lokal", "no executor is called 'lokal'; did you mean 'local'?"),
         ("--scene demo:tiny -o workes=2", "executor 'local' has no option 'workes': did you mean 'workers'?"),
         ("--scene demo:tiny -o workers=many", "bad value 'many' for option 'workers' of 'local'"),
+        ("--scene demo:tiny -o workers=2 -o workers.x=2", "option 'workers' is no table"),
         ("--scene demo:tiny -o workers=100000", "workers = 100000: this machine has "),
         ("--scene demo:tiny --seed 0,x", "'x' is not a valid integer"),
         ("--scene demo:tiny --out plan.toml/x", "cannot write into plan.toml/x"),

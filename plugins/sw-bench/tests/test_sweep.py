@@ -243,6 +243,23 @@ def test_discarding_a_run_leaves_what_is_not_its_own(tmp_path):
     assert sorted(path.name for path in each.directory.iterdir()) == [".lock", "notes.txt"]
 
 
+def test_discarding_a_training_for_several_removes_it_and_its_note(tmp_path):
+    from sw_bench.state import discard_shared, is_shared_training_done
+
+    job, home = shared(tmp_path), tmp_path / ".trained" / "demo-a-key"
+    discard_shared(job.shared)  # there is nothing yet
+    home.mkdir(parents=True)
+    (home / "steps.json").write_text('{"train": {}}')
+    job.shared.note.parent.mkdir()
+    for place, is_left in ((tmp_path / ".trained" / ".." / ".trained" / "demo-a-key", False), (tmp_path, True)):
+        (place / "steps.json").write_text('{"train": {}}')
+        job.shared.note.write_text(json.dumps({"directory": str(place.resolve())}))
+        assert is_shared_training_done(job.shared)
+        discard_shared(job.shared)
+        assert not job.shared.note.exists()
+        assert (place / "steps.json").exists() is is_left  # only of what lies among the trained scenes
+
+
 def test_an_index_follows_its_plan(tmp_path):
     index = Index(tmp_path)
     first, second = cell(tmp_path, "a"), cell(tmp_path, "b")

@@ -24,14 +24,14 @@ from splatwizard_core.tooling import (
     print_table,
     say,
 )
-from sw_bench.cells import Cell, Job, Layout, cells_of, jobs_of, prepare
+from sw_bench.cells import Cell, Job, Layout, cells_of, jobs_of, prepare, training_key
 from sw_bench.display import Lines, LiveTable
 from sw_bench.estimates import Estimates
 from sw_bench.executor import Executor, Site
 from sw_bench.index import Index
 from sw_bench.plan import Plan, checked_plan, read_plan
 from sw_bench.results import results, table_of
-from sw_bench.state import State, changes_of, discard, state_of
+from sw_bench.state import State, changes_of, discard, discard_shared, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
@@ -79,7 +79,7 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
         part = plan.part(methods, scenes, seeds)
     changes = {
         "device": given["device"] or plan.device, "executor": given["executor"] or plan.executor,
-        "geometry": given["geometry"] or plan.geometry, "options": {**plan.options, **_pairs(given["given"])},
+        "geometry": given["geometry"] or plan.geometry, "options": _with_pairs(plan.options, _pairs(given["given"])),
         "repeats": given["repeats"] if given["repeats"] != 1 else plan.repeats,
     }  # fmt: skip
     plan = plan.model_copy(update=changes)
@@ -129,6 +129,20 @@ def _pairs(words: Sequence[str]) -> dict[str, Any]:
     return found
 
 
+def _with_pairs(options: Mapping[str, Any], pairs: Mapping[str, str]) -> dict[str, Any]:
+    """Put `KEY=VALUE`, or `TABLE.KEY=VALUE`, into options of an executor."""
+    found = {key: dict(value) if isinstance(value, Mapping) else value for key, value in options.items()}
+    for key, value in pairs.items():
+        table, _, inner = key.partition(".")
+        if not inner:
+            found[key] = value
+        elif isinstance(found.setdefault(table, {}), dict):
+            found[table][inner] = value
+        else:
+            raise ConfigError(f"option '{table}' is no table: '{key}' cannot be set", key=key)
+    return found
+
+
 def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     """Run a plan, or print what it would run; return the exit status: 1 if a run failed."""
     plugins, plan, layout = load_plugins(), wanted.plan, wanted.layout
@@ -163,6 +177,11 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         for cell in unfinished:
             if states[cell] is State.CHANGED:
                 discard(cell)
+        if not given.get("resume", True):
+            own = {cell.training for cell in cells}
+            for job in jobs:
+                if job.shared is not None and training_key(job.shared.resolved) in own:
+                    discard_shared(job.shared)
         prepare(jobs, layout)
         estimates = Estimates(index.durations())
         finished = [cell for cell in cells if states[cell] is State.FINISHED]
