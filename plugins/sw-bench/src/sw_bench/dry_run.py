@@ -62,6 +62,8 @@ def dry_run(
 
 def plan_size(cells: Sequence[Cell]) -> str:
     """`8 methods x 3 scenes x 2 seeds`."""
-    named = {"method": [c.label for c in cells], "scene": [c.scene for c in cells], "seed": [c.seed for c in cells]}
-    sizes = {name: len(set(each)) for name, each in named.items()}
+    sizes = {
+        "method": len({cell.label for cell in cells}), "scene": len({cell.scene for cell in cells}),
+        "seed": len({cell.seed for cell in cells}),
+    }  # fmt: skip
     return " x ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in sizes.items())

@@ -55,3 +55,6 @@ class Executor(Protocol):
 
 LOST = -1000
 """Status of a process whose machine is gone."""
+
+PATIENCE_SECONDS = 70.0
+"""Time for a process that is asked to end: more than it gives itself to write its checkpoint."""

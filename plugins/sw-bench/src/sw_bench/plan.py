@@ -168,8 +168,9 @@ def checked_plan(content: Mapping[str, Any], source: str) -> Plan:
             if name not in known:
                 raise ConfigError(f"{source}: [{kind}.{name}] is for none of `{kind}s`: {_hint(name, known)}")
     for i, each in enumerate(plan.override, 1):
-        for name, given, there in (("methods", each.methods, plan.methods), ("scenes", each.scenes, plan.scenes)):
-            for one in given:
+        for name in ("methods", "scenes", "seeds"):
+            there = [str(one) for one in getattr(plan, name)]
+            for one in map(str, getattr(each, name)):
                 if one not in there:
                     raise ConfigError(f"{source}: override {i}: '{one}' is none of `{name}`: {_hint(one, there)}")
     for name in ("methods", "scenes", "seeds"):

@@ -22,12 +22,11 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import write_json
-from sw_bench.executor import LOST, Site
+from sw_bench.executor import LOST, PATIENCE_SECONDS, Site
 
 FOLDER = ".slurm"  # in the output folder: what submitit writes
 SUBMITTED = "submitted.json"  # in it: numbers of the jobs of a sweep that goes on, or was killed
 MOMENT = 0.2
-PATIENCE_SECONDS = 70.0
 KILLED = 9  # SIGKILL
 # The last two are of jobs on this machine.
 STATES_OF_LOSS = ("NODE_FAIL", "BOOT_FAIL", "PREEMPTED", "REVOKED", "UNKNOWN", "INTERRUPTED", "FINISHED")
