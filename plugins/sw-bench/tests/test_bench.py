@@ -105,6 +105,19 @@ def test_a_plan_with_other_values_discards_nothing_unasked(swept, capsys):
 
 
 @pytest.mark.pipeline
+def test_a_part_of_a_plan_leaves_the_rest_of_the_index(swept, capsys):
+    folder, _ = swept
+    words = [str(folder / "plan.toml"), "--out", str(folder / "out"), "--scene", "demo:tiny"]
+    assert main(["bench", *words]) == 0
+    told = capsys.readouterr()
+    assert "not in the plan any more" not in told.err
+    assert "spoilt" not in told.out
+    with index_of(folder / "out") as index:
+        rows = {Path(row["scene"]).name: row["status"] for row in index.execute("SELECT * FROM runs")}
+    assert rows == {"demo:tiny": "finished", "spoilt": "failed"}
+
+
+@pytest.mark.pipeline
 def test_a_damaged_index_is_told(swept, capsys):
     folder, _ = swept
     (folder / "other").mkdir()
@@ -131,6 +144,36 @@ def test_sw_run_with_several_scenes_or_seeds_is_a_sweep(monkeypatch, capsys, tmp
     assert given["resume"] is False
 
 
+def test_several_seeds_of_a_configuration_file_take_its_method_scene_and_rate(monkeypatch, capsys, tmp_path):
+    from splatwizard_core.tooling import Choices, load_plugins
+
+    chosen = Choices(methods=("lightgaussian",), scene="demo:tiny", rate="r2", sets=("iterations=3",))
+    (tmp_path / "config.toml").write_text(chosen.resolve(load_plugins())[0].toml())
+    words = ["--config", str(tmp_path / "config.toml"), "--out", str(tmp_path / "out")]
+    asked = []
+    monkeypatch.setattr("sw_bench.running.bench_plan", lambda wanted, given: asked.append(wanted) or 0)
+    assert main(["run", *words, "--seed", "0,1"]) == 0
+    assert (asked[0].plan.methods, asked[0].plan.scenes, asked[0].plan.rates) == (
+        ("lightgaussian",), ("demo:tiny",), None
+    )  # fmt: skip
+    monkeypatch.undo()
+    assert main(["bench", *words, "--seed", "0,1", "--dry-run", "--no-probe", "--json"]) == 0
+    (_, first, *_), out = json.loads(capsys.readouterr().out)["processes"], tmp_path / "out"
+    assert [run["directory"] for run in first["runs"]] == [str(out / "seed-1" / "demo-tiny" / "lightgaussian" / "r2")]
+
+
+def test_options_of_an_executor_may_be_in_a_table(monkeypatch, tmp_path):
+    asked = []
+    monkeypatch.setattr("sw_bench.running.bench_plan", lambda wanted, given: asked.append(wanted) or 0)
+    (tmp_path / "plan.toml").write_text(
+        'methods = ["3dgs"]\nscenes = ["demo"]\n[options]\ncores = 2\nextra = { constraint = "a", qos = "low" }\n'
+    )
+    assert main(["bench", str(tmp_path / "plan.toml"), "-o", "extra.constraint=v100", "-o", "extra.mail-type=END"]) == 0
+    assert asked[0].plan.options == {
+        "cores": 2, "extra": {"constraint": "v100", "qos": "low", "mail-type": "END"}
+    }  # fmt: skip
+
+
 @pytest.mark.pipeline
 @pytest.mark.parametrize(
     ("words", "told"),
@@ -143,6 +186,7 @@ def test_sw_run_with_several_scenes_or_seeds_is_a_sweep(monkeypatch, capsys, tmp
         ("--scene demo:tiny --executor lokal", "no executor is called 'lokal'; did you mean 'local'?"),
         ("--scene demo:tiny -o workes=2", "executor 'local' has no option 'workes': did you mean 'workers'?"),
         ("--scene demo:tiny -o workers=many", "bad value 'many' for option 'workers' of 'local'"),
+        ("--scene demo:tiny -o workers=2 -o workers.x=2", "option 'workers' is no table"),
         ("--scene demo:tiny -o workers=100000", "workers = 100000: this machine has "),
         ("--scene demo:tiny --seed 0,x", "'x' is not a valid integer"),
         ("--scene demo:tiny --out plan.toml/x", "cannot write into plan.toml/x"),

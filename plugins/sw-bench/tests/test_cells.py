@@ -74,6 +74,35 @@ def test_a_variant_has_a_root_of_its_own_and_shares_the_trained_scenes(tmp_path)
     prepare(jobs, layout)  # a second time changes nothing
 
 
+def test_a_tiny_scene_gets_the_preset_quick_in_the_sweep_as_in_its_processes(tmp_path, capsys):
+    """A folder whose pictures have few pixels: what the sweep expects is what `sw run` makes with these words."""
+    from splatwizard_core.cli.main import main
+
+    assert main(["data", "synth", str(tmp_path / "few"), "--size", "tiny"]) == 0
+    cells, jobs, _ = planned(
+        tmp_path, methods=["3dgs", "lightgaussian", "mesongs"], scenes=[str(tmp_path / "few")], set={}
+    )
+    assert [cell.resolved.preset for cell in cells] == ["quick"] * 3
+    assert [cell.words[cell.words.index("--preset") + 1] for cell in cells] == ["quick"] * 3
+    assert [job.shared.resolved.preset for job in jobs if job.shared] == ["quick"]
+    assert capsys.readouterr().err.count("preset quick: ") == 1
+    asked, _, _ = planned(tmp_path, methods=["3dgs"], scenes=[str(tmp_path / "few")], set={}, preset="paper")
+    assert asked[0].resolved.preset == "paper"
+
+
+def test_a_configuration_file_gives_what_the_plan_leaves_out(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (cell,), _, _ = planned(tmp_path, methods=["3dgs"], rates="r2")
+    (tmp_path / "config.toml").write_text(cell.resolved.toml())
+    (again,), (job,), _ = planned(
+        tmp_path, methods=["3dgs"], rates=None, set={}, config="config.toml", scenes=["demo:tiny"]
+    )
+    assert again.resolved.config_hash() == cell.resolved.config_hash()
+    words = [*job.words]
+    options = {word: words[i + 1] for i, word in enumerate(words) if word in ("--config", "--method", "--rate")}
+    assert options == {"--config": str(tmp_path / "config.toml"), "--method": "3dgs", "--rate": "r2"}
+
+
 def test_a_single_seed_needs_no_folder_of_its_own(tmp_path):
     cells, _, _ = planned(tmp_path, seed_folders=False, methods=["3dgs"])
     assert [cell.directory for cell in cells] == [tmp_path / "demo-tiny" / "3dgs" / "r1"]

@@ -10,7 +10,6 @@ from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
-from sw_bench import display
 from sw_bench.cells import Cell, run_job
 from sw_bench.display import LiveTable
 from sw_bench.estimates import Estimates
@@ -61,8 +60,8 @@ def test_it_counts_by_method_and_scene_and_shows_what_runs(sweep):
     assert lines[-1].startswith("[1/3] runs · about 1 min")
 
 
-def test_a_failure_is_counted_and_printed_above(sweep, monkeypatch):
-    monkeypatch.setattr(display, "record_of", lambda each: None)
+def test_a_failure_is_counted_and_printed_above(sweep):
+    sweep.index = SimpleNamespace(row=lambda each: SimpleNamespace(status="failed"))
     shown = table(sweep)
     shown.ended(sweep, sweep.jobs[1], "failed", "no memory", 3.0)
     assert "0/1 1 failed" in text(shown, sweep)

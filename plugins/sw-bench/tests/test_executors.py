@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -199,6 +200,57 @@ def test_a_job_whose_time_is_up_ends_its_process_and_goes_back_into_the_queue(tm
     assert (tmp_path / "log").read_text() == "began\ntold to end\n"
     assert isinstance(again, submitit.helpers.DelayedSubmission)
     assert again.function == Work(work.command, work.log)
+
+
+def test_a_signal_that_comes_while_a_job_waits_lets_its_process_end_at_once(tmp_path, monkeypatch):
+    """As submitit does it: the checkpoint is asked for by a signal handler, in the thread that waits."""
+    pytest.importorskip("submitit", reason="pip install 'sw-bench[slurm]'")
+    import threading
+
+    from sw_bench import slurm as module
+
+    monkeypatch.setattr(module, "PATIENCE_SECONDS", 5.0)
+    work, after = module.Work(python(WAITS), str(tmp_path / "log")), []
+
+    def take_checkpoint(*_):
+        work.checkpoint()
+        after.append(work._process.returncode)
+
+    def send():
+        wait_for(tmp_path / "log", "began")
+        os.kill(os.getpid(), signal.SIGUSR2)
+
+    before = signal.signal(signal.SIGUSR2, take_checkpoint)
+    try:
+        threading.Thread(target=send).start()
+        assert work()[0] == 0
+    finally:
+        signal.signal(signal.SIGUSR2, before)
+    assert after == [0]  # it had ended when the checkpoint was done
+
+
+@pytest.mark.parametrize(
+    ("state", "told", "status", "reason"),
+    [
+        ("NODE_FAIL", "Job has not produced any output", LOST, ""),
+        ("PREEMPTED by 5", "Job has not produced any output", LOST, ""),
+        ("OUT_OF_MEMORY", "Job has not produced any output", -9, ""),
+        ("CANCELLED by 5", "Job has not produced any output", 1, "no result, CANCELLED by 5"),
+        ("FAILED", "trace:\n  File x\nOSError: no space left\nsee the log", 1, "OSError: no space left"),
+    ],
+)
+def test_a_job_without_a_result_tells_why(state, told, status, reason):
+    from sw_bench.slurm import _status_of
+
+    assert _status_of(RuntimeError(told), state) == (status, reason)
+
+
+def test_what_fails_on_a_node_is_a_line_of_the_log(tmp_path):
+    executor = slurm(tmp_path, cluster="local")
+    executor.start("a", ["/nowhere/python"], tmp_path / "log")
+    assert ended(executor, 1) == {"a": 1}
+    assert re.fullmatch(r"error: job \d+: FileNotFoundError: .*/nowhere/python.*\n", (tmp_path / "log").read_text())
+    executor.stop()
 
 
 def test_jobs_that_a_killed_sweep_left_are_cancelled(tmp_path, monkeypatch):

@@ -88,6 +88,7 @@ HEAD = 'methods = ["3dgs"]\nscenes = ["demo"]\n'
         (HEAD + "[method.hac]\nrates = 'r1'", "[method.hac] is for none of `methods`: there are 3dgs"),
         (HEAD + "[scene.dmo]\nrates = 'r1'", "[scene.dmo] is for none of `scenes`: did you mean 'demo'?"),
         (HEAD + "[[override]]\nscenes = ['dem']", "override 1: 'dem' is none of `scenes`: did you mean 'demo'?"),
+        (HEAD + "[[override]]\nseeds = [1]", "override 1: '1' is none of `seeds`: there are 0"),
         (HEAD + "set.seed = 3", "`seeds` of the plan gives the seeds"),
         (HEAD + "repeats = 0", "bad value 0 for 'repeats'"),
         ('methods = ["3dgs", "3dgs"]\nscenes = ["demo"]', "'3dgs' stands twice in `methods`"),

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
-from sw_bench import display, results, sweep
+from sw_bench import results, state, sweep
 from sw_bench.cells import Cell, Job, SharedTraining, run_job
 from sw_bench.display import Lines
 from sw_bench.estimates import Estimates
@@ -88,7 +88,7 @@ def records(monkeypatch):
         made = (each.directory / "made").exists()
         return SimpleNamespace(file=SimpleNamespace(bytes=7), metrics={}) if made else None
 
-    for module in (sweep, display, results):
+    for module in (sweep, state, results):
         monkeypatch.setattr(module, "record_of", record_of)
 
 
@@ -144,6 +144,36 @@ def test_after_a_failed_rate_point_the_others_of_its_training_are_made(tmp_path)
     assert made.states == {"r1": ("finished", ""), "r2": ("failed", "r2 does not decode"), "r3": ("finished", "")}
 
 
+def finished_before(tmp_path, *rates):
+    """Runs whose records are there."""
+    cells = [cell(tmp_path, rate=rate) for rate in rates]
+    for each in cells:
+        each.directory.mkdir(parents=True)
+        for name in ("made", "metrics.json"):
+            (each.directory / name).write_text("before")
+    return cells
+
+
+def test_a_finished_run_that_cannot_be_done_again_has_failed(tmp_path):
+    job = run_job(finished_before(tmp_path, "r1"))
+    made = Made(tmp_path, [job], {job.name: [(1, "", "error: no picture")]}).run()
+    assert made.states == {"r1": ("failed", "no picture")}
+    assert "failed" in made.lines[-1]
+    assert list(made.sweep.failed.values()) == ["no picture"]
+    (row,) = results.results(made.cells, made.index)
+    assert (row["seeds"], row["failed"], row["waiting"]) == ([0], {"0": "no picture"}, [])
+
+
+def test_of_finished_runs_in_one_process_the_one_that_fails_is_found(tmp_path):
+    job = run_job(finished_before(tmp_path, "r1", "r2", "r3"))
+    script = {
+        "a demo seed 0 r1,r2,r3": [(1, "none", "error: no picture")],
+        "a demo seed 0 r2": [(1, "none", "error: no picture")],
+    }
+    made = Made(tmp_path, [job], script).run()
+    assert made.states == {"r1": ("finished", ""), "r2": ("failed", "no picture"), "r3": ("finished", "")}
+
+
 def test_a_training_that_fails_is_not_tried_for_every_rate_point(tmp_path):
     job = run_job([cell(tmp_path, rate=rate) for rate in ("r1", "r2")])
     made = Made(tmp_path, [job], {job.name: [(1, "", "error: it diverged")]}, trained=False).run()
@@ -158,7 +188,9 @@ def test_what_was_killed_goes_on_and_fails_after_the_last_retry(tmp_path, status
     made = Made(tmp_path, jobs, script, trained=False).run()
     assert made.states["a"] == ("finished", "")
     assert made.states["b"][0] == "failed"
-    assert {KILLED: "killed by SIGKILL", LOST: "its machine was lost"}.get(status, "") in made.states["b"][1]
+    assert {KILLED: "killed by SIGKILL", 137: "killed by SIGKILL", LOST: "its machine was lost", 130: "interrupted"}[
+        status
+    ] in made.states["b"][1]
     assert sorted(made.executor.started) == [f"{job.name} #{i}" for job in jobs for i in (1, 2, 3)]
 
 
@@ -209,6 +241,23 @@ def test_discarding_a_run_leaves_what_is_not_its_own(tmp_path):
         (each.directory / name).write_text("x")
     discard(each)
     assert sorted(path.name for path in each.directory.iterdir()) == [".lock", "notes.txt"]
+
+
+def test_discarding_a_training_for_several_removes_it_and_its_note(tmp_path):
+    from sw_bench.state import discard_shared, is_shared_training_done
+
+    job, home = shared(tmp_path), tmp_path / ".trained" / "demo-a-key"
+    discard_shared(job.shared)  # there is nothing yet
+    home.mkdir(parents=True)
+    (home / "steps.json").write_text('{"train": {}}')
+    job.shared.note.parent.mkdir()
+    for place, is_left in ((tmp_path / ".trained" / ".." / ".trained" / "demo-a-key", False), (tmp_path, True)):
+        (place / "steps.json").write_text('{"train": {}}')
+        job.shared.note.write_text(json.dumps({"directory": str(place.resolve())}))
+        assert is_shared_training_done(job.shared)
+        discard_shared(job.shared)
+        assert not job.shared.note.exists()
+        assert (place / "steps.json").exists() is is_left  # only of what lies among the trained scenes
 
 
 def test_an_index_follows_its_plan(tmp_path):

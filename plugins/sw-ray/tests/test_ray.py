@@ -11,7 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
-from sw_ray.executor import LOST, RayExecutor, RayOptions
+from sw_ray.executor import LOST, RayExecutor, RayOptions, status_of
+from sw_ray.work import work
 
 from splatwizard_core.api import UserInputError
 
@@ -67,6 +68,42 @@ def test_without_ray_the_package_to_install_is_named(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserInputError, match=r"pip install 'sw-ray\[ray\]'"):
         RayExecutor(RayOptions(), Site(tmp_path))
+
+
+def named(name, base=Exception, **facts):
+    """An exception of a class of this name, as Ray has them."""
+    return type(name, (base,), facts)("this  is\nsaid")
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "reason"),
+    [
+        (named("WorkerCrashedError"), LOST, ""),
+        (named("OwnerDiedError", type("ObjectLostError", (Exception,), {})), LOST, ""),
+        (named("OutOfMemoryError"), -9, ""),
+        (named("RuntimeEnvSetupError"), 1, "RuntimeEnvSetupError: this is said"),
+        (named("RayTaskError", cause=FileNotFoundError("no python")), 1, "FileNotFoundError: no python"),
+    ],
+)
+def test_only_what_takes_a_worker_with_it_is_a_loss(error, status, reason):
+    assert status_of(error) == (status, reason)
+
+
+def test_a_process_gets_the_directory_and_the_variables_of_the_sweep(tmp_path):
+    program = "import os; print(os.getcwd(), os.environ['SPLATWIZARD_TEST'])"
+    status, _ = work([sys.executable, "-c", program], str(tmp_path / "log"), str(tmp_path), {"SPLATWIZARD_TEST": "x"})
+    assert status == 0
+    assert (tmp_path / "log").read_text() == f"{tmp_path.resolve()} x\n"
+
+
+def test_a_process_needs_whole_gpus_and_the_memory_of_a_node():
+    with pytest.raises(ValueError, match="a part of one GPU, or a whole number"):
+        RayOptions(gpus=1.5)
+    executor = object.__new__(RayExecutor)
+    executor._options = RayOptions(cores=1, gpus=0.5, memory_gb=2)
+    node = {"CPU": 8.0, "GPU": 2.0, "memory": 7e9}
+    assert executor._places(node) == 3
+    assert executor._places({**node, "memory": 1e9}) == 0
 
 
 @pytest.mark.slow

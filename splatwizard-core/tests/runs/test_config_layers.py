@@ -1,5 +1,6 @@
 """Configuration: the order of its layers, the parsing of text, and what is said of typos."""
 
+from dataclasses import replace
 from enum import Enum
 from pathlib import Path
 from types import SimpleNamespace
@@ -199,6 +200,19 @@ def test_a_tiny_scene_gets_the_quick_plan_unless_something_else_is_asked_for(ope
         if preset == "quick"
         else []
     )
+
+
+def test_values_by_data_set_are_told_once_for_each_method(opened):
+    def found(preset):
+        by_data_set = [replace(resolved(rate=r), method=m, provenance={"steps": "data set 'db'"})
+                       for m in ("one", "other") for r in ("r1", "r2")]  # fmt: skip
+        return [resolved(preset="paper"), *by_data_set]
+
+    _, told = opened(found)
+    assert told[-3:] == ["one, by data set: steps = [1, 2]", "other, by data set: steps = [1, 2]", "on the CPU"]
+    assert not any("by data set" in line for line in told[:-3])
+    _, told = opened(lambda preset: [resolved(preset=preset)] if preset else found(preset), side=100)
+    assert not any("by data set" in line for line in told)
 
 
 def test_rate_points_that_differ_only_in_the_codec_train_alike():

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import os
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from splatwizard_core.api import ConfigError, UserInputError
 from splatwizard_core.tooling import (
@@ -21,6 +23,7 @@ from splatwizard_core.tooling import (
     make_method,
     named_scenes,
     run_directory,
+    say,
     useful_starts,
     write_atomic,
 )
@@ -148,17 +151,12 @@ def cells_of(plan: Plan, layout: Layout, plugins: PluginManager) -> list[Cell]:
     Raises UserInputError that names the run; ConfigError for a plan without any run, or with two of one directory.
     """
     found: list[Cell] = []
-    loaded = set()
+    load, told = _load_once(plugins), list[str]()
     for seed in plan.seeds:
         for label in plan.methods:
             for scene in plan.scenes:
                 try:
-                    for cell in _resolved(plan, label, scene, seed, layout, plugins):
-                        key = (cell.resolved.scene_spec, cell.resolved.scene.images)
-                        if key not in loaded:
-                            load_scene(cell.resolved.scene_spec, cell.resolved.scene, plugins)  # it must be there
-                            loaded.add(key)
-                        found.append(cell)
+                    found += _resolved(plan, label, scene, seed, layout, plugins, load, told.append)
                 except UserInputError as error:
                     raise type(error)(f"{label} on {scene}: {error}") from None
     if not found:
@@ -167,10 +165,34 @@ def cells_of(plan: Plan, layout: Layout, plugins: PluginManager) -> list[Cell]:
     if clashing:
         scenes = " and ".join(dict.fromkeys(f"'{c.scene}'" for c in found if c.directory == clashing[0]))
         raise ConfigError(f"scenes {scenes} would share the folder {clashing[0]}: give each a plan of its own")
+    for line in dict.fromkeys(told):
+        say(line)
     return found
 
 
-def _resolved(plan: Plan, label: str, scene: str, seed: int, layout: Layout, plugins: PluginManager) -> list[Cell]:
+def _load_once(plugins: PluginManager) -> Callable[[ResolvedConfig], Any]:
+    """Make a function that loads the scene of a configuration, the same for all seeds."""
+    loaded: dict[tuple[str, str], Any] = {}
+
+    def load(resolved: ResolvedConfig) -> Any:
+        key = resolved.scene_spec, repr(replace(resolved.scene, seed=0))
+        if key not in loaded:
+            loaded[key] = load_scene(resolved.scene_spec, resolved.scene, plugins)
+        return loaded[key]
+
+    return load
+
+
+def _resolved(
+    plan: Plan,
+    label: str,
+    scene: str,
+    seed: int,
+    layout: Layout,
+    plugins: PluginManager,
+    load: Callable[[ResolvedConfig], Any],
+    tell: Callable[[str], None],
+) -> list[Cell]:
     """Resolve the rate points of one method on one scene with one seed."""
     values = plan.values_for(label, scene, seed)
     if values is None:
@@ -179,26 +201,31 @@ def _resolved(plan: Plan, label: str, scene: str, seed: int, layout: Layout, plu
     given, init = dict(values.set), plan.init
     everywhere = {key for key, value in plan.set.items() if given.get(key) == value}
     choices = Choices(
-        methods=(method,), scene=scene, images=values.images, rate=values.rates or "default", preset=values.preset,
-        device=plan.device, seed=seed, config_file=plan.config,
+        methods=(method,), scene=scene, images=values.images, rate=values.rates, preset=values.preset,
+        device=plan.device, seed=seed, config_file=None if plan.config is None else os.path.abspath(plan.config),
     )  # fmt: skip
     useful = useful_starts(plugins, choices.resolve(plugins)[0])
     if "pretrained" not in useful:  # said for all methods, it is for those that start from a trained scene
         given = {k: v for k, v in given.items() if not (k.startswith("pretrained.") and k in everywhere)}
     if "init" not in useful and "init" not in plugins.methods.load(method).Config.model_fields:
         init = None
+    if init is not None and os.path.exists(init):
+        init = os.path.abspath(init)  # processes on other machines have other working directories
     choices = replace(choices, sets=tuple(set_words(given)), init=init)
+    resolved = choices.settled(choices.resolve(plugins), plugins, load, tell)
+    for each in resolved:
+        load(each)  # it must be there
     root = layout.root(seed, "" if label == method else label)
     words = [
-        *(("--method", method) if plan.config is None else ("--config", plan.config)),
-        *(part for option in ("images", "preset", "device", "init")
-          if (text := getattr(choices, option)) is not None for part in (f"--{option}", text)),
+        "--method", method, "--preset", resolved[0].preset,
+        *(part for option in ("images", "device", "init", "config_file")
+          if (text := getattr(choices, option)) is not None for part in (f"--{option.removesuffix('_file')}", text)),
         "--seed", str(seed), "--repeats", str(plan.repeats), *(["--geometry"] * plan.geometry),
         *(part for text in choices.sets for part in ("--set", text)),
     ]  # fmt: skip
     return [
         Cell(label, scene, each, root, ("--scene", each.absolute_scene, *words, "--out", str(root)))
-        for each in choices.resolve(plugins)
+        for each in resolved
     ]
 
 

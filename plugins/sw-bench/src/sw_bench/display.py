@@ -13,7 +13,6 @@ from splatwizard_core.tooling import say
 from splatwizard_native import duration
 from sw_bench.cells import Cell, Job
 from sw_bench.estimates import Estimates
-from sw_bench.state import record_of
 
 if TYPE_CHECKING:
     from rich.console import Console, RenderableType
@@ -53,14 +52,13 @@ class Lines:
     def ended(self, sweep: Sweep, job: Job, status: str, reason: str, seconds: float) -> None:
         """Count and tell."""
         for cell in job.cells:
-            if self.states[cell] != "finished":
-                self.states[cell] = "finished" if record_of(cell) else "waiting" if status == "again" else status
+            self.states[cell] = sweep.index.row(cell).status
         waiting = {cell for each in sweep.waiting for cell in each.cells}
         self.states |= dict.fromkeys(waiting, "waiting")
         if status == "finished":
             self.estimates.learn(*job.about, seconds)
         left = self.left(sweep)
-        told = {"finished": f"in {duration(seconds)}", "again": f"goes on, as it was {reason}"}.get(status, reason)
+        told = {"finished": f"in {duration(seconds)}", "again": f"goes on: {reason}"}.get(status, reason)
         line = f"{self.counted()} {status:9} {job.name}: {told}"
         self.tell(line + (f" · about {duration(left)} left" if left is not None and status == "finished" else ""))
 

@@ -12,12 +12,10 @@ from sw_bench.display import SLOTS_UNKNOWN
 from sw_bench.estimates import Estimates
 from sw_bench.executor import Executor
 from sw_bench.index import FILE_NAME, Index
-from sw_bench.plan import Plan
 from sw_bench.state import State
 
 
 def dry_run(
-    plan: Plan,
     jobs: Sequence[Job],
     cells: Sequence[Cell],
     states: Mapping[Cell, State],
@@ -58,11 +56,14 @@ def dry_run(
         rows.append([job.name, ", ".join(told), "?" if seconds is None else duration(seconds)])
     print_table(["process", "state", "about"], rows, right=1)
     counted = ", ".join(f"{number} {name}" for name, number in counts.items() if number)
-    say(f"{len(cells)} runs of {plan_size(plan)}: {counted}; {len(jobs)} processes, {slots} at a time, "
+    say(f"{len(cells)} runs of {plan_size(cells)}: {counted}; {len(jobs)} processes, {slots} at a time, "
         + ("of unknown length" if left is None else f"about {duration(left)} of training"))  # fmt: skip
 
 
-def plan_size(plan: Plan) -> str:
+def plan_size(cells: Sequence[Cell]) -> str:
     """`8 methods x 3 scenes x 2 seeds`."""
-    sizes = {"method": len(plan.methods), "scene": len(plan.scenes), "seed": len(plan.seeds)}
+    sizes = {
+        "method": len({cell.label for cell in cells}), "scene": len({cell.scene for cell in cells}),
+        "seed": len({cell.seed for cell in cells}),
+    }  # fmt: skip
     return " x ".join(f"{n} {name}{'s' * (n != 1)}" for name, n in sizes.items())

@@ -45,7 +45,8 @@ class Executor(Protocol):
         """Return (ticket, exit status, where it ran) of processes that ended since the last call.
 
         Waits up to `timeout` seconds for the first. A negative status is the signal that killed the process; of one
-        that was lost with its machine it is LOST.
+        that was lost with its machine it is LOST; where its own machinery failed it is 1, and the last line of
+        `log` says why: `error: ...`.
         """
 
     def stop(self) -> None:
@@ -54,3 +55,6 @@ class Executor(Protocol):
 
 LOST = -1000
 """Status of a process whose machine is gone."""
+
+PATIENCE_SECONDS = 70.0
+"""Time for a process that is asked to end: more than it gives itself to write its checkpoint."""

@@ -18,6 +18,7 @@ from sw_bench.cells import Cell
 
 FILE_NAME = "bench.sqlite"
 SCHEMA = 1
+ONE_RUN = "label = ? AND scene = ? AND seed = ? AND rate = ?"
 TABLES = """
 CREATE TABLE IF NOT EXISTS sweep (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE IF NOT EXISTS runs (
@@ -40,13 +41,10 @@ class Row:
 
     status  waiting, running, finished or failed
     reason  of a failure, one line
-    seconds of its processes so far, shared equally by the runs of one process
     """
 
     status: str
     reason: str
-    attempts: int
-    seconds: float
 
 
 class Index:
@@ -85,7 +83,7 @@ class Index:
         gone = sorted(before - set(wanted))
         with self._file:
             self._file.execute("BEGIN")
-            self._file.executemany("DELETE FROM runs WHERE label = ? AND scene = ? AND seed = ? AND rate = ?", gone)
+            self._file.executemany(f"DELETE FROM runs WHERE {ONE_RUN}", gone)
             for cell in wanted.values():
                 facts = {
                     "method": cell.resolved.method, "preset": cell.resolved.preset,
@@ -105,20 +103,15 @@ class Index:
         """Change facts of a run."""
         facts["changed"] = _now()
         columns = ", ".join(f"{name} = ?" for name in facts)
-        where = "label = ? AND scene = ? AND seed = ? AND rate = ?"
-        self._file.execute(f"UPDATE runs SET {columns} WHERE {where}", (*facts.values(), *cell.key))
+        self._file.execute(f"UPDATE runs SET {columns} WHERE {ONE_RUN}", (*facts.values(), *cell.key))
 
     def spent(self, cell: Cell, seconds: float) -> None:
         """Add the seconds of a process to a run."""
-        where = "label = ? AND scene = ? AND seed = ? AND rate = ?"
-        self._file.execute(f"UPDATE runs SET seconds = seconds + ? WHERE {where}", (seconds, *cell.key))
+        self._file.execute(f"UPDATE runs SET seconds = seconds + ? WHERE {ONE_RUN}", (seconds, *cell.key))
 
     def row(self, cell: Cell) -> Row:
         """Return the state of a run."""
-        where = "label = ? AND scene = ? AND seed = ? AND rate = ?"
-        found = self._file.execute(
-            f"SELECT status, reason, attempts, seconds FROM runs WHERE {where}", cell.key
-        ).fetchone()
+        found = self._file.execute(f"SELECT status, reason FROM runs WHERE {ONE_RUN}", cell.key).fetchone()
         return Row(*found)
 
     def job_ended(self, name: str, about: tuple[str, str], runs: int, status: str, seconds: float, place: str) -> None:

@@ -13,11 +13,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from splatwizard_core.api import UserInputError
 from splatwizard_native import available_cores
-from sw_bench.executor import Site
+from sw_bench.executor import PATIENCE_SECONDS, Site
 
 CORES_EACH = 4  # on a CPU: a training scales well up to about four cores
 MOMENT = 0.05  # seconds between two looks at what runs
-PATIENCE_SECONDS = 70.0  # more than a process gives itself to write its checkpoint
 
 
 class LocalOptions(BaseModel):

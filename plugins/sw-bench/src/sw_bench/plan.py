@@ -81,6 +81,7 @@ class Plan(Values):
     methods     names, or names of tables [method.NAME]
     seeds       of every random stream
     device      auto, cpu or cuda
+    rates       None: what `config` says, else the default of each method
     config      a file for `--config` of every run
     init        a .ply for `--init` of every run
     repeats     measurements of the rendering speed
@@ -92,7 +93,6 @@ class Plan(Values):
     methods: tuple[str, ...] = Field(min_length=1)
     scenes: tuple[str, ...] = Field(min_length=1)
     seeds: tuple[int, ...] = Field((0,), min_length=1)
-    rates: str | None = "default"
     device: str | None = None
     config: str | None = None
     init: str | None = None
@@ -168,8 +168,9 @@ def checked_plan(content: Mapping[str, Any], source: str) -> Plan:
             if name not in known:
                 raise ConfigError(f"{source}: [{kind}.{name}] is for none of `{kind}s`: {_hint(name, known)}")
     for i, each in enumerate(plan.override, 1):
-        for name, given, there in (("methods", each.methods, plan.methods), ("scenes", each.scenes, plan.scenes)):
-            for one in given:
+        for name in ("methods", "scenes", "seeds"):
+            there = [str(one) for one in getattr(plan, name)]
+            for one in map(str, getattr(each, name)):
                 if one not in there:
                     raise ConfigError(f"{source}: override {i}: '{one}' is none of `{name}`: {_hint(one, there)}")
     for name in ("methods", "scenes", "seeds"):

@@ -18,7 +18,7 @@ def results(cells: Sequence[Cell], index: Index) -> list[Facts]:
     """Return a row for each method, scene and rate point, in the order of the plan, as plain values.
 
     `metrics` and `bytes` are means over the finished seeds, with `deviations` (of the sample, n - 1) where there are
-    several; `failed` maps a seed to the reason.
+    several; `failed` maps a seed to the reason, also of a finished run that could not be done again.
     """
     groups: dict[tuple[str, str, str], list[Cell]] = {}
     for cell in cells:
@@ -28,8 +28,7 @@ def results(cells: Sequence[Cell], index: Index) -> list[Facts]:
 
 def _row(label: str, scene: str, rate: str, group: Sequence[Cell], index: Index) -> Facts:
     records = {cell.seed: record for cell in group if (record := record_of(cell)) is not None}
-    missing = [cell for cell in group if cell.seed not in records]
-    states = {cell.seed: index.row(cell) for cell in missing}
+    states = {cell.seed: index.row(cell) for cell in group}
     values: dict[str, list[float]] = {"bytes": [float(record.file.bytes) for record in records.values()]}
     for name in _shared_metrics(list(records.values())):
         values[name] = [float(record.metrics[name].mean or 0.0) for record in records.values()]
@@ -40,7 +39,7 @@ def _row(label: str, scene: str, rate: str, group: Sequence[Cell], index: Index)
         "means": {name: statistics.fmean(each) for name, each in values.items() if each},
         "deviations": {name: statistics.stdev(each) for name, each in values.items() if len(each) > 1},
         "failed": {str(seed): row.reason for seed, row in states.items() if row.status == "failed"},
-        "waiting": [seed for seed, row in states.items() if row.status != "failed"],
+        "waiting": [seed for seed, row in states.items() if row.status != "failed" and seed not in records],
     }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 from splatwizard_core.api import ConfigError, UserInputError
 from splatwizard_core.tooling import (
     OUTPUT_FOLDER,
+    Choices,
     PluginManager,
     choose_device,
     directory_lock,
@@ -23,14 +24,14 @@ from splatwizard_core.tooling import (
     print_table,
     say,
 )
-from sw_bench.cells import Cell, Job, Layout, cells_of, jobs_of, prepare
+from sw_bench.cells import Cell, Job, Layout, cells_of, jobs_of, prepare, training_key
 from sw_bench.display import Lines, LiveTable
 from sw_bench.estimates import Estimates
 from sw_bench.executor import Executor, Site
 from sw_bench.index import Index
 from sw_bench.plan import Plan, checked_plan, read_plan
 from sw_bench.results import results, table_of
-from sw_bench.state import State, changes_of, discard, state_of
+from sw_bench.state import State, changes_of, discard, discard_shared, state_of
 from sw_bench.sweep import Sweep
 
 NAMED = 5  # runs that a message names
@@ -42,12 +43,21 @@ OF_A_PLAN = ("rate", "preset", "images", "init", "config_file", "sets")
 class Wanted:
     """The plan of a command.
 
+    plan    of the whole sweep
+    layout  places of its runs
     text    of the file; empty: the options of the command
+    part    the methods, scenes and seeds of it that are to run; None: all
     """
 
     plan: Plan
     layout: Layout
     text: str
+    part: Plan | None = None
+
+    def has(self, cell: Cell) -> bool:
+        """Whether a run of the plan is to run."""
+        part = self.part or self.plan
+        return cell.label in part.methods and cell.scene in part.scenes and cell.seed in part.seeds
 
 
 def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
@@ -55,8 +65,9 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
     if given.get("allow_changed_plan"):
         raise click.UsageError("--allow-changed-plan is for one run at a time: leave out further scenes and seeds")
     methods, scenes, seeds = words_of(given["methods"]), scenes_of(given["scene"]), seeds_of(given["seed"])
-    if path is None and not (methods or scenes or seeds):
+    if path is None and not (methods or scenes or seeds or given["config_file"]):
         raise click.UsageError("name a PLAN.toml, or what to run by --method, --scene and --seed")
+    part = None
     if path is None:
         plan, text = _plan_of_words(methods, scenes, seeds, given), ""
     else:
@@ -64,27 +75,31 @@ def plan_of_options(path: str | None, given: Mapping[str, Any]) -> Wanted:
         if useless is not None:
             option = {"config_file": "config", "sets": "set"}.get(useless, useless)
             raise click.UsageError(f"--{option} stands in the plan, {path}: put it there, or leave the plan out")
-        whole, text = read_plan(path)
-        plan = whole.part(methods, scenes, seeds)
+        plan, text = read_plan(path)
+        part = plan.part(methods, scenes, seeds)
     changes = {
         "device": given["device"] or plan.device, "executor": given["executor"] or plan.executor,
-        "geometry": given["geometry"] or plan.geometry, "options": {**plan.options, **_pairs(given["given"])},
+        "geometry": given["geometry"] or plan.geometry, "options": _with_pairs(plan.options, _pairs(given["given"])),
         "repeats": given["repeats"] if given["repeats"] != 1 else plan.repeats,
     }  # fmt: skip
     plan = plan.model_copy(update=changes)
     out = given["out"] or plan.out or ("out" if path is None else f"out/{Path(path).stem}")
     OUTPUT_FOLDER.convert(out, None, None)
-    return Wanted(plan, Layout(Path(out).resolve(), path is not None or len(plan.seeds) > 1), text)
+    return Wanted(plan, Layout(Path(out).resolve(), path is not None or len(plan.seeds) > 1), text, part)
 
 
 def _plan_of_words(methods: list[str], scenes: list[str], seeds: list[int], given: Mapping[str, Any]) -> Plan:
-    plugins = load_plugins()
+    plugins, file = load_plugins(), given["config_file"]
     default = {"methods": plugins.methods.default, "scenes": plugins.datasets.default}
+    if file is not None:
+        said = Choices(methods=tuple(methods), config_file=file)
+        default["methods"] = said.method_names(plugins)[0]
+        default["scenes"] = default["scenes"] if scenes else said.resolve(plugins)[0].scene_spec
     content: dict[str, Any] = {
         "methods": methods or [name for name in [default["methods"]] if name],
         "scenes": scenes or [name for name in [default["scenes"]] if name],
-        "seeds": seeds or [0], "rates": given["rate"] or "default", "preset": given["preset"],
-        "images": given["images"], "init": given["init"], "config": given["config_file"], "set": _pairs(given["sets"]),
+        "seeds": seeds or [0], "rates": given["rate"], "preset": given["preset"],
+        "images": given["images"], "init": given["init"], "config": file, "set": _pairs(given["sets"]),
     }  # fmt: skip
     return checked_plan(content, "the command")
 
@@ -114,10 +129,27 @@ def _pairs(words: Sequence[str]) -> dict[str, Any]:
     return found
 
 
+def _with_pairs(options: Mapping[str, Any], pairs: Mapping[str, str]) -> dict[str, Any]:
+    """Put `KEY=VALUE`, or `TABLE.KEY=VALUE`, into options of an executor."""
+    found = {key: dict(value) if isinstance(value, Mapping) else value for key, value in options.items()}
+    for key, value in pairs.items():
+        table, _, inner = key.partition(".")
+        if not inner:
+            found[key] = value
+        elif isinstance(found.setdefault(table, {}), dict):
+            found[table][inner] = value
+        else:
+            raise ConfigError(f"option '{table}' is no table: '{key}' cannot be set", key=key)
+    return found
+
+
 def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
     """Run a plan, or print what it would run; return the exit status: 1 if a run failed."""
     plugins, plan, layout = load_plugins(), wanted.plan, wanted.layout
-    cells = cells_of(plan, layout, plugins)
+    planned = cells_of(plan, layout, plugins)
+    cells = [cell for cell in planned if wanted.has(cell)]
+    if not cells:
+        raise ConfigError("this part of the plan leaves no run: every one is skipped")
     states = {cell: state_of(cell, plugins, geometry=plan.geometry) for cell in cells}
     changed = [cell for cell in cells if states[cell] is State.CHANGED]
     again = bool(given["rerun_changed"]) or not given.get("resume", True)
@@ -133,7 +165,7 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         from sw_bench.dry_run import dry_run
 
         executor = None if plan.executor != LOCAL else make_executor(plan, layout, plugins)
-        dry_run(plan, jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
+        dry_run(jobs, cells, states, layout, executor, probe=given["probe"], as_json=given["as_json"])
         return 0
     executor = make_executor(plan, layout, plugins)
     layout.out.mkdir(parents=True, exist_ok=True)
@@ -141,20 +173,26 @@ def bench_plan(wanted: Wanted, given: Mapping[str, Any]) -> int:
         stack.enter_context(directory_lock(layout.out, say=say))
         index = Index(layout.out)
         stack.callback(index.close)
-        _begin(index, wanted, cells, states)
+        _begin(index, wanted, planned, states)
         for cell in unfinished:
             if states[cell] is State.CHANGED:
                 discard(cell)
+        if not given.get("resume", True):
+            own = {cell.training for cell in cells}
+            for job in jobs:
+                if job.shared is not None and training_key(job.shared.resolved) in own:
+                    discard_shared(job.shared)
         prepare(jobs, layout)
         estimates = Estimates(index.durations())
         finished = [cell for cell in cells if states[cell] is State.FINISHED]
         say(_counts(cells, states, jobs, executor))
         try:
             with _display(cells, finished, estimates) as display:
-                Sweep(layout.out, jobs, executor, index, display, retries=given["retries"]).run()
+                sweep = Sweep(layout.out, jobs, executor, index, display, retries=given["retries"])
+                sweep.run()
         finally:
             rows = results(cells, index)
-        failed = any(row["failed"] for row in rows)
+        failed = bool(sweep.failed)
         if given["as_json"]:
             print_json({"out": str(layout.out), "runs": rows})
         else:
@@ -184,9 +222,9 @@ def make_executor(plan: Plan, layout: Layout, plugins: PluginManager) -> Executo
     return made
 
 
-def _begin(index: Index, wanted: Wanted, cells: Sequence[Cell], states: Mapping[Cell, State]) -> None:
-    """Bring the index to the plan, and say what it no longer has."""
-    gone = index.plan(cells)
+def _begin(index: Index, wanted: Wanted, planned: Sequence[Cell], states: Mapping[Cell, State]) -> None:
+    """Bring the index to the whole plan and the states of what is to run, and say what it no longer has."""
+    gone = index.plan(planned)
     if gone:
         named = ", ".join(gone[:NAMED]) + (", ..." if len(gone) > NAMED else "")
         say(f"{len(gone)} runs of before are not in the plan any more, and stay where they are: {named}")

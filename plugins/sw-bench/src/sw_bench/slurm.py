@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import shutil
 import socket
 import subprocess
@@ -21,12 +22,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import write_json
-from sw_bench.executor import LOST, Site
+from sw_bench.executor import LOST, PATIENCE_SECONDS, Site
 
 FOLDER = ".slurm"  # in the output folder: what submitit writes
 SUBMITTED = "submitted.json"  # in it: numbers of the jobs of a sweep that goes on, or was killed
 MOMENT = 0.2
-PATIENCE_SECONDS = 70.0
+KILLED = 9  # SIGKILL
+# The last two are of jobs on this machine.
+STATES_OF_LOSS = ("NODE_FAIL", "BOOT_FAIL", "PREEMPTED", "REVOKED", "UNKNOWN", "INTERRUPTED", "FINISHED")
 
 
 class SlurmOptions(BaseModel):
@@ -63,7 +66,10 @@ class Work:
                 self.command, stdin=subprocess.PIPE, stdout=output, stderr=subprocess.STDOUT
             )
         try:
-            return self._process.wait(), socket.gethostname()
+            # `wait` would hold the lock of the process, which `checkpoint` needs: a signal calls it in this thread.
+            while (status := self._process.poll()) is None:
+                time.sleep(MOMENT)
+            return status, socket.gethostname()
         finally:
             self._end()
 
@@ -99,6 +105,7 @@ class SlurmExecutor:
         self.slots = options.at_a_time or None
         self._options, self._folder = options, site.out / FOLDER
         self._jobs: dict[str, Any] = {}
+        self._logs: dict[str, Path] = {}
         self._executor = submitit.AutoExecutor(folder=self._folder / "%j", cluster=options.cluster,
                                                slurm_max_num_timeout=options.timeouts)  # fmt: skip
         self._executor.update_parameters(**self._parameters())
@@ -115,15 +122,19 @@ class SlurmExecutor:
         if not self._jobs:
             self._cancel_those_before()
         self._jobs[ticket] = self._executor.submit(Work(list(command), str(log)))
+        self._logs[ticket] = log
         self._note()
 
     def ended(self, timeout: float) -> list[tuple[str, int, str]]:
         """Return the jobs that ended; one that Slurm lost has the status LOST."""
         until = time.monotonic() + timeout
         while True:
-            found = [(ticket, *self._result(job)) for ticket, job in self._jobs.items() if self._is_done(job)]
+            found = [
+                (ticket, *self._result(job, self._logs[ticket]))
+                for ticket, job in self._jobs.items() if self._is_done(job)
+            ]  # fmt: skip
             for ticket, _, _ in found:
-                del self._jobs[ticket]
+                del self._jobs[ticket], self._logs[ticket]
             if found:
                 self._note()
             if found or not self._jobs or time.monotonic() >= until:
@@ -146,10 +157,15 @@ class SlurmExecutor:
             job.wait()
         return bool(job.done())
 
-    def _result(self, job: Any) -> tuple[int, str]:
+    def _result(self, job: Any, log: Path) -> tuple[int, str]:
         error = job.exception()
         if error is not None:
-            return LOST, str(getattr(job, "job_id", ""))
+            place = f"job {job.job_id}"
+            status, reason = _status_of(error, str(job.state))
+            if reason:
+                with open(log, "a", encoding="utf-8") as file:
+                    file.write(f"error: {place}: {reason}\n")
+            return status, place
         status, machine = job.result()
         return int(status), str(machine)
 
@@ -163,3 +179,17 @@ class SlurmExecutor:
             left = [str(number) for number in json.loads((self._folder / SUBMITTED).read_text("utf-8"))]
             if left and self._options.cluster == "slurm":
                 subprocess.run(["scancel", *left], check=False)
+
+
+def _status_of(error: Exception, state: str) -> tuple[int, str]:
+    """Return the exit status for a job without a result, and the reason where the status does not tell it.
+
+    state   of the job, as Slurm names it
+    """
+    if state.startswith("OUT_OF_ME"):
+        return -KILLED, ""
+    # The end of a traceback: what went wrong in Python on the node.
+    told = [line for line in str(error).splitlines() if re.match(r"[A-Za-z_][\w.]*(Error|Exception|Exit)\b", line)]
+    if told:
+        return 1, told[-1]
+    return (LOST, "") if state.startswith(STATES_OF_LOSS) else (1, f"no result, {state}")

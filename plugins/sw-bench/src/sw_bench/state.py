@@ -10,7 +10,7 @@ from typing import Any
 from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import FILE_NAME, OWN_FILES, Choices, PluginManager, Record, directory_lock, read_record
 from splatwizard_native import remove_folder
-from sw_bench.cells import Cell, SharedTraining, training_key
+from sw_bench.cells import TRAINED, Cell, SharedTraining, training_key
 
 CONFIG = "config.toml"
 STEPS = "steps.json"
@@ -66,10 +66,22 @@ def _leaves(table: dict[str, Any], prefix: str = "") -> dict[str, Any]:
 
 def discard(cell: Cell) -> None:
     """Remove what a run has left in its directory, as `--fresh` does; other files stay."""
-    if not cell.directory.exists():
+    _clear(cell.directory)
+
+
+def discard_shared(shared: SharedTraining) -> None:
+    """Remove a training for several and its note; where it was cannot be known without the note."""
+    directory = _noted(shared)
+    shared.note.unlink(missing_ok=True)
+    if directory is not None and directory.parent == (shared.root / TRAINED).resolve():
+        _clear(directory)
+
+
+def _clear(directory: Path) -> None:
+    if not directory.exists():
         return
-    with directory_lock(cell.directory):
-        for path in (cell.directory / name for name in OWN_FILES):
+    with directory_lock(directory):
+        for path in (directory / name for name in OWN_FILES):
             if path.is_dir() and not path.is_symlink():
                 remove_folder(path)
             else:
@@ -88,6 +100,17 @@ def record_of(cell: Cell) -> Record | None:
     return record if record.config_hash == cell.resolved.config_hash() else None
 
 
+def stamp_of(cell: Cell) -> tuple[int, int] | None:
+    """Return what changes whenever the record of a run is written; None: there is no record of these values."""
+    if record_of(cell) is None:
+        return None
+    try:
+        facts = (cell.directory / FILE_NAME).stat()
+    except OSError:
+        return None
+    return facts.st_mtime_ns, facts.st_ino
+
+
 def is_trained(directory: Path) -> bool:
     """Whether a directory says that its training is finished."""
     try:
@@ -99,8 +122,13 @@ def is_trained(directory: Path) -> bool:
 
 def is_shared_training_done(shared: SharedTraining) -> bool:
     """Whether a training for several was finished, and is still there."""
+    directory = _noted(shared)
+    return directory is not None and is_trained(directory)
+
+
+def _noted(shared: SharedTraining) -> Path | None:
+    """Return where the note of a training for several says that it lies."""
     try:
-        directory = Path(json.loads(shared.note.read_text("utf-8"))["directory"])
+        return Path(json.loads(shared.note.read_text("utf-8"))["directory"])
     except (OSError, ValueError, KeyError, TypeError):
-        return False
-    return is_trained(directory)
+        return None

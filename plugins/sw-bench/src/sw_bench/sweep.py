@@ -14,7 +14,7 @@ from typing import Protocol
 from sw_bench.cells import Cell, Job, run_job
 from sw_bench.executor import LOST, Executor
 from sw_bench.index import Index
-from sw_bench.state import is_shared_training_done, is_trained, record_of
+from sw_bench.state import is_shared_training_done, is_trained, record_of, stamp_of
 
 LOGS = "logs"
 MOMENT = 0.25  # seconds between two updates of what is shown
@@ -51,11 +51,14 @@ class Sweep:
     running: dict[str, tuple[Job, float, int]] = field(default_factory=dict)
     done: set[Job] = field(default_factory=set)
     failed: dict[Job, str] = field(default_factory=dict)
+    before: dict[Cell, tuple[int, int]] = field(default_factory=dict)  # stamps of records that were there already
 
     def run(self) -> None:
         """Run everything; returns when nothing is left. However it ends, the processes have ended with a checkpoint."""
         (self.out / LOGS).mkdir(exist_ok=True)
         self.waiting = list(self.jobs)
+        stamps = {cell: stamp_of(cell) for job in self.jobs for cell in job.cells}
+        self.before = {cell: stamp for cell, stamp in stamps.items() if stamp is not None}
         for job in self.jobs:
             if job.shared is not None and is_shared_training_done(job.shared):
                 self.waiting.remove(job)
@@ -110,7 +113,8 @@ class Sweep:
         """Note how a process ended: finished, failed with its reason, or to be started again."""
         job, began, size = self.running.pop(ticket)
         seconds = time.monotonic() - began
-        left = [cell for cell in job.cells if record_of(cell) is None]
+        # The record of a run that was started again says that it went well only if it is a new one.
+        left = [cell for cell in job.cells if record_of(cell) is None or (status != 0 and self._is_as_before(cell))]
         for cell in job.cells:
             self.index.spent(cell, seconds / len(job.cells))
             if cell not in left:
@@ -124,16 +128,32 @@ class Sweep:
         reason = _reason(self.out / LOGS / job.log, size, status)
         if (status < 0 or status in INTERRUPTED or status == 128 + KILLED) and job.attempts <= self.retries:
             self.waiting.insert(0, job)  # goes on from its checkpoint
+            for cell in left:
+                self.index.note(cell, status="waiting")
             self.watcher.ended(self, job, "again", reason, seconds)
             return
         self.index.job_ended(job.name, job.about, len(job.cells), "failed", seconds, place)
+        if len(left) > 1 and left[0] in self.before:  # there may have been nothing to do for it: each by itself
+            self._start_again(job, [[cell] for cell in left])
+            self.watcher.ended(self, job, "again", reason, seconds)
+            return
         # The command ends with the first run that fails. Where their training is there, the others can still be made.
         others = left[1:] if left and any(is_trained(cell.directory) for cell in job.cells) else []
-        if others:
-            rest = run_job(others)
+        self._start_again(job, [others] if others else [])
+        self._fail(job, [cell for cell in left if cell not in others], reason, seconds)
+
+    def _is_as_before(self, cell: Cell) -> bool:
+        """Whether the record of a run is still the one that was there before the sweep began."""
+        return cell in self.before and stamp_of(cell) == self.before[cell]
+
+    def _start_again(self, job: Job, groups: Sequence[Sequence[Cell]]) -> None:
+        """Let runs of a process that failed wait for processes of their own."""
+        for group in reversed(groups):
+            rest = run_job(group)
             rest.needs = job.needs
             self.waiting.insert(0, rest)
-        self._fail(job, [cell for cell in left if cell not in others], reason, seconds)
+            for cell in group:
+                self.index.note(cell, status="waiting")
 
     def _fail(self, job: Job, cells: Sequence[Cell], reason: str, seconds: float) -> None:
         self.failed[job] = reason
@@ -146,6 +166,9 @@ def _reason(log: Path, start: int, status: int) -> str:
     """One line why a process failed: its last error message, or the signal that ended it."""
     if status == LOST:
         return "its machine was lost"
+    if status == 130:
+        return "interrupted"
+    status = -KILLED if status == 128 + KILLED else status  # as a shell tells it
     if status < 0:
         name = signal.Signals(-status).name if -status in signal.valid_signals() else f"signal {-status}"
         return f"killed by {name}" + (" (the memory may have been full)" if -status == KILLED else "")

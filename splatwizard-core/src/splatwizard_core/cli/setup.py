@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from splatwizard_core.plugins import PluginManager
     from splatwizard_core.runs.config import ResolvedConfig
     from splatwizard_core.runs.session import Session
+    from splatwizard_core.scene.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,6 @@ class Choices:
         """One configuration for every method and rate point; wrong input fails before anything runs."""
         from splatwizard_core.runs.config import rate_points, resolve
         from splatwizard_core.runs.pretrained import checked_start
-        from splatwizard_core.training.keys import dotted
 
         values = self.values()
         found = [
@@ -82,12 +82,32 @@ class Choices:
             for method in map(plugins.methods.load, self.method_names(plugins))
             for rate in ([None] if self.rate is None else rate_points(method, self.rate))
         ]
-        for each in found:
+        return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
+
+    def settled(
+        self, found: list[ResolvedConfig], plugins: PluginManager, scene: Callable[[ResolvedConfig], Scene],
+        tell: Callable[[str], None] = say,
+    ) -> list[ResolvedConfig]:  # fmt: skip
+        """Return what `resolve` found, a tiny scene with the preset "quick" where nothing says otherwise.
+
+        scene   loads the scene of a configuration
+        tell    is told of that, and of the values by data set of each method
+        """
+        from splatwizard_core.training.keys import dotted
+
+        free = self.preset is None and self.config_file is None and found[0].preset != "quick"
+        if free and all("iterations" not in each.provenance for each in found):
+            pixels = max(sum(view.camera.width * view.camera.height for view in scene(each).train) for each in found)
+            if pixels < TINY:
+                found = replace(self, preset="quick").resolve(plugins)
+                why = f"the plan scaled down for {pixels:,} training pixels"
+                tell(f"preset quick: {why} (--preset paper runs it in full)")
+        for each in reversed({each.method: each for each in reversed(found)}.values()):  # its first rate point
             values = dotted(each.config.model_dump() | each.scene_options, "")
             told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
-            if told and each.rate == found[0].rate:
-                say(f"{each.method}, by data set: {', '.join(told)}")
-        return [checked_start(plugins, each) for each in _without_unused_starts(plugins, found)]
+            if told:
+                tell(f"{each.method}, by data set: {', '.join(told)}")
+        return found
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
         """The configuration of a command that makes one thing."""
@@ -187,18 +207,14 @@ def open_session(resolved: ResolvedConfig, plugins: PluginManager) -> Session:
 def open_training_session(chosen: Choices, plugins: PluginManager) -> tuple[list[ResolvedConfig], Session]:
     """The configurations of trainings and their session, the scenes loaded: what is wrong with one is told first.
 
-    A tiny scene gets the preset "quick" where nothing says otherwise. Tells so, and where they compute, and why there.
+    Tells where they compute, and why there.
     """
     from splatwizard_core.runs.device import device_reason
 
     resolved = chosen.resolve(plugins)
     _warn_of_equal_rates(resolved)
     session = open_session(resolved[0], plugins)
-    free = [chosen.preset is None and "iterations" not in each.provenance for each in resolved]
-    pixels = [sum(view.camera.width * view.camera.height for view in session.scene(each).train) for each in resolved]
-    if chosen.config_file is None and all(free) and max(pixels) < TINY and resolved[0].preset != "quick":
-        resolved = replace(chosen, preset="quick").resolve(plugins)
-        say(f"preset quick: the plan scaled down for {max(pixels):,} training pixels (--preset paper runs it in full)")
+    resolved = chosen.settled(resolved, plugins, session.scene)
     say(device_reason(resolved[0].ppl.device, session.device, plugins))
     return resolved, session
 
