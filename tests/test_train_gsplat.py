@@ -52,6 +52,8 @@ def test_the_loop_hands_gsplat_what_it_expects(version, resets, strategy):
         "scene": "demo:tiny",
         "images": "",
         "cap": 10,
+        "surfels": None,
+        "distortion": 0.0,
         "padding": "valid",
         "seed": 0,
         "iterations": 5,
