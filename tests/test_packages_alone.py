@@ -15,6 +15,10 @@ from splatwizard_core.coding.container import ContainerReader
 GOLDEN = Path(__file__).parent / "golden"
 ONE_OF_EACH_METHOD = sorted({ContainerReader.open(p).method: p for p in sorted(GOLDEN.glob("*.swz"))}.values())
 IN_DEFAULT_TESTS = {"3dgs", "hac", "chimerags", "mesongs"}
+ALONE_IN_DEFAULT_TESTS = {
+    "sw-3dgs", "sw-bench", "sw-chimerags", "sw-datasets", "sw-geometry", "sw-hac-plus", "sw-kit", "sw-report",
+}  # fmt: skip
+"""The rest is slow: that a package declares what it imports is also read off its source (test_layers)."""
 IN_EVERY_ENVIRONMENT = needed("splatwizard-core")
 BY_NAME = {str(project(package)["name"]): package for package in PACKAGES}
 IMPORT_ALL = """
@@ -32,7 +36,10 @@ for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
 
 
 @pytest.mark.pipeline
-@pytest.mark.parametrize("distribution", sorted(BY_NAME))
+@pytest.mark.parametrize(
+    "distribution",
+    [pytest.param(name, marks=[] if name in ALONE_IN_DEFAULT_TESTS else pytest.mark.slow) for name in sorted(BY_NAME)],
+)
 def test_a_package_works_alone_beside_the_core(core, wheels, distribution):
     core.install(*(wheels[name] for name in needed(distribution) if name not in IN_EVERY_ENVIRONMENT))
     provides = "entry-points" in project(BY_NAME[distribution])

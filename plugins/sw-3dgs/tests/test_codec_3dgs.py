@@ -84,8 +84,8 @@ def test_exact_mode_costs_236_bytes_a_gaussian():
     assert len(encoded(random_model(1000))) == pytest.approx(236_000, rel=0.005)
 
 
-def test_default_is_the_exact_mode():
-    assert ThreeDGS.RATES[ThreeDGS.DEFAULT_RATE]["codec.name"] == "gaussians-exact"
+def test_the_default_rate_point_compresses_and_values_alone_keep_every_bit():
+    assert ThreeDGS.RATES[ThreeDGS.DEFAULT_RATE]["codec.name"] == "gaussians-quantized"
     assert ThreeDGSConfig().codec.name == "gaussians-exact"
 
 

@@ -297,7 +297,7 @@ class CodedAnchors(AnchorModel):
         return self._constants(like)[2]
 
     def _constants(self, like: Tensor) -> Triple:
-        """What `_columns` and `base_steps_like` return. None replaces another: graphs read them where they stand."""
+        """Tensors of `_columns` and `base_steps_like`; none replaces another: graphs read them where they stand."""
         widths, steps = self.shape.widths, tuple(self.base_steps)
         key = (like.device, like.dtype, widths, steps)
         if key not in self._groups:

@@ -9,7 +9,7 @@ import click
 
 from splatwizard_core.cli import options as shared
 from splatwizard_core.cli.complete import PRESET, name_of
-from splatwizard_core.cli.setup import Choices, takes_choices
+from splatwizard_core.cli.setup import Choices, takes_choices, tell_data_set_values
 from splatwizard_core.plugins import load_plugins
 
 if TYPE_CHECKING:
@@ -41,6 +41,7 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
     plugins = load_plugins()
     preset = chosen.preset or (None if chosen.config_file else "paper")
     resolved = replace(chosen, methods=(method,), preset=preset).resolve_one(plugins)
+    tell_data_set_values([resolved])
     entry, origins = plugins.methods.entry(method), Origins(plugins)
     stages = list(plugins.methods.load(method)(plugins, resolved.config).stages())
     found: list[dict[str, Any]] = []

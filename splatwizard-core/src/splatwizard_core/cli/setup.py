@@ -93,8 +93,6 @@ class Choices:
         scene   loads the scene of a configuration
         tell    is told of that, and of the values by data set of each method
         """
-        from splatwizard_core.training.keys import dotted
-
         free = self.preset is None and self.config_file is None and found[0].preset != "quick"
         if free and all("iterations" not in each.provenance for each in found):
             pixels = max(sum(view.camera.width * view.camera.height for view in scene(each).train) for each in found)
@@ -102,11 +100,7 @@ class Choices:
                 found = replace(self, preset="quick").resolve(plugins)
                 why = f"the plan scaled down for {pixels:,} training pixels"
                 tell(f"preset quick: {why} (--preset paper runs it in full)")
-        for each in reversed({each.method: each for each in reversed(found)}.values()):  # its first rate point
-            values = dotted(each.config.model_dump() | each.scene_options, "")
-            told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
-            if told:
-                tell(f"{each.method}, by data set: {', '.join(told)}")
+        tell_data_set_values(found, tell)
         return found
 
     def resolve_one(self, plugins: PluginManager) -> ResolvedConfig:
@@ -154,6 +148,17 @@ class Choices:
         )
         found = dotted(wanted.config.model_dump(), "").items()
         return replace(chosen, rate=None, below={k: v for k, v in found if f"{k}.".startswith(keys)})
+
+
+def tell_data_set_values(found: Sequence[ResolvedConfig], tell: Callable[[str], None] = say) -> None:
+    """Tell the values by data set of each method: those of its first rate point."""
+    from splatwizard_core.training.keys import dotted
+
+    for each in reversed({each.method: each for each in reversed(found)}.values()):
+        values = dotted(each.config.model_dump() | each.scene_options, "")
+        told = [f"{k} = {values[k]}" for k, source in each.provenance.items() if source.startswith("data set ")]
+        if told:
+            tell(f"{each.method}, by data set: {', '.join(told)}")
 
 
 def only(found: Sequence[ResolvedConfig]) -> ResolvedConfig:

@@ -39,6 +39,10 @@ NAMES: Rule = (_names, "a list of names")
 SUFFIXED: Rule = (lambda value: isinstance(value, str) and value.startswith(".") and len(value) > 1, 'such as ".ply"')
 SUFFIX: Rule = (lambda value: value == "" or SUFFIXED[0](value), 'such as ".ply", or "" (by --format alone)')
 WHERE: Rule = (lambda value: isinstance(value, str) and bool(TARGET.fullmatch(value)), '"module:attribute"')
+MODULES: Rule = (
+    lambda value: all(WHERE[0](each) for each in (value if isinstance(value, list) else [value])),
+    '"module:attribute" of a NativeModule, or a list of them',
+)
 DIRECTION: Rule = (lambda value: value in ("higher", "lower"), '"higher" or "lower"')
 OVER: Rule = (lambda value: value in ("image", "model"), '"image" or "model"')
 CODES: Rule = (lambda value: value in SORTS, f"one of {', '.join(SORTS)}")
@@ -91,9 +95,9 @@ def check_entry(entry: Entry) -> None:
 
         RasterizerInfo.from_entry(entry)  # its own message names the field
         return
-    known = FIELDS.get(entry.kind)
-    if known is None:
+    if entry.kind not in FIELDS:
         return
+    known = {**FIELDS[entry.kind], "native": MODULES}  # of any kind: what `sw build-kernels` compiles
     wanted = REQUIRED.get(entry.kind)
     unknown = next((f", but '{n}', which its kind does not have" for n in entry.declared if n not in known), "")
     hold(

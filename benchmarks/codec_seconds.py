@@ -1,0 +1,77 @@
+"""Encode and decode seconds of methods for as many Gaussians as asked, with nothing pruned and nothing trained.
+
+    python benchmarks/codec_seconds.py [--n 1000000] [--methods mesongs,c3dgs] [--device cpu] [--threads 2]
+
+The Gaussians are those of benchmarks/scene.py, written as a .ply and given to `sw run --init` with 0 steps on the tiny
+demo scene; what a method makes before it encodes (scores, codebooks) is its training's time, "before". Seconds are
+those of the record: encoding once, decoding in a fresh process, the least of its runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import torch
+from sw_gaussians.ply import export_ply
+
+from splatwizard_core.api import GaussianModel
+
+sys.path.insert(0, str(Path(__file__).parent))
+from scene import make_splats
+
+KEEP_ALL = {"mesongs": ["prune.tau=0"], "c3dgs": ["prune_threshold=-1"]}
+
+
+def write(n: int, path: Path) -> None:
+    """Write the scene as a trained model."""
+    g = make_splats(n)
+    assert g.sh is not None
+    assert g.scales is not None
+    assert g.quats is not None
+    model = GaussianModel.from_tensors(
+        g.means, g.sh.dc, g.sh.rest, torch.logit(g.opacities), g.scales.log(), g.quats, active_sh_degree=3
+    )
+    export_ply(model, path)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--n", type=int, default=1_000_000, help="Gaussians (default: 1,000,000)")
+    parser.add_argument("--methods", default="mesongs,c3dgs", help="comma list of METHOD[@RATE]")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default: cpu)")
+    parser.add_argument("--threads", type=int, default=0, help="CPU threads (default: all)")
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        ply = Path(folder) / "scene.ply"
+        write(args.n, ply)
+        print(f"{args.n:,} Gaussians, {ply.stat().st_size:,} bytes as .ply, {args.device}")
+        for asked in args.methods.split(","):
+            method, _, rate = asked.partition("@")
+            words = ["run", "--method", method, "--scene", "demo:tiny", "--init", str(ply), "--out", f"{folder}/out"]
+            words += ["--rate", rate] if rate else []
+            sets = ["iterations=0", f"threads={args.threads}", *KEEP_ALL.get(method, [])]
+            words += ["--preset", "paper", "--device", args.device, *(w for each in sets for w in ("--set", each))]
+            done = subprocess.run(
+                [sys.executable, "-m", "splatwizard_core", *words], capture_output=True, text=True, check=False
+            )
+            if done.returncode != 0:
+                print(f"{asked}: {done.stderr.strip().splitlines()[-1]}", flush=True)
+                continue
+            (record,) = Path(folder, "out").glob(f"*/{method}/*/metrics.json")
+            facts = json.loads(record.read_text("utf-8"))
+            codec = facts["codec"]
+            print(
+                f"{method:12} {facts['rate']}  {facts['counts']['num_gaussians']:>9,} Gaussians  "
+                f"{facts['file']['bytes']:>11,} bytes  before {facts['train']['train_s']:7.1f} s  "
+                f"encode {codec['encode_s']:6.2f} s  decode {codec['decode_s']:6.2f} s",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    main()
