@@ -3,8 +3,8 @@
     python benchmarks/codec_seconds.py [--n 1000000] [--methods mesongs,c3dgs] [--device cpu] [--threads 2]
 
 The Gaussians are those of benchmarks/scene.py, written as a .ply and given to `sw run --init` with 0 steps on the tiny
-demo scene; what a method makes before it encodes (scores, codebooks) is its training's time, "before". Seconds are
-those of the record: encoding once, decoding in a fresh process, the least of its runs.
+demo scene. Seconds are those of the record: encoding once, decoding in a fresh process. What a method makes before it
+encodes (scores, codebooks) is not in them, but takes minutes for a million on a CPU.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def main() -> None:
             codec = facts["codec"]
             print(
                 f"{method:12} {facts['rate']}  {facts['counts']['num_gaussians']:>9,} Gaussians  "
-                f"{facts['file']['bytes']:>11,} bytes  before {facts['train']['train_s']:7.1f} s  "
+                f"{facts['file']['bytes']:>11,} bytes  "
                 f"encode {codec['encode_s']:6.2f} s  decode {codec['decode_s']:6.2f} s",
                 flush=True,
             )
