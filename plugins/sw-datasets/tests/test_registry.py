@@ -38,7 +38,7 @@ def no_own_registry(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def published() -> list[DataSet]:
-    """What this package lists itself; others list more."""
+    """Downloads that this package lists itself; others list more."""
     return [dataset for dataset in load_registry().values() if dataset.registry == PUBLIC]
 
 

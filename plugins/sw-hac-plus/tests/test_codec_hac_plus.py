@@ -45,7 +45,7 @@ class Recorder(AttributeEncoder):
 
 
 def recorded(model, mode="exact"):
-    """What a walk over the model hands to its encoder, and the geometry."""
+    """Blocks that a walk over the model hands to its encoder, and the geometry."""
     model = copy.deepcopy(model)
     model.fold_units()
     round_networks(model.networks(), "float32")

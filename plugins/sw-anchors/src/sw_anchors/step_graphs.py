@@ -182,7 +182,7 @@ class Watched:
 
     @property
     def learning(self) -> list[Tensor]:
-        """Those that learn."""
+        """Tensors among the watched ones that learn."""
         return [tensor for _, _, tensor, _, learns in self.tensors if learns]
 
     def unchanged(self) -> bool:

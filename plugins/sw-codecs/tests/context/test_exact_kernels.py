@@ -20,7 +20,7 @@ def generator(seed=0):
 
 
 def both(kernels, compute):
-    """What `compute` gives with kernels and without."""
+    """Results of `compute` with kernels and without."""
     found = []
     for compiled in (True, False):
         kernels(compiled)
