@@ -27,7 +27,7 @@ from sw_metrics.lpips_weights import BACKBONES, Weights, check_folder, find_weig
 from sw_metrics.torchvision_import import import_torchvision
 
 EXTRA = "sw-metrics[lpips]"
-"""Extra that brings `lpips` and torchvision; `install_command` names versions that leave the installed torch as it is."""
+"""Extra with `lpips` and torchvision; `install_command` names versions that leave the installed torch as it is."""
 SMALLEST = {"vgg": 16, "alex": 31}  # pixels; below, a pooling layer is left with nothing
 
 
