@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from sw_codecs.context.plane_kernels import fit_kernels, look_up, look_up_backward
 from sw_codecs.context.principal_frame import UNIT, PrincipalFrame
 from sw_codecs.exact_native import EXACT
 
@@ -149,6 +150,10 @@ class _Sampled(torch.autograd.Function):
         n, channels = len(cells), planes[0].shape[1]
         ctx.save_for_backward(cells, weights)
         ctx.shapes = [plane.shape for plane in planes]
+        ctx.by_kernel = fit_kernels(planes)
+        if ctx.by_kernel:
+            ctx.planes = [plane.detach() for plane in planes]
+            return look_up(cells, weights, planes, GAIN if rounded else 0)
         width = len(PAIRS) * channels
         features = weights.new_empty(n, len(planes), width)
         for i, plane in enumerate(planes):
@@ -167,6 +172,8 @@ class _Sampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         cells, weights = ctx.saved_tensors
+        if ctx.by_kernel:
+            return None, None, None, *look_up_backward(cells, weights, grad, ctx.planes)
         parts = grad.unflatten(1, (len(ctx.shapes), len(PAIRS), -1))  # [n, scales, 3, C]
         total: Tensor | None = None
         found: list[Tensor] = []
