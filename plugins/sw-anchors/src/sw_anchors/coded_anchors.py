@@ -6,22 +6,23 @@ quantisation, and the rate of a sample of the visible anchors. A method adds the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
+from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
 from sw_anchors.fused_ops import anchor_values, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_codecs.entropy.rates import gaussian_bits
+from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound, add_noise
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import Camera, GaussianInputs
+    from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
     from sw_anchors.fixed_decoder import FixedDecoder
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
@@ -29,57 +30,6 @@ FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy trai
 
 MASK_THRESHOLD = 0.01
 INITIAL_MASK_LOGIT = 1.0
-
-Triple = tuple[Tensor, Tensor, Tensor]
-
-
-@dataclass(frozen=True)
-class AnchorContext:
-    """Prediction of a context model for V anchors: a triple for each of `shape.GROUPS`, in the units of the values.
-
-    means, scales   [V,C] of each group: mean and standard deviation of every number; scales may be <= 0 (see `rate`)
-    steps           [V,1] of each group: quantiser step of the anchor
-    own_bits        scalar, differentiable: bits of all that the context model itself stores, if it has come along
-    """
-
-    means: Triple
-    scales: Triple
-    steps: Triple
-    own_bits: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class AnchorForecast:
-    """Prediction of a context model in training: steps of all V anchors, distributions of a sample once it is drawn.
-
-    steps       [V,3] quantiser step of each group; differentiable
-    own_bits    as in AnchorContext
-    hidden      [V,H] what `sample` starts from, or None; rows of the sample are taken from it
-    sample      (rows [S] of the V, their rows of `hidden`, their values [S,C]) -> means and scales [S,C]; the columns
-                are those of all groups side by side
-    """
-
-    steps: Tensor
-    own_bits: Tensor | None
-    hidden: Tensor | None
-    sample: Callable[[Tensor, Tensor | None, Tensor], tuple[Tensor, Tensor]]
-
-
-@dataclass(frozen=True)
-class AnchorRate:
-    """Rate of the anchors of one view; `RenderResult.extras["rate"]` in the entropy phase.
-
-    bits        scalar, differentiable: bits a number over a sample of visible, kept anchors, times the share of visible
-                anchors that are kept; 0 for an empty sample
-    by_group    [3] bits of features, scales and offsets in the sample, detached
-    numbers     scalar: how many numbers the sample has
-    own_bits    of the context
-    """
-
-    bits: Tensor
-    by_group: Tensor
-    numbers: Tensor
-    own_bits: Tensor | None = None
 
 
 class CodedAnchors(AnchorModel):
@@ -133,12 +83,13 @@ class CodedAnchors(AnchorModel):
         self.sample, self.smallest_probability = sample, smallest_probability
         self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
+        self._order: tuple[Tensor, Tensor] | None = None
         self._groups: dict[tuple[Any, ...], Triple] = {}
         self.fixed: FixedDecoder | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy decodes by itself: graphs of a GPU belong to one model."""
-        return {**self.__dict__, "fixed": None}
+        """A copy decodes by itself: graphs of a GPU belong to one model. It sorts anew."""
+        return {**self.__dict__, "fixed": None, "_order": None}
 
     # Positions
 
@@ -168,6 +119,18 @@ class CodedAnchors(AnchorModel):
         """Codes [N,3] of the anchors on the 16-bit lattice, and where they are taken to be [N,3]."""
         codes = position_codes(self.anchors, self.bounds)
         return codes, coded_positions(codes, self.bounds)
+
+    @torch.no_grad()
+    def visible_anchors(self, camera: Camera, rasterizer: Rasterizer) -> Tensor:
+        """As of AnchorModel. In training on a GPU neighbours follow one another, whose gradients meet in the same cells
+        of grids and planes: kernels add those up before they write."""
+        if not (self.training and self.device.type == "cuda"):
+            return super().visible_anchors(camera, rasterizer)
+        codes = self.codes()
+        if self._order is None or self._order[0] is not codes:
+            self._order = codes, torch.argsort(interleave(codes))
+        order = self._order[1]
+        return order[rasterizer.visible_filter(self.balls(), camera).index_select(0, order) > 0]
 
     # Masks
 
@@ -387,9 +350,3 @@ class CodedAnchors(AnchorModel):
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         super().load_state_dict_extra(extra)
         self.phase = str(extra["phase"])
-
-
-def triple(parts: Iterable[Tensor]) -> Triple:
-    """Tensors of the three groups in their order."""
-    first, second, third = parts
-    return first, second, third

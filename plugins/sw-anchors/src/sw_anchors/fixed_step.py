@@ -17,7 +17,8 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
-from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED, AnchorRate
+from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
+from sw_anchors.forecasts import AnchorRate
 from sw_anchors.fused_ops import anchor_values
 from sw_anchors.neural_gaussians import visible_gaussians
 from sw_anchors.step_graphs import Found

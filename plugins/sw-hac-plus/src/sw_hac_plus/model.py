@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
-from sw_anchors.coded_anchors import MASK_THRESHOLD, AnchorForecast, AnchorRate
+from sw_anchors.coded_anchors import MASK_THRESHOLD
+from sw_anchors.forecasts import AnchorForecast, AnchorRate
 from sw_anchors.fused_ops import anchor_values, widen
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
