@@ -14,9 +14,8 @@ from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
-from sw_anchors.fused_ops import anchor_values, take_rows, widen
+from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
-from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound, add_noise
@@ -29,6 +28,8 @@ FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy trai
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
 
 MASK_THRESHOLD = 0.01
+SMALLEST_SCALE = 1e-9
+"""Floor of a predicted deviation, as published."""
 INITIAL_MASK_LOGIT = 1.0
 
 
@@ -327,15 +328,11 @@ class CodedAnchors(AnchorModel):
         else:
             x, step, mask, hidden = take_rows(drawn, values, forecast.steps, masks, forecast.hidden)
         mean, scale = forecast.sample(drawn, hidden, x)
-        # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
-        widths = self.shape.widths
-        alone = counted[:, None].expand(-1, widths[0] + widths[1])
-        factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
-        step = self.widened(step)
-        bits = gaussian_bits(x, mean, scale.clamp(min=1e-9), step, p_min=self.smallest_probability) * factors
-        numbers = counted.sum() * sum(widths)
-        by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
-        return AnchorRate(bits.sum() * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
+        bits, by_group = sample_bits(
+            x, mean, scale, step, mask, counted, p_min=self.smallest_probability, smallest_scale=SMALLEST_SCALE
+        )
+        numbers = counted.sum() * sum(self.shape.widths)
+        return AnchorRate(bits * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
 
     # State
 

@@ -18,6 +18,7 @@ from torch.autograd.function import once_differentiable
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of
+from sw_anchors.fused_ops import put_rows
 from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
 if TYPE_CHECKING:
@@ -165,10 +166,8 @@ class _Decoded(torch.autograd.Function):
         (rows,) = ctx.saved_tensors
         grads = ctx.step.backward(slopes[: ctx.count])
         add_gradients(ctx.networks, grads[len(ctx.shapes) :])
-        found = [
-            None if grad is None else grad.new_zeros(shape[0], *grad.shape[1:]).index_copy_(0, rows, grad[: len(rows)])
-            for grad, shape in zip(grads, ctx.shapes, strict=False)
-        ]
+        own = grads[: len(ctx.shapes)]
+        found = put_rows(rows, own, ctx.shapes[0][0])
         shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
         return None, None, None, None, *shaped
 

@@ -19,8 +19,9 @@ from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
 from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
 from sw_anchors.forecasts import AnchorRate
-from sw_anchors.fused_ops import anchor_values
+from sw_anchors.fused_ops import noisy_rows
 from sw_anchors.neural_gaussians import visible_gaussians
+from sw_anchors.row_kernels import fit_kernels, load_rows
 from sw_anchors.step_graphs import Found
 from sw_anchors.view_networks import network_outputs
 
@@ -62,6 +63,10 @@ class FixedRows:
         pairs += [(getattr(model, name).detach(), mine) for name, mine in zip(PARAMETERS, self.parameters, strict=True)]
         if weights is not None and self.weights is not None:
             pairs.append((weights, self.weights))
+        sources, targets = [source for source, _ in pairs], [mine.detach() for _, mine in pairs]
+        if fit_kernels(*sources) and fit_kernels(*targets):
+            load_rows(rows, sources, targets)
+            pairs = []
         for source, mine in pairs:
             flat = source if source.dim() == mine.dim() else source.flatten(1)
             torch.index_select(flat, 0, rows, out=mine.detach()[:v])
@@ -79,30 +84,27 @@ def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
     Returns (the three outputs of the networks, offsets [C,k,3], scales [C,6], masks [C,k], then in the entropy phase
     bits and, if the context has any, own bits of `AnchorRate`), and (by_group and numbers of the rate).
     """
-    features, log_scales, offsets, logits = at.parameters
-    capacity, k = logits.shape
-    values, masks = anchor_values(
-        None, features, log_scales, offsets.view(capacity, k, 3), logits, at.weights, MASK_THRESHOLD
-    )
-    valid = (torch.arange(capacity, device=values.device) < at.count).to(values)
-    masks = masks * valid[:, None]
-    noise, draws = torch.split(at.random, [values.numel(), capacity])
-    rate: list[Tensor] = []
-    rate_counts: tuple[Tensor, ...] = ()
+    capacity, k = at.parameters[-1].shape
+    noise, draws = torch.split(at.random, [len(at.random) - capacity, capacity])
+    steps: Tensor | None = None
     if model.phase == QUANTIZED:
-        values = torch.addcmul(values, noise.view_as(values), model.wide_base_steps(values))
+        steps = model.base_steps_like(noise)[None] * model.noise_factor
     elif model.phase == ENTROPY:
         forecast = model.forecast_at(at.parts)
-        steps = model.widened(forecast.steps)
-        values = torch.addcmul(values, noise.view_as(values), steps)
-        kept = masks.detach().amax(dim=1)
+        steps = forecast.steps
+    values, (own, scales, shifts), masks, kept = noisy_rows(
+        at.parameters, at.weights, at.count, None if steps is None else noise, steps, MASK_THRESHOLD
+    )
+    valid = (torch.arange(capacity, device=values.device) < at.count).to(values)
+    rate: list[Tensor] = []
+    rate_counts: tuple[Tensor, ...] = ()
+    if model.phase == ENTROPY:
         drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
         counted = kept.index_select(0, drawn) * is_drawn
         share = kept.sum() / at.count.clamp(min=1)
         found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
         rate = [found_rate.bits] + ([] if found_rate.own_bits is None else [found_rate.own_bits])
         rate_counts = found_rate.by_group, found_rate.numbers
-    own, scales, shifts = torch.split(values, list(model.shape.widths), dim=1)
     # What is not valid may stand at the camera's centre, where a direction is none.
     positions = torch.where(valid[:, None] > 0, at.positions, at.center + 1)
     networks = (model.mlp_opacity, model.mlp_cov, model.mlp_color)
