@@ -16,6 +16,7 @@ from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
 from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
+from sw_anchors.pool_rows import bernoulli_rows
 from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound, add_noise
@@ -23,6 +24,7 @@ from sw_codecs.quantizers.rounding import SteRound, add_noise
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
     from sw_anchors.fixed_decoder import FixedDecoder
+    from sw_anchors.pool_rows import PoolRows
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
@@ -51,6 +53,9 @@ class CodedAnchors(AnchorModel):
 
     HAS_FIXED_FORM: ClassVar[bool] = True
     """Whether `sw_anchors.fixed_step` computes what a training step of this class does."""
+
+    SAMPLES_ALL: ClassVar[bool] = False
+    """Whether the rate is of a sample of all anchors, not of the visible ones; then there is `pool_rate`."""
 
     def __init__(
         self,
@@ -204,6 +209,19 @@ class CodedAnchors(AnchorModel):
     def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
         """Predict for training from rows of `context_rows`, without waiting for a GPU."""
         raise NotImplementedError
+
+    def forecast_pool(self, parts: tuple[Tensor, ...], pool: tuple[Tensor, ...]) -> AnchorForecast:
+        """As `forecast_at`, and of the sample of all anchors what `pool_rate` takes; rows of `context_rows` of both."""
+        raise NotImplementedError
+
+    def pool_rate(self, pool: PoolRows, forecast: AnchorForecast) -> AnchorRate:
+        """Estimate the bits of a sample of all anchors, with the forecast of `forecast_pool`."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def pool_sample(self, size: int) -> tuple[Tensor, Tensor]:
+        """Draw a sample of all anchors into `size` places, see `pool_rows.bernoulli_rows`."""
+        return bernoulli_rows(self.uniform(size), self.num_rows, self.sample)
 
     def step_key(self) -> tuple[Any, ...]:
         """Plain values that decide which operators a step of training runs."""

@@ -19,9 +19,9 @@ from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
 from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
 from sw_anchors.forecasts import AnchorRate
-from sw_anchors.fused_ops import noisy_rows
+from sw_anchors.fused_ops import load_rows, noisy_rows
 from sw_anchors.neural_gaussians import visible_gaussians
-from sw_anchors.row_kernels import fit_kernels, load_rows
+from sw_anchors.pool_rows import PoolRows
 from sw_anchors.step_graphs import Found
 from sw_anchors.view_networks import network_outputs
 
@@ -63,13 +63,7 @@ class FixedRows:
         pairs += [(getattr(model, name).detach(), mine) for name, mine in zip(PARAMETERS, self.parameters, strict=True)]
         if weights is not None and self.weights is not None:
             pairs.append((weights, self.weights))
-        sources, targets = [source for source, _ in pairs], [mine.detach() for _, mine in pairs]
-        if fit_kernels(*sources) and fit_kernels(*targets):
-            load_rows(rows, sources, targets)
-            pairs = []
-        for source, mine in pairs:
-            flat = source if source.dim() == mine.dim() else source.flatten(1)
-            torch.index_select(flat, 0, rows, out=mine.detach()[:v])
+        load_rows(rows, [source for source, _ in pairs], [mine.detach() for _, mine in pairs])
         self.draw(model)
 
     def draw(self, model: CodedAnchors) -> None:
@@ -78,11 +72,13 @@ class FixedRows:
         self.random.uniform_(-0.5, 0.5, generator=model.noise if own else None)
 
 
-def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
+def decode_rows(model: CodedAnchors, at: FixedRows, pool: PoolRows | None) -> Found:
     """Compute all that does not depend on which Gaussians are visible; rows beyond the count have masks 0.
 
     Returns (the three outputs of the networks, offsets [C,k,3], scales [C,6], masks [C,k], then in the entropy phase
     bits and, if the context has any, own bits of `AnchorRate`), and (by_group and numbers of the rate).
+
+    pool    what the rate is of; None: a sample of the visible anchors
     """
     capacity, k = at.parameters[-1].shape
     noise, draws = torch.split(at.random, [len(at.random) - capacity, capacity])
@@ -90,7 +86,7 @@ def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
     if model.phase == QUANTIZED:
         steps = model.base_steps_like(noise)[None] * model.noise_factor
     elif model.phase == ENTROPY:
-        forecast = model.forecast_at(at.parts)
+        forecast = model.forecast_at(at.parts) if pool is None else model.forecast_pool(at.parts, pool.parts)
         steps = forecast.steps
     values, (own, scales, shifts), masks, kept = noisy_rows(
         at.parameters, at.weights, at.count, None if steps is None else noise, steps, MASK_THRESHOLD
@@ -99,10 +95,13 @@ def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
     rate: list[Tensor] = []
     rate_counts: tuple[Tensor, ...] = ()
     if model.phase == ENTROPY:
-        drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
-        counted = kept.index_select(0, drawn) * is_drawn
-        share = kept.sum() / at.count.clamp(min=1)
-        found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
+        if pool is None:
+            drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
+            counted = kept.index_select(0, drawn) * is_drawn
+            share = kept.sum() / at.count.clamp(min=1)
+            found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
+        else:
+            found_rate = model.pool_rate(pool, forecast)
         rate = [found_rate.bits] + ([] if found_rate.own_bits is None else [found_rate.own_bits])
         rate_counts = found_rate.by_group, found_rate.numbers
     # What is not valid may stand at the camera's centre, where a direction is none.
@@ -135,14 +134,15 @@ def sample_capacity(capacity: int, share: float) -> int:
     return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
 
 
-def inputs_of(at: FixedRows, rows: Tensor, found: Found) -> GaussianInputs:
+def inputs_of(model: CodedAnchors, at: FixedRows, rows: Tensor, found: Found) -> GaussianInputs:
     """The Gaussians with opacity > 0, from what `decode_rows` found; anchors `rows` are those that were loaded.
 
     Waits for the device once, for their number.
     """
     (alpha, geometry, color, offsets, scales, masks, *rate), counts = found
     spawned = visible_gaussians(alpha, geometry, color, at.positions, offsets, scales, masks)
-    extras: dict[str, Any] = {"anchors": AnchorSelection(rows, spawned.all_opacities[: len(rows)], spawned.drawn)}
+    seen = spawned.alphas if model.COUNTS_MASKED else spawned.all_opacities
+    extras: dict[str, Any] = {"masks": masks, "anchors": AnchorSelection(rows, seen[: len(rows)], spawned.drawn)}
     if rate:
         extras["rate"] = AnchorRate(rate[0], counts[0], counts[1], rate[1] if len(rate) > 1 else None)
     return GaussianInputs(

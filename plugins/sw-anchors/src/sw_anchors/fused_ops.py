@@ -150,6 +150,16 @@ def take_rows(rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     return found
 
 
+def load_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+    """Copy rows [V] (int64) of each source [N,...], flat, into the first V rows of its target [V or more, ...]."""
+    if fit_kernels(*sources) and fit_kernels(*into):
+        row_kernels.load_rows(rows, sources, into)
+        return
+    for source, mine in zip(sources, into, strict=True):
+        flat = source if source.dim() == mine.dim() else source.flatten(1)
+        torch.index_select(flat, 0, rows, out=mine[: len(rows)])
+
+
 def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list[Tensor | None]:
     """For each source [V or more,...] `count` rows of zeros, of which `rows` [V] are its first V; None for None."""
     given = [source for source in sources if source is not None]
