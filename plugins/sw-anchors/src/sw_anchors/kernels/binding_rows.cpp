@@ -150,7 +150,7 @@ Rows rows_of(const Tensor& features, const Tensor& log_scales, const Tensor& off
     check(*noise, "noise", features, {c * (f + 6 + 3 * k)});
     check(*steps, "steps", features, {steps->size(0) == 1 ? 1 : c, kGroups});
     from.noise = noise->const_data_ptr<float>(), from.steps = steps->const_data_ptr<float>();
-    from.step_row = steps->size(0) == 1 ? 0 : kGroups;
+    from.step_row = steps->size(0) == c ? kGroups : 0;
   }
   return from;
 }
