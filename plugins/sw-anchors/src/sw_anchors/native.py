@@ -7,10 +7,15 @@ from splatwizard_native import NativeModule
 ANCHORS = NativeModule(
     name="sw_anchors",
     package="sw_anchors",
-    sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp", "kernels/binding_rows.cpp"),
+    sources=(
+        "kernels/binding.cpp",
+        "kernels/binding_cuda.cpp",
+        "kernels/binding_rows.cpp",
+        "kernels/binding_networks.cpp",
+    ),
     kernels=("kernels/spawn.cpp",),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/spawn.cu", "kernels/cuda/rows.cu"),
+    cuda_sources=("kernels/cuda/spawn.cu", "kernels/cuda/rows.cu", "kernels/cuda/networks.cu"),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
     seconds=10,
     without="anchors are decoded by torch operations: the same numbers, slower",
