@@ -116,7 +116,9 @@ def _check_dialect(header: PlyHeader, name: str, path: str) -> tuple[int, bool]:
 
     names = set(header.names("vertex"))
     if header.names("codebook_centers"):
-        raise refuse("a .ply with codebooks (Reducing the Memory Footprint), which is not read: export it as plain .ply")
+        raise refuse(
+            "a .ply with codebooks (Reducing the Memory Footprint), which is not read: export it as plain .ply"
+        )
     if "packed_position" in names:
         raise refuse("a compressed .ply: call it NAME.compressed.ply, which sw-interchange reads")
     if any(n.startswith(("f_offset", "f_anchor_feat")) for n in names):

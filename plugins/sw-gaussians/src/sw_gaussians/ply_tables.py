@@ -139,9 +139,7 @@ def read_tables(data: bytes | memoryview, header: PlyHeader, wanted: tuple[str, 
     return found
 
 
-def _by_plyfile(
-    data: bytes | memoryview, header: PlyHeader, wanted: tuple[str, ...], name: str
-) -> Mapping[str, Table]:
+def _by_plyfile(data: bytes | memoryview, header: PlyHeader, wanted: tuple[str, ...], name: str) -> Mapping[str, Table]:
     try:
         parsed = PlyData.read(io.BytesIO(data))
         found = {each.name: each.data for each in parsed.elements if each.name in wanted}
