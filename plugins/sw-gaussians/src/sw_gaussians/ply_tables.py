@@ -1,6 +1,6 @@
 """Elements of a .ply file as tables: the header checked against the size of the file before anything is allocated.
 
-Rows of fixed width are viewed where they lie; files of text, and elements with lists before the rows, are read by plyfile.
+Rows of fixed width are viewed where they lie; text, and what stands behind elements with lists, is read by plyfile.
 """
 
 from __future__ import annotations

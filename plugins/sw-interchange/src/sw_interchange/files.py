@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport,
 from sw_interchange.source import Source
 
 NO_LIMITS = Limits()
+FOLDER = "sog-folder"
 
 
 def read(
@@ -77,6 +80,9 @@ def write(
     """
     chosen = format_of_suffix(path) if format is None else format_named(format)
     parts, report = _encoded(scene, chosen, options)
+    if chosen.name == FOLDER:
+        _unpack(parts[0], Path(path))
+        return report
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.writelines(parts)
     return report
@@ -86,6 +92,14 @@ def encode(scene: GaussianScene, format: str, **options: Any) -> tuple[bytes, Wr
     """Encode a scene as `write` does, into bytes."""
     parts, report = _encoded(scene, format_named(format), options)
     return b"".join(parts), report
+
+
+def _unpack(bundle: bytes, meta: Path) -> None:
+    """Write the images of a bundle beside its meta.json, which comes last: it names files that are there."""
+    with zipfile.ZipFile(io.BytesIO(bundle)) as archive:
+        for name in archive.namelist():
+            with replacing(meta if name == "meta.json" else meta.parent / name) as temporary:
+                temporary.write_bytes(archive.read(name))
 
 
 def _checked(source: Source) -> Source:
@@ -114,6 +128,8 @@ def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tu
     writer = chosen.load("writer")
     options = chosen.load("options")(**values)
     report = WriteReport(chosen.name, num_gaussians=scene.num_gaussians)
+    if chosen.name != "ply":
+        scene = _sound(scene, report)
     if scene.num_gaussians == 0 and chosen.name != "ply":
         raise UserInputError(f"a scene without Gaussians cannot be written as {chosen.name}")
     if scene.sh_degree > chosen.max_sh_degree:
@@ -124,3 +140,13 @@ def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tu
     parts = writer(replace(in_frame(scene, chosen.frame), report=None), options, report)
     report.bytes = sum(len(part) for part in parts)
     return parts, report
+
+
+def _sound(scene: GaussianScene, report: WriteReport) -> GaussianScene:
+    """The scene without rows that are no numbers, which codes of integers cannot hold."""
+    kept = cleaned(scene, ReadReport("scene"), strict=False, name="the scene")
+    if kept.num_gaussians < scene.num_gaussians:
+        left = scene.num_gaussians - kept.num_gaussians
+        report.warnings.append(f"{left:,} Gaussians hold values that are no numbers, and were left out")
+        report.num_gaussians = kept.num_gaussians
+    return kept

@@ -57,6 +57,19 @@ _FORMATS = (
     Format("ply", ".ply", "3DGS .ply in all its dialects, float32", 4, reader="ply:read_ply", writer="ply:write_ply"),
     Format("splat", ".splat", "32 bytes a Gaussian, no SH", 0, reader="splat:read_splat", writer="splat:write_splat",
            options="splat:SplatOptions"),
+    Format("spz", ".spz", "quantised and compressed, SH included (Niantic)", 4, reader="spz:read_spz",
+           writer="spz:write_spz", options="spz:SpzOptions"),
+    Format("compressed-ply", ".compressed.ply", "quantised in chunks of 256 (PlayCanvas)", 3,
+           reader="compressed_ply:read_compressed_ply", writer="compressed_ply:write_compressed_ply"),
+    Format("sog", ".sog", "ZIP of lossless WebP images, the smallest here (PlayCanvas)", 3, reader="sog:read_sog",
+           writer="sog_writer:write_sog", options="sog_writer:SogOptions"),
+    Format("sog-folder", ".json", "the same images in a folder, beside their meta.json", 3, reader="sog:read_sog",
+           writer="sog_writer:write_sog", options="sog_writer:SogOptions"),
+    Format("ksplat", ".ksplat", "buckets of quantised Gaussians (mkkellogg)", 2, reader="ksplat:read_ksplat"),
+    Format("gltf", ".glb", "binary glTF with KHR_gaussian_splatting, float32", 3, frame="LUF",
+           reader="gltf:read_gltf", writer="gltf_writer:write_gltf", options="gltf_writer:GltfOptions"),
+    Format("checkpoint", ".pt", "PyTorch checkpoints of gsplat, nerfstudio and 3DGS", 4,
+           reader="checkpoint:read_checkpoint"),
 )  # fmt: skip
 
 
