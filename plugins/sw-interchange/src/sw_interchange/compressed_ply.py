@@ -57,7 +57,12 @@ def read_compressed_ply(source: Source, limits: Limits, report: ReadReport) -> G
     # Degree 0 has no element `sh`; some writers write one without properties.
     coefficients = [each for each in header.names("sh") if each.startswith("f_rest_")]
     degrees = {3 * k: degree for degree, k in COEFFICIENTS.items() if degree < 4}
-    if len(coefficients) not in degrees or (coefficients and header.count("sh") != count):
+    wanted = [f"f_rest_{i}" for i in range(len(coefficients))]
+    if (
+        len(coefficients) not in degrees
+        or sorted(coefficients) != sorted(wanted)
+        or (coefficients and header.count("sh") != count)
+    ):
         raise BitstreamError(f"{name}: {len(coefficients)} SH values of {header.count('sh'):,} Gaussians", section="sh")
     k = len(coefficients) // 3
     limits.check(count, count * (56 + 12 * k), name)

@@ -135,7 +135,8 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     if version not in (1, 2):
         raise BitstreamError(f"{bundle.name}: version {version!r:.20} of SOG; 1 and 2 are read")
     report.version = str(version)
-    count = _count(bundle, version, limits.max_gaussians)
+    count = _count(bundle, version)
+    limits.check(count, 56 * count, bundle.name)
     images = _checked_images(bundle, count)
     shared = {name: _texels(data, name, count) for name, data in images}
     low, high, scales, quats, sh0 = shared.values()
@@ -151,7 +152,8 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     )
 
 
-def _count(bundle: _Bundle, version: int, most: int) -> int:
+def _count(bundle: _Bundle, version: int) -> int:
+    most = LARGEST_SIDE**2
     if version == 2:
         return bundle.count(bundle.meta, "count", most)
     shape = bundle.part("means").get("shape")

@@ -27,7 +27,10 @@ def inflate(data: bytes | memoryview, most: int, name: str) -> bytes:
     """Inflate a gzip stream, at most `most` bytes of it, whatever it claims. Raises BitstreamError."""
     decoder = gzip_codec.decompressobj(wbits=_GZIP)
     try:
-        return bytes(decoder.decompress(data, most))
+        content = bytes(decoder.decompress(data, most))
+        if len(content) < most and not decoder.eof:
+            raise BitstreamError(f"{name}: its gzip stream does not end: the file is truncated")
+        return content
     except (zlib.error, gzip_codec.error) as error:
         raise BitstreamError(f"{name}: damaged gzip stream: {error}") from error
 
