@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from sw_interchange import GaussianScene, encode
+from sw_interchange.bands import COEFFICIENTS
 from sw_interchange.ksplat import HEADER, SECTION_HEADER, _row_type
-from sw_interchange.scene import COEFFICIENTS
 
 
 def random_scene(n: int, degree: int, seed: int = 0) -> GaussianScene:

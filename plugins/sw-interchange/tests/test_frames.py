@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from interchange_files import random_scene
 from sw_interchange import GaussianScene
+from sw_interchange.bands import COEFFICIENTS, SH_C0
 from sw_interchange.frames import axes_of, band_rotation, flipped, sh_band, sh_signs, transformed
-from sw_interchange.scene import COEFFICIENTS, SH_C0
 
 from splatwizard_core.api import UserInputError
 

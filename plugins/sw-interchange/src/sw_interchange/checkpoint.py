@@ -17,7 +17,8 @@ import numpy as np
 
 from splatwizard_core.api import BitstreamError, SceneError
 from sw_interchange.archive import entries_of
-from sw_interchange.scene import COEFFICIENTS, SH_C0, Array, GaussianScene, Limits, ReadReport
+from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
+from sw_interchange.scene import GaussianScene, Limits, ReadReport
 from sw_interchange.source import Source
 
 _NERFSTUDIO = "_model.gauss_params."

@@ -10,20 +10,11 @@ import numpy.typing as npt
 from sw_gaussians.ply_tables import MAX_HEADER, Table, read_header, read_tables
 
 from splatwizard_core.api import BitstreamError
+from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
 from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, from_smallest_three, smallest_three
-from sw_interchange.scene import (
-    COEFFICIENTS,
-    LARGEST_LOGIT,
-    SH_C0,
-    Array,
-    GaussianScene,
-    Limits,
-    ReadReport,
-    WriteReport,
-    sigmoid,
-)
+from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, WriteReport, sigmoid
 from sw_interchange.source import Source
 
 CHUNK = 256

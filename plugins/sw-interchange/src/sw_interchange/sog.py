@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError
 from sw_interchange.archive import read_archive
+from sw_interchange.bands import Array
 from sw_interchange.quats import ROOT_2, from_smallest_three
-from sw_interchange.scene import LARGEST_LOGIT, Array, GaussianScene, Limits, ReadReport, logit_of_byte
+from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, logit_of_byte
 from sw_interchange.source import Source
 from sw_interchange.webp import LARGEST_SIDE, Pixels, decode_image, image_size
 

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.quats import from_smallest_three, smallest_three
-from sw_interchange.scene import COEFFICIENTS, Array, GaussianScene, WriteReport, logit_of_byte, sigmoid
+from sw_interchange.scene import GaussianScene, WriteReport, logit_of_byte, sigmoid
 from sw_interchange.threads import each_of, rows_of
 
 if TYPE_CHECKING:
