@@ -11,7 +11,7 @@ import torch
 from splatwizard_core.tooling import NegotiatedRasterizer, open_subject, render_view
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import Camera, RasterOptions, RenderResult, Scene, SplatModel
+    from splatwizard_core.api import Camera, RasterOptions, RenderResult, Scene, SplatModel, View
     from splatwizard_core.tooling import ResolvedConfig, Session
 
 
@@ -37,6 +37,12 @@ class Drawing:
         with torch.no_grad():
             scales = self.model.gaussians(camera.to(self.device), self.rasterizer).scales
         return scales is not None and scales.shape[-1] == 2
+
+    def views(self, which: str) -> list[View]:
+        """Views of the scene: "test", "train" or "all", each name once."""
+        train, test = self.scene.train, self.scene.test
+        wanted = {"test": test, "train": train, "all": [*train, *test]}[which]
+        return list({view.name: view for view in wanted}.values())
 
     @property
     def depth_ratio(self) -> float:
