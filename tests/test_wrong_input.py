@@ -93,6 +93,8 @@ ROWS = [
     Row("decode {grey.swz} --repeats -1", "Invalid value for '--repeats'"),
     Row("mesh {grey.swz} --scene demo:tiny --depth ratio=2", "must be expected, median, or ratio=R with R in 0..1"),
     Row("render {grey.swz} --views some", "'some' is not one of 'test', 'train', 'all'"),
+    Row("bake {grey.swz} {new}.ply --scene demo:tiny", "explicit already"),
+    Row("bake {grey.swz} {new}.ply --sh-degree 4", "4 is not in the range 0<=x<=3"),
     Row("render {grey.swz} --trajectory orbti", "'orbti' is none of orbit, spiral, cameras, and no file"),
     Row("render {grey.swz} --video {new}.mp4", "are for --trajectory"),
     Row("render {grey.swz} --scene demo:tiny --trajectory {notes.txt}", "not a JSON file of cameras"),

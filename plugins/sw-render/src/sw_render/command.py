@@ -9,7 +9,6 @@ from typing import Any
 
 import click
 
-from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import (
     EXISTING,
     OUTPUT_FILE,
@@ -133,7 +132,7 @@ def render(
     depth; only surfels have normals of their own. With --trajectory the cameras move, and --video makes one file of the
     frames. What the arrays hold, and the JSON of cameras, is in the README of sw-render.
     """
-    from sw_render.drawing import open_drawing
+    from sw_render.drawing import encoded_file, open_drawing
     from sw_render.exr import exr_library
     from sw_render.films import draw_films
     from sw_render.map_files import MapFiles
@@ -159,7 +158,7 @@ def render(
         check_video(video)
     if file.is_dir():
         chosen = replace(chosen, config_file=chosen.config_file or str(file / "config.toml"))
-        file = _encoded(file)
+        file = encoded_file(file)
     resolved = chosen.resolve_without_method()
     drawing = open_drawing(file, open_session(resolved, load_plugins()), resolved)
     if trajectory is None:
@@ -183,13 +182,3 @@ def render(
     if not request.is_empty:
         facts |= {"normals": request.normals, "rasterizers": drawing.rasterizer.choices}
     print_facts(facts, as_json, told)
-
-
-def _encoded(directory: Path) -> Path:
-    """The file of a run directory. Raises UserInputError."""
-    found = directory / "scene.swz"
-    if not found.is_file() or not (directory / "config.toml").is_file():
-        raise UserInputError(
-            f"{directory} is no finished run directory, it has no scene.swz and config.toml: name a file"
-        )
-    return found

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import NegotiatedRasterizer, open_subject, render_view
 
 if TYPE_CHECKING:
@@ -59,3 +60,13 @@ def open_drawing(path: Path, session: Session, resolved: ResolvedConfig) -> Draw
     found = open_subject(path, session, resolved)
     assert isinstance(found.rasterizer, NegotiatedRasterizer)  # a session has no other
     return Drawing(found.model, found.scene, found.rasterizer, found.options, session.device)
+
+
+def encoded_file(directory: Path) -> Path:
+    """Return the file of a run directory. Raises UserInputError."""
+    found = directory / "scene.swz"
+    if not found.is_file() or not (directory / "config.toml").is_file():
+        raise UserInputError(
+            f"{directory} is no finished run directory, it has no scene.swz and config.toml: name a file"
+        )
+    return found
