@@ -41,8 +41,10 @@ def nearest(x: Tensor, entries: Tensor, *, block: int | None = None, others: boo
     Two entries that are nearer to each other than about 1e-3 of the size of the whole codebook may be taken for one
     another in float32. Not differentiable.
     """
-    rows_at_once = min(block_rows(len(entries), x.device, block), max(len(x), 1))
     search = None if others else _by_boxes(x, entries)
+    # Boxes are made for each tile, in the time that some 1,500 rows take; they need no scores.
+    rows_at_once = block_rows(len(entries) if search is None else 1, x.device, block)
+    rows_at_once = min(rows_at_once, max(len(x), 1))
     if search is None:
         search = _by_products(entries, rows_at_once, others=others)
     index = torch.empty(len(x), dtype=torch.int64, device=x.device)
