@@ -65,11 +65,16 @@ def points(records: Rows) -> list[list[SmallRecord]]:
 
 
 def smaller(group: Rows, records: Rows) -> list[float | None]:
-    """Divide the float32 .ply of the same seed's 3DGS by each file."""
+    """Divide the float32 .ply of the same seed's 3DGS by each file, that of the same repetition if there is one."""
     plain = [r for r in records if r.method == BASE and not r.variant]
     exact = max((r.rate for r in plain), default="")
-    base = {r.seed: PLY_BYTES * r.gaussians for r in plain if r.rate == exact and r.gaussians}
-    return [base[r.seed] / r.bytes if r.seed in base else None for r in group]
+    base: dict[tuple[int, int | None], int] = {}
+    for r in plain:
+        if r.rate == exact and r.gaussians:
+            base[r.seed, r.repetition] = PLY_BYTES * r.gaussians
+            base.setdefault((r.seed, None), PLY_BYTES * r.gaussians)
+    of = [base.get((r.seed, r.repetition), base.get((r.seed, None))) for r in group]
+    return [None if size is None else size / r.bytes for r, size in zip(group, of, strict=True)]
 
 
 def title(group: Rows) -> str:
@@ -164,10 +169,11 @@ def filled(text: str, records_at: Path = RECORDS) -> str:
     return MARKED.sub(lambda m: f"{m[1]}{table(m[2], m[3], records_at)}{m[4]}", text)
 
 
-def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "") -> list[Path]:
+def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "", repetition: int = 0) -> list[Path]:
     """Keep the small records of all runs under `roots`, by scene; one with the key of an older one takes its place.
 
-    name    of the file in place of the scene's, if all runs are of one scene
+    name        of the file in place of the scene's, if all runs are of one scene
+    repetition  of all of them: those of another number stay beside them
 
     Raises SystemExit where there is no run, or the runs of several protocols would come together.
     """
@@ -179,7 +185,7 @@ def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = ""
         raise SystemExit(f"no metrics.json below {', '.join(map(str, roots))}")
     by_file = defaultdict(list)
     for run in runs:
-        record = extract(run, plugins)
+        record = extract(run, plugins, repetition)
         by_file[name or record.scene].append(record)
     written = []
     for file, new in by_file.items():
@@ -200,6 +206,7 @@ def main() -> int:
     gather = commands.add_parser("collect", help="records of runs, then the tables")
     gather.add_argument("out", nargs="+", type=Path, metavar="OUT", help="where runs lie, at any depth")
     gather.add_argument("--name", default="", help="of the file in docs/records (default: the scene)")
+    gather.add_argument("--repetition", type=int, default=0, help="number of this matrix of runs (default: 0)")
     gather.add_argument("--fresh", action="store_true", help="drop the records that are there first")
     write_tables = commands.add_parser("tables", help="the tables from the records")
     write_tables.add_argument("--check", action="store_true", help="write nothing, status 1 where they disagree")
@@ -209,7 +216,7 @@ def main() -> int:
             (RECORDS / f"{args.name}.jsonl").unlink(missing_ok=True)
         elif args.fresh:
             parser.error("--fresh needs --name")
-        for path in collect(args.out, name=args.name):
+        for path in collect(args.out, name=args.name, repetition=args.repetition):
             print(path)
     stale = []
     for page in PAGES:
