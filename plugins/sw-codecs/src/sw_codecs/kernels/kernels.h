@@ -7,6 +7,8 @@
 //                  and dL/dfound are the first of levels * features columns of rows that are `row` long
 //   huffman_decode codes of `n` symbols, bits of a byte from the lowest one -> whether the bytes sufficed.
 //                  counts [trees][size], size >= 2; index [n] below trees. Source: docs/bitstream.md, Huffman codes
+//   nearest_entries rows [n][dim], entries [size][dim], size > 0 -> index [n] of the nearest entry; returns the share
+//                  0..1 of the distances that were computed. Of values that are not finite an index is some entry's
 #pragma once
 
 #include <splatwizard/dispatch.h>
@@ -26,6 +28,8 @@
                       const splatwizard::Parallel& parallel);                                                       \
   bool huffman_decode(const uint8_t* bytes, int64_t length, const float* counts, int64_t trees, int64_t size,       \
                       const int64_t* index, int64_t n, int32_t* symbols);                                           \
+  double nearest_entries(const float* rows, int64_t n, const float* entries, int64_t size, int dim, int64_t* index, \
+                         const splatwizard::Parallel& parallel);                                                    \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_GRID)
 #undef SW_DECLARE_GRID
