@@ -38,9 +38,11 @@ def gradients(found, leaves, generator):
 
 
 @pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize(("n", "dtype", "tolerance"), [(40, torch.float32, 1e-5), (40, torch.float64, 1e-10),
+@pytest.mark.parametrize("learns", [True, False])
+@pytest.mark.parametrize(("n", "dtype", "tolerance"), [(250, torch.float32, 1e-5), (40, torch.float64, 1e-10),
                                                        (0, torch.float32, 0)])  # fmt: skip
-def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
+def test_spawning_equals_the_same_written_out(masked, learns, n, dtype, tolerance):
+    """With positions that learn, networks and Gaussians are apart; else on the CPU they are one kernel."""
     g, k, width = torch.Generator().manual_seed(0), 5, 7
 
     def leaf(*shape):
@@ -50,7 +52,9 @@ def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
     masks = (torch.rand(n, k, generator=g) > 0.3).to(dtype).requires_grad_() if masked else None
     tensors = [leaf(n, 3), leaf(n, width), leaf(n, k, 3), leaf(n, 6)]
     center = torch.tensor([0.3, -2.0, 5.0], dtype=dtype)
-    leaves = [*tensors, *([masks] if masked else []), *(p for network in networks for p in network.parameters())]
+    tensors[0].requires_grad_(learns)
+    own = tensors if learns else tensors[1:]
+    leaves = [*own, *([masks] if masked else []), *(p for network in networks for p in network.parameters())]
     expected = written_out(center, *tensors, masks, networks)
     found = spawn(center, *tensors, masks, networks)
     found = tuple(getattr(found, name) for name in
@@ -60,6 +64,27 @@ def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
     pairs = [gradients(each, leaves, torch.Generator().manual_seed(1)) for each in (found, expected)]
     for a, b in zip(*pairs, strict=True):
         torch.testing.assert_close(a, b, atol=10 * tolerance, rtol=10 * tolerance)
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_one_kernel_gives_the_same_bits_on_any_number_of_threads(threads):
+    g, n, k = torch.Generator().manual_seed(0), 3000, 8
+    networks = tuple(two_layers(28, 48, out * k, g) for out in (1, 7, 3))
+    tensors = [torch.randn(size, generator=g) for size in ((n, 3), (n, 24), (n, k, 3), (n, 6))]
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (1, threads):
+            torch.set_num_threads(count)
+            leaves = [t.clone().requires_grad_() for t in tensors[1:]]
+            spawned = spawn(torch.zeros(3), tensors[0], *leaves, None, networks)
+            parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
+            learning = [*leaves, *(p for network in networks for p in network.parameters())]
+            total = sum((part * part).flatten()[:: i + 2].sum() for i, part in enumerate(parts))
+            found.append([*parts, *torch.autograd.grad(total, learning)])
+    finally:
+        torch.set_num_threads(before)
+    assert len(spawned.drawn) > n  # on threads indeed
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
 def test_gradients_of_networks_are_aligned_for_the_optimizer():
