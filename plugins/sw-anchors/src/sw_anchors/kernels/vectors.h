@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <initializer_list>
 
 namespace SW_ARCH {
 
@@ -20,12 +21,14 @@ typedef float VecLoad __attribute__((vector_size(4 * LANES), aligned(4)));
 
 inline Vec load(const float* p) { return *reinterpret_cast<const VecLoad*>(p); }
 inline void store(float* p, Vec v) { *reinterpret_cast<VecLoad*>(p) = v; }
-inline Vec all(float x) {
-  Vec v;
-#pragma GCC unroll 16
-  for (int i = 0; i < LANES; ++i) v[i] = x;
-  return v;
-}
+// Written out: from a loop GCC makes no broadcast.
+#if defined(__AVX512F__)
+inline Vec all(float x) { return Vec{x, x, x, x, x, x, x, x, x, x, x, x, x, x, x, x}; }
+#elif defined(__AVX__)
+inline Vec all(float x) { return Vec{x, x, x, x, x, x, x, x}; }
+#else
+inline Vec all(float x) { return Vec{x, x, x, x}; }
+#endif
 
 inline int64_t padded(int64_t count, int64_t unit) { return (count + unit - 1) / unit * unit; }
 
