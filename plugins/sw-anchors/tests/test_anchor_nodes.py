@@ -5,6 +5,7 @@ import torch
 from sw_anchors.anchors import two_layers
 from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, widen
 from sw_anchors.neural_gaussians import spawn
+from sw_anchors.noisy_values import Noise, noisy_values
 
 
 def written_out(center, positions, features, offsets, scales, masks, networks):
@@ -118,6 +119,33 @@ def test_values_and_masks_equal_indexing(weighted):
     right = torch.autograd.grad((expected * to_values).sum() + (soft * to_masks).sum(), leaves)
     for a, b in zip(found, right, strict=True):
         torch.testing.assert_close(a, b)
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize("steps", ["none", "of all", "of each"])
+def test_noisy_values_of_the_kernel_equal_those_of_operators(weighted, steps):
+    """float64 has no kernel."""
+    g, n, k = torch.Generator().manual_seed(0), 700, 3
+    tables = [torch.randn(size, generator=g) for size in ((n, 5), (n, 6), (n, k, 3), (n, k))]
+    rows = torch.randperm(n, generator=g)[:600]
+    drawn = torch.nonzero(torch.rand(600, generator=g) < 0.1).squeeze(1)
+    weights = torch.rand(n, 1, generator=g) if weighted else None
+    step = torch.rand((3,) if steps == "of all" else (600, 3), generator=g)
+    uniform, slopes = torch.rand(600, 5 + 6 + 3 * k, generator=g), torch.randn(600, 5 + 6 + 4 * k, generator=g)
+    group = torch.tensor([0] * 5 + [1] * 6 + [2] * 3 * k)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [t.to(dtype).requires_grad_() for t in tables]
+        own = step.to(dtype).requires_grad_(steps == "of each")
+        columns = group, torch.nn.functional.one_hot(group, 3).to(dtype)
+        noise = None if steps == "none" else Noise(own, uniform.to(dtype), columns)
+        values = noisy_values(rows, tuple(leaves), None if weights is None else weights.to(dtype), 0.4, noise, drawn)
+        parts = [values.features, values.scales, values.offsets.flatten(1), values.masks]
+        total = (torch.cat(parts, dim=1) * slopes.to(dtype)).sum() + values.sample.square().sum()
+        learning = [*leaves, *([own] if steps == "of each" else [])]
+        found.append([*parts, values.sample, *torch.autograd.grad(total, learning)])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a.double(), b.double(), atol=2e-5, rtol=2e-5)  # exp in float32
 
 
 def test_rows_columns_and_products_have_their_gradients():

@@ -9,6 +9,7 @@
 //                    `from.geometry` and `from.color` are these outputs, `compact`
 //   heads_backward   all gradients, `to` as of spawn_backward, `to_features` [n, features]; sums of weights the same for
 //                    any number of threads
+//   noisy_values     values of some anchors with noise, and all numbers of a sample of these
 #pragma once
 
 #include <splatwizard/dispatch.h>
@@ -16,6 +17,7 @@
 
 #include "heads.h"
 #include "spawn.h"
+#include "values.h"
 
 #define SW_DECLARE_ANCHORS(arch)                                                                                  \
   namespace arch {                                                                                              \
@@ -35,6 +37,10 @@
                       const sw_anchors::Heads& heads, const float* hidden, const sw_anchors::Gaussians& slope,  \
                       const sw_anchors::Gradients& to, float* to_features,                                      \
                       const sw_anchors::HeadGradients& to_heads, const splatwizard::Parallel& parallel);        \
+  void noisy_values(const sw_anchors::Rows& from, const sw_anchors::RowValues& to,                              \
+                    const splatwizard::Parallel& parallel);                                                     \
+  void noisy_values_backward(const sw_anchors::Rows& from, const sw_anchors::RowValues& slope,                  \
+                             const sw_anchors::RowGradients& to, const splatwizard::Parallel& parallel);        \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_ANCHORS)
 #undef SW_DECLARE_ANCHORS
