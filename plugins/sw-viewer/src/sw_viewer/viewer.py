@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     import viser
 
 INSTALL = "pip install 'sw-viewer[viser]'"
-LIT = 0.5
-"""Of a colour, under the lights of viser: they would bleach it otherwise."""
 QUALITY_MOVING, QUALITY_STILL = 70, 92  # JPEG
 
 
@@ -165,7 +163,9 @@ class Viewer:
             quality = QUALITY_STILL if share == 1 else QUALITY_MOVING
             visitor.client.scene.set_background_image(pixels, format="jpeg", jpeg_quality=quality)
             size = f"{camera.width} x {camera.height} in {1000 * seconds:.0f} ms"
-            visitor.told.content = "  \n".join(filter(None, [self.note, left.told(), size]))
+            beside = visitor.beside.value
+            second = "" if beside == NOTHING else f"right: {self._exhibit(beside).told()}"
+            visitor.told.content = "  \n".join(filter(None, [self.note, left.told(), second, size]))
         self.pictures += 1
 
     def _drawn(self, visitor: Visitor, left: Exhibit, camera: Camera) -> Pixels:
@@ -202,7 +202,7 @@ class Viewer:
         return visitor.client.scene.add_batched_meshes_simple(
             f"/{ELLIPSOIDS}", vertices, faces, solid.quats, solid.means,
             batched_scales=solid.scales * np.float32(visitor.sigmas.value), lod="off",
-            batched_colors=(LIT * solid.colors).astype(np.uint8), cast_shadow=False, receive_shadow=False,
+            batched_colors=_lit(solid.colors), cast_shadow=False, receive_shadow=False,
         )  # fmt: skip
 
     def _frusta(self) -> list[viser.CameraFrustumHandle]:
@@ -210,8 +210,9 @@ class Viewer:
         for i, each in enumerate(self._around.cameras):
             camera = each.camera
             frustum = self.server.scene.add_camera_frustum(
-                f"/cameras/{i}", camera.fov_y, camera.width / camera.height, scale=0.06 * self._around.size,
-                color=(230, 120, 30), wxyz=orientation_of(camera), position=camera.center.cpu().numpy(), visible=False,
+                f"/cameras/{i}", camera.fov_y, camera.width / camera.height, scale=0.04 * self._around.size,
+                thickness=0.004 * self._around.size, color=(230, 120, 30), visible=False,
+                wxyz=orientation_of(camera), position=camera.center.cpu().numpy(),
             )  # fmt: skip
 
             def jump(event: viser.SceneNodePointerEvent[viser.CameraFrustumHandle], name: str = each.name) -> None:
@@ -223,3 +224,9 @@ class Viewer:
             frustum.on_click(jump)
             found.append(frustum)
         return found
+
+
+def _lit(colors: Pixels) -> Pixels:
+    """Darken colours for the lights of viser, which would bleach them."""
+    lit: Pixels = (0.8 * 255 * (colors / 255.0) ** 2).astype(np.uint8)
+    return lit
