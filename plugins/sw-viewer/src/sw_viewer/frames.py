@@ -26,15 +26,24 @@ LARGEST_SIDE = 1920
 class Pace:
     """Share of the side lengths that is drawn while the camera moves: as many pixels as the budget allows.
 
-    The time of a frame is taken as a fixed part and a part in proportion to its pixels; the former is the rasterizer's
-    work on Gaussians, which fewer pixels do not save, so a share is only ever lowered by halves of what is asked.
+    The seconds of a frame are taken as fixed + slope * share^2, by its last two frames of different shares: what is
+    spent on Gaussians is fixed, and fewer pixels do not save it. Where it alone is over the budget, the pixels may take
+    as long again.
     """
 
     share: float = 0.5
+    fixed: float = 0.0
+    _last: tuple[float, float] | None = None
 
     def drew(self, share: float, seconds: float) -> None:
         """Learn from a frame: its share of the side lengths, and the seconds that it took."""
-        wanted = share * math.sqrt(BUDGET / max(seconds, 1e-4))
+        area = share * share
+        if self._last is not None and abs(area - self._last[0]) > 0.2 * area:
+            slope = max(0.0, (seconds - self._last[1]) / (area - self._last[0]))
+            self.fixed = max(0.0, seconds - slope * area)
+        self._last = (area, seconds)
+        slope = max(seconds - self.fixed, 1e-4) / area
+        wanted = math.sqrt(max(BUDGET - self.fixed, self.fixed) / slope)
         self.share = min(1.0, max(LEAST_SHARE, 0.5 * self.share + 0.5 * wanted))
 
     def of(self, still_for: float) -> float:
