@@ -109,10 +109,13 @@ def render_page(collection: Collection, options: PageOptions, folder: Path | Non
 
 def scene_links(runs: Sequence[Run], folder: Path) -> list[tuple[str, str]]:
     """Return (address relative to `folder`, name) of the pages in 3D that sw-viewer left beside the records."""
-    found = [(run.directory / SCENE_PAGE, run) for run in runs if (run.directory / SCENE_PAGE).is_file()]
-    names = ["Look at it in 3D"] if len(runs) == 1 else [f"{run.label} on {run.facts.scene}" for _, run in found]
-    addresses = [quote(os.path.relpath(page, folder).replace(os.sep, "/")) for page, _ in found]
-    return list(zip(addresses, names, strict=True))[:MOST_LINKS]
+    found = []
+    for run in runs:
+        page = run.directory / SCENE_PAGE
+        if page.is_file():
+            name = "Look at it in 3D" if len(runs) == 1 else f"{run.label} on {run.facts.scene}"
+            found.append((quote(os.path.relpath(page, folder).replace(os.sep, "/")), name))
+    return found[:MOST_LINKS]
 
 
 def _unique(values: Sequence[str]) -> list[str]:
