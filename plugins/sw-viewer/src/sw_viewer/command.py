@@ -26,7 +26,11 @@ from splatwizard_core.tooling import (
     takes_choices,
 )
 
-LOCAL = "127.0.0.1"
+LOCAL, EVERYWHERE = "127.0.0.1", "0.0.0.0"
+
+
+def _addresses(_context: click.Context, _parameter: click.Parameter, incomplete: str) -> list[str]:
+    return [address for address in (LOCAL, EVERYWHERE) if address.startswith(incomplete)]
 
 
 @click.command(short_help="look at decoded models in the browser")
@@ -34,10 +38,10 @@ LOCAL = "127.0.0.1"
 @options(
     click.option("--port", type=click.IntRange(0, 65535), default=8080, show_default=True, metavar="N",
                  help="Port of the server; another one if it is taken."),
-    click.option("--host", default=LOCAL, show_default=True, metavar="ADDRESS",
+    click.option("--host", default=LOCAL, show_default=True, metavar="ADDRESS", shell_complete=_addresses,
                  help="Address that the server listens on; 0.0.0.0: all of this machine's, open to its network."),
     click.option("--html", "page", type=OUTPUT_FILE, metavar="FILE",
-                 help="Write one HTML file that shows the model offline, in place of a server."),
+                 help="Write one HTML file that shows the model offline.  [default: none, but a server]"),
     scene_option, images_option, config_option, set_option, device_option, json_option, debug_option,
 )  # fmt: skip
 @takes_choices
