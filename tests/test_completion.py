@@ -49,6 +49,7 @@ def offered(line: str, incomplete: str = "") -> list[str]:
         ("export a b --format", "pl", ["ply", "ply-as-3dgs"]),
         ("render x.swz --depth", "me", ["median"]),
         ("view", "a", ["<file>"]),
+        ("render x.swz --trajectory", "o", ["orbit"]),
         ("decode", "a", ["<file>"]),
         ("run --out", "a", ["<dir>"]),
         ("run --scene", "de", ["<dir>", "demo"]),

@@ -46,7 +46,10 @@ ROOMS = {
 }
 """Room of the core -> the rooms that it may import when it runs. What only a type checker reads is free."""
 
-LIBRARIES = {"sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference", "sw_render"}
+LIBRARIES = {
+    "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference", "sw_interchange",
+    "sw_render",
+}  # fmt: skip
 """Packages that others may import when they declare them."""
 ABOUT_RUNS = {
     "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_render", "sw_report",
