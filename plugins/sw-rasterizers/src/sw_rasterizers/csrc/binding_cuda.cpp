@@ -155,7 +155,7 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   const bool absgrad = flags & kAbsgrad, median = flags & kMedianDepth;
   const int length = row_length(channels.total(), absgrad, median);
   const Tensor row_memory = at::zeros({gaussians, length}, image_gradient.options().requires_grad(false));
-  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
+  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
   Image image{};
   image.channels = channels.total(), image.color_channels = channels.colors;
   image.background = data<float>(background);
@@ -234,7 +234,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   };
   out.grad2d = screen(kWantGrad2d);
   out.absgrad2d = screen(kWantAbsgrad2d);
-  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
+  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
   if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
