@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
@@ -34,8 +34,9 @@ class CadencedOptimizer(SplatOptimizer):
         every: int,
         slow: tuple[str, ...] = ("sh_rest",),
         pace: str = "sh_dc",
+        **settings: Any,
     ) -> None:
-        super().__init__(model, groups)
+        super().__init__(model, groups, **settings)
         self.every, self.slow, self.pace = every, slow, pace
 
     def due(self) -> Iterator[tuple[str, AdamUpdate]]:

@@ -98,8 +98,7 @@ class OptimizationParams(Params):
 
     iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     scale_schedule: bool = Field(
-        False,
-        description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run",
+        False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"
     )
 
     @property
