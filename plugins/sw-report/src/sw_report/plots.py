@@ -234,9 +234,9 @@ def _training_figures(drawn: Sequence[Drawn]) -> list[Figure]:
     add("Training loss (logarithmic, means of neighbouring steps)", "Training loss over steps", lambda c: c.loss,
         log=True)  # fmt: skip
     for name in sorted({name for d in drawn for name in d.curves.quality}, key=lambda name: (name != "psnr", name)):
-        heading = metric_style(name).heading
-        add(f"{heading} of the test views over seconds of training, evaluation not counted",
-            f"{heading} over seconds of training", lambda c, name=name: c.quality.get(name, []),  # type: ignore[misc]
+        style = metric_style(name)
+        add(f"{style.label} of the test views over seconds of training, evaluation not counted",
+            f"{style.heading} over seconds of training", lambda c, name=name: c.quality.get(name, []),  # type: ignore[misc]
             over="seconds of training")  # fmt: skip
     counted = {key for d in drawn for key in d.curves.counts}
     for key in sorted(counted, key=lambda key: (key != "num_gaussians", key)):
