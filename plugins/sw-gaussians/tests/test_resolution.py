@@ -60,10 +60,6 @@ def test_scales_fall_to_one_and_pixels_grow_linearly_between():
     assert resolution_plan([image], image, full_at=8000, most=1.0) == ResolutionPlan((0,), (1.0,))
 
 
-def test_the_position_rate_may_fall_from_the_last_level_above_two():
-    assert ResolutionPlan((0, 10, 20, 30), (4.0, 3.0, 1.5, 1.0)).near_full == 10
-
-
 def views(sizes=((24, 16), (24, 16))) -> list[View]:
     eye = torch.eye(3)
     made = []

@@ -80,13 +80,7 @@ class ResolutionPlan:
             return 1.0
         t0, t1 = self.times[at - 1], self.times[at]
         p0, p1 = self.scales[at - 1] ** -2, self.scales[at] ** -2
-        return (p0 + (step - t0) / (t1 - t0) * (p1 - p0)) ** -0.5
-
-    @property
-    def near_full(self) -> int:
-        """Step from which pictures are at most twice too small."""
-        first = next(k for k, scale in enumerate(self.scales) if scale < 2)
-        return self.times[max(0, first - 1)]
+        return float((p0 + (step - t0) / (t1 - t0) * (p1 - p0)) ** -0.5)
 
 
 def resolution_plan(spectra: Sequence[Spectrum], mean: Spectrum, *, full_at: int, most: float = 4.0) -> ResolutionPlan:
