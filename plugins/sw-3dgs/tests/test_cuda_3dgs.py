@@ -20,6 +20,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
+from splatwizard_native import seeded
 from splatwizard_native.fused.native import TRAINING
 from sw_3dgs.config import ThreeDGSConfig
 
@@ -88,6 +89,29 @@ def waits_for_nothing(trainer: Trainer) -> None:
     trainer.check_losses()
     assert all(math.isfinite(record.total.item()) for record in records)
     assert trainer.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
+
+
+DENSE = {"densify": {"start": 60, "interval": 40, "grad_threshold": 5e-5, "reset_interval": 150}, "iterations": 7000}
+CHAIN = {"mcmc": {"enabled": True, "start": 60, "interval": 40, "cap": 700}, "iterations": 7000}
+
+
+@pytest.mark.parametrize("values", [DENSE, {**DENSE, "sparse_adam": "per_row"}, CHAIN], ids=["dense", "sparse", "mcmc"])
+def test_two_deterministic_trainings_give_the_same_bits(values):
+    config = ThreeDGSConfig.model_validate(values)
+    outcomes = []
+    for _ in range(2):
+        losses = []
+        with seeded(0, deterministic=True):
+            trainer = make_trainer(small_scene(3), config, deterministic=True)
+            trainer.run(250, lambda record, losses=losses: losses.append(record.total))
+        outcomes.append((torch.stack(losses), dict(trainer.model.named_parameters()), trainer.optimizer.states))
+    (losses, parameters, states), (others, theirs, other_states) = outcomes
+    assert torch.equal(losses, others)
+    assert len(parameters["means"]) != 500  # densification took part
+    for name, parameter in parameters.items():
+        assert torch.equal(parameter, theirs[name]), name
+        for key, moment in states[name].tensors.items():
+            assert torch.equal(moment, other_states[name].tensors[key]), (name, key)
 
 
 def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():

@@ -40,6 +40,7 @@ class Flag(enum.IntFlag):
     FLASH = 8192  # CUDA only
     TENSOR_CORES = 16384
     BYTES = 32768
+    ORDERED = 131072
 
 
 @dataclass

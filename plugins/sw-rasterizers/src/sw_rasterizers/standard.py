@@ -122,6 +122,7 @@ class StandardRasterizer:
         flags = _flags(
             opt.profile, opt.clamp_grad, frozenset(opt.depth), opt.antialias, opt.clamp_color,
             opt.features_detach_geometry, opt.absgrad, opt.alpha, self.count,
+            torch.are_deterministic_algorithms_enabled(),
         )  # fmt: skip
         watch = torch.is_grad_enabled()
         background = opt.background_of(3 if g.colors is None else g.colors.shape[1], cam, g.means)
@@ -165,6 +166,7 @@ def _flags(
     absgrad: bool,
     alpha: bool,
     count: bool,
+    ordered: bool,
 ) -> Flag:
     """The switches of the kernels that these options stand for."""
     quirks = profile == "dgr-exact"
@@ -182,6 +184,7 @@ def _flags(
         (absgrad, Flag.ABSGRAD),
         (alpha or "expected" in depth, Flag.ALPHA_MAP),
         (count, Flag.COUNT),
+        (ordered, Flag.ORDERED),
     ):
         if asked:
             flags |= flag

@@ -160,10 +160,9 @@ class SplatOptimizer:
                 expected=(model.num_rows,),
             )
         index = mask.nonzero().squeeze(1)
-        everything = index.numel() == mask.numel()
 
         def kept(tensor: Tensor) -> Tensor:
-            return tensor if everything else tensor.index_select(0, index)
+            return tensor if index.numel() == mask.numel() else tensor.index_select(0, index)
 
         for name in model.ROWS:
             old = attrgetter(name)(model)

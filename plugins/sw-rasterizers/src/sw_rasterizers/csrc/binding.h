@@ -36,6 +36,7 @@ enum Flag : int64_t {  // mirrored in ops.py
   kTensorCores = 16384,
   kBytes = 32768,
   kForScores = 65536,  // between the ops on CUDA: with kSave, nothing that only the backward pass needs
+  kOrdered = 131072,   // CUDA: sums of the backward pass in one order; on the CPU they always are
 };
 
 template <class S>

@@ -166,9 +166,24 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   const ImageGradient gradient{data<float>(image_gradient), data<float>(alpha_gradient), data<float>(median_gradient)};
   const Splats splats = splats_of(saved[kShape], saved[kChannelRows]);
   const bool general = channels.total() != 3 || channels.colors != 3 || median;
-  if (saved[kSplat].numel() > 0)
+  Ordered ordered{};
+  Tensor pair_sums;
+  Grouped pairs_of_splat, pixels_of_gaussian;
+  const int64_t pairs = saved[kSplat].numel();
+  if ((flags & kOrdered) && pairs > 0) {
+    ordered.pairs = pairs, ordered.splats = saved[kShape].size(0), ordered.gaussians = gaussians;
+    pair_sums = at::empty({pairs, pair_row_length(general, absgrad)}, row_memory.options());
+    ordered.pair_sums = data<float>(pair_sums);
+    pairs_of_splat = Grouped(saved[kSplat], ordered.splats, stream);
+    ordered.pairs_of_splat = pairs_of_splat.groups();
+    if (gradient.median != nullptr) {
+      pixels_of_gaussian = Grouped(saved[kMedianSplat], gaussians, stream);
+      ordered.pixels_of_gaussian = pixels_of_gaussian.groups();
+    }
+  }
+  if (pairs > 0)
     blend_backward(view, flags & kPassClamp, splats, {data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])},
-                   image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, stream);
+                   image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, ordered, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
   return {row_memory, clock.seconds()};
