@@ -9,6 +9,7 @@ which slows the host: busy time of phases, launches and the host's waits are of 
 nothing to do. The first size has next to nothing for the device: its wall clock is what the host takes for a step.
 
 dense           preset `paper`
+fused           spherical harmonics updated in the backward pass (`ThreeDGSStage.fuses_updates`)
 sparse          sparse_adam=per_row
 deterministic   deterministic=true: sums in one order
 """
@@ -45,7 +46,9 @@ SIZES = "2000@64x48,250000@799x532,1000000@799x532"
 VIEWS, ROUNDS, WARM_UP = 24, 3, 60
 # The plan of the first half, but for what changes the number of Gaussians.
 PLAN: dict[str, Any] = {"densify": {"start": 14_000, "stop": 15_000, "reset_interval": 15_000}}
-VARIANTS: dict[str, dict[str, Any]] = {"dense": {}, "sparse": {"sparse_adam": "per_row"}, "deterministic": {}}
+VARIANTS: dict[str, dict[str, Any]] = {
+    "dense": {}, "fused": {}, "sparse": {"sparse_adam": "per_row"}, "deterministic": {},
+}  # fmt: skip
 # Part of a kernel's name -> phase; the first that fits.
 PHASES = (
     ("project_backward_kernel", "gradients of inputs"), ("project_kernel", "project"), ("shade_kernel", "shade"),
@@ -91,6 +94,7 @@ def setting(variant: str) -> AbstractContextManager[None]:
 
 def trainer_of(variant: str, model: GaussianModel, scene: Scene, device: str) -> Trainer:
     stage = ThreeDGSStage(ThreeDGSConfig.model_validate({**PLAN, **VARIANTS[variant]}))
+    stage.fuses_updates = variant == "fused"
     ppl, streams = PipelineParams(device=device), Streams(0)
     rasterizer = NegotiatedRasterizer(load_plugins(), device=device)
     copy = GaussianModel.from_tensors(*(getattr(model, name).detach() for name in TENSORS)).to(device)

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from sw_gaussians.config import MCMC
+from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.mcmc import draw
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
@@ -112,6 +113,33 @@ def test_two_deterministic_trainings_give_the_same_bits(values):
         assert torch.equal(parameter, theirs[name]), name
         for key, moment in states[name].tensors.items():
             assert torch.equal(moment, other_states[name].tensors[key]), (name, key)
+
+
+@pytest.mark.parametrize("values", [DENSE, {**DENSE, "sh_interval": 5}, CHAIN], ids=["dense", "bands", "mcmc"])
+def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeypatch):
+    """Adam makes a step of a tiny gradient as large as of any: what rounding moves is bounded by the learning rate."""
+    config, outcomes, fused = ThreeDGSConfig.model_validate(values), [], []
+    step = FusingOptimizer.step
+
+    def spy(self, result=None):
+        fused.append(self.model.sh_rest.grad is None and self.model.means.grad is not None)
+        step(self, result)
+
+    monkeypatch.setattr(FusingOptimizer, "step", spy)
+    for fuses in (False, True):
+        with seeded(0, deterministic=True):
+            trainer = make_trainer(small_scene(3), config, deterministic=True)
+            trainer.stage.fuses_updates = fuses
+            trainer.run(50, lambda record: None)
+        outcomes.append(trainer)
+        assert sum(fused) == (49 if fuses else 0)  # the moments exist from the first update on
+        fused.clear()
+    plain, other = outcomes
+    for name, parameter in plain.model.named_parameters():
+        mine, theirs = parameter.detach(), dict(other.model.named_parameters())[name].detach()
+        assert float((mine - theirs).norm() / mine.norm()) < 1e-5, name
+        assert plain.optimizer.states[name].step == other.optimizer.states[name].step == 50
+    assert float(plain.model.sh_dc.detach().std()) > 0
 
 
 def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import torch
+
 from splatwizard_core.api import (
     ConfigError,
     LossPack,
@@ -18,6 +20,7 @@ from splatwizard_core.api import (
 from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians import tasks
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.moments import keep_moments
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 from sw_gaussians.statistics import collect_statistics
@@ -40,6 +43,8 @@ class ThreeDGSStage(Stage):
     """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
 
     name = "3dgs"
+    fuses_updates: bool = False
+    """Whether spherical harmonics are updated in the backward pass where nothing else asks for their gradients."""
 
     def __init__(self, opt: GaussianTraining) -> None:
         super().__init__(opt)
@@ -51,6 +56,7 @@ class ThreeDGSStage(Stage):
         self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self._optimizer: SplatOptimizer | None = None
+        self._post: Scheduler | None = None
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
     def steps(self, steps: int) -> int:
@@ -75,7 +81,7 @@ class ThreeDGSStage(Stage):
             ParamGroup("quats", lr=lr.quats),
         ]
         if self.config.sparse_adam == "off":
-            self._optimizer = SplatOptimizer(model, groups)
+            self._optimizer = FusingOptimizer(model, groups)
         else:
             self._optimizer = SparseSplatOptimizer(model, groups, bias_correction=self.config.sparse_adam)
         return self._optimizer
@@ -108,6 +114,7 @@ class ThreeDGSStage(Stage):
         )
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        self._post = scheduler
         if self.config.mcmc.enabled:
             self._register_mcmc(scheduler)
             return
@@ -155,12 +162,22 @@ class ThreeDGSStage(Stage):
         scheduler.register_task(when, grow, name="grow")
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
+        if self.fuses_updates:
+            self._offer_updates(step)
         if self._options is None or self._options.background is not background:
             statistics, absgrad = not self.config.mcmc.enabled, self.config.densify.absgrad
             self._options = RasterOptions(
                 background=background, grad2d=statistics and not absgrad, absgrad=statistics and absgrad
             )
         return self._options
+
+    def _offer_updates(self, step: int) -> None:
+        """Offer this step's updates to the backward pass, if no task but the statistics sees gradients."""
+        if type(self) is not ThreeDGSStage or not isinstance(self._optimizer, FusingOptimizer) or self._post is None:
+            return  # a stage made of this one may draw twice, or read gradients in its loss
+        due = [entry.task for entry in self._post.registrations if entry.due(step)]
+        if step < self.config.iterations and torch.is_grad_enabled() and due in ([], [collect_statistics]):
+            self._optimizer.offer()
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)

@@ -195,7 +195,8 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
     const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& scale_factors,
     const OptionalTensor& geom_indices, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
     double scale_modifier, double eps2d, int64_t flags, const Tensor& drawn,
-    const Tensor& row_memory, std::array<bool, kWantedCount> wanted) {
+    const Tensor& row_memory, std::array<bool, kWantedCount> wanted, const std::vector<Tensor>& updated,
+    at::ArrayRef<double> rates) {
   const OptionalTensor none;
   const Inputs in{means,    opacities, scales, quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
                   features, none,      none,   sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
@@ -250,7 +251,24 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   out.grad2d = screen(kWantGrad2d);
   out.absgrad2d = screen(kWantAbsgrad2d);
   const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
-  if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, stream);
+  TORCH_CHECK(updated.size() == 0 || (updated.size() == 6 && rates.size() == 12),
+              "sw_rasterizers: Adam in the backward pass takes three tensors and six numbers for each of sh_dc, sh_rest");
+  ShAdam adam{};
+  for (size_t i = 0; i < updated.size(); i += 3) {
+    const OptionalTensor& like = i == 0 ? in.sh_dc : in.sh_rest;
+    if (updated[i].numel() == 0) continue;
+    TORCH_CHECK(like.has_value() && updated[i].data_ptr() == like->data_ptr(),
+                "sw_rasterizers: Adam in the backward pass is of the tensors that were drawn");
+    for (size_t k = i; k < i + 3; ++k)
+      TORCH_CHECK(updated[k].is_contiguous() && updated[k].sizes() == like->sizes() &&
+                      updated[k].scalar_type() == at::kFloat && updated[k].device() == means.device() &&
+                      reinterpret_cast<uintptr_t>(updated[k].data_ptr()) % 16 == 0,
+                  "sw_rasterizers: parameter and moments must be contiguous float32 of shape ", like->sizes());
+    const double* r = rates.data() + 2 * i;
+    (i == 0 ? adam.dc : adam.rest) = {data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
+                                      float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
+  }
+  if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, adam, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
   return {std::move(grads), clock.seconds()};

@@ -168,8 +168,20 @@ void blend_backward(const View<float>& view, bool pass_clamp, const Splats& spla
                     const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
                     const Ordered& ordered, cudaStream_t stream);
 int pair_row_length(bool general, bool absgrad);
+
+// Adam of a [N, ...] tensor where its gradient is found, which is then never written. Formula and names: adam.cu of
+// splatwizard-native. 16-byte aligned; all null: the gradient is written.
+struct RowAdam {
+  float *param, *exp_avg, *exp_avg_sq;
+  float step_size, one_minus_beta1, beta2, one_minus_beta2, inv_bias2, eps;
+};
+struct ShAdam {
+  RowAdam dc, rest;  // [N, 1, 3] and [N, 3, 8 or 15, 3]
+  bool any() const { return dc.param != nullptr || rest.param != nullptr; }
+};
+
 void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
                       const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
-                      cudaStream_t stream);
+                      const ShAdam& adam, cudaStream_t stream);
 
 }  // namespace sw::cuda
