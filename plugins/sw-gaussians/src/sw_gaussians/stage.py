@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import torch
+
 from splatwizard_core.api import (
     ConfigError,
     LossPack,
@@ -19,6 +21,7 @@ from sw_gaussians import fast_tasks, fragments, tasks
 from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.moments import keep_moments
 from sw_gaussians.resolution import by_resolution
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
@@ -40,10 +43,16 @@ if TYPE_CHECKING:
     )
 
 
+READERS = (collect_statistics, fragments.collect_opacity_gradients)
+"""Tasks that leave all gradients alone, and read none of spherical harmonics."""
+
+
 class ThreeDGSStage(Stage):
     """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
 
     name = "3dgs"
+    fuses_updates: bool = False
+    """Whether spherical harmonics are updated in the backward pass where nothing else asks for their gradients."""
 
     def __init__(self, opt: GaussianTraining) -> None:
         super().__init__(opt)
@@ -61,6 +70,7 @@ class ThreeDGSStage(Stage):
         self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self._optimizer: SplatOptimizer | None = None
+        self._post: Scheduler | None = None
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
     def steps(self, steps: int) -> int:
@@ -102,7 +112,7 @@ class ThreeDGSStage(Stage):
         sparse, every = self.config.sparse_adam, self.config.fast.sh_every
         if sparse == "off":
             self._optimizer = (
-                CadencedOptimizer(model, groups, every=every) if every > 1 else SplatOptimizer(model, groups)
+                CadencedOptimizer(model, groups, every=every) if every > 1 else FusingOptimizer(model, groups)
             )
         elif every > 1:
             self._optimizer = SparseCadencedOptimizer(model, groups, every=every, bias_correction=sparse)
@@ -140,6 +150,7 @@ class ThreeDGSStage(Stage):
         )
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        self._post = scheduler
         if self.config.mcmc.enabled:
             self._register_mcmc(scheduler)
             return
@@ -211,6 +222,8 @@ class ThreeDGSStage(Stage):
         scheduler.register_task(when, grow, name="grow")
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
+        if self.fuses_updates:
+            self._offer_updates(step)
         # The variance of opacity gradients costs time in the backward pass; the last step asks for all there is.
         fragment = self._fragments and (step < self.steps(self.config.densify.stop) or step >= self.iterations)
         options = self._options
@@ -223,6 +236,14 @@ class ThreeDGSStage(Stage):
                 fragment_grad=fragment,
             )
         return options
+
+    def _offer_updates(self, step: int) -> None:
+        """Offer this step's updates to the backward pass, if no task but the statistics sees gradients."""
+        if type(self) is not ThreeDGSStage or not isinstance(self._optimizer, FusingOptimizer) or self._post is None:
+            return  # a stage made of this one may draw twice, or read gradients in its loss
+        due = (entry.task for entry in self._post.registrations if entry.due(step))
+        if step < self.config.iterations and torch.is_grad_enabled() and all(task in READERS for task in due):
+            self._optimizer.offer()
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)

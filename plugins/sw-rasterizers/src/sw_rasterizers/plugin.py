@@ -11,8 +11,9 @@ STANDARD_FEATURES = [
     "FLOAT64", "DETERMINISTIC", "FRAGMENT_GRAD",
 ]  # fmt: skip
 
-# Sums over pixels are atomic there: their order, and so their last bits, vary from run to run.
-ON_CUDA = {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
+ON_CUDA = {"lacks": ["FLOAT64"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
+# Some sums are always atomic there: their order, and so their last bits, vary from run to run.
+ATOMIC_ON_CUDA = {**ON_CUDA, "lacks": ["FLOAT64", "DETERMINISTIC"]}
 # Name -> (target, summary, features, speed). The same kernels under the names of what needs them; the speeds only rank
 # the others below `standard`, which serves whatever nobody asks for by name, codebooks excepted.
 STANDARD = {
@@ -92,7 +93,7 @@ def register_rasterizers(registry: Registry) -> None:
             dtypes=["float32", "float64"],
             features=features,
             available="sw_rasterizers.native:unavailable",
-            on={"cuda": ON_CUDA},
+            on={"cuda": ATOMIC_ON_CUDA if name == "c3dgs" else ON_CUDA},
             profiles=PROFILES,
             exactness="exact",
             speed=speed,
@@ -108,7 +109,7 @@ def register_rasterizers(registry: Registry) -> None:
         features=SURFEL_FEATURES,
         needs=["SURFEL"],
         available="sw_rasterizers.native:unavailable",
-        on={"cuda": {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}},
+        on={"cuda": ATOMIC_ON_CUDA},
         profiles=PROFILES,
         exactness="exact",
         speed=50,
@@ -139,7 +140,7 @@ def register_rasterizers(registry: Registry) -> None:
             features=[*STANDARD_FEATURES, *scores],
             combos_forbidden=[combo for combo in SCORING_FORBIDDEN if combo[1] in scores],
             available="sw_rasterizers.native:unavailable",
-            on={"cuda": ON_CUDA},
+            on={"cuda": ATOMIC_ON_CUDA},
             profiles=PROFILES,
             exactness="exact",
             speed=speed,

@@ -124,6 +124,7 @@ class StandardRasterizer:
         flags = _flags(
             opt.profile, opt.clamp_grad, frozenset(opt.depth), opt.antialias, opt.clamp_color,
             opt.features_detach_geometry, opt.absgrad, opt.fragment_grad, opt.alpha, self.count,
+            torch.are_deterministic_algorithms_enabled(),
         )  # fmt: skip
         watch = torch.is_grad_enabled()
         background = opt.background_of(3 if g.colors is None else g.colors.shape[1], cam, g.means)
@@ -169,6 +170,7 @@ def _flags(
     fragments: bool,
     alpha: bool,
     count: bool,
+    ordered: bool,
 ) -> Flag:
     """The switches of the kernels that these options stand for. Raises ConfigError for two that exclude each other."""
     if absgrad and fragments:
@@ -189,6 +191,7 @@ def _flags(
         (fragments, Flag.FRAGMENTS),
         (alpha or "expected" in depth, Flag.ALPHA_MAP),
         (count, Flag.COUNT),
+        (ordered, Flag.ORDERED),
     ):
         if asked:
             flags |= flag

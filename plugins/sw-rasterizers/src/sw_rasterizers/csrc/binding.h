@@ -36,7 +36,8 @@ enum Flag : int64_t {  // mirrored in ops.py
   kTensorCores = 16384,
   kBytes = 32768,
   kForScores = 65536,  // between the ops on CUDA: with kSave, nothing that only the backward pass needs
-  kFragments = 131072,
+  kOrdered = 131072,   // CUDA: sums of the backward pass in one order; on the CPU they always are
+  kFragments = 262144,
 };
 
 template <class S>
