@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from splatwizard_native.files import write_json as write_json
     from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
     from splatwizard_native.fused.adam import adam_steps as adam_steps
+    from splatwizard_native.fused.in_backward import end_offer as end_offer
+    from splatwizard_native.fused.in_backward import offer_update as offer_update
+    from splatwizard_native.fused.in_backward import offered_update as offered_update
     from splatwizard_native.fused.photometric import Padding as Padding
     from splatwizard_native.fused.photometric import photometric as photometric
     from splatwizard_native.interrupt import InterruptGuard as InterruptGuard
@@ -73,6 +76,7 @@ MODULES = {
     ),
     "lending": "lend",
     "fused.adam": "AdamUpdate adam_steps",
+    "fused.in_backward": "end_offer offer_update offered_update",
     "fused.photometric": "Padding photometric",
     "interrupt": "InterruptGuard",
     "machine": "describe_machine",
