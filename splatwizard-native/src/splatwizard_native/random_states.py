@@ -54,7 +54,7 @@ def _one_order_of_sums() -> Iterator[None]:
     An operation that has no such order raises RuntimeError and names itself.
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read at the first product on a GPU
-    settings = torch.utils.deterministic
+    settings: Any = torch.utils.deterministic
     asked, only_warned = (
         torch.are_deterministic_algorithms_enabled(),
         torch.is_deterministic_algorithms_warn_only_enabled(),
