@@ -2,12 +2,13 @@
 
 import os
 import random
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from splatwizard_native import seeded
+from splatwizard_native import ForeseenError, seeded, sums_vary_on_cuda
 
 
 def drawn() -> list[float]:
@@ -43,3 +44,14 @@ def test_torch_is_asked_for_one_order_in_the_block_alone(before, warn_only, monk
             assert torch.are_deterministic_algorithms_enabled() == before
     finally:
         torch.use_deterministic_algorithms(False)
+
+
+def test_sums_without_an_order_are_refused_by_name_on_a_gpu_alone():
+    on_gpu = SimpleNamespace(is_cuda=True)
+    sums_vary_on_cuda("hash grids", on_gpu)
+    with seeded(0, deterministic=True):
+        sums_vary_on_cuda("hash grids", torch.zeros(1))
+        with pytest.raises(
+            ForeseenError, match="deterministic=true: the sums of hash grids have no fixed order on a GPU"
+        ):
+            sums_vary_on_cuda("hash grids", on_gpu)

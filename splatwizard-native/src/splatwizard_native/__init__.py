@@ -56,6 +56,7 @@ if TYPE_CHECKING:
     from splatwizard_native.random_states import preserved_random_states as preserved_random_states
     from splatwizard_native.random_states import restore_random_states as restore_random_states
     from splatwizard_native.random_states import seeded as seeded
+    from splatwizard_native.random_states import sums_vary_on_cuda as sums_vary_on_cuda
     from splatwizard_native.scalars import Verdict as Verdict
     from splatwizard_native.scalars import read_scalars as read_scalars
     from splatwizard_native.settings import cache_root as cache_root
@@ -83,7 +84,7 @@ MODULES = {
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
     "progress": "Bar duration track",
-    "random_states": "capture_random_states preserved_random_states restore_random_states seeded",
+    "random_states": "capture_random_states preserved_random_states restore_random_states seeded sums_vary_on_cuda",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root",
     "strict_json": "dump_strict load_strict",

@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 import torch
 
+from splatwizard_native.errors import ForeseenError
+
 
 def capture_random_states() -> dict[str, Any]:
     """Return the process-wide states: python, numpy, torch CPU, and each CUDA device if CUDA is in use."""
@@ -54,7 +56,7 @@ def _one_order_of_sums() -> Iterator[None]:
     An operation that has no such order raises RuntimeError and names itself.
     """
     os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read at the first product on a GPU
-    settings = torch.utils.deterministic
+    settings: Any = torch.utils.deterministic
     asked, only_warned = (
         torch.are_deterministic_algorithms_enabled(),
         torch.is_deterministic_algorithms_warn_only_enabled(),
@@ -67,6 +69,18 @@ def _one_order_of_sums() -> Iterator[None]:
     finally:
         settings.fill_uninitialized_memory = filled
         torch.use_deterministic_algorithms(asked, warn_only=only_warned)
+
+
+def sums_vary_on_cuda(what: str, tensor: torch.Tensor) -> None:
+    """Raise ForeseenError where deterministic algorithms are asked for, and these sums of a GPU have no fixed order.
+
+    what    the sums, as a user knows them
+    tensor  of the device that adds them
+    """
+    if tensor.is_cuda and torch.are_deterministic_algorithms_enabled():
+        raise ForeseenError(
+            f"deterministic=true: the sums of {what} have no fixed order on a GPU; leave it out, or train on the CPU"
+        )
 
 
 @contextmanager

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -220,7 +221,14 @@ def _updates(call: Call, wanted: list[bool]) -> tuple[list[Tensor], list[float]]
         _, u = call.updates[name]
         wanted[INPUTS.index(name)] = False
         tensors += [u.param, u.exp_avg, u.exp_avg_sq]
-        rates += [u.lr / (1 - u.beta1**u.step), 1 - u.beta1, u.beta2, 1 - u.beta2, (1 - u.beta2**u.step) ** -0.5, u.eps]
+        rates += [
+            u.lr / (1 - u.beta1**u.step),
+            1 - u.beta1,
+            u.beta2,
+            1 - u.beta2,
+            1 / math.sqrt(1 - u.beta2**u.step),
+            u.eps,
+        ]
     return tensors, rates
 
 

@@ -93,7 +93,7 @@ def register_rasterizers(registry: Registry) -> None:
             dtypes=["float32", "float64"],
             features=features,
             available="sw_rasterizers.native:unavailable",
-            on={"cuda": ATOMIC_ON_CUDA if name == "c3dgs" else ON_CUDA},
+            on={"cuda": ON_CUDA},
             profiles=PROFILES,
             exactness="exact",
             speed=speed,

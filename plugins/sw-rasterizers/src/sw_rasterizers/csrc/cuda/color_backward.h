@@ -38,7 +38,8 @@ __device__ __forceinline__ void update_sh_values(const RowAdam& a, int64_t first
   float* const v = a.exp_avg_sq + first * kFloats;
   const auto gradient = [&](int at) {
     const int row = at / kFloats, value = at % kFloats, k = first_basis + value / 3;
-    return factors[row * kFactors + k] * factors[row * kFactors + kMaxBasis + value % 3];
+    // Rounded before it is used, as where it is written: the steps are the same.
+    return __fmul_rn(factors[row * kFactors + k], factors[row * kFactors + kMaxBasis + value % 3]);
   };
   const auto update = [&](float& p, float g, float& m, float& v) {
     m = m + a.one_minus_beta1 * (g - m);
