@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from sw_interchange.files import encode as encode
     from sw_interchange.files import read as read
     from sw_interchange.files import write as write
-    from sw_interchange.formats import Format as Format
-    from sw_interchange.formats import formats as formats
+    from sw_interchange.known_formats import Format as Format
+    from sw_interchange.known_formats import formats as formats
     from sw_interchange.scene import GaussianScene as GaussianScene
     from sw_interchange.scene import Limits as Limits
     from sw_interchange.scene import ReadReport as ReadReport
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 _PLACES = {
     "from_gaussians": "bridge", "to_gaussians": "bridge", "decode": "files", "encode": "files", "read": "files",
-    "write": "files", "Format": "formats", "formats": "formats", "GaussianScene": "scene", "Limits": "scene",
-    "ReadReport": "scene", "WriteReport": "scene",
+    "write": "files", "Format": "known_formats", "formats": "known_formats", "GaussianScene": "scene",
+    "Limits": "scene", "ReadReport": "scene", "WriteReport": "scene",
 }  # fmt: skip
 __all__ = list(_PLACES)
 

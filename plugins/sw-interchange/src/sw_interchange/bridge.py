@@ -7,7 +7,8 @@ import torch
 from sw_gaussians.surfels import gaussians_of
 
 from splatwizard_core.api import GaussianModel
-from sw_interchange.scene import FLAT, Array, GaussianScene, normalised
+from sw_interchange.bands import Array
+from sw_interchange.scene import FLAT, GaussianScene, normalised
 
 
 def to_gaussians(scene: GaussianScene) -> GaussianModel:

@@ -17,7 +17,8 @@ import numpy as np
 
 from splatwizard_core.api import BitstreamError, SceneError
 from sw_interchange.archive import entries_of
-from sw_interchange.scene import COEFFICIENTS, SH_C0, Array, GaussianScene, Limits, ReadReport
+from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
+from sw_interchange.scene import GaussianScene, Limits, ReadReport
 from sw_interchange.source import Source
 
 _NERFSTUDIO = "_model.gauss_params."
@@ -35,8 +36,6 @@ def read_checkpoint(source: Source, limits: Limits, report: ReadReport) -> Gauss
 
 
 def _unpickled(source: Source, limits: Limits) -> Any:
-    import torch
-
     name = source.name
     if source.head(4) != b"PK\x03\x04":
         raise BitstreamError(f"{name}: not a checkpoint that torch 1.6 or later saved")
@@ -47,6 +46,8 @@ def _unpickled(source: Source, limits: Limits) -> Any:
     # Storages are not compressed: none can be larger than the file.
     if sum(sizes) > len(source.data) or len(source.data) > limits.max_output_bytes:
         raise BitstreamError(f"{name}: its archive claims {sum(sizes):,} bytes, the file has {len(source.data):,}")
+    import torch
+
     try:
         return torch.load(io.BytesIO(source.data), map_location="cpu", weights_only=True)
     except pickle.UnpicklingError as error:

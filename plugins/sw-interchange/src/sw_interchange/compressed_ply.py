@@ -10,20 +10,11 @@ import numpy.typing as npt
 from sw_gaussians.ply_tables import MAX_HEADER, Table, read_header, read_tables
 
 from splatwizard_core.api import BitstreamError
+from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
 from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, from_smallest_three, smallest_three
-from sw_interchange.scene import (
-    COEFFICIENTS,
-    LARGEST_LOGIT,
-    SH_C0,
-    Array,
-    GaussianScene,
-    Limits,
-    ReadReport,
-    WriteReport,
-    sigmoid,
-)
+from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, WriteReport, sigmoid
 from sw_interchange.source import Source
 
 CHUNK = 256
@@ -57,7 +48,12 @@ def read_compressed_ply(source: Source, limits: Limits, report: ReadReport) -> G
     # Degree 0 has no element `sh`; some writers write one without properties.
     coefficients = [each for each in header.names("sh") if each.startswith("f_rest_")]
     degrees = {3 * k: degree for degree, k in COEFFICIENTS.items() if degree < 4}
-    if len(coefficients) not in degrees or (coefficients and header.count("sh") != count):
+    wanted = [f"f_rest_{i}" for i in range(len(coefficients))]
+    if (
+        len(coefficients) not in degrees
+        or sorted(coefficients) != sorted(wanted)
+        or (coefficients and header.count("sh") != count)
+    ):
         raise BitstreamError(f"{name}: {len(coefficients)} SH values of {header.count('sh'):,} Gaussians", section="sh")
     k = len(coefficients) // 3
     limits.check(count, count * (56 + 12 * k), name)

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.api import BitstreamError, SceneError, UserInputError, replacing
-from sw_interchange.formats import Format, detect, format_named, format_of_suffix
 from sw_interchange.frames import axes_of, in_frame
+from sw_interchange.known_formats import Format, detect, format_named, format_of_suffix
 from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, cleaned
 from sw_interchange.source import Source
 

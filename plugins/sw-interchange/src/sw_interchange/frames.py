@@ -6,12 +6,16 @@ Source: the real SH basis and signs of 3D Gaussian Splatting (arXiv 2308.04079).
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import UserInputError
-from sw_interchange.scene import COEFFICIENTS, Array, GaussianScene
+from sw_interchange.bands import COEFFICIENTS, Array
+
+if TYPE_CHECKING:
+    from sw_interchange.scene import GaussianScene
 
 Matrix = npt.NDArray[np.float64]
 

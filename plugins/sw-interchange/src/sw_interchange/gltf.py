@@ -15,9 +15,10 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, UserInputError
+from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.frames import transformed
 from sw_interchange.gltf_writer import EXTENSION
-from sw_interchange.scene import COEFFICIENTS, FLAT, LARGEST_LOGIT, Array, GaussianScene, Limits, ReadReport
+from sw_interchange.scene import FLAT, LARGEST_LOGIT, GaussianScene, Limits, ReadReport
 from sw_interchange.source import Source
 
 MAX_JSON = 1 << 24

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from splatwizard_core.api import UserInputError
+from sw_interchange.bands import SH_C0, Array
 from sw_interchange.options import Options
-from sw_interchange.scene import SH_C0, Array, GaussianScene, WriteReport, sigmoid
+from sw_interchange.scene import GaussianScene, WriteReport, sigmoid
 
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, UBYTE = 5126, 5121

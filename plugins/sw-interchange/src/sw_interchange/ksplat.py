@@ -12,7 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError
-from sw_interchange.scene import COEFFICIENTS, FLAT, SH_C0, Array, GaussianScene, Limits, ReadReport, logit_of_byte
+from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
+from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, logit_of_byte
 from sw_interchange.source import Source
 
 HEADER, SECTION_HEADER = 4096, 1024

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from sw_interchange.scene import Array
+from sw_interchange.bands import Array
 
 BITS = 10
 CROWD = 256

@@ -11,12 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError, UserInputError
+from sw_interchange.bands import COEFFICIENTS, Array
+from sw_interchange.frames import in_frame
 
-Array = npt.NDArray[np.float32]
-
-SH_C0 = 0.28209479177387814
-COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
-"""SH degree -> coefficients a channel above band 0."""
 FLAT = -20.0
 """Log scale of what has no thickness."""
 LARGEST_LOGIT = 13.815510
@@ -160,8 +157,6 @@ class GaussianScene:
 
     def in_frame(self, frame: str) -> GaussianScene:
         """The same scene in other axes, such as "RUB"; see `frames`."""
-        from sw_interchange.frames import in_frame
-
         return in_frame(self, frame)
 
 

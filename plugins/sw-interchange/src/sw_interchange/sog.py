@@ -17,8 +17,9 @@ import numpy.typing as npt
 
 from splatwizard_core.api import BitstreamError
 from sw_interchange.archive import read_archive
+from sw_interchange.bands import Array
 from sw_interchange.quats import ROOT_2, from_smallest_three
-from sw_interchange.scene import LARGEST_LOGIT, Array, GaussianScene, Limits, ReadReport, logit_of_byte
+from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, logit_of_byte
 from sw_interchange.source import Source
 from sw_interchange.webp import LARGEST_SIDE, Pixels, decode_image, image_size
 
@@ -135,7 +136,8 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     if version not in (1, 2):
         raise BitstreamError(f"{bundle.name}: version {version!r:.20} of SOG; 1 and 2 are read")
     report.version = str(version)
-    count = _count(bundle, version, limits.max_gaussians)
+    count = _count(bundle, version)
+    limits.check(count, 56 * count, bundle.name)
     images = _checked_images(bundle, count)
     shared = {name: _texels(data, name, count) for name, data in images}
     low, high, scales, quats, sh0 = shared.values()
@@ -151,7 +153,8 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     )
 
 
-def _count(bundle: _Bundle, version: int, most: int) -> int:
+def _count(bundle: _Bundle, version: int) -> int:
+    most = LARGEST_SIDE**2
     if version == 2:
         return bundle.count(bundle.meta, "count", most)
     shape = bundle.part("means").get("shape")

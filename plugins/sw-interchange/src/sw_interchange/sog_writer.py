@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from splatwizard_core.api import UserInputError
+from sw_interchange.bands import Array
 from sw_interchange.clusters import nearest_entry, scalar_codebook, vector_palette
 from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, smallest_three
-from sw_interchange.scene import Array, GaussianScene, WriteReport, sigmoid
+from sw_interchange.scene import GaussianScene, WriteReport, sigmoid
 from sw_interchange.sog import BANDS, MAX_PALETTE, PALETTE_COLUMNS
 from sw_interchange.webp import LARGEST_SIDE, Pixels, encode_image, tiled
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 import numpy as np
 
 from splatwizard_core.api import BitstreamError
+from sw_interchange.bands import SH_C0
 from sw_interchange.options import Options
 from sw_interchange.scene import (
     FLAT,
-    SH_C0,
     GaussianScene,
     Limits,
     ReadReport,

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
+from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.quats import from_smallest_three, smallest_three
-from sw_interchange.scene import COEFFICIENTS, Array, GaussianScene, WriteReport, logit_of_byte, sigmoid
+from sw_interchange.scene import GaussianScene, WriteReport, logit_of_byte, sigmoid
+from sw_interchange.threads import each_of, rows_of
 
 if TYPE_CHECKING:
     from sw_interchange.spz import SpzOptions
@@ -22,7 +23,6 @@ COLOUR_SCALE = 0.15
 XYZW = [1, 2, 3, 0]
 """Order of a quaternion's components in the file, from w,x,y,z."""
 WXYZ = [3, 0, 1, 2]
-ROWS_AT_ONCE = 1 << 15
 
 
 def field_sizes(count: int, version: int, degree: int) -> list[int]:
@@ -49,9 +49,7 @@ def decode_fields(
             np.subtract(raw[5][rows], np.float32(128), out=part, dtype=np.float32)
             part *= np.float32(1 / 128)
 
-    parts = [slice(at, at + ROWS_AT_ONCE) for at in range(0, count, ROWS_AT_ONCE)]
-    with ThreadPoolExecutor(2) as pool:
-        list(pool.map(some, parts))
+    each_of(some, rows_of(count))
     return GaussianScene(
         means=means,
         log_scales=(codes / 16 - 10)[scales],
@@ -119,10 +117,8 @@ def encode_fields(scene: GaussianScene, options: SpzOptions, fractional_bits: in
         planes[5][rows] = np.clip(codes, 0, 255, out=codes)
         return beyond
 
-    parts = [slice(at, at + ROWS_AT_ONCE) for at in range(0, n, ROWS_AT_ONCE)]
-    with ThreadPoolExecutor(2) as pool:
-        if beyond := sum(pool.map(some, parts)):
-            report.clamped["sh_rest"] = beyond
+    if beyond := sum(each_of(some, rows_of(n))):
+        report.clamped["sh_rest"] = beyond
     return [plane.tobytes() for plane in planes]
 
 

@@ -8,9 +8,9 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 
 from splatwizard_core.api import BitstreamError
+from sw_interchange.threads import each_of
 
 try:
     from zlib_ng import zlib_ng as gzip_codec
@@ -27,7 +27,10 @@ def inflate(data: bytes | memoryview, most: int, name: str) -> bytes:
     """Inflate a gzip stream, at most `most` bytes of it, whatever it claims. Raises BitstreamError."""
     decoder = gzip_codec.decompressobj(wbits=_GZIP)
     try:
-        return bytes(decoder.decompress(data, most))
+        content = bytes(decoder.decompress(data, most))
+        if len(content) < most and not decoder.eof:
+            raise BitstreamError(f"{name}: its gzip stream does not end: the file is truncated")
+        return content
     except (zlib.error, gzip_codec.error) as error:
         raise BitstreamError(f"{name}: damaged gzip stream: {error}") from error
 
@@ -38,12 +41,12 @@ def deflate(parts: Sequence[bytes | memoryview], level: int) -> list[bytes]:
     level = min(level, 9)
     blocks = [memoryview(content)[at : at + BLOCK] for at in range(0, len(content), BLOCK)]
 
-    def packed(block: memoryview, last: bool) -> bytes:
+    def packed(block: memoryview) -> bytes:
         encoder = gzip_codec.compressobj(level, zlib.DEFLATED, -zlib.MAX_WBITS)
-        return bytes(encoder.compress(block) + encoder.flush(zlib.Z_FINISH if last else zlib.Z_SYNC_FLUSH))
+        mode = zlib.Z_FINISH if block is blocks[-1] else zlib.Z_SYNC_FLUSH
+        return bytes(encoder.compress(block) + encoder.flush(mode))
 
-    with ThreadPoolExecutor(2) as pool:
-        streams = list(pool.map(packed, blocks, [False] * (len(blocks) - 1) + [True]))
+    streams = each_of(packed, blocks)
     return [_HEAD, *streams, struct.pack("<II", gzip_codec.crc32(content), len(content) & 0xFFFFFFFF)]
 
 
@@ -51,7 +54,8 @@ def unzstd(frames: Sequence[bytes | memoryview], sizes: Sequence[int], name: str
     """Decompress one zstd frame for each plane, of exactly its size. Raises BitstreamError."""
     import zstandard
 
-    def plain(frame: bytes | memoryview, size: int) -> bytes:
+    def plain(part: tuple[bytes | memoryview, int]) -> bytes:
+        frame, size = part
         decoder = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompressobj()
         pieces, got = [], 0
         try:
@@ -70,13 +74,11 @@ def unzstd(frames: Sequence[bytes | memoryview], sizes: Sequence[int], name: str
             raise BitstreamError(f"{name}: a stream decodes to {got:,} bytes, expected are {size:,}")
         return b"".join(pieces)
 
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(plain, frames, sizes))
+    return each_of(plain, list(zip(frames, sizes, strict=True)))
 
 
 def zstd(planes: Sequence[bytes | memoryview], level: int) -> list[bytes]:
     """One zstd frame for each plane, with its size in it."""
     import zstandard
 
-    with ThreadPoolExecutor(2) as pool:
-        return list(pool.map(lambda plane: zstandard.ZstdCompressor(level=level).compress(plane), planes))
+    return each_of(lambda plane: zstandard.ZstdCompressor(level=level).compress(plane), planes)
