@@ -11,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
-from sw_gaussians.ply import export_ply, from_ply, load_ply, property_names, to_ply
+from sw_gaussians.ply import export_ply, from_ply, load_ply, to_ply
+from sw_gaussians.ply_gaussians import property_names
 
 from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel

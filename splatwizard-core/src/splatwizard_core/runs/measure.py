@@ -180,16 +180,18 @@ def _flags(
 
 
 def opener(path: Path, session: Session) -> Callable[[], Opened]:
-    """Return a function that opens the model of a .swz or .ply on the session's device."""
+    """Return a function that opens the model of a .swz, .ply or other file of Gaussians on the session's device."""
+    encoded = session.plugins.importers.of_suffix(path) is None
 
     def open_file() -> Opened:
-        if path.suffix == ".ply":
-            gaussians = session.plugins.importers.load("ply")(path)
-            return Opened(gaussians.to(session.device).eval().requires_grad_(False), {})
+        if not encoded:
+            gaussians = session.plugins.read_gaussians(path)
+            raster = gaussians.origin.get("raster", {})
+            return Opened(gaussians.to(session.device).eval().requires_grad_(False), raster)
         model, reader = open_model(path, session.plugins, session.device)
         return Opened(model, reader.raster, reader.made_on is not None, reader.static)
 
-    if path.suffix != ".ply":
+    if encoded:
         import_method(path, session.plugins)  # code is not memory of the model
     return open_file
 
