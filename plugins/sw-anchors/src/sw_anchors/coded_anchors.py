@@ -16,9 +16,10 @@ from torch import Tensor, nn
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.fused_ops import anchor_values, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
+from sw_anchors.noisy_values import Noise, Tables, noisy_values
 from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.quantizers.binary import SteMask
-from sw_codecs.quantizers.rounding import SteRound, add_noise
+from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs
@@ -254,30 +255,38 @@ class CodedAnchors(AnchorModel):
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
         """Full-precision, noisy or rounded attributes, by phase and mode; each of `rows` at most once."""
-        values, masks = anchor_values(
-            rows, self.features, self.log_scales, self.offsets, self.mask_logits, self.mask_weights(), MASK_THRESHOLD
-        )
-        extras: dict[str, Any] = {}
         if self.phase != FULL and not self.training:
-            groups = triple(torch.split(values, list(self.shape.widths), dim=1))
-            steps = self.base_steps_like(values) if self.phase == QUANTIZED else self.predict(rows).steps
-            values = torch.cat(self._rounded(groups, steps), dim=1)
-        elif self.phase == QUANTIZED:
-            values = add_noise(values, self.wide_base_steps(values), self.uniform(*values.shape))
-        elif self.phase == ENTROPY:
-            forecast = self.forecast(rows)
-            wide = self.widened(forecast.steps)
-            values = add_noise(values, wide, self.uniform(*values.shape))
-            extras["rate"] = self.rate(values, forecast, masks)
-        features, scales, offsets = torch.split(values, list(self.shape.widths), dim=1)
+            return self._final(rows)
+        noise: Noise | None = None
+        forecast: AnchorForecast | None = None
+        drawn = rows[:0]
+        if self.phase != FULL:
+            steps = self.base_steps_like(self.features) * self.noise_factor
+            if self.phase == ENTROPY:
+                forecast = self.forecast(rows)
+                steps = forecast.steps
+            uniform = self.uniform(len(rows), sum(self.shape.widths))
+            noise = Noise(steps, uniform, self._columns(steps))
+            drawn = self.sampled(len(rows)) if forecast is not None else drawn
+        found = noisy_values(rows, self._tables, self.mask_weights(), MASK_THRESHOLD, noise, drawn)
+        extras = {} if forecast is None else {"rate": self.rate(drawn, found.sample, forecast, found.masks)}
+        positions = self.positions().index_select(0, rows)
         return AnchorAttributes(
-            self.positions().index_select(0, rows),
-            features,
-            offsets.reshape(-1, self.num_offsets, 3),
-            scales,
-            masks=masks,
-            extras=extras,
+            positions, found.features, found.offsets, found.scales, masks=found.masks, extras=extras
         )
+
+    def _final(self, rows: Tensor) -> AnchorAttributes:
+        """Rounded attributes."""
+        values, masks = anchor_values(rows, *self._tables, self.mask_weights(), MASK_THRESHOLD)
+        groups = triple(torch.split(values, list(self.shape.widths), dim=1))
+        steps = self.base_steps_like(values) if self.phase == QUANTIZED else self.predict(rows).steps
+        features, scales, offsets = self._rounded(groups, steps)
+        offsets = offsets.reshape(-1, self.num_offsets, 3)
+        return AnchorAttributes(self.positions().index_select(0, rows), features, offsets, scales, masks=masks)
+
+    @property
+    def _tables(self) -> Tables:
+        return self.features, self.log_scales, self.offsets, self.mask_logits
 
     def wide_base_steps(self, like: Tensor) -> Tensor:
         """[C] steps of the noise in the phase QUANTIZED, one for each column of `like` [V,C]."""
@@ -311,7 +320,7 @@ class CodedAnchors(AnchorModel):
         own = self.noise is not None and self.noise.device.type == self.device.type
         return torch.rand(shape, generator=self.noise if own else None, device=self.device)
 
-    def _sample(self, count: int) -> Tensor:
+    def sampled(self, count: int) -> Tensor:
         """[S] int64: a sample of `count` anchors, drawn on the host: to count it, one would wait for a GPU."""
         on_host = self.noise is None or self.noise.device.type == "cpu"
         where = "cpu" if on_host else self.device
@@ -331,18 +340,19 @@ class CodedAnchors(AnchorModel):
         kept = self.raw(torch.nonzero(self.kept()).squeeze(1))
         return triple(v.double().mean() if v.numel() else v.new_zeros(()).double() for v in kept)
 
-    def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
+    def rate(self, drawn: Tensor, sample: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
         """Estimate the bits of V anchors by a sample: each is drawn with probability `sample` and counts if it is kept.
 
-        values  [V,C] noisy numbers of all groups
+        drawn   [S] as of `sampled`
+        sample  [S,C] their noisy numbers of all groups
         masks   [V,k], with gradient: the bits of a masked offset do not count, its numbers do
         """
         kept = masks.detach().amax(dim=1)
-        drawn = self._sample(len(values))
         if not len(drawn):
             nothing = self.mask_logits.new_zeros(())
             return AnchorRate(nothing, nothing.new_zeros(3), nothing, forecast.own_bits)
-        return self.rate_of(drawn, values, forecast, masks, kept.index_select(0, drawn), kept.mean())
+        taken = take_rows(drawn, forecast.steps, masks, *([] if forecast.hidden is None else [forecast.hidden]))
+        return self._rate_of_sample(drawn, (sample, *taken), forecast, kept.index_select(0, drawn), kept.mean())
 
     def rate_of(
         self,
@@ -355,14 +365,20 @@ class CodedAnchors(AnchorModel):
     ) -> AnchorRate:
         """Estimate the bits of a sample `drawn` [S] of the V anchors; other arguments as of `rate`.
 
+        values      [V,C] noisy numbers of all groups
         counted     [S] 1 where the anchor is kept, else 0
         share       scalar: kept anchors over visible ones
         """
-        hidden = None
-        if forecast.hidden is None:
-            x, step, mask = take_rows(drawn, values, forecast.steps, masks)
-        else:
-            x, step, mask, hidden = take_rows(drawn, values, forecast.steps, masks, forecast.hidden)
+        hidden = [] if forecast.hidden is None else [forecast.hidden]
+        taken = take_rows(drawn, values, forecast.steps, masks, *hidden)
+        return self._rate_of_sample(drawn, taken, forecast, counted, share)
+
+    def _rate_of_sample(
+        self, drawn: Tensor, taken: tuple[Tensor, ...], forecast: AnchorForecast, counted: Tensor, share: Tensor
+    ) -> AnchorRate:
+        """`rate_of` values, steps and masks `taken` of the sample, and of what the forecast starts from."""
+        x, step, mask = taken[:3]
+        hidden = taken[3] if len(taken) > 3 else None
         mean, scale = forecast.sample(drawn, hidden, x)
         # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
         widths = self.shape.widths

@@ -23,9 +23,13 @@ def network_outputs(
 
     Of V anchors at positions [V,3] with features [V,F], for a camera at `center` [3], which gets no gradient.
     """
-    parameters = [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
-    found: tuple[Tensor, Tensor, Tensor] = _Outputs.apply(center, positions, features, *parameters)  # type: ignore[no-untyped-call]
+    found: tuple[Tensor, Tensor, Tensor] = _Outputs.apply(center, positions, features, *parameters_of(networks))  # type: ignore[no-untyped-call]
     return found
+
+
+def parameters_of(networks: Networks) -> list[Tensor]:
+    """Weight and bias of the first layer, then of the last one, of each network."""
+    return [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
 
 
 class _Outputs(torch.autograd.Function):

@@ -65,7 +65,9 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """
     if not isinstance(model, GaussianModel):
         raise SceneError(
-            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera", path=str(path)
+            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera; "
+            "`sw bake FILE OUT --scene SCENE` fits explicit ones",
+            path=str(path),
         )
     with replacing(path) as temporary, open(temporary, "wb") as file:
         file.writelines(_parts_of(model))

@@ -87,7 +87,7 @@ class HACPlusAnchors(GridAnchors):
 
     def forecast(self, rows: Tensor) -> PoolForecast:
         """Predict steps of the anchors `rows`, and for a sample of all anchors what their bits are counted with."""
-        drawn = self._sample(self.num_rows)
+        drawn = super().sampled(self.num_rows)
         both = torch.cat([rows, drawn])
         features, bits = self._looked_up(tuple(part.index_select(0, both) for part in self.context_rows()))
         first, last = linear_layers(self.mlp_grid)
@@ -107,7 +107,11 @@ class HACPlusAnchors(GridAnchors):
     def _no_sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
         raise NotImplementedError("the bits of HAC++ are no Gaussian's alone: HACPlusAnchors.rate counts them")
 
-    def rate(self, values: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
+    def sampled(self, count: int) -> Tensor:
+        """None of the visible anchors: the rate looks at a sample of all."""
+        return torch.zeros(0, dtype=torch.int64, device=self.device)
+
+    def rate(self, drawn: Tensor, sample: Tensor, forecast: AnchorForecast, masks: Tensor) -> AnchorRate:
         """Estimate the bits a number over a sample of all anchors, under noise of its own.
 
         Masked anchors and offsets have no bits, but count as numbers. What is drawn in this view is no matter.
