@@ -303,6 +303,10 @@ class CodedAnchors(AnchorModel):
         return torch.rand(shape, generator=self.noise if own else None, device=self.device)
 
     def sampled(self, count: int) -> Tensor:
+        """[S] int64: those of `count` visible anchors whose bits are counted in this step."""
+        return self.draw_sample(count)
+
+    def draw_sample(self, count: int) -> Tensor:
         """[S] int64: a sample of `count` anchors, drawn on the host: to count it, one would wait for a GPU."""
         on_host = self.noise is None or self.noise.device.type == "cpu"
         where = "cpu" if on_host else self.device

@@ -87,8 +87,7 @@ def _one_step(
         mock.patch.object(PoolRows, "draw", fill),
         mock.patch.object(model, "pool_sample", pool),
         mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
-        # Of the class: a method may draw from the visible anchors by another function than from all.
-        mock.patch.object(CodedAnchors, "sampled", lambda _, n: torch.nonzero(draws[:n] < sample).squeeze(1)),
+        mock.patch.object(model, "draw_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
     ):
         inputs = model.decode(camera, rows)
     image = rasterizer.render(inputs, camera, RasterOptions(grad2d=True))

@@ -60,7 +60,7 @@ class _Outputs(torch.autograd.Function):
         ctx.by_kernel = not ctx.needs_input_grad[1] and fit_kernel(positions, features, parameters)
         if ctx.by_kernel:
             inputs = (center.contiguous(), positions.contiguous(), features)
-            alpha, geometry, color = torch.ops.sw_anchors.view_networks(*inputs, parameters)
+            alpha, geometry, color = torch.ops.sw_anchors.view_networks(*inputs, list(parameters))
             ctx.save_for_backward(*inputs, alpha, *parameters)
             return alpha, geometry, color
         first, last = parameters[0::4], parameters[2::4]
@@ -86,7 +86,7 @@ class _Outputs(torch.autograd.Function):
         if ctx.by_kernel:
             inputs, alpha, parameters = ctx.saved_tensors[:3], ctx.saved_tensors[3], ctx.saved_tensors[4:]
             slopes = [slope.contiguous() for slope in (to_alpha, to_geometry, to_color)]
-            found = torch.ops.sw_anchors.view_networks_backward(*inputs, parameters, alpha, slopes)
+            found = torch.ops.sw_anchors.view_networks_backward(*inputs, list(parameters), alpha, slopes)
             return None, None, *found
         direction, distance, context, weights, hidden, alpha, *last = ctx.saved_tensors
         outputs = (to_alpha * (1 - alpha * alpha), to_geometry, to_color)

@@ -90,7 +90,7 @@ class HACPlusAnchors(GridAnchors):
 
     def forecast(self, rows: Tensor) -> PoolForecast:
         """Predict steps of the anchors `rows`, and for a sample of all anchors what their bits are counted with."""
-        drawn, parts = super().sampled(self.num_rows), self.context_rows()
+        drawn, parts = self.draw_sample(self.num_rows), self.context_rows()
         found = self.forecast_pool(*(tuple(part.index_select(0, each) for part in parts) for each in (rows, drawn)))
         return dataclasses.replace(found, rows=drawn)
 

@@ -153,8 +153,8 @@ class _Sampled(torch.autograd.Function):
         n, channels = len(cells), planes[0].shape[1]
         ctx.save_for_backward(cells, weights)
         ctx.shapes = [plane.shape for plane in planes]
-        ctx.on_cuda = fit_kernels(planes)
-        if ctx.on_cuda:
+        ctx.on_gpu = fit_kernels(planes)
+        if ctx.on_gpu:
             ctx.planes = [plane.detach() for plane in planes]
             return look_up(cells, weights, planes, GAIN if rounded else 0)
         tables = [plane.movedim(1, 3).reshape(-1, channels) for plane in planes]  # [3 H W, C]
@@ -179,7 +179,7 @@ class _Sampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         cells, weights = ctx.saved_tensors
-        if ctx.on_cuda:
+        if ctx.on_gpu:
             return None, None, None, *look_up_backward(cells, weights, grad, ctx.planes)
         if ctx.by_kernel:
             rows_of = [k * h * w for k, _, h, w in ctx.shapes]

@@ -4,7 +4,7 @@
 // until the block has no more tiles.
 //
 // Biases are weights of an input that is 1. Hidden layers stand side by side, kHiddenRoom numbers each; outputs too, each
-// network's from kOutputStart on. Numbers that no network has are 0.
+// network's from `output_start` on. Numbers that no network has are 0.
 #include "networks.h"
 
 namespace sw_anchors::cuda {
