@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.fixture
 def tools(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    for name in ("results", "result_records", "trainer_records"):
+    for name in ("results", "result_records", "trainer_records", "result_groups", "result_plots", "result_claims"):
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("results")
 
@@ -48,6 +48,55 @@ def test_every_record_file_is_shown_and_every_record_is_read(tools):
         assert path.stem in shown
         assert tools.read(path)
     assert {path.stem for path in (tools.RECORDS / "trainers").iterdir()} <= shown
+
+
+def test_every_figure_shows_what_its_records_say(tools):
+    shown = [found[3] for page in tools.PAGES for found in tools.MARKED.finditer(page.read_text("utf-8"))
+             if found[2] == "plot"]  # fmt: skip
+    assert sorted(shown) == ["fox", "lego", "room"]
+    for scene in shown:
+        assert not tools.result_plots.is_stale(scene), "python tools/results.py tables"
+
+
+def test_a_figure_is_stale_once_a_record_differs(tools, record, tmp_path):
+    pytest.importorskip("matplotlib")
+    plots = tools.result_plots
+    runs = [replace(record, rate=f"r{i}", bytes=1000 * i, psnr=30.0 + i, ssim=0.9) for i in (1, 2)]
+    runs += [replace(record, method="hac", rate=rate, anchors=5, ssim=None) for rate in ("r1", "r1")]
+    tools.write(runs, tmp_path / "x.jsonl")
+    file = tmp_path / "rd.svg"
+    assert plots.is_stale("x", tmp_path, file)
+    plots.draw("x", tmp_path, file)
+    assert not plots.is_stale("x", tmp_path, file)
+    drawn = file.read_text("utf-8")
+    assert "3DGS<" in drawn
+    assert "HAC<" in drawn
+    first, second = plots.panels(runs)
+    assert [(line.name, line.dashed, line.points) for line in first.lines] == [
+        ("3DGS", False, [(0.001, 31.0, None), (0.002, 32.0, None)]),
+        ("HAC", True, [(record.bytes / 1e6, record.psnr, 0.0)]),
+    ]
+    assert [line.name for line in second.lines] == ["3DGS"]  # without a value there is no point
+    tools.write([replace(runs[0], psnr=20.0), *runs[1:]], tmp_path / "x.jsonl")
+    assert plots.is_stale("x", tmp_path, file)
+    assert plots.shown("none", tmp_path) == "*No records of none yet.*\n"
+
+
+def test_a_claim_is_held_where_ratio_and_loss_are(tools, record, tmp_path):
+    exact = replace(record, method="3dgs", rate="r6", gaussians=100, psnr=30.0, seed=0)
+    small = replace(record, method="mesongs", rate="r4", bytes=800, psnr=29.7, seed=0, default_rate=True)
+    more = [replace(each, seed=1) for each in (exact, small)]
+    tools.write([exact, small], tmp_path / "lego.jsonl")
+    tools.write([exact, small, *more], tmp_path / "fox.jsonl")
+    row = tools.table("claims", "all", tmp_path).splitlines()[2]
+    told = "27.5x, -0.36 dB (NeRF-Synthetic)"
+    # 24,800 bytes of .ply over 800: 31.0. The claim is for renderings, and fox is none.
+    cells = "31.0 ± 0.0x, -0.30 ± 0.00 dB (n = 2) | **31.0x, -0.30 dB**"
+    assert row == f"| MesonGS | r4 * | {told} | {cells} |"
+    tools.write([exact, replace(small, psnr=29.5)], tmp_path / "lego.jsonl")
+    assert "**" not in tools.table("claims", "all", tmp_path)
+    tools.write([small], tmp_path / "lego.jsonl")
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
 
 
 def test_a_trainer_stands_beside_ours_with_means_and_without_speeds_of_shared_gpus(tools, tmp_path):

@@ -41,6 +41,8 @@ class SmallRecord:
     memory_kind         "cuda" (torch's allocator) or "rss" (growth of the resident set)
     device              GPU or CPU
     version             of the core and of the method's package
+    repetition          number of the matrix of runs: a seed that ran twice on a GPU gave two results, and a file is
+                        compared with the 3DGS of its own matrix
     """
 
     method: str
@@ -80,14 +82,15 @@ class SmallRecord:
     protocol: str
     date: str
     command: str
+    repetition: int
 
     @property
-    def key(self) -> tuple[str, str, str, int]:
-        """Identity among the runs of one scene: method, variant, rate point, seed."""
-        return self.method, self.variant, self.rate, self.seed
+    def key(self) -> tuple[str, str, str, int, int]:
+        """Identity among the runs of one scene: method, variant, rate point, seed, repetition."""
+        return self.method, self.variant, self.rate, self.seed, self.repetition
 
 
-def extract(run: Path, plugins: PluginManager) -> SmallRecord:
+def extract(run: Path, plugins: PluginManager, repetition: int = 0) -> SmallRecord:
     """Read a run directory. Raises UserInputError for a damaged record, PluginError where its method is missing."""
     record = read_record(run / "metrics.json")
     path = run / "matrix.json"
@@ -152,6 +155,7 @@ def extract(run: Path, plugins: PluginManager) -> SmallRecord:
         protocol=record.protocol.id,
         date=record.date[:10],
         command=str(beside.get("command", "")),
+        repetition=repetition,
     )  # fmt: skip
 
 

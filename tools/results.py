@@ -1,11 +1,12 @@
-"""Make every table of measured runs in docs/results.md and README.md from the small records in docs/records.
+"""Make every table and plot of measured runs in docs/results.md and README.md from the small records in docs/records.
 
-    python tools/results.py collect OUT...       # records of all runs under OUT into docs/records, then the tables
-    python tools/results.py tables               # the tables alone
-    python tools/results.py tables --check       # status 1 where a table and its records disagree; writes nothing
+    python tools/results.py collect OUT...       # records of all runs under OUT into docs/records, then what follows
+    python tools/results.py tables               # the tables and plots alone
+    python tools/results.py tables --check       # status 1 where one and its records disagree; writes nothing
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
-file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl. Values are means over the seeds
+file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at every
+scene. Between `<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the seeds
 ± the deviation of the sample (n - 1).
 """
 
@@ -13,74 +14,21 @@ from __future__ import annotations
 
 import argparse
 import re
-import statistics
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+import result_claims
+import result_plots
 import trainer_records
-from result_records import MIB, RECORDS, ROOT, SmallRecord, extract, merged, read, write
+from result_groups import BASE, NONE, Rows, points, rate, smaller, spread, title
+from result_records import MIB, RECORDS, ROOT, extract, merged, read, write
 
 from splatwizard_core.tooling import load_plugins
 
 PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md")
-MARKED = re.compile(r"(<!-- table (\w[\w-]*) (\w[\w.-]*) -->\n).*?(<!-- end -->)", re.S)
-PLY_BYTES = 248  # of a Gaussian in a float32 .ply of SH degree 3
-BASE = "3dgs"
-TITLES = {
-    "3dgs": "3DGS", "trimming-the-fat": "Trimming the Fat", "pup-3dgs": "PUP-3DGS", "speedy-splat": "Speedy-Splat",
-    "lightgaussian": "LightGaussian", "chimerags": "ChimeraGS", "hac": "HAC", "hac-plus": "HAC++",
-    "cat-3dgs": "CAT-3DGS", "mesongs": "MesonGS", "c3dgs": "C3DGS", "compact3dgs": "Compact3DGS", "2dgs": "2DGS",
-    "flat-3dgs": "flat 3DGS", "trim-3dgs": "Trim3DGS", "trim-2dgs": "Trim2DGS",
-    "trim-2dgs-scratch": "Trim2DGS, scratch",
-}  # fmt: skip
-NONE = "-"
-
-Rows = Sequence[SmallRecord]
-
-
-def spread(values: Sequence[float | None], digits: int) -> str:
-    """Write mean ± deviation of the values; "-" if one of them is missing or there is none."""
-    known = [value for value in values if value is not None]
-    if not known or len(known) < len(values):
-        return NONE
-    mean = f"{statistics.fmean(known):,.{digits}f}"
-    return mean if len(known) == 1 else f"{mean} ± {statistics.stdev(known):,.{digits}f}"
-
-
-def points(records: Rows) -> list[list[SmallRecord]]:
-    """Group the records of one scene by method, variant and rate point, largest file of a method first."""
-    groups = defaultdict(list)
-    for record in records:
-        groups[record.method, record.variant, record.rate].append(record)
-    order = list(TITLES)
-
-    def place(group: list[SmallRecord]) -> tuple[int, str, str, float]:
-        first = group[0]
-        known = order.index(first.method) if first.method in order else len(order)
-        return known, first.method, first.variant, -statistics.fmean(r.bytes for r in group)
-
-    return sorted((sorted(group, key=lambda r: r.seed) for group in groups.values()), key=place)
-
-
-def smaller(group: Rows, records: Rows) -> list[float | None]:
-    """Divide the float32 .ply of the same seed's 3DGS by each file."""
-    plain = [r for r in records if r.method == BASE and not r.variant]
-    exact = max((r.rate for r in plain), default="")
-    base = {r.seed: PLY_BYTES * r.gaussians for r in plain if r.rate == exact and r.gaussians}
-    return [base[r.seed] / r.bytes if r.seed in base else None for r in group]
-
-
-def title(group: Rows) -> str:
-    """Name a method and its variant."""
-    first = group[0]
-    return f"{TITLES.get(first.method, first.method)}{f' ({first.variant})' if first.variant else ''}"
-
-
-def rate(group: Rows) -> str:
-    """Name a rate point; the default one is marked."""
-    return f"{group[0].rate} *" if group[0].default_rate else group[0].rate
+MARKED = re.compile(r"(<!-- (?:table|(?=plot)) ?(\w[\w-]*) (\w[\w.-]*) -->\n).*?(<!-- end -->)", re.S)
 
 
 def quality_table(records: Rows) -> list[list[str]]:
@@ -140,8 +88,12 @@ def table(name: str, scene: str, records_at: Path = RECORDS) -> str:
     """Write one table, and below it where its records come from. Raises SystemExit for a name that is none."""
     if name == "trainers":
         return trainer_records.table(records_at / "trainers" / f"{scene}.jsonl")
+    if name == "claims":
+        return result_claims.table(records_at)
+    if name == "plot":
+        return result_plots.shown(scene, records_at)
     if name not in TABLES:
-        raise SystemExit(f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers'])}")
+        raise SystemExit(f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers', 'claims'])}")
     path = records_at / f"{scene}.jsonl"
     if not path.exists():
         return f"*No records of {scene} yet.*\n"
@@ -164,10 +116,11 @@ def filled(text: str, records_at: Path = RECORDS) -> str:
     return MARKED.sub(lambda m: f"{m[1]}{table(m[2], m[3], records_at)}{m[4]}", text)
 
 
-def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "") -> list[Path]:
+def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "", repetition: int = 0) -> list[Path]:
     """Keep the small records of all runs under `roots`, by scene; one with the key of an older one takes its place.
 
-    name    of the file in place of the scene's, if all runs are of one scene
+    name        of the file in place of the scene's, if all runs are of one scene
+    repetition  of all of them: those of another number stay beside them
 
     Raises SystemExit where there is no run, or the runs of several protocols would come together.
     """
@@ -179,7 +132,7 @@ def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = ""
         raise SystemExit(f"no metrics.json below {', '.join(map(str, roots))}")
     by_file = defaultdict(list)
     for run in runs:
-        record = extract(run, plugins)
+        record = extract(run, plugins, repetition)
         by_file[name or record.scene].append(record)
     written = []
     for file, new in by_file.items():
@@ -200,6 +153,7 @@ def main() -> int:
     gather = commands.add_parser("collect", help="records of runs, then the tables")
     gather.add_argument("out", nargs="+", type=Path, metavar="OUT", help="where runs lie, at any depth")
     gather.add_argument("--name", default="", help="of the file in docs/records (default: the scene)")
+    gather.add_argument("--repetition", type=int, default=0, help="number of this matrix of runs (default: 0)")
     gather.add_argument("--fresh", action="store_true", help="drop the records that are there first")
     write_tables = commands.add_parser("tables", help="the tables from the records")
     write_tables.add_argument("--check", action="store_true", help="write nothing, status 1 where they disagree")
@@ -209,7 +163,7 @@ def main() -> int:
             (RECORDS / f"{args.name}.jsonl").unlink(missing_ok=True)
         elif args.fresh:
             parser.error("--fresh needs --name")
-        for path in collect(args.out, name=args.name):
+        for path in collect(args.out, name=args.name, repetition=args.repetition):
             print(path)
     stale = []
     for page in PAGES:
@@ -220,6 +174,12 @@ def main() -> int:
             if args.command == "collect" or not args.check:
                 page.write_text(made, encoding="utf-8")
                 print(f"{page}: tables rewritten")
+        for scene in [found[3] for found in MARKED.finditer(text) if found[2] == "plot"]:
+            if result_plots.is_stale(scene):
+                stale.append(result_plots.path_of(scene))
+                if args.command == "collect" or not args.check:
+                    result_plots.draw(scene)
+                    print(f"{result_plots.path_of(scene)}: drawn")
     if args.command == "tables" and args.check and stale:
         print(f"tables and docs/records disagree in {', '.join(p.name for p in stale)}: python tools/results.py tables")
         return 1

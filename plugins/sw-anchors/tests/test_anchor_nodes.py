@@ -3,8 +3,11 @@
 import pytest
 import torch
 from sw_anchors.anchors import two_layers
+from sw_anchors.fixed_step import sample_capacity
 from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, widen
 from sw_anchors.neural_gaussians import spawn
+from sw_anchors.noisy_values import Noise, noisy_values
+from sw_anchors.pool_rows import bernoulli_rows
 
 
 def written_out(center, positions, features, offsets, scales, masks, networks):
@@ -38,9 +41,11 @@ def gradients(found, leaves, generator):
 
 
 @pytest.mark.parametrize("masked", [True, False])
-@pytest.mark.parametrize(("n", "dtype", "tolerance"), [(40, torch.float32, 1e-5), (40, torch.float64, 1e-10),
+@pytest.mark.parametrize("learns", [True, False])
+@pytest.mark.parametrize(("n", "dtype", "tolerance"), [(250, torch.float32, 1e-5), (40, torch.float64, 1e-10),
                                                        (0, torch.float32, 0)])  # fmt: skip
-def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
+def test_spawning_equals_the_same_written_out(masked, learns, n, dtype, tolerance):
+    """With positions that learn, networks and Gaussians are apart; else on the CPU they are one kernel."""
     g, k, width = torch.Generator().manual_seed(0), 5, 7
 
     def leaf(*shape):
@@ -50,7 +55,9 @@ def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
     masks = (torch.rand(n, k, generator=g) > 0.3).to(dtype).requires_grad_() if masked else None
     tensors = [leaf(n, 3), leaf(n, width), leaf(n, k, 3), leaf(n, 6)]
     center = torch.tensor([0.3, -2.0, 5.0], dtype=dtype)
-    leaves = [*tensors, *([masks] if masked else []), *(p for network in networks for p in network.parameters())]
+    tensors[0].requires_grad_(learns)
+    own = tensors if learns else tensors[1:]
+    leaves = [*own, *([masks] if masked else []), *(p for network in networks for p in network.parameters())]
     expected = written_out(center, *tensors, masks, networks)
     found = spawn(center, *tensors, masks, networks)
     found = tuple(getattr(found, name) for name in
@@ -60,6 +67,27 @@ def test_spawning_equals_the_same_written_out(masked, n, dtype, tolerance):
     pairs = [gradients(each, leaves, torch.Generator().manual_seed(1)) for each in (found, expected)]
     for a, b in zip(*pairs, strict=True):
         torch.testing.assert_close(a, b, atol=10 * tolerance, rtol=10 * tolerance)
+
+
+@pytest.mark.parametrize("threads", [2, 5])
+def test_one_kernel_gives_the_same_bits_on_any_number_of_threads(threads):
+    g, n, k = torch.Generator().manual_seed(0), 3000, 8
+    networks = tuple(two_layers(28, 48, out * k, g) for out in (1, 7, 3))
+    tensors = [torch.randn(size, generator=g) for size in ((n, 3), (n, 24), (n, k, 3), (n, 6))]
+    before, found = torch.get_num_threads(), []
+    try:
+        for count in (1, threads):
+            torch.set_num_threads(count)
+            leaves = [t.clone().requires_grad_() for t in tensors[1:]]
+            spawned = spawn(torch.zeros(3), tensors[0], *leaves, None, networks)
+            parts = (spawned.means, spawned.opacities, spawned.scales, spawned.quats, spawned.colors)
+            learning = [*leaves, *(p for network in networks for p in network.parameters())]
+            total = sum((part * part).flatten()[:: i + 2].sum() for i, part in enumerate(parts))
+            found.append([*parts, *torch.autograd.grad(total, learning)])
+    finally:
+        torch.set_num_threads(before)
+    assert len(spawned.drawn) > n  # on threads indeed
+    assert all(torch.equal(a, b) for a, b in zip(*found, strict=True))
 
 
 def test_gradients_of_networks_are_aligned_for_the_optimizer():
@@ -95,6 +123,33 @@ def test_values_and_masks_equal_indexing(weighted):
         torch.testing.assert_close(a, b)
 
 
+@pytest.mark.parametrize("weighted", [True, False])
+@pytest.mark.parametrize("steps", ["none", "of all", "of each"])
+def test_noisy_values_of_the_kernel_equal_those_of_operators(weighted, steps):
+    """float64 has no kernel."""
+    g, n, k = torch.Generator().manual_seed(0), 700, 3
+    tables = [torch.randn(size, generator=g) for size in ((n, 5), (n, 6), (n, k, 3), (n, k))]
+    rows = torch.randperm(n, generator=g)[:600]
+    drawn = torch.nonzero(torch.rand(600, generator=g) < 0.1).squeeze(1)
+    weights = torch.rand(n, 1, generator=g) if weighted else None
+    step = torch.rand((3,) if steps == "of all" else (600, 3), generator=g)
+    uniform, slopes = torch.rand(600, 5 + 6 + 3 * k, generator=g), torch.randn(600, 5 + 6 + 4 * k, generator=g)
+    group = torch.tensor([0] * 5 + [1] * 6 + [2] * 3 * k)
+    found = []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [t.to(dtype).requires_grad_() for t in tables]
+        own = step.to(dtype).requires_grad_(steps == "of each")
+        columns = group, torch.nn.functional.one_hot(group, 3).to(dtype)
+        noise = None if steps == "none" else Noise(own, uniform.to(dtype), columns)
+        values = noisy_values(rows, tuple(leaves), None if weights is None else weights.to(dtype), 0.4, noise, drawn)
+        parts = [values.features, values.scales, values.offsets.flatten(1), values.masks]
+        total = (torch.cat(parts, dim=1) * slopes.to(dtype)).sum() + values.sample.square().sum()
+        learning = [*leaves, *([own] if steps == "of each" else [])]
+        found.append([*parts, values.sample, *torch.autograd.grad(total, learning)])
+    for a, b in zip(*found, strict=True):
+        torch.testing.assert_close(a.double(), b.double(), atol=2e-5, rtol=2e-5)  # exp in float32
+
+
 def test_rows_columns_and_products_have_their_gradients():
     g = torch.Generator().manual_seed(0)
     a, b, scales = (torch.randn(n, 3, generator=g, dtype=torch.float64).requires_grad_() for n in (6, 6, 5))
@@ -127,3 +182,19 @@ def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
         found.append([each.detach().cpu() for each in (*parts, *gradients)])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.7, 1.0])
+def test_a_sample_of_all_rows_draws_each_with_its_probability(share):
+    n, g = 4000, torch.Generator().manual_seed(0)
+    size = sample_capacity(n, share)
+    found = torch.zeros(n)
+    for _ in range(50):
+        rows, counted = bernoulli_rows(torch.rand(size, generator=g), n, share)
+        drawn = rows[counted > 0]
+        assert len(drawn.unique()) == len(drawn)
+        assert bool((rows[counted == 0] == n - 1).all())
+        found[drawn] += 1
+    spread = (share * (1 - share) * 50) ** 0.5
+    assert abs(float(found.mean()) - 50 * share) <= 4 * spread / n**0.5 + 1e-6
+    assert float(found.std()) == pytest.approx(spread, rel=0.05, abs=1e-6)  # rows are drawn independently

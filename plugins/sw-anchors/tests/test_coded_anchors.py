@@ -5,8 +5,9 @@ import math
 
 import pytest
 import torch
-from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, AnchorContext, CodedAnchors
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.forecasts import AnchorContext
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -134,7 +135,7 @@ def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
     assert rate.numbers == 40 * (5 + 6 + 12)
     masks, forecast = model.masks(rows), model.forecast(rows)
     values = tuple(v.detach() for v in model.raw(rows))
-    again = model.rate(torch.cat(values, dim=1), forecast, masks)
+    again = model.rate(rows, torch.cat(values, dim=1), forecast, masks)
     normal = torch.distributions.Normal(0.0, 1.0)
     probability = normal.cdf(values[2] + 0.1) - normal.cdf(values[2] - 0.1)
     bits = -torch.log2(probability.clamp(min=1e-6)) * masks.repeat_interleave(3, 1)

@@ -80,6 +80,15 @@ def test_the_published_hyper_parameters():
     assert (lr.position_init, lr.position_final, lr.opacity, lr.scales, lr.quats) == (1.6e-4, 1.6e-6, 0.05, 5e-3, 1e-3)
 
 
+@pytest.mark.parametrize(
+    ("scene", "log2_size", "weight"),
+    [("nerf_synthetic/lego", 16, 4e-3), ("dtu/scan24", 16, 4e-3), ("mipnerf360/room", 19, 5e-4)],
+)
+def test_scenes_known_to_be_synthetic_have_the_authors_values(scene, log2_size, weight):
+    config = resolve(Compact3DGS, "paper", rate="r5", scene=scene, plugins=load_plugins()).config
+    assert (config.grid.log2_table, config.mask.weight) == (log2_size, weight)
+
+
 def test_rate_points_are_multiples_of_the_presets_weight():
     weights = {}
     for rate in Compact3DGS.RATES:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from plyfile import PlyData, PlyElement
-from sw_gaussians.ply import export_ply, from_ply, load_ply, property_names, to_ply
+from sw_gaussians.ply import export_ply, from_ply, load_ply, to_ply
+from sw_gaussians.ply_gaussians import property_names
 
 from splatwizard_core.errors import BitstreamError, SceneError, UserInputError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -99,6 +101,35 @@ def test_ascii_double_and_any_order_are_read(tmp_path):
     PlyData([PlyElement.describe(rows, "vertex")], text=True).write(str(tmp_path / "ascii.ply"))
     # plyfile prints doubles with 18 digits, so float32 values survive
     assert bits(load_ply(tmp_path / "ascii.ply")) == bits(model)
+
+
+def test_big_endian_rows_behind_another_element_are_read(tmp_path):
+    model = random_model(4, 1, 3)
+    export_ply(model, tmp_path / "m.ply")
+    vertex = PlyData.read(tmp_path / "m.ply")["vertex"].data
+    other = np.zeros(3, dtype=[("a", "u1"), ("b", "f8")])
+    elements = [PlyElement.describe(other, "camera"), PlyElement.describe(vertex, "vertex")]
+    PlyData([*elements, PlyElement.describe(other, "more")], byte_order=">").write(str(tmp_path / "big.ply"))
+    assert bits(load_ply(tmp_path / "big.ply")) == bits(model)
+
+
+def test_a_file_is_not_read_row_by_row():
+    def calls(n: int) -> int:
+        data, count = to_ply(random_model(n, 3, 0)), 0
+
+        def counted(_frame, _event, _argument):
+            nonlocal count
+            count += 1
+
+        before = sys.getprofile()
+        sys.setprofile(counted)
+        try:
+            from_ply(data, "somewhere")
+        finally:
+            sys.setprofile(before)
+        return count
+
+    assert calls(40) < 1.2 * calls(4)
 
 
 @pytest.fixture

@@ -99,6 +99,10 @@ def test_no_two_methods_of_the_field_look_alike():
     looks = [look_of(method) for method in FIELD]
     assert len(set(looks)) == len(looks)
     assert max(sum(look % STYLES == colour for look in looks) for colour in range(STYLES)) == 3
+    together = FIELD[:1] + FIELD[6:14]
+    assert len({look_of(method) % STYLES for method in together}) == STYLES  # nine methods
+    surfaces = FIELD[1:6]
+    assert len({look_of(method) % STYLES for method in surfaces}) == len(surfaces)
 
 
 def test_a_method_looks_alike_whatever_stands_beside_it(make_curve, tmp_path):

@@ -132,6 +132,16 @@ class AnchorSplats(SplatModel):
         """The Gaussians of the visible anchors; `extras["anchors"]` is the AnchorSelection."""
         return self.decode(camera, self.visible_anchors(camera, rasterizer))
 
+    @property
+    def num_gaussian_ids(self) -> int:
+        """Number of Gaussians that there can be: N k."""
+        return self.num_rows * self.num_offsets
+
+    def gaussian_ids(self, inputs: GaussianInputs) -> Tensor:
+        """[M] int64: of `gaussians(...)`, index into the N k offsets of the model; what baking asks for."""
+        selection: AnchorSelection = inputs.extras["anchors"]
+        return selection.offset_index()
+
     def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
         """The Gaussians of the anchors `rows` [V] as `camera` sees them; those of opacity <= 0 are left out."""
         a = self.attributes(rows)

@@ -1,6 +1,7 @@
 """Neural Gaussians of a view, from what the networks say of anchors: those with opacity > 0.
 
-In float32 kernels decode each Gaussian, and its gradient, in one pass; torch operations everywhere else.
+In float32 kernels decode each Gaussian, and its gradient, in one pass, on the CPU together with the networks; torch
+operations everywhere else.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from splatwizard_native import sums_vary_on_cuda
+from sw_anchors.fused_heads import fits_kernel, spawn_by_kernel
 from sw_anchors.native import ANCHORS
 from sw_anchors.view_networks import Networks, network_outputs
 
@@ -56,6 +58,8 @@ def spawn(
 
     Waits for the device once, for M.
     """
+    if fits_kernel(positions, (center, features, offsets, scales, masks), networks):
+        return NeuralGaussians(*spawn_by_kernel(center, positions, features, offsets, scales, masks, networks))
     outputs = network_outputs(center, positions, features, networks)
     return visible_gaussians(*outputs, positions, offsets, scales, masks)
 

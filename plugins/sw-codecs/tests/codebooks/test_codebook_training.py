@@ -1,14 +1,19 @@
 """Codebooks: k-means that moves entries, the weighted batch loops and their updates, stored precision."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
 from splatwizard_core.errors import ShapeError
+from sw_codecs.codebooks import batches
+from sw_codecs.codebooks import nearest as search
 from sw_codecs.codebooks.kmeans import kmeans
 from sw_codecs.codebooks.nearest import nearest
 from sw_codecs.codebooks.relocation import relocate
 from sw_codecs.codebooks.weighted_rows import draw, gather
+from sw_codecs.native import CODECS
 from sw_codecs.quantizers.vector_quantizer import VectorQuantizer
 
 
@@ -41,6 +46,76 @@ def test_the_search_is_brute_force(size, block, dtype):
         other, _ = nearest(entries, entries, block=block, others=True)
         apart = torch.cdist(entries.double(), entries.double()).fill_diagonal_(torch.inf)
         assert torch.allclose(apart.gather(1, other[:, None])[:, 0], apart.amin(1), atol=1e-4)
+
+
+@pytest.fixture
+def boxes(monkeypatch):
+    if CODECS.available() is not None:
+        pytest.skip(str(CODECS.available()))
+    CODECS.load()
+    monkeypatch.setattr(search, "WORTH_BOXES", 0)
+    monkeypatch.setattr(search, "SHARE", 1.0)
+    monkeypatch.setattr(search, "_by_products", None)  # not what is to be seen
+
+
+@pytest.mark.parametrize("width", [1, 3, 8, 9, 30])  # boxes have 8 axes
+@pytest.mark.parametrize("size", [1, 16, 17, 130, 1100])  # leaves have 16 entries, branches 128, groups of them 1,024
+def test_boxes_leave_out_nothing_that_is_nearest(boxes, size, width):
+    rows, entries = (torch.randn(n, width, generator=gen(n)) * torch.linspace(1, 0.1, width) + 3 for n in (400, size))
+    index, distance = nearest(rows, entries, block=150)
+    exact = torch.cdist(rows.double(), entries.double()).square()
+    chosen = exact.gather(1, index[:, None])[:, 0]
+    assert (chosen <= exact.amin(1) * (1 + 1e-5) + 1e-9).all()  # float32 sums of up to 30 squares
+    assert torch.allclose(distance.double(), chosen, rtol=1e-4, atol=1e-9)
+
+
+def test_boxes_take_the_first_of_equal_entries_and_survive_numbers_that_are_none(boxes):
+    entries = torch.randn(40, 3, generator=gen()).repeat(3, 1)
+    rows = torch.cat([entries, torch.tensor([[math.nan, 0, 0], [math.inf, 0, 0], [3e38, 0, 0]])])
+    index = nearest(rows, entries)[0]
+    assert torch.equal(index[:120], torch.arange(40).repeat(3))
+    assert (index >= 0).all()
+    assert (index < 120).all()
+
+
+def test_of_rows_along_few_axes_few_distances_are_computed(boxes):
+    rows = torch.cat([torch.randn(2000, 3, generator=gen()), torch.zeros(2000, 37)], 1)
+    index, share = torch.ops.sw_codecs.nearest_entries(rows, rows[:1000].clone())
+    assert torch.equal(index[:1000], torch.arange(1000))
+    assert share < 5 / 63  # of the leaves
+
+
+def test_where_boxes_leave_out_little_products_are_made(boxes, monkeypatch):
+    x, entries = (torch.randn(n, 40, generator=gen(n)) for n in (300, 200))
+    monkeypatch.setattr(search, "SHARE", 0.5)
+    with pytest.raises(TypeError):  # the fixture took the search by products away
+        nearest(x, entries)
+
+
+@pytest.mark.parametrize("width", [0, 3])
+def test_the_kernel_refuses_what_does_not_fit(boxes, width):
+    for rows, entries in ((torch.zeros(2, width), torch.zeros(0, width)), (torch.zeros(2, 4), torch.zeros(2, width))):
+        with pytest.raises(RuntimeError, match="nearest_entries: rows"):
+            torch.ops.sw_codecs.nearest_entries(rows, entries)
+
+
+def test_a_batch_as_large_as_the_rows_looks_at_each_once(monkeypatch):
+    x, weights, looked = clusters(300, 12), torch.rand(300, generator=gen(1)), []
+
+    def seen(rows, entries, **options):
+        looked.append(len(rows))
+        return nearest(rows, entries, **options)
+
+    monkeypatch.setattr(batches, "nearest", seen)
+    books, counted = [], batches._counted
+    for count in (lambda drawn, _rows: (drawn, torch.ones_like(drawn)), counted):
+        monkeypatch.setattr(batches, "_counted", count)
+        vq = VectorQuantizer(12)
+        vq.train(x, weights, 5, 300, generator=gen(), rule="batch-mean")
+        books.append(vq.codebook)
+    assert looked[:5] == [300] * 5
+    assert all(150 < count < 220 for count in looked[5:])  # 1 - 1/e of them
+    torch.testing.assert_close(books[0], books[1])
 
 
 def test_the_search_keeps_its_digits_far_from_the_origin():

@@ -12,7 +12,7 @@ from sw_compact3dgs import file
 from sw_compact3dgs.colors import ColorField
 from sw_compact3dgs.config import Compact3DGSConfig
 from sw_compact3dgs.model import CompactGaussians
-from sw_compact3dgs.presets import PRESETS, RATES
+from sw_compact3dgs.presets import BY_DATASET, PRESETS, RATES
 from sw_compact3dgs.stage import Compact3DGSStage
 
 if TYPE_CHECKING:
@@ -34,6 +34,7 @@ class Compact3DGS(Method):
     version: ClassVar[int] = 1
     Config = Compact3DGSConfig
     PRESETS: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
+    BY_DATASET: ClassVar[Mapping[str, Mapping[str, Any]]] = BY_DATASET
     RATES: ClassVar[Mapping[str, Mapping[str, Any]]] = RATES
     DEFAULT_RATE: ClassVar[str] = "r5"
 

@@ -3,19 +3,23 @@
 from collections.abc import Mapping
 from typing import Any
 
+SYNTHETIC: Mapping[str, Any] = {
+    "grid.log2_size": 16,
+    "mask.weight": 4e-3,
+    "mask.lr": 1e-3,
+    "network.lr": 1e-3,
+    "network.lr_steps": [25_000],
+}
+
+BY_DATASET: Mapping[str, Mapping[str, Any]] = {"nerf_synthetic": SYNTHETIC, "dtu": SYNTHETIC}
+
 PRESETS: Mapping[str, Mapping[str, Any]] = {
     # The authors' values for real scenes (Mip-NeRF 360, Tanks and Temples, Deep Blending), plan of Splatwizard's paper.
     "paper": {},
     # Their strict comparison makes 600 the first densification.
     "inria": {"densify.start": 600},
-    # The authors' values for Synthetic-NeRF and DTU.
-    "synthetic": {
-        "grid.log2_size": 16,
-        "mask.weight": 4e-3,
-        "mask.lr": 1e-3,
-        "network.lr": 1e-3,
-        "network.lr_steps": [25_000],
-    },
+    # The authors' values for Synthetic-NeRF and DTU; "paper" has them for scenes that are known to be of these.
+    "synthetic": SYNTHETIC,
     # The plan scaled down for a CPU and the demo scene: a small grid, step sizes for few steps, codebooks of 4 stages.
     "quick": {
         "iterations": 1800,

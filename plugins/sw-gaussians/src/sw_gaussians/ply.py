@@ -5,41 +5,19 @@ That of 2DGS differs in one thing: a surfel has no `scale_2`. Which of the two a
 
 from __future__ import annotations
 
-import io
-import math
+import logging
+import mmap
 import os
-import re
+from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
 import torch
-from plyfile import PlyData
-from torch import Tensor
 
-from splatwizard_core.api import BitstreamError, GaussianModel, SceneError, SplatModel, replacing
-from sw_gaussians.surfels import SurfelModel, as_ellipsoids, gaussians_of
+from splatwizard_core.api import GaussianModel, SceneError, SplatModel, replacing
+from sw_gaussians.ply_gaussians import file_parts, parse_gaussians
+from sw_gaussians.surfels import as_ellipsoids, gaussians_of
 
-MAX_HEADER = 1 << 16
-_SIZES = {
-    "char": 1, "uchar": 1, "int8": 1, "uint8": 1, "short": 2, "ushort": 2, "int16": 2, "uint16": 2,
-    "int": 4, "uint": 4, "int32": 4, "uint32": 4, "float": 4, "float32": 4, "double": 8, "float64": 8,
-}  # fmt: skip
-
-
-def property_names(sh_rest: int, scales: int = 3) -> list[str]:
-    """The vertex properties in the order of the file.
-
-    sh_rest     K - 1, higher SH coefficients a channel
-    scales      of a Gaussian: 3, of a surfel 2
-    """
-    return [
-        "x", "y", "z", "nx", "ny", "nz",
-        *(f"f_dc_{i}" for i in range(3)),
-        *(f"f_rest_{i}" for i in range(3 * sh_rest)),
-        "opacity",
-        *(f"scale_{i}" for i in range(scales)),
-        *(f"rot_{i}" for i in range(4)),
-    ]  # fmt: skip
+log = logging.getLogger(__name__)
 
 
 def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
@@ -47,64 +25,36 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
 
     A file with scale_0 and scale_1 and no scale_2 holds surfels: a SurfelModel.
 
-    Any order of properties, float or double, binary or ASCII, is read; normals and unknown properties are ignored.
+    Any order of properties, any type of number, binary or ASCII, is read; normals and unknown properties are ignored.
     Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
     """
     path = Path(path)
     try:
         with path.open("rb") as file:
-            # Before the rest is read: it may be anything.
-            _check_header(file.read(MAX_HEADER), os.fstat(file.fileno()).st_size, str(path))
-            file.seek(0)
-            return from_ply(file.read(), str(path))
+            if not os.fstat(file.fileno()).st_size:
+                return from_ply(b"", str(path))
+            # Not closed here: an error on its way out still holds views of it.
+            return from_ply(memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)), str(path))
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
 
 
-def from_ply(data: bytes, path: str) -> GaussianModel:
+def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
     """Read a model from the bytes of a file, as `load_ply` does.
 
     path    what errors call it: where it lies, if it lies anywhere
     """
-    name = Path(path).name
-    count = _check_header(data[:MAX_HEADER], len(data), path)
-    try:
-        vertex = PlyData.read(io.BytesIO(data))["vertex"].data
-    except Exception as error:  # plyfile raises many kinds for damaged files, MemoryError and IndexError among them
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise BitstreamError(f"{name}: not a readable .ply: {reason}", section="vertex") from error
-    if len(vertex) != count:
-        raise BitstreamError(f"{name}: {len(vertex)} vertices, header says {count}", section="vertex")
-    names = set(vertex.dtype.names or ())
-    rest = sum(1 for each in names if re.fullmatch(r"f_rest_\d+", each))
-    degree = math.isqrt(rest // 3 + 1) - 1
-    if rest % 3 or (degree + 1) ** 2 != rest // 3 + 1 or degree > 3:
-        raise SceneError(f"{name}: {rest} f_rest properties; 0, 9, 24 or 45 (SH degree 0 to 3) are possible", path=path)
-    flat = "scale_1" in names and "scale_2" not in names
-    scales = SurfelModel.NUM_SCALES if flat else GaussianModel.NUM_SCALES
-    needed = [each for each in property_names(rest // 3, scales) if each not in ("nx", "ny", "nz")]
-    missing = [each for each in needed if each not in names]
-    if missing:
+    found = parse_gaussians(data, path)
+    if found.sh_rest.shape[1] > 15:
         raise SceneError(
-            f"{name}: not a 3DGS model, property '{missing[0]}' is missing ({len(missing)} in all)", path=path
+            f"{Path(path).name}: {3 * found.sh_rest.shape[1]} f_rest properties; 0, 9, 24 or 45 (SH degree 0 to 3) "
+            "are possible",
+            path=path,
         )
-
-    def columns(*wanted: str) -> Tensor:
-        table = np.empty((count, len(wanted)), dtype=np.float32)
-        for i, each in enumerate(wanted):
-            table[:, i] = vertex[each]
-        return torch.from_numpy(table)
-
-    # f_rest is channel-major: all K-1 coefficients of red, then green, then blue.
-    sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(count, 3, rest // 3)
-    return gaussians_of(
-        columns("x", "y", "z"),
-        columns("f_dc_0", "f_dc_1", "f_dc_2")[:, None, :],
-        sh_rest.transpose(1, 2).contiguous(),
-        columns("opacity")[:, 0],
-        columns(*(f"scale_{i}" for i in range(scales))),
-        columns("rot_0", "rot_1", "rot_2", "rot_3"),
-    )
+    for note in found.notes:
+        log.warning("%s: %s", Path(path).name, note)
+    columns = (found.means, found.sh_dc[:, None], found.sh_rest, found.opacity_logits, found.log_scales, found.quats)
+    return gaussians_of(*(torch.from_numpy(column) for column in columns))
 
 
 def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
@@ -115,10 +65,12 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """
     if not isinstance(model, GaussianModel):
         raise SceneError(
-            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera", path=str(path)
+            f"a {type(model).__name__} cannot be written as .ply: its Gaussians depend on the camera; "
+            "`sw bake FILE OUT --scene SCENE` fits explicit ones",
+            path=str(path),
         )
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_file_parts(model))
+        file.writelines(_parts_of(model))
 
 
 def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
@@ -131,57 +83,9 @@ def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
 
 def to_ply(model: GaussianModel) -> bytes:
     """The bytes that `export_ply` writes of a model."""
-    return b"".join(_file_parts(model))
+    return b"".join(_parts_of(model))
 
 
-def _file_parts(model: GaussianModel) -> tuple[bytes, memoryview]:
-    """The header, and the rows [N, 17 + 3 (K - 1)] (surfels: one less) little-endian, columns as `property_names`."""
-    names = property_names(model.sh_rest.shape[1], model.NUM_SCALES)
-    properties = "".join(f"property float {name}\n" for name in names)
-    header = f"ply\nformat binary_little_endian 1.0\nelement vertex {model.num_rows}\n{properties}end_header\n"
-    columns = (
-        model.means,
-        model.means.new_zeros(model.num_rows, 3),
-        model.sh_dc[:, 0, :],
-        model.sh_rest.transpose(1, 2).flatten(1),
-        model.opacity_logits[:, None],
-        model.log_scales,
-        model.quats,
-    )
-    rows = np.concatenate([each.detach().cpu().float().numpy() for each in columns], axis=1, dtype="<f4")
-    return header.encode("ascii"), rows.data
-
-
-def _check_header(head: bytes, size: int, path: str) -> int:
-    """The vertex count that a header claims, checked against the size of the file before anything is allocated."""
-    name = Path(path).name
-    match = re.search(rb"(?:^|\n)end_header\r?\n", head)
-    if not head.startswith(b"ply") or match is None:
-        raise BitstreamError(f"{name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
-    binary, element = False, None
-    counts: dict[str, int] = {}
-    widths: dict[str, int] = {}
-    for line in head[: match.start()].decode("ascii", "replace").splitlines():
-        words = line.split()
-        if words[:1] == ["format"]:
-            binary = len(words) > 1 and words[1].startswith("binary")
-        elif words[:1] == ["element"]:
-            if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]):
-                raise BitstreamError(f"{name}: bad header line '{line[:60]}'", section="header")
-            element = words[1]
-            counts[element], widths[element] = int(words[2]), 0
-        elif words[:1] == ["property"] and element is not None:
-            if len(words) != 3 or words[1] not in _SIZES:
-                raise BitstreamError(f"{name}: property '{line[:60]}' has no place in a 3DGS model", section="header")
-            widths[element] += _SIZES[words[1]] if binary else 2
-    if "vertex" not in counts:
-        raise SceneError(f"{name}: not a 3DGS model: the header names no element 'vertex'", path=path)
-    # An ASCII value takes two bytes at least; an element without properties would loop for nothing.
-    claimed = sum(counts[each] * max(widths[each], 1) for each in counts)
-    have = size - match.end()
-    if claimed > have + (0 if binary else 1):
-        raise BitstreamError(
-            f"{name}: the header claims {claimed:,} bytes of data, the file holds {have:,}: it is truncated",
-            section="vertex",
-        )
-    return counts["vertex"]
+def _parts_of(model: GaussianModel) -> Iterator[bytes | memoryview]:
+    columns = (model.means, model.sh_dc[:, 0], model.sh_rest, model.opacity_logits, model.log_scales, model.quats)
+    return file_parts(*(column.detach().cpu().float().numpy() for column in columns))

@@ -46,6 +46,7 @@ class Flag(enum.IntFlag):
     TENSOR_CORES = 16384
     BYTES = 32768
     ORDERED = 131072
+    FRAGMENTS = 262144  # with ABSGRAD: other sums in its two columns
 
 
 @dataclass

@@ -8,7 +8,7 @@ PROFILES = ["3dgs", "dgr-exact"]
 STANDARD_FEATURES = [
     "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",
     "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "TIGHT_TILES",
-    "FLOAT64", "DETERMINISTIC",
+    "FLOAT64", "DETERMINISTIC", "FRAGMENT_GRAD",
 ]  # fmt: skip
 
 ON_CUDA = {"lacks": ["FLOAT64"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
@@ -24,7 +24,10 @@ STANDARD = {
     "accel": (
         "variants:AccelRasterizer",
         "the kernels of standard for training: split SH, exact tiles (Taming 3DGS)",
-        ["BACKWARD", "ABSGRAD", "VISIBLE_FILTER", "SPLIT_SH", "TIGHT_TILES", "COLORS_ND", "FLOAT64", "DETERMINISTIC"],
+        [
+            "BACKWARD", "ABSGRAD", "VISIBLE_FILTER", "SPLIT_SH", "TIGHT_TILES", "COLORS_ND", "FLOAT64", "DETERMINISTIC",
+            "FRAGMENT_GRAD",
+        ],
         44,
     ),
     "depth": (

@@ -27,16 +27,29 @@ def turbo(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return colors
 
 
-def depth_colors(depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return [H,W,3]: values between the 2nd and the 98th percentile along Turbo; black where nothing is seen.
+def depth_range(depth: NDArray[np.float32], alpha: NDArray[np.float32]) -> tuple[float, float] | None:
+    """Return the 2nd and the 98th percentile of the depths [H,W] that are seen; None if none is."""
+    seen = (depth > 0) & (alpha >= ALPHA_MIN)
+    if not seen.any():
+        return None
+    low, high = np.percentile(depth[seen], [2, 98])
+    return float(low), float(high)
+
+
+def depth_colors(
+    depth: NDArray[np.float32], alpha: NDArray[np.float32], span: tuple[float, float] | None = None
+) -> NDArray[np.uint8]:
+    """Return [H,W,3]: the depths of a span along Turbo; black where nothing is seen.
 
     depth   [H,W], 0: no surface
     alpha   [H,W]
+    span    depths of the first and the last colour; None: `depth_range` of these
     """
-    seen = (depth > 0) & (alpha >= ALPHA_MIN)
     colors = np.zeros((*depth.shape, 3), np.uint8)
-    if seen.any():
-        low, high = np.percentile(depth[seen], [2, 98])
+    span = span or depth_range(depth, alpha)
+    if span is not None:
+        seen = (depth > 0) & (alpha >= ALPHA_MIN)
+        low, high = span
         colors[seen] = turbo((depth[seen] - low) / max(high - low, 1e-12))
     return colors
 

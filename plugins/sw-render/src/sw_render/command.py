@@ -9,9 +9,9 @@ from typing import Any
 
 import click
 
-from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import (
     EXISTING,
+    OUTPUT_FILE,
     OUTPUT_FOLDER,
     Choices,
     config_option,
@@ -27,7 +27,7 @@ from splatwizard_core.tooling import (
     set_option,
     takes_choices,
 )
-from sw_render.modes import AUTO, DEPTHS, NORMALS
+from sw_render.modes import AUTO, DEPTHS, NORMALS, PATHS
 
 
 def _modes(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[str, ...]:
@@ -37,6 +37,15 @@ def _modes(_context: click.Context, _parameter: click.Parameter, value: str | No
             swallowed = " (FILE goes before it)" if Path(word).exists() and word else ""
             raise click.UsageError(f"--depth has no mode '{word}': one or more of {', '.join(DEPTHS)}{swallowed}")
     return tuple(dict.fromkeys(words))
+
+
+def _size(_context: click.Context, _parameter: click.Parameter, value: str | None) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    sides = value.lower().split("x")
+    if len(sides) != 2 or not all(side.isascii() and side.isdigit() and 16 <= int(side) <= 16_384 for side in sides):
+        raise click.UsageError(f"--size '{value}' is no size: WIDTHxHEIGHT in pixels, 16 to 16384, such as 1280x720")
+    return int(sides[0]), int(sides[1])
 
 
 def _offered(names: Iterable[str]) -> Callable[[click.Context, click.Parameter, str], list[str]]:
@@ -55,6 +64,23 @@ def _offered(names: Iterable[str]) -> Callable[[click.Context, click.Parameter, 
     click.option(
         "--views", type=click.Choice(["test", "train", "all"]), default="test", show_default=True,
         help="Which cameras of the scene.",
+    ),
+    click.option(
+        "--trajectory", metavar="PATH", shell_complete=_offered(PATHS),
+        help=f"Cameras on a path in place of the views: {', '.join(PATHS)} (by the training cameras), or a JSON file.  "
+        "[default: the views]",
+    ),
+    click.option(
+        "--video", type=OUTPUT_FILE, metavar="FILE",
+        help="Write the frames as one video (.mp4, .webm, .mkv, .mov), maps beside it; needs av.  [default: PNGs]",
+    ),
+    click.option("--frames", type=click.IntRange(1, 100_000), metavar="N", help="Cameras on the path.  [default: 120]"),
+    click.option(
+        "--fps", type=click.FloatRange(0, 1000, min_open=True), metavar="F", help="Frames a second.  [default: 30]"
+    ),
+    click.option(
+        "--size", callback=_size, metavar="WxH", shell_complete=_offered(("960x540", "1280x720", "1920x1080")),
+        help="Of the frames, pixels.  [default: that of the first camera]"
     ),
     click.option(
         "--depth", "depths", is_flag=False, flag_value="expected", metavar="[MODE[,MODE]]", callback=_modes,
@@ -85,6 +111,11 @@ def render(
     file: Path,
     out: Path,
     views: str,
+    trajectory: str | None,
+    video: Path | None,
+    frames: int | None,
+    fps: float | None,
+    size: tuple[int, int] | None,
     depths: tuple[str, ...],
     normals: str | None,
     alpha: bool,
@@ -98,45 +129,56 @@ def render(
     """Draw FILE from the cameras of a scene, as 8-bit PNG; with --depth, --normals, --alpha also maps.
 
     FILE is a .swz, a .ply, or a run directory: then its scene.swz, on its own scene. Any method can be drawn with
-    depth; only surfels have normals of their own. What the arrays hold is in the README of sw-render.
+    depth; only surfels have normals of their own. With --trajectory the cameras move, and --video makes one file of the
+    frames. What the arrays hold, and the JSON of cameras, is in the README of sw-render.
     """
-    from sw_render.drawing import open_drawing
+    from sw_render.drawing import encoded_file, open_drawing
     from sw_render.exr import exr_library
+    from sw_render.films import draw_films
     from sw_render.map_files import MapFiles
     from sw_render.maps import MapRequest
+    from sw_render.trajectory import even, make_trajectory
+    from sw_render.video import check_video
     from sw_render.views import draw_views
 
     if normals not in (None, AUTO, *NORMALS):
         raise click.UsageError(f"--normals has no kind '{normals}': {' or '.join(NORMALS)}")
-    if (depth_png or depth_exr or depth_scale is not None) and not depths:
-        raise click.UsageError("--depth-png, --depth-exr and --depth-scale say how --depth is written: add --depth")
+    if (depth_png or depth_exr or depth_scale is not None) and (not depths or video is not None):
+        other = "leave out --video" if depths else "add --depth"
+        raise click.UsageError(f"--depth-png, --depth-exr and --depth-scale say how --depth is written: {other}")
+    if trajectory is None and (video is not None or frames is not None or size is not None):
+        raise click.UsageError(f"--video, --frames and --size are for --trajectory: {', '.join(PATHS)} or a JSON file")
+    if trajectory is not None and trajectory not in PATHS and not Path(trajectory).is_file():
+        raise click.UsageError(f"--trajectory '{trajectory}' is none of {', '.join(PATHS)}, and no file")
+    if fps is not None and video is None:
+        raise click.UsageError("--fps is for --video: add that")
     if depth_exr:
         exr_library()
+    if video is not None:
+        check_video(video)
     if file.is_dir():
         chosen = replace(chosen, config_file=chosen.config_file or str(file / "config.toml"))
-        file = _encoded(file)
+        file = encoded_file(file)
     resolved = chosen.resolve_without_method()
     drawing = open_drawing(file, open_session(resolved, load_plugins()), resolved)
-    scene = drawing.scene
-    wanted = {"test": scene.test, "train": scene.train, "all": [*scene.train, *scene.test]}[views]
-    unique = list({view.name: view for view in wanted}.values())
+    if trajectory is None:
+        path, drawn = None, drawing.views(views)
+    else:
+        path = make_trajectory(drawing, trajectory, frames=frames, fps=fps, size=size, fit=even if video else None)
+        drawn = path.views
     request = MapRequest(depths, normals, alpha, drawing.depth_ratio if depth_ratio is None else depth_ratio)
-    if unique and not request.is_empty:
-        request = request.suited(surfels=drawing.has_surfels(unique[0].camera), what=file.name)
-    maps = MapFiles(out, request, png=depth_png or depth_scale is not None, exr=depth_exr, scale=depth_scale)
-    files = draw_views(drawing, unique, out, maps)
-    facts: dict[str, Any] = {"folder": str(out), "files": files}
+    if drawn and not request.is_empty:
+        request = request.suited(surfels=drawing.has_surfels(drawn[0].camera), what=file.name)
+    facts: dict[str, Any]
+    if video is not None and path is not None:
+        written = draw_films(drawing, path, video, request)
+        facts = {"files": [str(each) for each in written], "frames": len(drawn), "fps": path.fps}
+        told = f"{len(drawn)} frames, {len(drawn) / path.fps:.1f} s: {', '.join(facts['files'])}"
+    else:
+        maps = MapFiles(out, request, png=depth_png or depth_scale is not None, exr=depth_exr, scale=depth_scale)
+        files = draw_views(drawing, drawn, out, maps)
+        facts = {"folder": str(out), "files": files, **({} if request.is_empty else {"maps": maps.written})}
+        told = f"{', '.join([f'{len(files)} pictures', *maps.written])}: {out}"
     if not request.is_empty:
-        facts |= {"maps": maps.written, "normals": request.normals, "rasterizers": drawing.rasterizer.choices}
-    told = ", ".join([f"{len(files)} pictures", *maps.written])
-    print_facts(facts, as_json, f"{told}: {out}")
-
-
-def _encoded(directory: Path) -> Path:
-    """The file of a run directory. Raises UserInputError."""
-    found = directory / "scene.swz"
-    if not found.is_file() or not (directory / "config.toml").is_file():
-        raise UserInputError(
-            f"{directory} is no finished run directory, it has no scene.swz and config.toml: name a file"
-        )
-    return found
+        facts |= {"normals": request.normals, "rasterizers": drawing.rasterizer.choices}
+    print_facts(facts, as_json, told)

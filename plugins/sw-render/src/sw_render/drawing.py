@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from splatwizard_core.api import UserInputError
 from splatwizard_core.tooling import NegotiatedRasterizer, open_subject, render_view
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import Camera, RasterOptions, RenderResult, Scene, SplatModel
+    from splatwizard_core.api import Camera, RasterOptions, RenderResult, Scene, SplatModel, View
     from splatwizard_core.tooling import ResolvedConfig, Session
 
 
@@ -38,6 +39,12 @@ class Drawing:
             scales = self.model.gaussians(camera.to(self.device), self.rasterizer).scales
         return scales is not None and scales.shape[-1] == 2
 
+    def views(self, which: str) -> list[View]:
+        """Views of the scene: "test", "train" or "all", each name once."""
+        train, test = self.scene.train, self.scene.test
+        wanted = {"test": test, "train": train, "all": [*train, *test]}[which]
+        return list({view.name: view for view in wanted}.values())
+
     @property
     def depth_ratio(self) -> float:
         """The share of the median in the depth of the surface that the model was trained with; 0 if it says none."""
@@ -53,3 +60,13 @@ def open_drawing(path: Path, session: Session, resolved: ResolvedConfig) -> Draw
     found = open_subject(path, session, resolved)
     assert isinstance(found.rasterizer, NegotiatedRasterizer)  # a session has no other
     return Drawing(found.model, found.scene, found.rasterizer, found.options, session.device)
+
+
+def encoded_file(directory: Path) -> Path:
+    """Return the file of a run directory. Raises UserInputError."""
+    found = directory / "scene.swz"
+    if not found.is_file() or not (directory / "config.toml").is_file():
+        raise UserInputError(
+            f"{directory} is no finished run directory, it has no scene.swz and config.toml: name a file"
+        )
+    return found

@@ -24,3 +24,10 @@ NORMALS: Mapping[str, str] = {
 
 AUTO = "auto"
 """The first of NORMALS that a model has."""
+
+PATHS: Mapping[str, str] = {
+    "orbit": "a circle around what the training cameras look at",
+    "spiral": "a spiral about the mean training camera, for forward-facing scenes",
+    "cameras": "a smooth curve through the training cameras",
+}
+"""Paths of cameras -> meaning."""

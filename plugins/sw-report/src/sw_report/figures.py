@@ -52,11 +52,7 @@ def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
 
     Nothing is written where no metric has a value. Raises UserInputError without matplotlib; returns the files.
     """
-    try:
-        import matplotlib
-        from matplotlib.figure import Figure
-    except ImportError:
-        raise UserInputError("--plots needs matplotlib: pip install 'sw-report[plots]'") from None
+    _check_matplotlib()
     looks = looks_of(runs)
     drawings: dict[str, list[Panel]] = {}
     for place in dict.fromkeys(run.place for run in runs):
@@ -64,14 +60,43 @@ def write_figures(runs: Sequence[Run], folder: Path) -> list[Path]:
     for table in dataset_tables(runs):
         drawings[_free(drawings, table.dataset)] = _of_means(table, runs, looks)
     folder.mkdir(parents=True, exist_ok=True)
-    written = []
+    return [
+        write_panels(panels, folder / f"rd-{name}.{form}")
+        for name, panels in drawings.items() if panels
+        for form in FORMS
+    ]  # fmt: skip
+
+
+def write_panels(panels: Sequence[Panel], path: Path, *, about: str = "") -> Path:
+    """Write one figure of panels side by side; equal panels make equal files.
+
+    path    .svg or .pdf
+    about   kept in the file's metadata, not shown
+
+    Raises UserInputError without matplotlib; returns the path.
+    """
+    _check_matplotlib()
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    form = path.suffix.removeprefix(".")
+    undated: dict[str, str | None] = {"Date": None} if form == "svg" else {"CreationDate": None, "ModDate": None}
+    if about:
+        undated["Description" if form == "svg" else "Subject"] = about
     with matplotlib.rc_context({"svg.hashsalt": SALT, "svg.fonttype": "none", "pdf.fonttype": 42, "font.size": 9}):
-        for name, panels in drawings.items():
-            if panels:
-                figure = Figure((PANEL[0] * len(panels), PANEL[1]), layout="constrained")
-                _draw(figure, panels)
-                written += _save(figure, folder / f"rd-{name}")
-    return written
+        figure = Figure((PANEL[0] * len(panels), PANEL[1]), layout="constrained")
+        _draw(figure, panels)
+        content = io.BytesIO()
+        figure.savefig(content, format=form, metadata=undated)
+    write_atomic(path, content.getvalue())
+    return path
+
+
+def _check_matplotlib() -> None:
+    try:
+        import matplotlib  # noqa: F401
+    except ImportError:
+        raise UserInputError("--plots needs matplotlib: pip install 'sw-report[plots]'") from None
 
 
 def _free(taken: dict[str, list[Panel]], title: str) -> str:
@@ -139,15 +164,3 @@ def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
 def _plain(text: str) -> str:
     """Text that matplotlib does not take for mathematics."""
     return text.replace("$", r"\$")
-
-
-def _save(figure: Figure, stem: Path) -> list[Path]:
-    written = []
-    for form in FORMS:
-        content = io.BytesIO()
-        undated = {"Date": None} if form == "svg" else {"CreationDate": None, "ModDate": None}
-        figure.savefig(content, format=form, metadata=undated)
-        path = stem.with_name(f"{stem.name}.{form}")
-        write_atomic(path, content.getvalue())
-        written.append(path)
-    return written

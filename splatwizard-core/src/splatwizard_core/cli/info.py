@@ -34,8 +34,8 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
         kind, facts, show = "file", _file_facts(where), _print_file
     elif where.suffix == ".json" and where.is_file():
         kind, facts, show = "record", _record_facts(where), _print_record
-    elif where.suffix == ".ply":
-        kind, facts = "ply", _ply_facts(where)
+    elif (importer := load_plugins().importers.of_suffix(where)) is not None:
+        kind, facts = importer, _gaussian_facts(where)
     else:
         kind, facts = "scene", _scene_facts(path, chosen)
     shared.print_facts({"kind": kind, **facts}, as_json, show)
@@ -82,14 +82,15 @@ def _part(facts: dict[str, Any], *names: str) -> dict[str, Any]:
     return {name: facts[name] for name in names}
 
 
-def _ply_facts(path: Path) -> dict[str, Any]:
-    model = load_plugins().importers.load("ply")(existing(str(path)))
+def _gaussian_facts(path: Path) -> dict[str, Any]:
+    model = load_plugins().read_gaussians(existing(path))
     means, scales, opacities = model.means.detach(), model.scales.detach(), model.opacities.detach()
     sound = means.isfinite().all(1) & scales.isfinite().all(1) & opacities.isfinite()
     known = bool(sound.any())  # else there is no box and no median
     return {
         "path": str(path),
         "size": path.stat().st_size,
+        **model.origin,
         **model.counts(),
         "not_finite": int((~sound).sum()),
         "sh_degree": model.max_sh_degree,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -37,6 +38,8 @@ class GaussianModel(SplatModel):
     """Columns of `log_scales`; a subclass of flat Gaussians (surfels) has 2."""
     RAW: tuple[str, ...] = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
     """The raw parameters of any GaussianModel, in the order of the constructor."""
+    origin: Mapping[str, Any] = {}
+    """Facts that an importer tells of its file; `raster` in them: options that it asks of a rasterizer."""
     ROWS: tuple[str, ...] = (*RAW, "grad_accum", "denom", "max_radii2d")
 
     means: nn.Parameter
@@ -88,20 +91,11 @@ class GaussianModel(SplatModel):
         self._splits = 0
 
     @classmethod
-    def from_tensors(
-        cls,
-        means: Tensor,
-        sh_dc: Tensor,
-        sh_rest: Tensor,
-        opacity_logits: Tensor,
-        log_scales: Tensor,
-        quats: Tensor,
-        *,
-        active_sh_degree: int | None = None,
-    ) -> GaussianModel:
-        """A model of copies of these raw tensors (shapes: the class). active_sh_degree None: the full degree."""
-        tensors = (means, sh_dc, sh_rest, opacity_logits, log_scales, quats)
-        return cls(*(t.detach().clone().contiguous() for t in tensors), active_sh_degree=active_sh_degree)
+    def from_tensors(cls, *raw: Tensor, active_sh_degree: int | None = None, **named: Tensor) -> GaussianModel:
+        """A model of copies of the tensors of RAW, in that order or by name. active_sh_degree None: the full degree."""
+        given = {**dict(zip(cls.RAW, raw, strict=False)), **named}
+        copies = {name: tensor.detach().clone().contiguous() for name, tensor in given.items()}
+        return cls(**copies, active_sh_degree=active_sh_degree)
 
     @property
     def max_sh_degree(self) -> int:

@@ -18,8 +18,11 @@ from splatwizard_core.plugins.catalogue import normal_name
 from splatwizard_core.plugins.guards import guarded_hooks, one_line, prints_to_stderr
 from splatwizard_core.plugins.loading import PluginInfo
 from splatwizard_core.plugins.registry import Coders, Entry, Registry, TypedRegistry
+from splatwizard_native import ForeseenError
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import click
 
     from splatwizard_core.coding.contracts import (
@@ -73,24 +76,9 @@ class PluginManager:
         self.checks: TypedRegistry[Callable[[], list[Check]]] = TypedRegistry("check")
         self.downloads: TypedRegistry[Callable[[], bytes]] = TypedRegistry("download")
         self.commands: TypedRegistry[click.Command] = TypedRegistry("command")
-        self._filled_by: dict[str, Registry] = {
-            "register_rasterizers": self.rasterizers,
-            "register_pruners": self.pruners,
-            "register_quantizers": self.quantizers,
-            "register_entropy_models": self.entropy_models,
-            "register_context_models": self.context_models,
-            "register_coders": self.coders,
-            "register_tasks": self.tasks,
-            "register_methods": self.methods,
-            "register_datasets": self.datasets,
-            "register_metrics": self.metrics,
-            "register_exporters": self.exporters,
-            "register_importers": self.importers,
-            "register_executors": self.executors,
-            "register_checks": self.checks,
-            "register_downloads": self.downloads,
-            "register_commands": self.commands,
-        }
+        # Each attribute is filled by the hook of its name.
+        own = {name: each for name, each in vars(self).items() if isinstance(each, Registry)}
+        self._filled_by = {f"register_{name}": registry for name, registry in own.items()}
         self.registries: dict[str, Registry] = {r.kind: r for r in self._filled_by.values()}
         self._pluggy = pluggy.PluginManager(hookspecs.PROJECT)
         self._pluggy.add_hookspecs(hookspecs)
@@ -145,6 +133,22 @@ class PluginManager:
                 log.warning("%s %s: %s failed: %s", info.distribution, info.version, hook, one_line(error))
                 return
             info.error = f"{hook}: {one_line(error)}"
+
+    @contextlib.contextmanager
+    def guarding(self, registry: Registry, name: str) -> Iterator[None]:
+        """Make whatever an entry raises that is no error for users a PluginError that names its distribution."""
+        try:
+            yield
+        except (ForeseenError, OSError):
+            raise
+        except (Exception, SystemExit) as error:
+            raise PluginError(f"{registry.entry(name).whose} failed: {one_line(error)}") from error
+
+    def read_gaussians(self, path: Path) -> GaussianModel:
+        """Read explicit Gaussians by the importer whose suffix `path` has, else as .ply. Raises UserInputError."""
+        name = self.importers.of_suffix(path) or "ply"
+        with self.guarding(self.importers, name):
+            return self.importers.load(name)(path)
 
     @property
     def hook(self) -> pluggy.HookRelay:

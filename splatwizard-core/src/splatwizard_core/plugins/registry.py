@@ -141,6 +141,11 @@ class Registry:
         """Sorted names that can be asked for."""
         return sorted(self._entries)
 
+    def of_suffix(self, path: object) -> str | None:
+        """Name of the entry whose declared suffix a path has: of ours before others', then the longest; else None."""
+        told = [(not e.foreign, e.declared.get("suffix") or "\0", e.name) for e in self]
+        return max(((o, len(s), n) for o, s, n in told if str(path).lower().endswith(s)), default=(0, 0, None))[2]
+
     @property
     def default(self) -> str | None:
         """Name of the entry that a package of ours declares as default; None: it is not installed."""

@@ -49,6 +49,7 @@ class Feature(enum.Flag):
     TIGHT_TILES = enum.auto()
     FLOAT64 = enum.auto()
     DETERMINISTIC = enum.auto()
+    FRAGMENT_GRAD = enum.auto()
     UINT8_OUT = enum.auto()
 
     @property
@@ -122,6 +123,7 @@ def _of_options(opt: RasterOptions) -> Feature:
     return _all_of(
         Feature.ANTIALIAS if opt.antialias else None,
         Feature.ABSGRAD if opt.absgrad else None,
+        Feature.FRAGMENT_GRAD if opt.fragment_grad else None,
         Feature.NORMALS if opt.normals else None,
         Feature.DISTORTION if opt.distortion else None,
         Feature.ALPHA_MAP if opt.alpha else None,

@@ -18,11 +18,10 @@ from splatwizard_core.evaluation.speed import spread
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
-from splatwizard_core.plugins.guards import one_line
 from splatwizard_core.runs.contention import contention
 from splatwizard_core.runs.file_needs import missing_plugin, other_versions, upgrade_command
 from splatwizard_core.runs.session import Session
-from splatwizard_native import CoreTime, ForeseenError, MemoryMeter, replacing, synchronize, track
+from splatwizard_native import CoreTime, MemoryMeter, replacing, synchronize, track
 
 REPEATS = 3
 
@@ -165,18 +164,12 @@ def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: st
     Raises UserInputError if there is none, or if the model has no such form, PluginError if the exporter breaks.
     """
     if name is None:
-        ours_last = sorted(plugins.exporters, key=lambda e: not e.foreign)  # a suffix of ours stays ours
-        suffixes = {e.declared.get("suffix", ""): e.name for e in ours_last}
-        name = suffixes.get(path.suffix) if path.suffix else None  # one without a suffix is for who names it
+        name = plugins.exporters.of_suffix(path)
         if name is None:
-            known = ", ".join(f"{suffix} ({exporter})" for suffix, exporter in sorted(suffixes.items()) if suffix)
+            known = ", ".join(f"{s} ({e.name})" for e in plugins.exporters if (s := e.declared.get("suffix")))
             raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
-    try:
+    with plugins.guarding(plugins.exporters, name):
         plugins.exporters.load(name)(model, path)
         if not path.exists():
             raise RuntimeError(f"it wrote no {path}")
-    except (ForeseenError, OSError):
-        raise
-    except (Exception, SystemExit) as error:
-        raise PluginError(f"{plugins.exporters.entry(name).whose} failed: {one_line(error)}") from error
     return name

@@ -103,9 +103,9 @@ def encode_directory(session: Session, resolved: ResolvedConfig, directory: Path
 def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: Path) -> dict[str, Any]:
     """Encode the explicit Gaussians of a .ply. Raises UserInputError for methods that do not encode such."""
     session.load_kernels()
-    if path.suffix != ".ply":
+    if session.plugins.importers.of_suffix(path) is None:
         raise UserInputError(f"{path}: `sw encode` takes a run directory or a .ply")
-    model = session.plugins.importers.load("ply")(path).to(session.device).eval().requires_grad_(False)
+    model = session.plugins.read_gaussians(path).to(session.device).eval().requires_grad_(False)
     method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
     raster = raster_header(replace(last.raster_options(last.iterations, torch.zeros(3)), **resolved.ppl.raster.options))

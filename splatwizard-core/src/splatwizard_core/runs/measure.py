@@ -180,25 +180,27 @@ def _flags(
 
 
 def opener(path: Path, session: Session) -> Callable[[], Opened]:
-    """Return a function that opens the model of a .swz or .ply on the session's device."""
+    """Return a function that opens the model of a .swz, .ply or other file of Gaussians on the session's device."""
+    encoded = session.plugins.importers.of_suffix(path) is None
 
     def open_file() -> Opened:
-        if path.suffix == ".ply":
-            gaussians = session.plugins.importers.load("ply")(path)
-            return Opened(gaussians.to(session.device).eval().requires_grad_(False), {})
+        if not encoded:
+            gaussians = session.plugins.read_gaussians(path)
+            raster = gaussians.origin.get("raster", {})
+            return Opened(gaussians.to(session.device).eval().requires_grad_(False), raster)
         model, reader = open_model(path, session.plugins, session.device)
         return Opened(model, reader.raster, reader.made_on is not None, reader.static)
 
-    if path.suffix != ".ply":
+    if encoded:
         import_method(path, session.plugins)  # code is not memory of the model
     return open_file
 
 
-def open_subject(path: Path, session: Session, resolved: ResolvedConfig) -> quality.Subject:
-    """Open the model of a .swz or .ply, then its scene; what draws it is as the run and the file ask."""
+def open_subject(path: Path, session: Session, resolved: ResolvedConfig, scene: Scene | None = None) -> quality.Subject:
+    """Open a model, then its scene (None: the configured one); what draws it is as the run and the file ask."""
     model, raster, _, static = opener(path, session)()
     model.check_finite()
-    scene = session.scene(resolved)
+    scene = scene or session.scene(resolved)
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     with torch.no_grad():
         model.prepare()

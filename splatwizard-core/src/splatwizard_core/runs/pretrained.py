@@ -161,7 +161,7 @@ def check_model(path: str) -> GaussianModel:
         if file.read(4) == b"SPWZ":
             raise UserInputError(f"init: {path} is an encoded file: `sw export {path} FILE.ply` makes a .ply of it")
     try:
-        model = load_plugins().importers.load("ply")(where)
+        model = load_plugins().read_gaussians(where)
     except SplatwizardError as error:
         reason = str(error).removeprefix(f"{where}: ").removeprefix(f"{where.name}: ")
         raise UserInputError(f"init: {path}: {reason}") from None

@@ -54,6 +54,7 @@ class LogParams(Params):
     """Programs that a training is logged for besides log.jsonl: observers of `run_started` read it."""
 
     tensorboard: bool = Field(False, description="write the curves for TensorBoard too, into tensorboard/ of the run")
+    view: int = Field(0, ge=0, le=65535, description="port where sw-viewer shows the training; 0: nowhere")
 
 
 class PipelineParams(Params):
@@ -99,8 +100,7 @@ class OptimizationParams(Params):
 
     iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     scale_schedule: bool = Field(
-        False,
-        description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run",
+        False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"
     )
 
     @property

@@ -28,6 +28,7 @@ struct Anchors {
   int64_t offset_row, scale_row;
   const int64_t* drawn;    // [count] ascending numbers of Gaussians in 0 .. n k - 1
   int64_t count;
+  bool compact;            // geometry [count,7] and color [count,3], and their gradients, are of the drawn ones alone
 };
 
 struct Gaussians {  // [count, ...], or gradients by them
@@ -41,15 +42,15 @@ struct Gradients {  // of the members of Anchors; masks and positions or null; o
 SW_SPAWN_HD float sigmoid(float x) { return 1.f / (1.f + expf(-x)); }
 
 SW_SPAWN_HD void spawn_one(const Anchors& from, int64_t m, const Gaussians& to) {
-  const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k;
-  const float* geometry = from.geometry + kGeometry * i;
+  const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k, own = from.compact ? m : i;
+  const float* geometry = from.geometry + kGeometry * own;
   const float* scale = from.scales + a * from.scale_row;
   const float* offset = from.offsets + a * from.offset_row + 3 * j;
   for (int axis = 0; axis < 3; ++axis) {
     to.means[3 * m + axis] = from.positions[3 * a + axis] + offset[axis] * scale[axis];
     // Noise or rounding may take a base scale through zero: a Gaussian of scale -s is that of scale s.
     to.scales[3 * m + axis] = fabsf(scale[3 + axis]) * sigmoid(geometry[axis]);
-    to.colors[3 * m + axis] = sigmoid(from.color[3 * i + axis]);
+    to.colors[3 * m + axis] = sigmoid(from.color[3 * own + axis]);
   }
   const float* q = geometry + 3;
   const float norm = fmaxf(sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), kShortest);
@@ -61,18 +62,18 @@ SW_SPAWN_HD void spawn_one(const Anchors& from, int64_t m, const Gaussians& to) 
 template <class Add>
 SW_SPAWN_HD void spawn_one_backward(const Anchors& from, int64_t m, const Gaussians& slope, const Gradients& to,
                                     const Add& add) {
-  const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k;
-  const float* geometry = from.geometry + kGeometry * i;
+  const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k, own = from.compact ? m : i;
+  const float* geometry = from.geometry + kGeometry * own;
   const float* scale = from.scales + a * from.scale_row;
   const float* offset = from.offsets + a * from.offset_row + 3 * j;
   for (int axis = 0; axis < 3; ++axis) {
     const float to_mean = slope.means[3 * m + axis], to_size = slope.scales[3 * m + axis];
-    const float factor = sigmoid(geometry[axis]), base = scale[3 + axis], color = sigmoid(from.color[3 * i + axis]);
+    const float factor = sigmoid(geometry[axis]), base = scale[3 + axis], color = sigmoid(from.color[3 * own + axis]);
     to.offsets[3 * i + axis] = to_mean * scale[axis];
     add(to.scales + 6 * a + axis, to_mean * offset[axis]);
     add(to.scales + 6 * a + 3 + axis, base > 0.f ? to_size * factor : base < 0.f ? -to_size * factor : 0.f);
-    to.geometry[kGeometry * i + axis] = to_size * fabsf(base) * factor * (1.f - factor);
-    to.color[3 * i + axis] = slope.colors[3 * m + axis] * color * (1.f - color);
+    to.geometry[kGeometry * own + axis] = to_size * fabsf(base) * factor * (1.f - factor);
+    to.color[3 * own + axis] = slope.colors[3 * m + axis] * color * (1.f - color);
     if (to.positions != nullptr) add(to.positions + 3 * a + axis, to_mean);
   }
   const float* q = geometry + 3;
@@ -80,7 +81,7 @@ SW_SPAWN_HD void spawn_one_backward(const Anchors& from, int64_t m, const Gaussi
   const float norm = fmaxf(sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), kShortest);
   float along = 0.f;
   for (int c = 0; c < 4; ++c) along += q[c] / norm * to_quat[c];
-  for (int c = 0; c < 4; ++c) to.geometry[kGeometry * i + 3 + c] = (to_quat[c] - q[c] / norm * along) / norm;
+  for (int c = 0; c < 4; ++c) to.geometry[kGeometry * own + 3 + c] = (to_quat[c] - q[c] / norm * along) / norm;
   to.alpha[i] = from.masks == nullptr ? slope.opacities[m] : slope.opacities[m] * from.masks[i];
   if (to.masks != nullptr) to.masks[i] = slope.opacities[m] * from.alpha[i];
 }

@@ -62,10 +62,14 @@ def train_codebook(
     with track(label, total=iterations) as bar:
         for i in range(iterations):
             drawn = torch.randint(len(x), (min(batch, len(x)),), generator=generator, device=generator.device)
-            drawn = drawn.to(x.device)
+            drawn, times = drawn.to(x.device), None
+            if rule == "batch-mean" and 2 * len(drawn) >= len(x):
+                drawn, times = _counted(drawn, len(x))
             rows, importance = x[drawn], weights[drawn]
             scale = largest if rule == "batch-mean" else importance.mean()
             importance = torch.where(scale > 0, importance / scale.clamp_min(1e-30), 1.0).to(x.dtype)
+            if times is not None:
+                importance = importance * times
             index, distance = nearest(rows, entries, block=block)
             errors[i] = (distance * importance).sum() / importance.sum().clamp_min(1e-30)
             n, m = gather(rows, importance, index, size)
@@ -91,6 +95,16 @@ def train_codebook(
     if rule != "ema":  # what the EMA steps of VectorQuantizer.update go on from
         counts, sums = torch.ones_like(counts), entries.to(torch.float64)
     return entries, counts, sums, errors
+
+
+def _counted(drawn: Tensor, rows: int) -> tuple[Tensor, Tensor]:
+    """Return the distinct numbers below `rows` that were drawn, ascending, and how often each was, both [n].
+
+    Of as many draws as there are rows a third are repetitions, which would be searched in vain.
+    """
+    times = torch.bincount(drawn, minlength=rows)
+    distinct = times.nonzero().squeeze(1)
+    return distinct, times[distinct]
 
 
 def smoothed(counts: Tensor) -> Tensor:

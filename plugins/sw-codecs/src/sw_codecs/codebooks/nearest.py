@@ -1,12 +1,27 @@
-"""Nearest codebook entries of many rows: one matrix product a tile, never all rows times all entries."""
+"""Nearest codebook entries of many rows, a tile at a time: by boxes about groups of entries, or by matrix products.
+
+On a CPU a native kernel leaves out the groups whose box is farther than an entry that was found. Where the entries have
+few axes or vary along few (shapes, trained colours), that is nearly all of them; where a sample of the rows shows that
+it is not, and on a GPU, all distances of a tile are one matrix product.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
 
+from sw_codecs.native import CODECS
+
 GROUP = 64  # entries whose least score is found first: a minimum is vectorised on a CPU, its place is not
 TILE = {"cpu": 1 << 24, "cuda": 1 << 27}  # scores at a time: 64 MB fit a cache's reach, 512 MB fill a GPU
+WORTH_BOXES = 1 << 22  # distances: some 10 ms of matrix products
+SAMPLE = 512  # rows that tell whether boxes leave out enough
+SHARE = 0.5  # of the distances; each that is computed costs about as much as one of a matrix product
+
+Search = Callable[[Tensor, int], Tensor]
+"""(tile [n, d] of rows, number of its first row) -> index [n] int64 of the nearest entry of each."""
 
 
 def block_rows(size: int, device: torch.device, block: int | None = None) -> int:
@@ -23,35 +38,51 @@ def nearest(x: Tensor, entries: Tensor, *, block: int | None = None, others: boo
     block    rows at a time; None: as many as make 64 MB of scores (CPU) or 512 MB (CUDA)
     others   x is `entries` itself: look for the nearest other one (K >= 2)
 
+    Two entries that are nearer to each other than about 1e-3 of the size of the whole codebook may be taken for one
+    another in float32. Not differentiable.
+    """
+    search = None if others else _by_boxes(x, entries)
+    # Boxes are made for each tile, in the time that some 1,500 rows take; they need no scores.
+    rows_at_once = block_rows(len(entries) if search is None else 1, x.device, block)
+    rows_at_once = min(rows_at_once, max(len(x), 1))
+    if search is None:
+        search = _by_products(entries, rows_at_once, others=others)
+    index = torch.empty(len(x), dtype=torch.int64, device=x.device)
+    distance = torch.empty(len(x), dtype=x.dtype, device=x.device)
+    for start in range(0, len(x), rows_at_once):
+        rows = x[start : start + rows_at_once]
+        found = search(rows, start)
+        index[start : start + len(rows)] = found
+        distance[start : start + len(rows)] = (rows - entries[found]).square().sum(1)
+    return index, distance
+
+
+def _by_products(entries: Tensor, rows_at_once: int, *, others: bool) -> Search:
+    """Return the search by matrix products.
+
     |x|^2 changes no order, so the score is |c|^2 - 2 x.c, about the mean of the entries: far from the origin the
-    difference of large squares would lose the digits that decide. Two entries that are nearer to each other than about
-    1e-3 of the size of the whole codebook may be taken for one another in float32. Not differentiable.
+    difference of large squares would lose the digits that decide.
     """
     size, width = entries.shape
     centre = entries.mean(0)
     centred = entries - centre
-    grouped = x.device.type == "cpu" and size >= 16 * GROUP
-    table = torch.zeros(width + 1, size + (-size % GROUP if grouped else 0), dtype=x.dtype, device=x.device)
+    grouped = entries.device.type == "cpu" and size >= 16 * GROUP
+    table = entries.new_zeros(width + 1, size + (-size % GROUP if grouped else 0))
     table[:width, :size] = -2 * centred.T
     table[width] = torch.inf  # what fills the last group is never chosen
     table[width, :size] = centred.square().sum(1)
-    rows_at_once = min(block_rows(size, x.device, block), max(len(x), 1))
-    scores = torch.empty(rows_at_once, table.shape[1], dtype=x.dtype, device=x.device)  # one for all tiles
-    padded = torch.ones(rows_at_once, width + 1, dtype=x.dtype, device=x.device)
-    index = torch.empty(len(x), dtype=torch.int64, device=x.device)
-    distance = torch.empty(len(x), dtype=x.dtype, device=x.device)
-    for start in range(0, len(x), rows_at_once):
-        part = slice(start, min(start + rows_at_once, len(x)))
-        count = part.stop - start
-        rows, tile = padded[:count], scores[:count]
-        rows[:, :width] = x[part] - centre
-        torch.mm(rows, table, out=tile)
+    scores = entries.new_empty(rows_at_once, table.shape[1])  # one for all tiles
+    padded = entries.new_ones(rows_at_once, width + 1)
+
+    def search(rows: Tensor, start: int) -> Tensor:
+        tile, moved = scores[: len(rows)], padded[: len(rows)]
+        moved[:, :width] = rows - centre
+        torch.mm(moved, table, out=tile)
         if others:
             tile.diagonal(start).fill_(torch.inf)
-        found = _least_by_groups(tile) if grouped else tile.argmin(1)
-        index[part] = found
-        distance[part] = (x[part] - entries[found]).square().sum(1)
-    return index, distance
+        return _least_by_groups(tile) if grouped else tile.argmin(1)
+
+    return search
 
 
 def _least_by_groups(scores: Tensor) -> Tensor:
@@ -59,3 +90,26 @@ def _least_by_groups(scores: Tensor) -> Tensor:
     groups = scores.view(len(scores), -1, GROUP)
     best = groups.amin(2).argmin(1)
     return best * GROUP + groups[torch.arange(len(scores)), best].argmin(1)
+
+
+def _by_boxes(x: Tensor, entries: Tensor) -> Search | None:
+    """Return the search of the native kernel; None where it is not at hand, or boxes leave out too little for x."""
+    fits = x.device.type == "cpu" and x.dtype == entries.dtype == torch.float32 and entries.shape[1] > 0
+    if not fits or len(x) * len(entries) < WORTH_BOXES or not CODECS.try_load():
+        return None
+    centre = entries.mean(0)
+    centred = entries - centre
+    # Along the axes of the entries' variance, the largest first, boxes about the first few leave out most.
+    squares = centred.double().T @ centred.double()
+    if not bool(torch.isfinite(squares).all()):
+        return None
+    axes = torch.linalg.eigh(squares).eigenvectors.flip(1).to(x.dtype)
+    turned = (centred @ axes).contiguous()
+
+    def look(rows: Tensor) -> tuple[Tensor, float]:
+        found: tuple[Tensor, float] = torch.ops.sw_codecs.nearest_entries((rows - centre) @ axes, turned)
+        return found
+
+    if look(x[:: max(len(x) // SAMPLE, 1)])[1] > SHARE:
+        return None
+    return lambda rows, _start: look(rows)[0]

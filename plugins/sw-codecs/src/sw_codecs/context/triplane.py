@@ -14,8 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from sw_codecs.context.plane_kernels import fit_kernels, look_up, look_up_backward
 from sw_codecs.context.principal_frame import UNIT, PrincipalFrame
 from sw_codecs.exact_native import EXACT
+from sw_codecs.native import CODECS
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Axes (width, height) of the three planes."""
@@ -25,6 +27,8 @@ INTEGER_LIMIT = 1 << 24
 ROWS_AT_ONCE = 1 << 13
 MOST_SCALES = 4
 """That the kernel of the exact look-up takes."""
+MOST_SAMPLED = 8
+"""Scales that the kernel of training takes."""
 
 
 class PlaneSites(NamedTuple):
@@ -149,12 +153,20 @@ class _Sampled(torch.autograd.Function):
         n, channels = len(cells), planes[0].shape[1]
         ctx.save_for_backward(cells, weights)
         ctx.shapes = [plane.shape for plane in planes]
+        ctx.on_gpu = fit_kernels(planes)
+        if ctx.on_gpu:
+            ctx.planes = [plane.detach() for plane in planes]
+            return look_up(cells, weights, planes, GAIN if rounded else 0)
+        tables = [plane.movedim(1, 3).reshape(-1, channels) for plane in planes]  # [3 H W, C]
+        if rounded:
+            tables = [torch.round(table * GAIN).div_(GAIN) for table in tables]
+        ctx.by_kernel = _sites_fit_kernel(weights, tables)
+        if ctx.by_kernel:
+            tables = [table.contiguous() for table in tables]
+            return torch.ops.sw_codecs.sites_lookup(cells.contiguous(), weights.contiguous(), tables)
         width = len(PAIRS) * channels
         features = weights.new_empty(n, len(planes), width)
-        for i, plane in enumerate(planes):
-            table = plane.movedim(1, 3).reshape(-1, channels)  # [3 H W, C]
-            if rounded:
-                table = torch.round(table * GAIN).div_(GAIN)
+        for i, table in enumerate(tables):
             index, share = cells[:, i].reshape(-1, 4), weights[:, i].reshape(-1, 4)
             found = nn.functional.embedding_bag(index, table, per_sample_weights=share, mode="sum").view(n, width)
             if i == 0:
@@ -167,6 +179,14 @@ class _Sampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         cells, weights = ctx.saved_tensors
+        if ctx.on_gpu:
+            return None, None, None, *look_up_backward(cells, weights, grad, ctx.planes)
+        if ctx.by_kernel:
+            rows_of = [k * h * w for k, _, h, w in ctx.shapes]
+            tables = torch.ops.sw_codecs.sites_backward(
+                cells.contiguous(), weights.contiguous(), grad.contiguous(), rows_of, ctx.shapes[0][1]
+            )
+            return None, None, None, *map(_as_plane, tables, ctx.shapes)
         parts = grad.unflatten(1, (len(ctx.shapes), len(PAIRS), -1))  # [n, scales, 3, C]
         total: Tensor | None = None
         found: list[Tensor] = []
@@ -180,8 +200,22 @@ class _Sampled(torch.autograd.Function):
             for index, share in zip(cells[:, i].unbind(2), weights[:, i].unbind(2), strict=True):
                 torch.mul(rows, share.reshape(-1, 1), out=weighted)
                 table.index_add_(0, index.reshape(-1), weighted)
-            found.append(table.view(k, h, w, channels).movedim(3, 1).contiguous())
+            found.append(_as_plane(table, ctx.shapes[i]))
         return None, None, None, *reversed(found)
+
+
+def _as_plane(table: Tensor, shape: Sequence[int]) -> Tensor:
+    """A plane [3, C, H, W] of `shape` from its table [3 H W, C]."""
+    k, channels, h, w = shape
+    return table.view(k, h, w, channels).movedim(3, 1).contiguous()
+
+
+def _sites_fit_kernel(weights: Tensor, tables: Sequence[Tensor]) -> bool:
+    """Whether there is a kernel for the samples of float32 planes on this device; loads it."""
+    if len(tables) > MOST_SAMPLED or not tables[0].numel():
+        return False
+    fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (weights, *tables))
+    return fits and CODECS.try_load()
 
 
 def _kernel_takes(corners: Sequence[Tensor]) -> bool:

@@ -1,10 +1,12 @@
-// Registers the ops of grids of real numbers and of Huffman codes, and their kernels on the CPU.
+// Registers the ops of grids of real numbers, of Huffman codes and of codebooks, and their kernels on the CPU.
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/zeros.h>
 #include <torch/library.h>
 
 #include <splatwizard/torch_parallel.h>
+
+#include <tuple>
 
 #include "binding.h"
 #include "kernels.h"
@@ -77,6 +79,22 @@ at::Tensor huffman_decode(const at::Tensor& bytes, const at::Tensor& counts, con
   return all ? symbols : symbols.narrow(0, 0, 0);
 }
 
+// rows [n, dim], entries [size, dim] float32 -> the nearest entry of each row, int64 [n], and the share 0..1 of the
+// distances that were computed.
+std::tuple<at::Tensor, double> nearest_entries(const at::Tensor& rows, const at::Tensor& entries) {
+  TORCH_CHECK(rows.dim() == 2 && entries.dim() == 2 && entries.size(0) > 0 && rows.size(1) == entries.size(1) &&
+                  rows.size(1) > 0 && rows.size(1) <= 1 << 16 && rows.is_cpu() && entries.is_cpu() &&
+                  rows.scalar_type() == at::kFloat && entries.scalar_type() == at::kFloat && rows.is_contiguous() &&
+                  entries.is_contiguous(),
+              "nearest_entries: rows [n,d], entries [k,d], contiguous float32 on a CPU, got ", rows.sizes(), " and ",
+              entries.sizes());
+  at::Tensor index = at::empty({rows.size(0)}, rows.options().dtype(at::kLong).requires_grad(false));
+  const double share = SW_SELECT(nearest_entries)(
+      rows.const_data_ptr<float>(), rows.size(0), entries.const_data_ptr<float>(), entries.size(0),
+      int(entries.size(1)), index.mutable_data_ptr<int64_t>(), splatwizard::torch_parallel());
+  return {index, share};
+}
+
 }  // namespace
 
 TORCH_LIBRARY(sw_codecs, m) {
@@ -93,6 +111,8 @@ TORCH_LIBRARY(sw_codecs, m) {
   m.impl("signs_backward", c10::DispatchKey::CPU, TORCH_FN(signs_backward));
   m.def("huffman_decode(Tensor bytes, Tensor counts, Tensor index) -> Tensor");
   m.impl("huffman_decode", c10::DispatchKey::CPU, TORCH_FN(huffman_decode));
+  m.def("nearest_entries(Tensor rows, Tensor entries) -> (Tensor, float)");
+  m.impl("nearest_entries", c10::DispatchKey::CPU, TORCH_FN(nearest_entries));
   m.impl("lookup", c10::DispatchKey::CPU, TORCH_FN(lookup));
   m.impl("backward", c10::DispatchKey::CPU, TORCH_FN(backward));
 }

@@ -155,7 +155,7 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   const bool absgrad = flags & kAbsgrad, median = flags & kMedianDepth;
   const int length = row_length(channels.total(), absgrad, median);
   const Tensor row_memory = at::zeros({gaussians, length}, image_gradient.options().requires_grad(false));
-  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
+  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
   Image image{};
   image.channels = channels.total(), image.color_channels = channels.colors;
   image.background = data<float>(background);
@@ -250,7 +250,7 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   };
   out.grad2d = screen(kWantGrad2d);
   out.absgrad2d = screen(kWantAbsgrad2d);
-  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
+  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
   TORCH_CHECK(updated.size() == 0 || (updated.size() == 6 && rates.size() == 12),
               "sw_rasterizers: Adam in the backward pass takes three tensors and six numbers for each of sh_dc, sh_rest");
   ShAdam adam{};

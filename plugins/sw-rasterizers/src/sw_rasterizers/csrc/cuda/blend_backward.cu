@@ -207,9 +207,13 @@ __global__ void __launch_bounds__(kThreads)
           const float moment = unclamped <= clamp_limit ? -(unclamped * alpha_gradient) : 0.f;
           const float along_y = moment * dy;
           v0 += moment, vy += along_y, vyy += along_y * dy;
-          if constexpr (kAbsgrad) {  // A = -Ka log2(e)/2 and so on: back to natural units
-            sums[kAt] += float(kLn2) * fabsf(2.f * s0.z * dx * moment + s0.w * along_y);
-            sums[kAt + 1] += float(kLn2) * fabsf(s0.w * dx * moment + 2.f * s1.x * along_y);
+          if constexpr (kAbsgrad) {
+            if (rows.fragments) {
+              sums[kAt] += moment * moment, sums[kAt + 1] += touched ? 1.f : 0.f;
+            } else {  // A = -Ka log2(e)/2 and so on: back to natural units
+              sums[kAt] += float(kLn2) * fabsf(2.f * s0.z * dx * moment + s0.w * along_y);
+              sums[kAt + 1] += float(kLn2) * fabsf(s0.w * dx * moment + 2.f * s1.x * along_y);
+            }
           }
         }
         if (!any_touched) continue;

@@ -69,6 +69,7 @@ struct Rows {
   int64_t stride;
   int channels;
   bool absgrad, median;
+  bool fragments = false;  // with absgrad, the two are the sum of (o dL/do)^2 over the fragments, and their number
 };
 
 // Where an image has fewer tiles than this, a block a tile leaves most of the GPU idle and the longest list decides how

@@ -120,7 +120,10 @@ __global__ void __launch_bounds__(kThreads)
       reinterpret_cast<float2*>(to)[n] = make_float2(half[0] * pixels[0], half[1] * pixels[1]);
     };
     if (out.grad2d != nullptr) ndc(out.grad2d, screen);
-    if (out.absgrad2d != nullptr) ndc(out.absgrad2d, absolute_screen);
+    if (out.absgrad2d != nullptr && rows.fragments)
+      reinterpret_cast<float2*>(out.absgrad2d)[n] = make_float2(absolute_screen[0], absolute_screen[1]);
+    else if (out.absgrad2d != nullptr)
+      ndc(out.absgrad2d, absolute_screen);
   }
   write_sh_gradient<kAdam>(g, out, first, basis, color, shared, adam);
 }

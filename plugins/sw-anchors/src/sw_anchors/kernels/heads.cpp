@@ -1,0 +1,248 @@
+// The three networks of anchors and the Gaussians that they spawn, and the gradient.
+//
+// Blocks of anchors are worked through with everything in the second cache. Gradients of weights are summed by a number
+// of groups of blocks that does not depend on the number of threads, then group by group.
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+#include "kernels.h"
+#include "vectors.h"
+
+namespace SW_ARCH {
+
+using namespace sw_anchors;
+
+namespace {
+
+constexpr int64_t BLOCK = 96, GROUPS = 8;  // of anchors, a multiple of ROWS; sums of weights
+
+// Sizes of the padded matrices.
+struct Sizes {
+  int64_t inputs, columns, head, width, k;
+  Sizes(const Heads& heads, int64_t offsets)
+      : inputs(heads.features + 5),  // the last one is 1, for the bias
+        columns(padded(inputs, TILE)),
+        head(padded(heads.hidden, LANES)),
+        width(padded(kHeads * head, TILE)),
+        k(offsets) {}
+};
+
+// The last layers with rows padded to whole vectors, head after head: [11 k, head].
+struct LastLayers {
+  std::vector<float> weights;
+  const float* of[kHeads];
+  LastLayers(const Heads& heads, const Sizes& size) : weights(11 * size.k * size.head) {
+    float* to = weights.data();
+    for (int h = 0; h < kHeads; ++h) {
+      of[h] = to;
+      for (int64_t row = 0; row < kOutputs[h] * size.k; ++row, to += size.head)
+        std::copy_n(heads.last[h] + row * heads.hidden, heads.hidden, to);
+    }
+  }
+};
+
+// Inputs of the networks for anchors first .. first + BLOCK, [BLOCK, columns]; zeros beyond the last anchor.
+void fill_inputs(const Anchors& from, const Seen& seen, const Heads& heads, const Sizes& size, int64_t first,
+                 float* inputs) {
+  const int64_t count = std::min(BLOCK, from.n - first), f = heads.features;
+  std::fill_n(inputs, BLOCK * size.columns, 0.f);
+  for (int64_t i = 0; i < count; ++i, inputs += size.columns) {
+    std::copy_n(seen.features + (first + i) * seen.feature_row, f, inputs);
+    float toward[3], square = 0.f;
+    for (int axis = 0; axis < 3; ++axis) {
+      toward[axis] = from.positions[3 * (first + i) + axis] - seen.center[axis];
+      square += toward[axis] * toward[axis];
+    }
+    const float distance = std::sqrt(square);
+    for (int axis = 0; axis < 3; ++axis) inputs[f + axis] = toward[axis] / distance;
+    inputs[f + 3] = distance;
+    inputs[f + 4] = 1.f;
+  }
+}
+
+float dot(const float* a, const float* b, int64_t count) {
+  Vec sum = Vec{};
+  for (int64_t i = 0; i < count; i += LANES) sum += load(a + i) * load(b + i);
+  float total = 0.f;
+#pragma GCC unroll 16
+  for (int i = 0; i < LANES; ++i) total += sum[i];
+  return total;
+}
+
+// Outputs of one head for one Gaussian, the rows of `weights` being its own.
+template <int N>
+void outputs_of(const float* hidden, const float* weights, const float* bias, int64_t head, float* to) {
+  Vec sum[N] = {};
+  for (int64_t i = 0; i < head; i += LANES) {
+    const Vec value = load(hidden + i);
+#pragma GCC unroll 7
+    for (int c = 0; c < N; ++c) sum[c] += value * load(weights + c * head + i);
+  }
+#pragma GCC unroll 7
+  for (int c = 0; c < N; ++c) {
+    float total = bias[c];
+#pragma GCC unroll 16
+    for (int i = 0; i < LANES; ++i) total += sum[c][i];
+    to[c] = total;
+  }
+}
+
+// Adds to the gradients of the hidden layer, and of the weights [N, head] and biases [N] of one Gaussian.
+template <int N>
+void add_outputs(const float* hidden, const float* weights, const float* slope, int64_t head, float* to_hidden,
+                 float* to_weights, float* to_bias) {
+  Vec factor[N];
+#pragma GCC unroll 7
+  for (int c = 0; c < N; ++c) factor[c] = all(slope[c]), to_bias[c] += slope[c];
+  for (int64_t i = 0; i < head; i += LANES) {
+    const Vec value = load(hidden + i);
+    Vec sum = load(to_hidden + i);
+#pragma GCC unroll 7
+    for (int c = 0; c < N; ++c) {
+      sum += factor[c] * load(weights + c * head + i);
+      store(to_weights + c * head + i, load(to_weights + c * head + i) + factor[c] * value);
+    }
+    store(to_hidden + i, sum);
+  }
+}
+
+}  // namespace
+
+int64_t heads_rows(int64_t n) { return padded(n, BLOCK); }
+
+int64_t heads_width(const Heads& heads) { return Sizes(heads, 1).width; }
+
+void heads_opacities(const Anchors& from, const Seen& seen, const Heads& heads, float* hidden, float* alpha,
+                     float* opacities, const splatwizard::Parallel& parallel) {
+  const Sizes size(heads, from.k);
+  const LastLayers last(heads, size);
+  std::vector<float> first(size.inputs * size.width);  // [inputs, width]
+  for (int h = 0; h < kHeads; ++h)
+    for (int64_t row = 0; row < heads.hidden; ++row) {
+      for (int64_t i = 0; i < heads.features + 4; ++i)
+        first[i * size.width + h * size.head + row] = heads.first[h][row * (heads.features + 4) + i];
+      first[(heads.features + 4) * size.width + h * size.head + row] = heads.first_bias[h][row];
+    }
+  parallel(heads_rows(from.n) / BLOCK, 1, [&](int64_t begin, int64_t end) {
+    std::vector<float> inputs(BLOCK * size.columns);
+    for (int64_t block = begin; block < end; ++block) {
+      const int64_t start = block * BLOCK, count = std::min(BLOCK, from.n - start);
+      float* to = hidden + start * size.width;
+      fill_inputs(from, seen, heads, size, start, inputs.data());
+      product<false>(inputs.data(), size.columns, 1, first.data(), size.width, size.inputs, to, size.width, BLOCK,
+                     size.width);
+      for (int64_t i = 0; i < BLOCK * size.width; i += LANES) {
+        const Vec value = load(to + i);
+        store(to + i, value > Vec{} ? value : Vec{});
+      }
+      float* const block_alpha = alpha + start * from.k;
+      for (int64_t a = 0; a < count; ++a)
+        for (int64_t j = 0; j < from.k; ++j)
+          block_alpha[a * from.k + j] =
+              heads.last_bias[0][j] + dot(to + a * size.width, last.of[0] + j * size.head, size.head);
+      for (int64_t i = 0; i < count * from.k; i += LANES) {  // tanh(x) = 1 - 2 / (e^2x + 1)
+        float padded_values[LANES] = {};
+        const int64_t some = std::min<int64_t>(LANES, count * from.k - i);
+        std::copy_n(block_alpha + i, some, padded_values);
+        store(padded_values, all(1.f) - all(2.f) / (exponential(load(padded_values) * all(2.f)) + all(1.f)));
+        std::copy_n(padded_values, some, block_alpha + i);
+      }
+      for (int64_t i = start * from.k; i < (start + count) * from.k; ++i)
+        opacities[i] = from.masks == nullptr ? alpha[i] : alpha[i] * from.masks[i];
+    }
+  });
+}
+
+void heads_spawn(const Anchors& from, const Heads& heads, const float* hidden, float* geometry, float* color,
+                 const Gaussians& to, const splatwizard::Parallel& parallel) {
+  const Sizes size(heads, from.k);
+  const LastLayers last(heads, size);
+  parallel(from.count, 256, [&](int64_t begin, int64_t end) {
+    for (int64_t m = begin; m < end; ++m) {
+      const int64_t a = from.drawn[m] / from.k, j = from.drawn[m] % from.k;
+      const float* row = hidden + a * size.width + size.head;
+      outputs_of<kGeometry>(row, last.of[1] + kGeometry * j * size.head, heads.last_bias[1] + kGeometry * j,
+                            size.head, geometry + kGeometry * m);
+      outputs_of<3>(row + size.head, last.of[2] + 3 * j * size.head, heads.last_bias[2] + 3 * j, size.head,
+                    color + 3 * m);
+      spawn_one(from, m, to);
+    }
+  });
+}
+
+void heads_backward(const Anchors& from, const Seen& seen, const Heads& heads, const float* hidden,
+                    const Gaussians& slope, const Gradients& to, float* to_features, const HeadGradients& to_heads,
+                    const splatwizard::Parallel& parallel) {
+  const Sizes size(heads, from.k);
+  const LastLayers last(heads, size);
+  std::vector<float> first(padded(size.width, ROWS) * size.columns);  // [width, columns]: first layers, side by side
+  for (int h = 0; h < kHeads; ++h)
+    for (int64_t row = 0; row < heads.hidden; ++row)
+      std::copy_n(heads.first[h] + row * (heads.features + 4), heads.features,
+                  first.data() + (h * size.head + row) * size.columns);
+  const int64_t blocks = heads_rows(from.n) / BLOCK;
+  const int64_t rows = padded(size.width, ROWS), outputs = 11 * size.k;  // of the sums
+  const int64_t summed = rows * size.columns + outputs * (size.head + 1);
+  std::vector<float> sums(GROUPS * summed);
+
+  parallel(GROUPS, 1, [&](int64_t begin, int64_t end) {
+    std::vector<float> inputs(BLOCK * size.columns), to_inputs(BLOCK * size.columns);
+    std::vector<float> to_hidden(BLOCK * size.width + ROWS);
+    for (int64_t group = begin; group < end; ++group) {
+      float* const to_first = sums.data() + group * summed;
+      float* const to_last = to_first + rows * size.columns;
+      float* const to_bias = to_last + outputs * size.head;
+      for (int64_t block = group * blocks / GROUPS; block < (group + 1) * blocks / GROUPS; ++block) {
+        const int64_t start = block * BLOCK, count = std::min(BLOCK, from.n - start);
+        const auto place = [&](int64_t anchor) {
+          return std::lower_bound(from.drawn, from.drawn + from.count, anchor * from.k) - from.drawn;
+        };
+        std::fill(to_hidden.begin(), to_hidden.end(), 0.f);
+        for (int64_t m = place(start), stop = place(start + count); m < stop; ++m) {
+          const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k;
+          spawn_one_backward(from, m, slope, to, [](float* where, float value) { *where += value; });
+          const float* row = hidden + a * size.width;
+          float* to_row = to_hidden.data() + (a - start) * size.width;
+          const float to_opacity = to.alpha[i] * (1.f - from.alpha[i] * from.alpha[i]);
+          add_outputs<1>(row, last.of[0] + j * size.head, &to_opacity, size.head, to_row, to_last + j * size.head,
+                         to_bias + j);
+          const int64_t g = size.k + kGeometry * j, c = (1 + kGeometry) * size.k + 3 * j;
+          add_outputs<kGeometry>(row + size.head, last.of[1] + kGeometry * j * size.head,
+                                 to.geometry + kGeometry * m, size.head, to_row + size.head,
+                                 to_last + g * size.head, to_bias + g);
+          add_outputs<3>(row + 2 * size.head, last.of[2] + 3 * j * size.head, to.color + 3 * m, size.head,
+                         to_row + 2 * size.head, to_last + c * size.head, to_bias + c);
+        }
+        const float* const own = hidden + start * size.width;
+        for (int64_t i = 0; i < BLOCK * size.width; i += LANES)
+          store(&to_hidden[i], load(own + i) > Vec{} ? load(&to_hidden[i]) : Vec{});
+        fill_inputs(from, seen, heads, size, start, inputs.data());
+        product<true>(to_hidden.data(), 1, size.width, inputs.data(), size.columns, BLOCK, to_first, size.columns,
+                      rows, size.columns);
+        product<false>(to_hidden.data(), size.width, 1, first.data(), size.columns, size.width, to_inputs.data(),
+                       size.columns, BLOCK, size.columns);
+        for (int64_t a = 0; a < count; ++a)
+          std::copy_n(to_inputs.data() + a * size.columns, heads.features, to_features + (start + a) * heads.features);
+      }
+    }
+  });
+
+  for (int64_t group = 1; group < GROUPS; ++group)
+    for (int64_t i = 0; i < summed; ++i) sums[i] += sums[group * summed + i];
+  const float* to_last = sums.data() + rows * size.columns;
+  const float* to_bias = to_last + outputs * size.head;
+  for (int h = 0; h < kHeads; ++h) {
+    for (int64_t row = 0; row < heads.hidden; ++row) {
+      const float* found = sums.data() + (h * size.head + row) * size.columns;
+      std::copy_n(found, heads.features + 4, to_heads.first[h] + row * (heads.features + 4));
+      to_heads.first_bias[h][row] = found[heads.features + 4];
+    }
+    for (int64_t row = 0; row < kOutputs[h] * size.k; ++row, to_last += size.head)
+      std::copy_n(to_last, heads.hidden, to_heads.last[h] + row * heads.hidden);
+    std::copy_n(to_bias, kOutputs[h] * size.k, to_heads.last_bias[h]);
+    to_bias += kOutputs[h] * size.k;
+  }
+}
+
+}  // namespace SW_ARCH

@@ -1,0 +1,12 @@
+"""Spherical harmonics as all formats count them: bands, and the constant of the first."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+Array = npt.NDArray[np.float32]
+
+SH_C0 = 0.28209479177387814
+COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
+"""SH degree -> coefficients a channel above band 0."""

@@ -1,0 +1,152 @@
+"""Reading and writing: the same few steps for every format."""
+
+from __future__ import annotations
+
+import io
+import os
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from splatwizard_core.api import BitstreamError, SceneError, UserInputError, replacing
+from sw_interchange.frames import axes_of, in_frame
+from sw_interchange.known_formats import Format, detect, format_named, format_of_suffix
+from sw_interchange.scene import GaussianScene, Limits, ReadReport, WriteReport, cleaned
+from sw_interchange.source import Source
+
+NO_LIMITS = Limits()
+FOLDER = "sog-folder"
+
+
+def read(
+    path: str | os.PathLike[str],
+    *,
+    format: str | None = None,
+    limits: Limits = NO_LIMITS,
+    frame: str | None = "RDF",
+    strict: bool = False,
+    spz_frame: str = "RUB",
+    undo_dataparser: str | os.PathLike[str] | None = None,
+) -> GaussianScene:
+    """Read a file; `scene.report` says what was found and mended.
+
+    format          None: by its content, then by its suffix
+    frame           axes of the result; None: as stored
+    strict          raise where rows hold what is no number, instead of dropping them
+    spz_frame       axes of .spz files that do not say: "RUB" as the format's text has it, "raw" for RDF
+    undo_dataparser dataparser_transforms.json of nerfstudio: back to the axes and size of the photographs
+
+    Raises BitstreamError if the file is damaged, SceneError if it cannot be read or holds no Gaussians, UserInputError.
+    """
+    where = Path(path)
+    if where.is_dir():
+        where = where / "meta.json"
+    source = _checked(Source.open(where, spz_frame=spz_frame))
+    scene = _decoded(source, format, limits, frame, strict)
+    if undo_dataparser is None:
+        return scene
+    from sw_interchange.dataparser import undone
+
+    return undone(scene, undo_dataparser)
+
+
+def decode(
+    data: bytes,
+    format: str | None = None,
+    *,
+    name: str = "data",
+    limits: Limits = NO_LIMITS,
+    frame: str | None = "RDF",
+    strict: bool = False,
+    spz_frame: str = "RUB",
+) -> GaussianScene:
+    """Read the bytes of a file, as `read` does.
+
+    name    for messages
+    """
+    return _decoded(_checked(Source(data, name, None, spz_frame)), format, limits, frame, strict)
+
+
+def write(
+    scene: GaussianScene, path: str | os.PathLike[str], *, format: str | None = None, **options: Any
+) -> WriteReport:
+    """Write a file, complete or absent, in the axes of its format; the report says what it could not hold.
+
+    format      None: by the suffix of `path`
+    options     of the format, see docs/formats.md
+
+    Raises UserInputError for unknown formats and options, and for scenes that the format cannot hold at all.
+    """
+    chosen = format_of_suffix(path) if format is None else format_named(format)
+    parts, report = _encoded(scene, chosen, options)
+    if chosen.name == FOLDER:
+        _unpack(parts[0], Path(path))
+        return report
+    with replacing(path) as temporary, open(temporary, "wb") as file:
+        file.writelines(parts)
+    return report
+
+
+def encode(scene: GaussianScene, format: str, **options: Any) -> tuple[bytes, WriteReport]:
+    """Encode a scene as `write` does, into bytes."""
+    parts, report = _encoded(scene, format_named(format), options)
+    return b"".join(parts), report
+
+
+def _unpack(bundle: bytes, meta: Path) -> None:
+    """Write the images of a bundle beside its meta.json, which comes last: it names files that are there."""
+    with zipfile.ZipFile(io.BytesIO(bundle)) as archive:
+        for name in archive.namelist():
+            with replacing(meta if name == "meta.json" else meta.parent / name) as temporary:
+                temporary.write_bytes(archive.read(name))
+
+
+def _checked(source: Source) -> Source:
+    if source.spz_frame != "raw":
+        axes_of(source.spz_frame)
+    return source
+
+
+def _decoded(source: Source, name: str | None, limits: Limits, frame: str | None, strict: bool) -> GaussianScene:
+    if frame is not None:
+        axes_of(frame)
+    chosen = detect(source) if name is None else format_named(name)
+    report = ReadReport(chosen.name, bytes=len(source.data))
+    try:
+        scene = chosen.load("reader")(source, limits, report)
+        scene = cleaned(scene, report, strict=strict, name=source.name)
+    except MemoryError as error:
+        raise BitstreamError(f"{source.name}: there is not enough memory for it") from error
+    report.stored_frame = scene.frame
+    if scene.num_gaussians == 0 and chosen.name != "ply":
+        raise SceneError(f"{source.name}: holds no Gaussian")
+    return scene if frame is None else in_frame(scene, frame)
+
+
+def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tuple[list[bytes], WriteReport]:
+    writer = chosen.load("writer")
+    options = chosen.load("options")(**values)
+    report = WriteReport(chosen.name, num_gaussians=scene.num_gaussians)
+    if chosen.name != "ply":
+        scene = _sound(scene, report)
+    if scene.num_gaussians == 0 and chosen.name != "ply":
+        raise UserInputError(f"a scene without Gaussians cannot be written as {chosen.name}")
+    if scene.sh_degree > chosen.max_sh_degree:
+        report.lost.append(f"SH degree {scene.sh_degree}: {chosen.max_sh_degree} at most")
+        scene = scene.with_degree(chosen.max_sh_degree)
+    if scene.antialiased and chosen.name in ("splat", "gltf"):
+        report.lost.append("that it was trained with antialiasing")
+    parts = writer(replace(in_frame(scene, chosen.frame), report=None), options, report)
+    report.bytes = sum(len(part) for part in parts)
+    return parts, report
+
+
+def _sound(scene: GaussianScene, report: WriteReport) -> GaussianScene:
+    """The scene without rows that are no numbers, which codes of integers cannot hold."""
+    kept = cleaned(scene, ReadReport("scene"), strict=False, name="the scene")
+    if kept.num_gaussians < scene.num_gaussians:
+        left = scene.num_gaussians - kept.num_gaussians
+        report.warnings.append(f"{left:,} Gaussians hold values that are no numbers, and were left out")
+        report.num_gaussians = kept.num_gaussians
+    return kept

@@ -1,0 +1,44 @@
+"""Morton order: Gaussians that lie together in space stand together in the file."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from sw_interchange.bands import Array
+
+BITS = 10
+CROWD = 256
+"""Points of one code that are ordered again, within their own bounds."""
+
+
+def morton_order(means: Array) -> npt.NDArray[np.intp]:
+    """The rows [N] along a Z-order curve, x lowest; points that share a cell are ordered within it."""
+    codes = _codes(means)
+    order = np.argsort(codes, kind="stable")
+    sorted_codes = codes[order]
+    starts = np.flatnonzero(np.r_[True, sorted_codes[1:] != sorted_codes[:-1]])
+    ends = np.r_[starts[1:], len(order)]
+    for start, end in zip(starts, ends, strict=True):
+        if end - start > CROWD and len(starts) > 1:
+            crowd = order[start:end]
+            order[start:end] = crowd[morton_order(means[crowd])]
+    return order
+
+
+def _codes(means: Array) -> npt.NDArray[np.uint32]:
+    low, high = means.min(0), means.max(0)
+    span = high - low
+    scale = np.divide(1 << BITS, span, out=np.zeros(3, np.float64), where=span > 0)
+    cells = np.minimum(((means - low) * scale), (1 << BITS) - 1).astype(np.uint32)
+    codes = np.zeros(len(means), np.uint32)
+    for axis in range(3):
+        codes |= _spread(cells[:, axis]) << np.uint32(axis)
+    return codes
+
+
+def _spread(x: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint32]:
+    """Ten bits, two zeros between each."""
+    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
+        x = (x | (x << np.uint32(shift))) & np.uint32(mask)
+    return x

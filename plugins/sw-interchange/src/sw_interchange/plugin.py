@@ -1,0 +1,42 @@
+"""Registers importers and exporters of the formats that other programs use."""
+
+from splatwizard_core.api import Registry, hookimpl
+
+
+@hookimpl
+def register_exporters(registry: Registry) -> None:
+    registry.add("splat", "sw_interchange.registered:export_splat", suffix=".splat",
+                 summary=".splat: 32 bytes a Gaussian, no SH")  # fmt: skip
+    registry.add("spz", "sw_interchange.registered:export_spz", suffix=".spz",
+                 summary=".spz of Niantic, version 3: quantised, gzip")  # fmt: skip
+    registry.add("spz-v4", "sw_interchange.registered:export_spz4", suffix="",
+                 summary=".spz of Niantic, version 4: the same in zstd, quicker")  # fmt: skip
+    registry.add("compressed-ply", "sw_interchange.registered:export_compressed_ply", suffix=".compressed.ply",
+                 summary="compressed .ply of PlayCanvas, as SuperSplat reads it")  # fmt: skip
+    registry.add("sog", "sw_interchange.registered:export_sog", suffix=".sog",
+                 summary=".sog of PlayCanvas: WebP images, the smallest of these")  # fmt: skip
+    registry.add("sog-folder", "sw_interchange.registered:export_sog_folder", suffix=".json",
+                 summary="the same as images beside their meta.json")  # fmt: skip
+    registry.add("gltf", "sw_interchange.registered:export_gltf", suffix=".glb",
+                 summary="binary glTF with KHR_gaussian_splatting, float32")  # fmt: skip
+
+
+@hookimpl
+def register_importers(registry: Registry) -> None:
+    registry.add("splat", "sw_interchange.registered:import_splat", suffix=".splat",
+                 summary=".splat: 32 bytes a Gaussian, no SH")  # fmt: skip
+    registry.add("spz", "sw_interchange.registered:import_spz", suffix=".spz",
+                 summary=".spz of Niantic, versions 1 to 4")  # fmt: skip
+    registry.add("compressed-ply", "sw_interchange.registered:import_compressed_ply", suffix=".compressed.ply",
+                 summary="compressed .ply of PlayCanvas")  # fmt: skip
+    registry.add("sog", "sw_interchange.registered:import_sog", suffix=".sog",
+                 summary=".sog of PlayCanvas, versions 1 and 2")  # fmt: skip
+    registry.add("sog-folder", "sw_interchange.registered:import_sog_folder", suffix=".json",
+                 summary="the same as images beside their meta.json")  # fmt: skip
+    registry.add("ksplat", "sw_interchange.registered:import_ksplat", suffix=".ksplat",
+                 summary=".ksplat of GaussianSplats3D, levels 0 to 2")  # fmt: skip
+    registry.add("gltf", "sw_interchange.registered:import_gltf", suffix=".glb",
+                 summary="binary glTF with KHR_gaussian_splatting")  # fmt: skip
+    for suffix in ("pt", "ckpt", "pth"):
+        registry.add(f"checkpoint-{suffix}", "sw_interchange.registered:import_checkpoint", suffix=f".{suffix}",
+                     summary="checkpoints of gsplat (.pt), nerfstudio (.ckpt) and 3DGS (.pth)")  # fmt: skip

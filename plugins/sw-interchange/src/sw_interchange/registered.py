@@ -1,0 +1,66 @@
+"""Importers and exporters as the registry wants them: (path) -> model, and (model, path)."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable
+from typing import Any
+
+from splatwizard_core.api import GaussianModel, SceneError, SplatModel
+from sw_interchange.bridge import from_gaussians, to_gaussians
+from sw_interchange.files import read, write
+from sw_interchange.scene import ReadReport
+
+log = logging.getLogger(__name__)
+
+Path = str | os.PathLike[str]
+
+
+def _importer(name: str) -> Callable[[Path], GaussianModel]:
+    def load(path: Path) -> GaussianModel:
+        scene = read(path, format=name)
+        model = to_gaussians(scene)
+        assert scene.report is not None  # of whatever was read
+        for line in notices(scene.report):
+            log.warning("%s: %s", os.path.basename(path), line)
+        raster = {"antialias": True} if scene.antialiased else {}
+        told = {key: value for key, value in scene.report.as_dict().items() if key not in ("bytes", "num_gaussians")}
+        model.origin = {**told, "antialiased": scene.antialiased, "raster": raster}
+        return model
+
+    return load
+
+
+def _exporter(name: str, **options: Any) -> Callable[[SplatModel, Path], None]:
+    def save(model: SplatModel, path: Path) -> None:
+        if not isinstance(model, GaussianModel):
+            raise SceneError(
+                f"a {type(model).__name__} cannot be written as {name}: its Gaussians depend on the camera",
+                path=str(path),
+            )
+        report = write(from_gaussians(model), path, format=name, **options)
+        for line in [*report.warnings, *(f"not kept: {what}" for what in report.lost)]:
+            log.warning("%s: %s", os.path.basename(path), line)
+        for field, count in report.clamped.items():
+            log.warning("%s: %s values of %s lie beyond its range", os.path.basename(path), f"{count:,}", field)
+
+    return save
+
+
+def notices(report: ReadReport) -> list[str]:
+    """Lines that a user should see of what a reader found."""
+    found = list(report.warnings)
+    if report.dropped:
+        found.append(f"{report.dropped:,} Gaussians hold values that are no numbers, and were left out")
+    return found
+
+
+import_splat, export_splat = _importer("splat"), _exporter("splat")
+import_spz, export_spz, export_spz4 = _importer("spz"), _exporter("spz"), _exporter("spz", version=4)
+import_sog, export_sog = _importer("sog"), _exporter("sog")
+import_sog_folder, export_sog_folder = _importer("sog"), _exporter("sog-folder")
+import_compressed_ply, export_compressed_ply = _importer("compressed-ply"), _exporter("compressed-ply")
+import_ksplat = _importer("ksplat")
+import_gltf, export_gltf = _importer("gltf"), _exporter("gltf")
+import_checkpoint = _importer("checkpoint")

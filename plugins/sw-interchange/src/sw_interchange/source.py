@@ -1,0 +1,43 @@
+"""The bytes of a file, and what errors call it."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from splatwizard_core.api import SceneError
+
+
+@dataclass(frozen=True)
+class Source:
+    """Bytes to decode.
+
+    data    all of them; of a file a view of the pages that the system holds
+    path    where they lie, if they lie anywhere: files beside it may belong to it
+    name    for messages
+    options of the reader, such as `spz_frame`
+    """
+
+    data: bytes | memoryview
+    name: str
+    path: Path | None = None
+    spz_frame: str = "RUB"
+
+    @classmethod
+    def open(cls, path: str | os.PathLike[str], *, spz_frame: str = "RUB") -> Source:
+        """Map a file. Raises SceneError if it cannot be read."""
+        where = Path(path)
+        try:
+            with where.open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                # Not closed here: arrays are views of it.
+                data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)) if size else b""
+        except OSError as error:
+            raise SceneError(f"{where}: cannot be read: {error.strerror}", path=str(where)) from error
+        return cls(data, where.name, where, spz_frame)
+
+    def head(self, count: int) -> bytes:
+        """The first bytes, at most `count`."""
+        return bytes(self.data[:count])

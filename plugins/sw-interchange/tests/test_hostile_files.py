@@ -1,0 +1,287 @@
+"""A file from a stranger is refused in one or two lines, before anything large is allocated, or it is a sound scene."""
+
+import gzip
+import io
+import json
+import pickle
+import struct
+import tracemalloc
+import zipfile
+import zlib
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from interchange_files import Sample, ksplat_file, mutants, random_scene, samples
+from sw_interchange import Limits, decode, encode, read
+
+from splatwizard_core.api import SplatwizardError, UserInputError
+
+LIMITS = Limits(max_gaussians=1 << 20, max_output_bytes=1 << 28)
+MEMORY = 256 << 20
+FLIPS = 1000
+SLOW_TO_OPEN = {"sog": 300, "spz": 600, "spz-v4": 600, "ksplat": 600}
+"""Fewer of these: eight images, or a compressor, for each."""
+
+
+@pytest.fixture(scope="module")
+def sound() -> dict[str, Sample]:
+    return samples()
+
+
+def spz_head(version: int = 3, count: int = 5, degree: int = 1, bits: int = 12, flags: int = 0, more: int = 0) -> bytes:
+    return b"NGSP" + struct.pack("<IIBBBB", version, count, degree, bits, flags, more)
+
+
+def spz4(count: int, *, streams: int = 5, start: int = 32, table: list[int] | None = None, rest: bytes = b"") -> bytes:
+    head = spz_head(4, count, 0, more=streams) + struct.pack("<I", start) + bytes(12)
+    return head + struct.pack(f"<{len(table or [])}Q", *(table or [])) + rest
+
+
+def sog_with(changes: dict[str, object] | None = None, **files: bytes | None) -> bytes:
+    """A small .sog with other entries of meta.json ("means.mins": ...) and other files; None removes one."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(encode(random_scene(5, 1), "sog")[0])) as old:
+        content: dict[str, bytes | None] = {name: old.read(name) for name in old.namelist()}
+    meta = json.loads(content["meta.json"] or b"")
+    for path, value in (changes or {}).items():
+        *parts, last = path.split(".")
+        place = meta
+        for part in parts:
+            place = place[part]
+        place[last] = value
+    content["meta.json"] = json.dumps(meta).encode()
+    content |= {name.replace("__", "."): data for name, data in files.items()}
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as new:
+        for name, data in content.items():
+            if data is not None:
+                new.writestr(name, data)
+    return buffer.getvalue()
+
+
+def huge_webp() -> bytes:
+    bits = (16382 | 16382 << 14).to_bytes(4, "little")
+    body = b"VP8L" + struct.pack("<I", 6) + b"\x2f" + bits + b"\0"
+    return b"RIFF" + struct.pack("<I", 4 + len(body)) + b"WEBP" + body
+
+
+def lossy_webp() -> bytes:
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    Image.new("RGB", (4, 4)).save(buffer, "WEBP", quality=50)
+    return buffer.getvalue()
+
+
+def glb(document: object, blob: bytes = b"") -> bytes:
+    text = json.dumps(document).encode() if not isinstance(document, bytes) else document
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(blob), b"BIN\0") + blob
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+def gltf_with(place: str, value: object) -> bytes:
+    data = encode(random_scene(5, 1), "gltf")[0]
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    *parts, last = [int(p) if p.isdigit() else p for p in place.split(".")]
+    part = document
+    for each in parts:
+        part = part[each]
+    part[last] = value
+    return glb(document, data[28 + size :])
+
+
+def nested_gltf(depth: int) -> bytes:
+    nodes = [{"children": [i + 1]} for i in range(depth)] + [{"children": [0]}]
+    return glb({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "nodes": nodes})
+
+
+def ksplat_with(offset: int, raw: bytes) -> bytes:
+    data = bytearray(ksplat_file(2, 1, 1))
+    data[offset : offset + len(raw)] = raw
+    return bytes(data)
+
+
+PLY = b"ply\nformat binary_little_endian 1.0\nelement vertex 2\nproperty float x\n"
+ZEROS = zlib.compressobj(9, zlib.DEFLATED, 31)
+GZIP_BOMB = ZEROS.compress(spz_head(count=1) + bytes(1 << 26)) + ZEROS.flush()
+
+
+def zstd_bomb() -> bytes:
+    import zstandard
+
+    frame = zstandard.ZstdCompressor(write_content_size=False).compress(bytes(1 << 26))
+    return spz4(1, table=[len(frame), 9, 0, 1, 0, 3, 0, 3, 0, 4], rest=frame)
+
+
+BAD = {
+    "nothing": (b"", None),
+    "text": (b"hello", None),
+    "ply without an end": (PLY, "ply"),
+    "ply with a negative count": (PLY.replace(b"2\n", b"-2\n") + b"end_header\n", "ply"),
+    "ply with half a Gaussian": (PLY.replace(b"2\n", b"2.5\n") + b"end_header\n", "ply"),
+    "ply with too many": (PLY.replace(b" 2\n", b" 999999999999\n") + b"end_header\n", "ply"),
+    "ply with a property twice": (PLY + b"property float x\nend_header\n" + bytes(99), "ply"),
+    "ply with a list": (PLY + b"property list uchar int y\nend_header\n" + bytes(99), "ply"),
+    "ply with an unknown type": (PLY + b"property quad y\nend_header\n" + bytes(99), "ply"),
+    "ply with many lists ahead": (b"ply\nformat ascii 1.0\nelement face 99999999\nproperty list uchar int i\n"
+                                  b"element vertex 1\nproperty float x\nend_header\n" + bytes(999), "ply"),
+    "splat of 33 bytes": (bytes(33), "splat"),
+    "splat of no bytes": (b"", "splat"),
+    "splat of a negative scale alone": (struct.pack("<6f", 0, 0, 0, -1, 1, 1) + bytes(8), "splat"),
+    "spz of no Gaussian": (gzip.compress(spz_head(count=0)), "spz"),
+    "spz of 2^32 - 1": (gzip.compress(spz_head(count=2**32 - 1) + bytes(999)), "spz"),
+    "spz of 2^31 - 1": (gzip.compress(spz_head(count=2**31 - 1) + bytes(999)), "spz"),
+    "spz of degree 5": (gzip.compress(spz_head(degree=5) + bytes(999)), "spz"),
+    "spz of version 5": (gzip.compress(spz_head(version=5) + bytes(999)), "spz"),
+    "spz of 25 fractional bits": (gzip.compress(spz_head(bits=25) + bytes(999)), "spz"),
+    "spz with a tree": (gzip.compress(spz_head(flags=0x80) + bytes(999)), "spz"),
+    "spz that is short": (gzip.compress(spz_head() + bytes(99)), "spz"),
+    "spz that ends early": (encode(random_scene(50, 3), "spz")[0][:-200], "spz"),
+    "spz of noise": (b"\x1f\x8b\x08" + bytes(range(200)), "spz"),
+    "spz with an extension that is cut off": (
+        gzip.compress(spz_head(count=1, degree=0, flags=2) + bytes(20) + struct.pack("<II", 1, 2**32 - 1)), "spz"),
+    "spz4 without streams": (spz4(5, streams=0, rest=bytes(99)), "spz"),
+    "spz4 with 255 streams": (spz4(5, streams=255, rest=bytes(99)), "spz"),
+    "spz4 with a table before the header's end": (spz4(5, start=8, rest=bytes(199)), "spz"),
+    "spz4 with a table beyond the end": (spz4(5, start=2**32 - 1, rest=bytes(199)), "spz"),
+    "spz4 with too many": (spz4(2**31 - 1, rest=bytes(199)), "spz"),
+    "spz4 of other sizes": (spz4(5, table=[1, 2**60] * 5, rest=bytes(5)), "spz"),
+    "spz4 bomb": (zstd_bomb(), "spz"),
+    "compressed ply without chunks": (encode(random_scene(5, 1), "compressed-ply")[0].replace(
+        b"element chunk 1", b"element chunk 0"), "compressed-ply"),
+    "compressed ply with other SH": (encode(random_scene(5, 1), "compressed-ply")[0].replace(
+        b"f_rest_8", b"f_more_8"), "compressed-ply"),
+    "ksplat that is short": (ksplat_file(2, 1, 1)[:-1], "ksplat"),
+    "ksplat of 4095 bytes": (ksplat_file(2, 1, 1)[:4095], "ksplat"),
+    "ksplat of level 3": (ksplat_with(20, b"\3"), "ksplat"),
+    "ksplat of 2^32 - 1 sections": (ksplat_with(4, b"\xff" * 8), "ksplat"),
+    "ksplat of degree 3": (ksplat_with(4096 + 40, b"\3"), "ksplat"),
+    "ksplat with a count that is too large": (ksplat_with(4096 + 4, b"\xff" * 4), "ksplat"),
+    "ksplat with other buckets": (ksplat_with(4096 + 36, b"\2"), "ksplat"),
+    "sog that is no archive": (b"PK\3\4" + bytes(200), "sog"),
+    "sog without meta.json": (sog_with(meta__json=None), "sog"),
+    "sog without an image": (sog_with(quats__webp=None), "sog"),
+    "sog with a path": (sog_with({"quats.files": ["../quats.webp"]}), "sog"),
+    "sog with an absolute path": (sog_with({"quats.files": ["/etc/passwd"]}), "sog"),
+    "sog with an address": (sog_with({"quats.files": ["http:x"]}), "sog"),
+    "sog with a number that is none": (sog_with(meta__json=b'{"version": 2, "count": NaN}'), "sog"),
+    "sog with deep brackets": (sog_with(meta__json=b"[" * 100_000), "sog"),
+    "sog of 2^40": (sog_with({"count": 2**40}), "sog"),
+    "sog of more than its images hold": (sog_with({"count": 17}), "sog"),
+    "sog of version 3": (sog_with({"version": 3}), "sog"),
+    "sog with a short codebook": (sog_with({"scales.codebook": list(range(3))}), "sog"),
+    "sog with a codebook of words": (sog_with({"scales.codebook": ["a"] * 256}), "sog"),
+    "sog with infinite bounds": (sog_with({"means.maxs": [1, 1, 1e300]}), "sog"),
+    "sog with bounds the wrong way": (sog_with({"means.maxs": [-99, 1, 1]}), "sog"),
+    "sog of degree 4": (sog_with({"shN.bands": 4}), "sog"),
+    "sog with another palette": (sog_with({"shN.count": 65536}), "sog"),
+    "sog with a huge image": (sog_with(quats__webp=huge_webp()), "sog"),
+    "sog with huge images alone": (sog_with({"count": 1 << 20}, **{f"{n}__webp": huge_webp() for n in (
+        "means_l", "means_u", "scales", "quats", "sh0")}), "sog"),
+    "sog with a lossy image": (sog_with(quats__webp=lossy_webp()), "sog"),
+    "sog with a damaged image": (sog_with(quats__webp=huge_webp().replace(b"\xfe\xbf", b"\3\0")), "sog"),
+    "sog bomb": (sog_with(more=bytes(1 << 26)), "sog"),
+    "gltf without splats": (glb({"asset": {"version": "2.0"}, "scenes": [{}]}), "gltf"),
+    "gltf of text": (b'{"asset": {"version": "2.0"}}', "gltf"),
+    "gltf that is no document": (glb([]), "gltf"),
+    "gltf with deep brackets": (glb(b"[" * 100_000), "gltf"),
+    "gltf with an accessor beyond its buffer": (gltf_with("accessors.0.count", 6), "gltf"),
+    "gltf with 2^40 rows": (gltf_with("accessors.0.count", 2**39), "gltf"),
+    "gltf with a stride of nothing": (gltf_with("bufferViews.0.byteStride", 1), "gltf"),
+    "gltf with a view beyond the end": (gltf_with("bufferViews.0.byteOffset", 2**32), "gltf"),
+    "gltf with a negative offset": (gltf_with("bufferViews.1.byteOffset", -4), "gltf"),
+    "gltf with another file": (gltf_with("buffers.0.uri", "/etc/passwd"), "gltf"),
+    "gltf with sparse rows": (gltf_with("accessors.0.sparse", {}), "gltf"),
+    "gltf that shears": (gltf_with("nodes.0.scale", [1, 2, 1]), "gltf"),
+    "gltf that flattens": (gltf_with("nodes.0.scale", [0, 0, 0]), "gltf"),
+    "gltf with a node of its own": (gltf_with("nodes.0.children", [0]), "gltf"),
+    "gltf with a ring of nodes": (nested_gltf(2000), "gltf"),
+    "checkpoint that is none": (b"PK\3\4" + bytes(99), "checkpoint"),
+    "checkpoint of text": (b"hello", "checkpoint"),
+    "checkpoint of an old pickle": (pickle.dumps({"splats": {}}), "checkpoint"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def little_memory() -> Iterator[None]:
+    """Fail if more than MEMORY is held at any time in the test."""
+    tracemalloc.start()
+    yield
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < MEMORY
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_refused_in_two_lines(name, little_memory):
+    data, format = BAD[name]
+    with pytest.raises(SplatwizardError) as caught:
+        decode(data, format, name="bad.file", limits=LIMITS)
+    assert caught.value.exit_status == 2
+    assert str(caught.value).startswith("bad.file")
+    assert len(str(caught.value)) < 300
+    assert "\n" not in str(caught.value)
+
+
+def test_what_stands_after_the_attributes_of_a_gzip_bomb_is_not_inflated(little_memory):
+    assert decode(GZIP_BOMB, "spz", limits=LIMITS).num_gaussians == 1
+
+
+@pytest.mark.parametrize("name", samples())
+def test_a_file_cut_off_anywhere_is_refused(name, sound):
+    sample = sound[name]
+    data = sample.data
+    for at in {0, 1, 3, 4, 8, 15, 16, 20, 31, 32, 100, len(data) // 2, len(data) - 1}:
+        if at < len(data) and not (name == "splat" and at % 32 == 0 and at):
+            with pytest.raises(UserInputError):
+                decode(data[:at], sample.format, limits=LIMITS)
+
+
+@pytest.mark.parametrize("name", samples())
+def test_a_mutated_file_is_a_scene_or_a_clear_error(name, sound):
+    """100,000 of each: benchmarks/interchange_fuzz.py."""
+    refused = told = 0
+    for data in mutants(sound[name], SLOW_TO_OPEN.get(name, FLIPS), seed=7):
+        try:
+            scene = decode(data, sound[name].format, limits=LIMITS)
+        except SplatwizardError as error:
+            refused += "\n" not in str(error)
+            told += 1
+        else:
+            assert np.isfinite(scene.means).all()
+            assert np.isfinite(scene.quats).all()
+            assert np.isfinite(scene.log_scales).all()
+    assert refused == told > 0
+
+
+def test_limits_hold(sound):
+    for name, sample in sound.items():
+        with pytest.raises(UserInputError, match="more than"):
+            decode(sample.data, sample.format, limits=Limits(max_gaussians=4)), name
+
+
+class Trap:
+    """A pickle that would run a command."""
+
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('it ran')",))
+
+
+def test_a_checkpoint_that_would_run_code_is_not_opened(tmp_path):
+    import torch
+
+    torch.save({"splats": {"means": Trap()}}, tmp_path / "trap.pt")
+    with pytest.raises(UserInputError, match="more than tensors"):
+        read(tmp_path / "trap.pt")
+
+
+def test_a_view_that_is_larger_than_its_file_is_refused(tmp_path):
+    import torch
+
+    wide = torch.zeros(1, 3).expand(1 << 21, 3)
+    torch.save({"splats": {"means": wide}}, tmp_path / "wide.pt")
+    assert (tmp_path / "wide.pt").stat().st_size < 1 << 20
+    with pytest.raises(UserInputError, match="more than the limit"):
+        read(tmp_path / "wide.pt", limits=LIMITS)

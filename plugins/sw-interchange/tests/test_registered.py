@@ -1,0 +1,115 @@
+"""Through the registry: `sw export`, `sw info` and `sw eval` take these files as they take a .ply."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from interchange_files import ksplat_file, random_scene
+from sw_gaussians.ply import load_ply
+from sw_interchange import GaussianScene, read, write
+
+from splatwizard_core.api import SceneError, SplatModel, UserInputError
+from splatwizard_core.cli.main import main
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.runs.decode import export_model
+
+SUFFIXES = [".splat", ".spz", ".sog", ".compressed.ply", ".glb", ".json"]
+
+
+@pytest.fixture(scope="module")
+def scene() -> GaussianScene:
+    return random_scene(30, 1)
+
+
+@pytest.fixture(scope="module")
+def ply(scene, tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("ply") / "scene.ply"
+    write(scene, path)
+    return path
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_a_ply_goes_out_and_comes_back(ply, scene, tmp_path, suffix, capsys):
+    there, back = tmp_path / f"scene{suffix}", tmp_path / "back.ply"
+    assert main(["export", str(ply), str(there)]) == 0
+    assert main(["export", str(there), str(back), "--json"]) == 0
+    assert json.loads(capsys.readouterr().out.partition("\n")[2])["counts"] == {"num_gaussians": 30}
+    model = load_ply(back)
+    assert model.max_sh_degree == (0 if suffix == ".splat" else 1)
+    nearest = np.abs(model.means.detach().numpy()[:, None] - scene.means).max(-1).min(1)
+    assert nearest.max() < 0.01
+
+
+def test_info_tells_format_version_and_axes(ply, tmp_path, capsys):
+    write(read(ply), tmp_path / "a.spz", version=4, antialiased=True)
+    assert main(["info", str(tmp_path / "a.spz"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["kind"], facts["version"], facts["stored_frame"], facts["sh_degree"]) == ("spz", "4", "RUB", 1)
+    assert (facts["antialiased"], facts["num_gaussians"]) == (True, 30)
+
+
+def test_that_a_file_was_trained_with_antialiasing_is_asked_of_the_rasterizer(ply, tmp_path):
+    write(read(ply), tmp_path / "a.spz", antialiased=True)
+    model = load_plugins().importers.load("spz")(tmp_path / "a.spz")
+    assert model.origin["raster"] == {"antialias": True}
+    write(read(ply), tmp_path / "b.spz")
+    assert load_plugins().importers.load("spz")(tmp_path / "b.spz").origin["raster"] == {}
+
+
+@pytest.mark.pipeline
+def test_a_file_is_measured_on_a_scene(ply, tmp_path, capsys):
+    write(read(ply), tmp_path / "a.sog")
+    assert main(["eval", str(tmp_path / "a.sog"), "--scene", "demo:tiny", "--no-speed", "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["counts"] == {"num_gaussians": 30}
+    assert facts["metrics"]["psnr"]["mean"] > 0
+
+
+def test_what_a_format_does_not_keep_is_told(ply, tmp_path, caplog):
+    export_model(load_plugins().read_gaussians(ply), tmp_path / "a.splat", load_plugins())
+    assert "not kept: SH degree 1" in caplog.text
+
+
+def test_a_ksplat_is_read(tmp_path):
+    for level in range(3):
+        for degree in range(3):
+            path = tmp_path / f"{level}{degree}.ksplat"
+            path.write_bytes(ksplat_file(2, level, degree))
+            model = load_plugins().read_gaussians(path)
+            assert model.num_rows == 5
+            assert model.max_sh_degree == degree
+
+
+def test_ksplat_places_records_in_their_buckets_and_bands_in_their_order(tmp_path):
+    path = tmp_path / "a.ksplat"
+    data = bytearray(ksplat_file(2, 2, 2))
+    body = 4096 + 1024
+    centres = np.frombuffer(bytes(data[body + 4 : body + 40]), "<f4").reshape(3, 3)
+    records, size = body + 40, 6 + 6 + 8 + 4 + 24
+    for i in range(5):
+        at = records + i * size
+        data[at : at + 6] = np.array([32767, 65534, 0], "<u2").tobytes()  # the middle of the bucket, and its ends
+        data[at + 24 : at + 48] = bytes(range(24))
+    path.write_bytes(data)
+    found = read(path)
+    assert np.allclose(found.means, np.repeat(centres, [2, 2, 1], axis=0) + np.array([0, 2.5, -2.5]), atol=1e-4)
+    codes = (found.sh_rest[0] + 1.5) / 3 * 255
+    bands = [[0, 3, 6], [1, 4, 7], [2, 5, 8], *([9 + i, 14 + i, 19 + i] for i in range(5))]
+    assert np.allclose(codes, bands, atol=1e-3)
+
+
+def test_what_depends_on_the_camera_is_refused(tmp_path):
+    with pytest.raises(SceneError, match="depend on the camera"):
+        export_model(SplatModel(), tmp_path / "a.spz", load_plugins())
+
+
+def test_a_damaged_file_is_one_line_of_the_command(tmp_path, capsys):
+    (tmp_path / "a.spz").write_bytes(b"\x1f\x8b nonsense")
+    assert main(["info", str(tmp_path / "a.spz")]) == 2
+    assert "a.spz" in (error := capsys.readouterr().err)
+    assert len(error.splitlines()) == 1
+    write(random_scene(3, 0), tmp_path / "b.ply", format="compressed-ply")
+    with pytest.raises(UserInputError, match=r"compressed \.ply"):
+        load_ply(tmp_path / "b.ply")
+    assert read(tmp_path / "b.ply").report.format == "compressed-ply"
