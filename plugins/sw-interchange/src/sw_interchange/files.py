@@ -121,7 +121,7 @@ def _decoded(source: Source, name: str | None, limits: Limits, frame: str | None
     report.stored_frame = scene.frame
     if scene.num_gaussians == 0 and chosen.name != "ply":
         raise SceneError(f"{source.name}: holds no Gaussian")
-    return scene if frame is None else in_frame(scene, frame)
+    return scene if frame is None else in_frame(scene, frame, in_place=True)
 
 
 def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tuple[list[bytes], WriteReport]:
