@@ -129,7 +129,7 @@ class _Columns:
 
 
 def _partners(a: _Columns, b: _Columns) -> tuple[str, NDArray[np.intp]]:
-    """How rows are matched, and the row of `b` for each of `a`."""
+    """Pair the rows: "in order" or "nearest", and the row of `b` for each of `a`."""
     tree = cKDTree(b.means)
     near, candidates = tree.query(a.means, k=min(NEIGHBORS, len(b.means)))
     near, candidates = near.reshape(len(a.means), -1), candidates.reshape(len(a.means), -1)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from splatwizard_core.tooling import (
+    EXISTING,
     Choices,
     debug_option,
     device_option,
@@ -34,7 +35,7 @@ GENERATED, SIZE = 12, (512, 512)
 @options(
     scene_option, images_option, set_option,
     click.option(
-        "--cameras", metavar="FILE",
+        "--cameras", type=EXISTING, metavar="FILE",
         help="JSON of the cameras to draw from (README of sw-render).  [default: the scene's test views; without a "
         "scene 12 cameras around the Gaussians]",
     ),
@@ -44,7 +45,7 @@ GENERATED, SIZE = 12, (512, 512)
 )  # fmt: skip
 @takes_choices
 def compare(
-    paths: tuple[str, ...], cameras: str | None, published: bool, own: bool, as_json: bool, chosen: Choices
+    paths: tuple[str, ...], cameras: Path | None, published: bool, own: bool, as_json: bool, chosen: Choices
 ) -> None:
     """Compare two files of any format or method, or run directories: bytes, attributes, and what they show.
 
@@ -79,7 +80,7 @@ def _beside_published(folders: tuple[str, ...], own: bool, as_json: bool) -> Non
     print_facts({"tables": [to_dict(table) for table in tables], "notes": collection.notes}, as_json, told)
 
 
-def _compared(a: Path, b: Path, camera_file: str | None, chosen: Choices) -> dict[str, Any]:
+def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> dict[str, Any]:
     import torch
 
     from splatwizard_core.api import GaussianModel, UserInputError
@@ -110,12 +111,14 @@ def _compared(a: Path, b: Path, camera_file: str | None, chosen: Choices) -> dic
         "b": right.facts(),
         "attributes": errors and errors.as_dict(),
         "no_attributes": reason,
-        "cameras": camera_file or ("around the Gaussians" if not test else f"test views of {scene and scene.name}"),
+        "cameras": str(camera_file)
+        if camera_file is not None
+        else ("around the Gaussians" if not test else f"test views of {scene and scene.name}"),
         "psnr": compare_pictures(left, right, places, _with_pictures(test)),
     }
 
 
-def _places(camera_file: str | None, left: OpenedFile, right: OpenedFile) -> list[Camera]:
+def _places(camera_file: Path | None, left: OpenedFile, right: OpenedFile) -> list[Camera]:
     """Cameras of a file, or around the Gaussians of whichever model is explicit."""
     from sw_gaussians.camera_files import read_cameras
     from sw_gaussians.camera_paths import around
