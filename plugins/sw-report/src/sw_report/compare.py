@@ -101,6 +101,8 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> di
     left, right = (open_file(path, session, resolved, background) for path in (a, b))
     test = [] if scene is None or camera_file is not None else scene.test
     places = [view.camera for view in test] or _places(camera_file, left, right)
+    seen_from = f"test views of {scene.name}" if scene is not None and test else "around the Gaussians"
+    seen_from = seen_from if camera_file is None else str(camera_file)
     errors = None
     explicit = isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel)
     if isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel):
@@ -111,9 +113,7 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> di
         "b": right.facts(),
         "attributes": errors and errors.as_dict(),
         "no_attributes": reason,
-        "cameras": str(camera_file)
-        if camera_file is not None
-        else ("around the Gaussians" if not test else f"test views of {scene and scene.name}"),
+        "cameras": seen_from,
         "psnr": compare_pictures(left, right, places, _with_pictures(test)),
     }
 
