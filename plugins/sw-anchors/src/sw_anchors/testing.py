@@ -76,7 +76,7 @@ def _one_step(
     with (
         mock.patch.object(FixedRows, "draw", fill),
         mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
-        mock.patch.object(model, "_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
+        mock.patch.object(model, "sampled", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
     ):
         inputs = model.decode(camera, rows)
     image = rasterizer.render(inputs, camera, RasterOptions(grad2d=True))

@@ -11,7 +11,8 @@ CODECS = NativeModule(
     kernels=("kernels/grid.cpp", "kernels/signs.cpp", "kernels/sites.cpp", "kernels/huffman.cpp", "kernels/nearest.cpp"),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
     cuda_sources=("kernels/cuda/grid.cu", "kernels/cuda/signs.cu"),
-    cflags=("-ffp-contract=off",),  # a place is rounded as torch rounds it
+    # A place is rounded as torch rounds it; no trap of a comparison keeps loops out of vector code.
+    cflags=("-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math"),
     seconds=20,
     without="hash grids and planes are looked up by torch operations, Huffman codes decoded by a loop, codebooks searched "
     "whole: slower",
