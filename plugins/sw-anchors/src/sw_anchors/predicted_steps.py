@@ -1,4 +1,4 @@
-"""Quantiser steps that a context network predicts for all visible anchors: one node of the graph, on the CPU a kernel."""
+"""Quantiser steps that a context network predicts for all visible anchors: one node, a kernel on the CPU."""
 
 from __future__ import annotations
 
@@ -37,9 +37,7 @@ def predicted_steps(
 
 class _ByKernel(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any, base: Tensor, offset: float, smallest: float, *inputs: Tensor
-    ) -> tuple[Tensor, Tensor]:
+    def forward(ctx: Any, base: Tensor, offset: float, smallest: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
         features, *parameters = (t.contiguous() for t in inputs)
         ctx.bounds = offset, smallest
         steps, hidden, tangents = torch.ops.sw_anchors.predicted_steps(features, parameters, base, offset, smallest)
