@@ -15,6 +15,7 @@ import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, Triple, triple
 from sw_anchors.lattice import low_and_step
+from sw_anchors.predicted_steps import predicted_steps
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
@@ -164,11 +165,16 @@ class CatContext(nn.Module):
         All anchors have noise of their own steps; means and scales are computed for the sample alone.
         """
         first, last = linear_layers(self.network)
-        hidden = torch.relu(self.triplane.projected(sites, first.weight, first.bias, rounded=self.rounded))
         widths = self.shape.outputs[:-1]
         weights = torch.split(last.weight, [sum(widths), PLANES])
         biases = torch.split(last.bias, [sum(widths), PLANES])
-        steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
+        if base_steps.is_cuda:  # where a product of the planes is cheaper than one of all features
+            hidden = torch.relu(self.triplane.projected(sites, first.weight, first.bias, rounded=self.rounded))
+            steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
+        else:
+            features = self.triplane.at_sites(sites, rounded=self.rounded)
+            parameters = (first.weight, first.bias, weights[1], biases[1])
+            steps, hidden = predicted_steps(features, parameters, base_steps, offset=STEP_OFFSET)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
