@@ -85,9 +85,8 @@ def measure(name: str, model: SplatModel, around: Surroundings, scene: Scene, pl
             if encoded:
                 jpeg(pixels)
             seconds.append(time.perf_counter() - began)
-        rates.append(
-            f"{1 / statistics.median(seconds):7.1f} (best {1 / min(seconds):6.1f}, {(time.process_time() - cores) / len(seconds):.3f} core s)"
-        )
+        spent = (time.process_time() - cores) / len(seconds)
+        rates.append(f"{1 / statistics.median(seconds):7.1f} (best {1 / min(seconds):6.1f}, {spent:.3f} core s)")
     pace, share = Pace(), 0.5
     for camera in cameras:
         began = time.perf_counter()
