@@ -20,6 +20,9 @@ from sw_datasets.demo.synthetic import SIZES
 from splatwizard_core.cli.main import main
 
 ROOT = Path(__file__).parent.parent
+sys.path.append(str(ROOT / "tools"))
+from first_minutes import commands  # noqa: E402
+
 SHORT: dict[str | None, list[str]] = {
     None: ["iterations=20"],
     "chimerags": ["distill.iterations=20", "pretrained.iterations=20"],
@@ -33,12 +36,6 @@ from sw_datasets.demo.synthetic import SIZES
 SIZES["demo"] = SIZES["tiny"]
 """
 """A plugin for the processes that a run starts: drawing `demo` would be most of their work."""
-
-
-def commands(page: Path) -> list[str]:
-    """The lines of the page's indented blocks, without trailing comments."""
-    lines = [line[4:] for line in page.read_text("utf-8").splitlines() if line.startswith("    ") and line.strip()]
-    return [line.split("  #")[0].split(" # ")[0].strip() for line in lines]
 
 
 def sw_arguments(command: str) -> list[str] | None:

@@ -59,6 +59,14 @@ def test_processes_of_this_machine_tell_how_they_ended(tmp_path, four_cores):
     assert log.read_text() == "2 threads\nerror: why\n"
 
 
+def test_who_waits_for_processes_does_not_look_again_and_again(tmp_path, monkeypatch, four_cores):
+    executor = LocalExecutor(LocalOptions(workers=1), Site(tmp_path, "cpu"))
+    monkeypatch.setattr(time, "sleep", lambda seconds: pytest.fail("waits by sleeping"))
+    assert executor.ended(0.0) == []
+    executor.start("a", python(""), tmp_path / "log")
+    assert executor.ended(60.0) == [("a", 0, "")]
+
+
 def test_stopping_lets_processes_end_by_themselves(tmp_path, four_cores):
     executor = LocalExecutor(LocalOptions(), Site(tmp_path, "cpu"))
     executor.start("a", python(WAITS), tmp_path / "log")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sqlite3
+from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -267,6 +269,32 @@ def test_an_index_follows_its_plan(tmp_path):
     index.note(first, status="failed", reason="why")
     assert index.plan([first, cell(tmp_path, "c")]) == ["b demo seed 0 r1"]
     assert (index.row(first).status, index.row(first).reason) == ("failed", "why")
+
+
+def test_a_free_place_is_taken_before_the_disk_is_waited_for(tmp_path):
+    made = Made(tmp_path, [run_job([cell(tmp_path, label)]) for label in "ab"], {}, slots=1)
+    start, seen = made.executor.start, []
+
+    def watched(*arguments):
+        with closing(sqlite3.connect(tmp_path / "bench.sqlite")) as other:
+            seen.append([row[0] for row in other.execute("SELECT status FROM runs ORDER BY label")])
+        start(*arguments)
+
+    made.executor.start = watched
+    made.run()
+    assert seen == [["waiting", "waiting"], ["running", "waiting"]]  # that the first has ended is written afterwards
+    assert set(made.states.values()) == {("finished", "")}
+
+
+def test_changes_of_a_block_reach_the_disk_at_its_end_even_of_one_that_fails(tmp_path):
+    index, one = Index(tmp_path), cell(tmp_path, "a")
+    index.plan([one])
+    with closing(sqlite3.connect(tmp_path / "bench.sqlite")) as other:
+        with suppress(KeyboardInterrupt), index.together():
+            index.note(one, status="failed")
+            assert other.execute("SELECT status FROM runs").fetchall() == [("waiting",)]
+            raise KeyboardInterrupt
+        assert other.execute("SELECT status FROM runs").fetchall() == [("failed",)]
 
 
 def test_an_index_that_is_none_is_refused(tmp_path):

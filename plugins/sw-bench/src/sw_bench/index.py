@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
@@ -53,7 +54,7 @@ class Index:
     def __init__(self, out: Path) -> None:
         self.path, self._out = out / FILE_NAME, out
         try:
-            # autocommit: each change is on the disk before the next thing happens
+            # autocommit: but for blocks of `together`, each change is on the disk before the next thing happens
             self._file = sqlite3.connect(self.path, isolation_level=None)
             self._file.executescript(TABLES)
             self._file.execute("INSERT OR IGNORE INTO sweep VALUES ('schema', ?)", (str(SCHEMA),))
@@ -62,6 +63,18 @@ class Index:
             raise UserInputError(f"{self.path}: {error}: move it away, and it is made anew from the runs") from None
         if schema != str(SCHEMA):
             raise UserInputError(f"{self.path} is of another release (schema {schema}): use another --out")
+
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Bring the changes of the block to the disk at once, at its end, however it ends.
+
+        Each change alone waits for the disk, and beside trainings that write checkpoints that takes long.
+        """
+        self._file.execute("BEGIN")
+        try:
+            yield
+        finally:
+            self._file.execute("COMMIT")
 
     def close(self) -> None:
         """Close the file."""

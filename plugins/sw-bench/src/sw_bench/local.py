@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import queue
 import subprocess
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,7 +18,6 @@ from splatwizard_native import available_cores
 from sw_bench.executor import PATIENCE_SECONDS, Site
 
 CORES_EACH = 4  # on a CPU: a training scales well up to about four cores
-MOMENT = 0.05  # seconds between two looks at what runs
 
 
 class LocalOptions(BaseModel):
@@ -54,6 +55,7 @@ class LocalExecutor:
         # More threads than cores wait for one another in loops.
         self.threads = max(1, cores // len(places))
         self._running: dict[str, Running] = {}
+        self._ended: queue.SimpleQueue[tuple[str, int]] = queue.SimpleQueue()
 
     def start(self, ticket: str, command: Sequence[str], log: Path) -> None:
         """Start a process; its group is its own, so that Ctrl-C at the terminal reaches the sweep alone."""
@@ -64,20 +66,21 @@ class LocalExecutor:
                 env=environment(self.threads, gpu),
             )  # fmt: skip
         self._running[ticket] = Running(process, gpu)
+        # The place is free the moment the process ends, and waiting for it takes nothing from those that run.
+        threading.Thread(target=lambda: self._ended.put((ticket, process.wait())), name=ticket, daemon=True).start()
 
     def ended(self, timeout: float) -> list[tuple[str, int, str]]:
         """Return the processes that ended, waiting up to `timeout` seconds for the first."""
-        until = time.monotonic() + timeout
-        while True:
-            found = []
-            for ticket, running in list(self._running.items()):
-                status = running.process.poll()
-                if status is not None:
-                    self._let_go(ticket)
-                    found.append((ticket, status, f"GPU {running.gpu}" if running.gpu else ""))
-            if found or not self._running or time.monotonic() >= until:
-                return found
-            time.sleep(MOMENT)
+        found: list[tuple[str, int, str]] = []
+        while self._running:
+            try:
+                ticket, status = self._ended.get(timeout=0 if found else timeout)
+            except queue.Empty:
+                break
+            if ticket in self._running:  # else `stop` has seen to it
+                gpu = self._let_go(ticket)
+                found.append((ticket, status, f"GPU {gpu}" if gpu else ""))
+        return found
 
     def stop(self) -> None:
         """Ask all processes to end, and wait until they have."""
@@ -94,11 +97,13 @@ class LocalExecutor:
         for ticket in list(self._running):
             self._let_go(ticket)
 
-    def _let_go(self, ticket: str) -> None:
+    def _let_go(self, ticket: str) -> str:
+        """Take the place of a process that has ended back; return its GPU."""
         running = self._running.pop(ticket)
         self._free.append(running.gpu)
         if running.process.stdin is not None:
             running.process.stdin.close()
+        return running.gpu
 
 
 def environment(threads: int, gpu: str) -> Mapping[str, str]:

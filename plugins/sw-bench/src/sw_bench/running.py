@@ -228,14 +228,15 @@ def _begin(index: Index, wanted: Wanted, planned: Sequence[Cell], states: Mappin
     if gone:
         named = ", ".join(gone[:NAMED]) + (", ..." if len(gone) > NAMED else "")
         say(f"{len(gone)} runs of before are not in the plan any more, and stay where they are: {named}")
-    index.put("plan", wanted.text or wanted.plan.model_dump_json())
-    for cell, state in states.items():
-        finished = state is State.FINISHED
-        row = index.row(cell)
-        if finished and row.status != "finished":
-            index.note(cell, status="finished", reason="")
-        elif not finished and row.status != "waiting":
-            index.note(cell, status="waiting", reason="")
+    with index.together():
+        index.put("plan", wanted.text or wanted.plan.model_dump_json())
+        for cell, state in states.items():
+            finished = state is State.FINISHED
+            row = index.row(cell)
+            if finished and row.status != "finished":
+                index.note(cell, status="finished", reason="")
+            elif not finished and row.status != "waiting":
+                index.note(cell, status="waiting", reason="")
 
 
 def _display(cells: list[Cell], finished: list[Cell], estimates: Estimates) -> Lines:

@@ -64,11 +64,15 @@ class Sweep:
                 self.waiting.remove(job)
                 self.done.add(job)
         try:
+            ended: list[tuple[str, int, str]] = []
             while self.waiting or self.running:
-                self._start_what_can()
-                for ticket, status, place in self.executor.ended(MOMENT):
-                    self._finish(ticket, status, place)
+                # The index waits for the disk after a free place has its next process, not before.
+                with self.index.together():
+                    for ticket, status, place in ended:
+                        self._finish(ticket, status, place)
+                    self._start_what_can()
                 self.watcher.tick(self)
+                ended = self.executor.ended(MOMENT)
         finally:
             self.executor.stop()
             for job, _, _ in self.running.values():

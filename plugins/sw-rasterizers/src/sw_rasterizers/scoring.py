@@ -54,7 +54,8 @@ class ScoreRasterizer(StandardRasterizer):
     """The standard rasterizer, with scores and Fisher blocks; a subclass for each name that is registered.
 
     Sums are formed per tile in the dtype of the Gaussians and across tiles and views in float64; on the CPU they are
-    bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies.
+    bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies,
+    unless torch is asked for deterministic algorithms.
     No score is differentiable, and none touches a gradient.
     """
 
@@ -96,7 +97,9 @@ class ScoreRasterizer(StandardRasterizer):
             return
         MODULE.load()
         # Maps and features change no score: they are not asked for.
-        call = self._call(g, cam, replace(opt, depth=frozenset(), alpha=False, absgrad=False, grad2d=False))
+        call = self._call(
+            g, cam, replace(opt, depth=frozenset(), alpha=False, absgrad=False, fragment_grad=False, grad2d=False)
+        )
         sh = g.sh
         tensors = (
             g.means, g.opacities, g.scales, g.quats, g.cov3d, None if sh is None else sh.dense,
