@@ -265,3 +265,9 @@ def test_a_soft_removal_leaves_no_gradient(counted):
     with torch.no_grad():
         post.exec(9000, with_result(task))
     assert all(parameter.grad is None for parameter in task.model.parameters())
+
+
+def test_the_fast_preset_of_3dgs_keeps_the_order_of_removals():
+    _, post = build_schedulers(stage_of(base__preset="fast"), PipelineParams())
+    names = [r.name for r in post.registrations]
+    assert names[-4:] == ["densify to budget", "soft prune", "halve opacity", "hard prune"]
