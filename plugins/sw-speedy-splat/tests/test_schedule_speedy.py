@@ -103,7 +103,7 @@ def test_every_key_of_3dgs_can_be_set_and_a_wrong_one_is_told():
     with pytest.raises(ConfigError, match=r"did you mean 'densify\.start'"):
         stage_of(base__densify__strat=3)
     with pytest.raises(ConfigError, match="preset"):
-        stage_of(base__preset="fast")
+        stage_of(base__preset="fastest")
 
 
 @pytest.mark.parametrize("name", [*SpeedySplat.PRESETS])
