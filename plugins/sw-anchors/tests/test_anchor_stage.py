@@ -177,11 +177,11 @@ def test_a_rate_that_never_decays_is_constant():
 
 
 def test_pictures_may_begin_small():
-    plain, small = AnchorParams(), AnchorParams(resolution={"schedule": "dash"})
+    plain, small = AnchorParams(), AnchorParams(pictures={"schedule": "dash"})
     scene = scene_of()
     assert not isinstance(AnchorStage(plain).create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
     sampler = AnchorStage(small).create_sampler(scene, stream(0, "sampler"))
     assert isinstance(sampler, ResolutionSampler)
     assert sampler.every == small.growth.interval
-    assert "resolution" not in plain.identity()
-    assert small.identity()["resolution"]["schedule"] == "dash"
+    assert "pictures" not in plain.identity()
+    assert small.identity()["pictures"]["schedule"] == "dash"

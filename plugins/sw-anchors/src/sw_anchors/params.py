@@ -64,7 +64,7 @@ class AnchorLoss(Params):
     volume: float = Field(0.01, ge=0, description="weight of the mean volume of a drawn Gaussian (product of scales)")
 
 
-class Resolution(Params):
+class Pictures(Params):
     """Sizes of the training pictures over time."""
 
     schedule: Literal["none", "dash"] = Field(
@@ -84,13 +84,13 @@ class AnchorParams(OptimizationParams):
     lr: AnchorLearningRates = Field(AnchorLearningRates(), description="step sizes")
     growth: AnchorGrowth = Field(AnchorGrowth(), description="growing and pruning of anchors")
     loss: AnchorLoss = Field(AnchorLoss(), description="distortion and regularisers")
-    resolution: Resolution = Field(Resolution(), description="sizes of the training pictures")
+    pictures: Pictures = Field(Pictures(), description="sizes of the training pictures")
 
     def identity(self) -> dict[str, Any]:
-        """Return all values but those of `resolution` where it is off: trainings of before it existed are found."""
+        """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
         content = super().identity()
-        if self.resolution == Resolution():
-            del content["resolution"]
+        if self.pictures == Pictures():
+            del content["pictures"]
         return content
 
 

@@ -79,16 +79,16 @@ class AnchorStage(Stage):
     # Optimizer
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        sampler, resolution, growth = super().create_sampler(scene, generator), self.opt.resolution, self.opt.growth
-        if resolution.schedule == "none":
+        sampler, pictures, growth = super().create_sampler(scene, generator), self.opt.pictures, self.opt.growth
+        if pictures.schedule == "none":
             return sampler
         return by_resolution(
             sampler,
             scene,
             full_at=self.steps(growth.stop),
             every=self.steps(growth.interval),
-            most=resolution.start,
-            rounding=resolution.rounding,
+            most=pictures.start,
+            rounding=pictures.rounding,
         )
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:
