@@ -164,7 +164,7 @@ class CatContext(nn.Module):
         All anchors have noise of their own steps; means and scales are computed for the sample alone.
         """
         first, last = linear_layers(self.network)
-        hidden = torch.relu(first(self.triplane.at_sites(sites, rounded=self.rounded)))
+        hidden = torch.relu(self.triplane.projected(sites, first.weight, first.bias, rounded=self.rounded))
         widths = self.shape.outputs[:-1]
         weights = torch.split(last.weight, [sum(widths), PLANES])
         biases = torch.split(last.bias, [sum(widths), PLANES])
