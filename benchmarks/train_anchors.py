@@ -1,9 +1,11 @@
-"""Training speed of HAC and CAT-3DGS by phase, where a step's time goes, and 3DGS drawing as many Gaussians beside.
+"""Training speed of HAC, HAC++ and CAT-3DGS by phase, where a step's time goes, and 3DGS drawing as many beside.
 
     python benchmarks/train_anchors.py demo --preset quick --device cuda
     python benchmarks/train_anchors.py ../shared/data/fox:images_2 --iterations 7000 --device cuda --syncs
     python benchmarks/train_anchors.py demo --preset quick --iterations 300 --device cpu --methods hac
     python benchmarks/train_anchors.py ../shared/data/room --device cuda --graphs on,off --brief
+    python benchmarks/train_anchors.py ../shared/data/room --device cuda --methods hac,cat-3dgs,hac-plus \
+        --fused off,on --iterations 1000 --last --baseline-steps 0
 
 A scene is FOLDER[:PICTURES] or demo. The plan of the preset is scaled to --iterations (default: as the preset has it).
 Iterations a second count all steps of a phase but those that are profiled, growth and pruning included. In the middle
@@ -12,6 +14,8 @@ goes into which part, forward and backward together (a backward operator counts 
 and kernels launched; and how often the host waits for the GPU (on a CPU: operators that would make it wait). The
 profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that wait (CUDA only).
 --graphs on,off trains twice, with the decoding as CUDA graphs and without, and prints both with the loss at the end.
+--fused off,on trains twice, without and with the kernels for rows of anchors, bits of planes and lookups in triplanes.
+Rows at the end compare the last phase of all trainings, and on a GPU the peak of their memory with that of HAC.
 
 3DGS beside: the Gaussians that all anchors spawn for one view, thinned at random until views draw as many on average
 as the anchors' last steps did, trained as 3DGS without densification and with all its spherical harmonics.
@@ -21,14 +25,17 @@ from __future__ import annotations
 
 import argparse
 import collections
+import itertools
 import math
 import os
 import sys
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
+from unittest import mock
 
 # A profiler that is taken down and set up again does not survive graphs (torch issue 75504).
 os.environ.setdefault("DISABLE_CUPTI_LAZY_REINIT", "1")
@@ -36,6 +43,7 @@ os.environ.setdefault("TEARDOWN_CUPTI", "0")
 
 import torch
 from step_parts import SECTION, kernel_times, longest_kernels, report
+from sw_anchors import fused_ops
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc
@@ -53,6 +61,7 @@ from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import StepRecord, Trainer
 from splatwizard_native import seeded
+from sw_codecs.context import spatial_ar, triplane
 
 # Attribute paths from the trainer -> the part of a step that its calls belong to; what a version lacks is left out.
 # Of nested ones the innermost counts.
@@ -97,6 +106,36 @@ class Phase:
     def rate(self) -> float:
         """Steps a second."""
         return self.steps / self.seconds if self.seconds else math.nan
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What one training came to: speed, milliseconds of the GPU a step and loss of its last phase, peak in GB."""
+
+    method: str
+    rate: float
+    busy: float
+    peak: float
+    loss: float
+    anchors: int
+
+    def line(self, how: str, hac: Summary | None) -> str:
+        """A row of the table at the end; hac: of HAC on the same scene."""
+        memory = "" if math.isnan(self.peak) else f"  peak {self.peak:5.2f} GB"
+        memory += f", {self.peak / hac.peak:.2f} of HAC's" if memory and hac is not None else ""
+        return (
+            f"  {self.method:10} {how:24} {self.rate:7.1f} it/s  GPU {self.busy:6.2f} ms  {self.anchors:9,} anchors  "
+            f"loss {self.loss:.5f}{memory}"
+        )
+
+
+@contextmanager
+def kernels_off() -> Iterator[None]:
+    """Do without the kernels of rows and planes, as before there were any."""
+    with ExitStack() as stack:
+        for module in (fused_ops, spatial_ar, triplane):
+            stack.enter_context(mock.patch.object(module, "fit_kernels", return_value=False))
+        yield
 
 
 @dataclass
@@ -206,8 +245,8 @@ def phases_of(method: str, stage: Any) -> list[Phase]:
 
 
 def anchors(
-    method: str, args: argparse.Namespace, session: Session, folder: str, pictures: str, *, graphs: bool
-) -> None:
+    method: str, args: argparse.Namespace, session: Session, folder: str, pictures: str, *, graphs: bool, scenes: Any
+) -> Summary:
     """Train and print one method, and 3DGS beside it."""
     cls = session.plugins.methods.load(method)
     planned = resolve(cls, args.preset, sets={}, scene=folder).config
@@ -218,7 +257,9 @@ def anchors(
     sets["graphs"] = graphs
     sets |= {"images": pictures} if pictures else {}
     resolved = resolve(cls, args.preset, sets=sets, scene=folder)
-    scene = session.scene(resolved)
+    if (folder, pictures) not in scenes:
+        scenes[folder, pictures] = session.scene(resolved)
+    scene = scenes[folder, pictures]
     made = make_method(session.plugins, resolved)
     rasterizer = NegotiatedRasterizer(session.plugins, device=session.device)
     with seeded(args.seed):
@@ -226,6 +267,8 @@ def anchors(
         trainer = trainer_of(made.stages()[0], model, scene, resolved.ppl, rasterizer)
         phases = phases_of(method, trainer.stage)
         phases[-1].end = last
+        if args.last:
+            phases = phases[-1:]
         watch = Watch(session.device, phases, args.window, args.syncs, args.kernels)
         drawn: list[Any] = []
         render = trainer.rasterizer.render
@@ -241,16 +284,20 @@ def anchors(
 
         def run() -> None:
             watch.begin()
+            if phases[0].start > 0:
+                trainer.run(phases[0].start, watch)
+                watch.begin()
             trainer.run(last, watch)
 
         with_pictures(scene, session.device, run)
     count = round(sum(int(d) for d in drawn) / max(len(drawn), 1))
     print(f"  {method}, {last:,} steps of preset {args.preset}, {trainer.model.num_rows:,} anchors, {count:,} drawn")
+    peak = math.nan
     cuda, prepared = session.device.type == "cuda", getattr(trainer.model, "fixed", None)
     if cuda:
         said = f"{prepared.captures} captures" if prepared is not None else "off"
-        print(f"    graphs: {said}; peak {torch.cuda.max_memory_allocated() / 1e9:.2f} GB")
-        torch.cuda.reset_peak_memory_stats()
+        peak = torch.cuda.max_memory_allocated() / 1e9
+        print(f"    graphs: {said}; peak {peak:.2f} GB")
     total = sum(phase.steps for phase in phases) / sum(phase.seconds for phase in phases)
     loss = float(torch.stack(list(watch.losses)).mean())
     print(f"    all phases: {total:.1f} it/s; mean loss of the last {len(watch.losses)} steps {loss:.5f}")
@@ -259,10 +306,12 @@ def anchors(
         print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {phase.rate:7.1f} it/s{used}")
         if not args.brief:
             print("\n".join(phase.lines), flush=True)
+    found = Summary(method, phases[-1].rate, phases[-1].busy, peak, loss, trainer.model.num_rows)
     if args.baseline_steps < 1:
-        return
+        return found
     rate, drawn_there = explicit(trainer.model, count, args, session, scene, folder)
     print(f"    3DGS drawing {drawn_there:,} Gaussians a view: {rate:.1f} it/s", flush=True)
+    return found
 
 
 def trainer_of(stage: Any, model: Any, scene: Scene, ppl: Any, rasterizer: Any) -> Trainer:
@@ -343,6 +392,8 @@ def main() -> None:
     parser.add_argument("--window", type=int, default=20, help="steps that are profiled in each phase")
     parser.add_argument("--baseline-steps", type=int, default=500, help="of 3DGS; 0: none")
     parser.add_argument("--graphs", default="on", help="decode as CUDA graphs: on, off or on,off")
+    parser.add_argument("--fused", default="on", help="kernels of rows and planes: on, off or off,on (CUDA)")
+    parser.add_argument("--last", action="store_true", help="watch the last phase alone")
     parser.add_argument("--kernels", type=int, default=0, help="list so many kernels that take the most time (CUDA)")
     parser.add_argument("--brief", action="store_true", help="no table of parts")
     parser.add_argument("--syncs", action="store_true", help="also which lines wait for the GPU")
@@ -355,12 +406,22 @@ def main() -> None:
     session.load_kernels()
     where = torch.cuda.get_device_name(0) if args.device == "cuda" else f"CPU, {torch.get_num_threads()} thread(s)"
     print(f"{where}, torch {torch.__version__}")
+    scenes: dict[tuple[str, str], Scene] = {}
     for asked in args.scenes:
         folder, _, pictures = asked.partition(":")
         print(asked)
+        rows: list[tuple[str, Summary]] = []
         for method in args.methods.split(","):
-            for graphs in args.graphs.split(","):
-                anchors(method, args, session, folder, pictures, graphs=graphs == "on")
+            for graphs, fused in itertools.product(args.graphs.split(","), args.fused.split(",")):
+                if args.device == "cuda":
+                    torch.cuda.empty_cache()
+                    torch.cuda.reset_peak_memory_stats()
+                print(f"  graphs {graphs}, kernels {fused}")
+                with nullcontext() if fused == "on" else kernels_off():
+                    found = anchors(method, args, session, folder, pictures, graphs=graphs == "on", scenes=scenes)
+                rows.append((f"graphs {graphs}, kernels {fused}", found))
+        hac = {how: found for how, found in rows if found.method == "hac"}
+        print("\n".join([asked, *(found.line(how, hac.get(how)) for how, found in rows)]), flush=True)
 
 
 if __name__ == "__main__":

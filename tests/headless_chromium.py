@@ -11,6 +11,7 @@ import shutil
 import signal
 import subprocess
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,8 @@ FLAGS = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync", "--hide-scrollbars",
     "--remote-debugging-pipe",
 )  # fmt: skip
+WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+"""Flags for WebGL2 without a GPU."""
 
 
 def find_chromium() -> str | None:
@@ -30,9 +33,10 @@ class Chromium:
     """One browser with one tab.
 
     profile     a new, empty folder for it
+    flags       further ones: `WEBGL`
     """
 
-    def __init__(self, executable: str, profile: Path, timeout: float = 60.0) -> None:
+    def __init__(self, executable: str, profile: Path, timeout: float = 60.0, flags: Sequence[str] = ()) -> None:
         to_browser, self._write = os.pipe()
         self._read, from_browser = os.pipe()
         os.set_blocking(self._read, False)
@@ -43,7 +47,7 @@ class Chromium:
                 os.dup2(fd, wanted)
 
         self._process = subprocess.Popen(
-            [executable, *FLAGS, f"--user-data-dir={profile}", "about:blank"],
+            [executable, *FLAGS, *flags, f"--user-data-dir={profile}", "about:blank"],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, close_fds=False, start_new_session=True,
             preexec_fn=hand_over,
         )  # fmt: skip

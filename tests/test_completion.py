@@ -48,6 +48,7 @@ def offered(line: str, incomplete: str = "") -> list[str]:
         ("data fetch", "dtu/2", ["dtu/24"]),
         ("export a b --format", "pl", ["ply", "ply-as-3dgs"]),
         ("render x.swz --depth", "me", ["median"]),
+        ("view", "a", ["<file>"]),
         ("render x.swz --trajectory", "o", ["orbit"]),
         ("decode", "a", ["<file>"]),
         ("run --out", "a", ["<dir>"]),

@@ -48,9 +48,13 @@ ROOMS = {
 
 LIBRARIES = {
     "sw_rasterizers", "sw_codecs", "sw_gaussians", "sw_anchors", "sw_finetuning", "sw_reference", "sw_interchange",
+    "sw_render",
 }  # fmt: skip
 """Packages that others may import when they declare them."""
-ABOUT_RUNS = {"sw_bench", "sw_render", "sw_report", "sw_doctor", "sw_datasets", "sw_metrics", "sw_geometry", "sw_kit"}
+ABOUT_RUNS = {
+    "sw_bench", "sw_datasets", "sw_doctor", "sw_geometry", "sw_kit", "sw_metrics", "sw_render", "sw_report",
+    "sw_viewer",
+}  # fmt: skip
 """Packages that may use `tooling` besides `api`."""
 
 

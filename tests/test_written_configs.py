@@ -16,7 +16,7 @@ METHODS = [entry.name for entry in load_plugins().methods if is_ours(entry.distr
 BESIDES = {
     "seed": 7, "raster.prefer": ["reference"], "random_background": True, "resolution": 4, "split": "every5",
     "images": None, "background": "white", "scale_schedule": True, "iterations": 123, "raster.profile": "3dgs",
-    "raster.antialias": False, "raster.eps2d": 0.1,
+    "raster.antialias": False, "raster.eps2d": 0.1, "deterministic": True,
 }  # fmt: skip
 SMALL_ANCHORS = {
     "voxel_size": 0.03, "feature_dim": 8, "num_offsets": 4, "hidden": 12, "growth.start_stat": 5, "growth.start": 20,

@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 from sw_gaussians.config import MCMC
+from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.mcmc import draw
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
@@ -20,6 +21,7 @@ from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.stage import StageContext
 from splatwizard_core.training.trainer import CHECK_EVERY, Trainer
+from splatwizard_native import seeded
 from splatwizard_native.fused.native import TRAINING
 from sw_3dgs.config import ThreeDGSConfig
 
@@ -88,6 +90,56 @@ def waits_for_nothing(trainer: Trainer) -> None:
     trainer.check_losses()
     assert all(math.isfinite(record.total.item()) for record in records)
     assert trainer.optimizer.moments("means")[2] == 4 * CHECK_EVERY  # every step has updated
+
+
+DENSE = {"densify": {"start": 60, "interval": 40, "grad_threshold": 5e-5, "reset_interval": 150}, "iterations": 7000}
+CHAIN = {"mcmc": {"enabled": True, "start": 60, "interval": 40, "cap": 700}, "iterations": 7000}
+
+
+@pytest.mark.parametrize("values", [DENSE, {**DENSE, "sparse_adam": "per_row"}, CHAIN], ids=["dense", "sparse", "mcmc"])
+def test_two_deterministic_trainings_give_the_same_bits(values):
+    config = ThreeDGSConfig.model_validate(values)
+    outcomes = []
+    for _ in range(2):
+        losses = []
+        with seeded(0, deterministic=True):
+            trainer = make_trainer(small_scene(3), config, deterministic=True)
+            trainer.run(250, lambda record, losses=losses: losses.append(record.total))
+        outcomes.append((torch.stack(losses), dict(trainer.model.named_parameters()), trainer.optimizer.states))
+    (losses, parameters, states), (others, theirs, other_states) = outcomes
+    assert torch.equal(losses, others)
+    assert len(parameters["means"]) != 500  # densification took part
+    for name, parameter in parameters.items():
+        assert torch.equal(parameter, theirs[name]), name
+        for key, moment in states[name].tensors.items():
+            assert torch.equal(moment, other_states[name].tensors[key]), (name, key)
+
+
+@pytest.mark.parametrize("values", [DENSE, {**DENSE, "sh_interval": 5}, CHAIN], ids=["dense", "bands", "mcmc"])
+def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeypatch):
+    """Adam makes a step of a tiny gradient as large as of any: what rounding moves is bounded by the learning rate."""
+    config, outcomes, fused = ThreeDGSConfig.model_validate(values), [], []
+    step = FusingOptimizer.step
+
+    def spy(self, result=None):
+        fused.append(self.model.sh_rest.grad is None and self.model.means.grad is not None)
+        step(self, result)
+
+    monkeypatch.setattr(FusingOptimizer, "step", spy)
+    for fuses in (False, True):
+        with seeded(0, deterministic=True):
+            trainer = make_trainer(small_scene(3), config, deterministic=True)
+            trainer.stage.fuses_updates = fuses
+            trainer.run(50, lambda record: None)
+        outcomes.append(trainer)
+        assert sum(fused) == (49 if fuses else 0)  # the moments exist from the first update on
+        fused.clear()
+    plain, other = outcomes
+    for name, parameter in plain.model.named_parameters():
+        mine, theirs = parameter.detach(), dict(other.model.named_parameters())[name].detach()
+        assert float((mine - theirs).norm() / mine.norm()) < 1e-5, name
+        assert plain.optimizer.states[name].step == other.optimizer.states[name].step == 50
+    assert float(plain.model.sh_dc.detach().std()) > 0
 
 
 def test_mcmc_grows_to_its_cap_with_what_it_draws_on_the_cpu():

@@ -3,9 +3,11 @@
 import pytest
 import torch
 from sw_anchors.anchors import two_layers
+from sw_anchors.fixed_step import sample_capacity
 from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, widen
 from sw_anchors.neural_gaussians import spawn
 from sw_anchors.noisy_values import Noise, noisy_values
+from sw_anchors.pool_rows import bernoulli_rows
 
 
 def written_out(center, positions, features, offsets, scales, masks, networks):
@@ -180,3 +182,19 @@ def test_spawning_on_a_gpu_equals_spawning_on_the_cpu():
         found.append([each.detach().cpu() for each in (*parts, *gradients)])
     for a, b in zip(*found, strict=True):
         torch.testing.assert_close(a, b, atol=1e-4, rtol=1e-3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.05, 0.7, 1.0])
+def test_a_sample_of_all_rows_draws_each_with_its_probability(share):
+    n, g = 4000, torch.Generator().manual_seed(0)
+    size = sample_capacity(n, share)
+    found = torch.zeros(n)
+    for _ in range(50):
+        rows, counted = bernoulli_rows(torch.rand(size, generator=g), n, share)
+        drawn = rows[counted > 0]
+        assert len(drawn.unique()) == len(drawn)
+        assert bool((rows[counted == 0] == n - 1).all())
+        found[drawn] += 1
+    spread = (share * (1 - share) * 50) ** 0.5
+    assert abs(float(found.mean()) - 50 * share) <= 4 * spread / n**0.5 + 1e-6
+    assert float(found.std()) == pytest.approx(spread, rel=0.05, abs=1e-6)  # rows are drawn independently

@@ -5,8 +5,9 @@ import math
 
 import pytest
 import torch
-from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, AnchorContext, CodedAnchors
+from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
 from sw_anchors.decoded_anchors import DecodedAnchors
+from sw_anchors.forecasts import AnchorContext
 from sw_anchors.growth import adjust_anchors
 from sw_anchors.lattice import TOP, bounds_of, coded_positions, position_codes
 from sw_reference.rasterizer import ReferenceRasterizer

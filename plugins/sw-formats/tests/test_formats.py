@@ -118,6 +118,18 @@ def test_damage_and_lies_are_told(name: str):
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_rows_that_lie_column_after_column_are_written_alike(name: str):
+    model = model_of(20)
+    wanted = written(name, model).section("file")
+    for key in model.RAW:
+        values = getattr(model, key).detach()
+        turned = values.flatten(1).T.contiguous().T.reshape(values.shape) if values.dim() == 2 else values
+        setattr(model, key, torch.nn.Parameter(turned))
+    assert not model.means.is_contiguous()
+    assert written(name, model).section("file") == wanted
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_surfels_are_refused(name: str):
     n = 4
     surfels = SurfelModel.from_tensors(

@@ -7,13 +7,14 @@ import pytest
 import torch
 from sw_gaussians import sparse_adam as module
 from sw_gaussians.native import GAUSSIANS
-from sw_gaussians.sparse_adam import SparseSplatOptimizer, sparse_adam
+from sw_gaussians.sparse_adam import SparseSplatOptimizer, sparse_adam, sparse_adam_steps
 from sw_gaussians.start import gaussians_from_points
 
 from splatwizard_core.errors import ShapeError
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
+from splatwizard_native import AdamUpdate
 
 BETA1, BETA2, EPS = 0.9, 0.999, 1e-15
 OPTIONS = {"beta1": BETA1, "beta2": BETA2, "eps": EPS}
@@ -173,6 +174,38 @@ def test_all_rows_with_bias_correction_per_row_is_adam():
         dense.step()
     for mine, theirs in zip(model.parameters(), dense_model.parameters(), strict=True):
         torch.testing.assert_close(mine, theirs, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("device", ["cpu", pytest.param("cuda", marks=NEEDS_GPU)])
+@pytest.mark.parametrize("mode", MODES)
+def test_many_parameters_at_once_are_each_alone(device, mode):
+    """Widths that are no multiple of four, more rows than a block owns, and one that no kernel takes."""
+    generator = torch.Generator().manual_seed(8)
+    shapes = [(700, 3), (700,), (700, 15, 3), (700, 0, 3), (700, 5)]
+
+    def tensor(shape):
+        return torch.rand(shape, generator=generator).to(device)
+
+    rows = (torch.rand(700, generator=generator) < 0.3).to(device)
+    rows[256:512] = False  # all that a block owns
+    pairs = []
+    for shape in shapes:
+        tensors = [tensor(shape) for _ in range(4)]
+        if shape == (700, 5):
+            tensors[0] = tensors[0].t().contiguous().t()  # strided
+        steps = torch.arange(700, dtype=torch.int32, device=device) if mode == "per_row" else None
+        pairs.append((tensors, steps, [t.clone() for t in tensors], None if steps is None else steps.clone()))
+    sparse_adam_steps(
+        [AdamUpdate(*mine, 0.01, BETA1, BETA2, EPS, 0) for mine, *_ in pairs], rows, [p[1] for p in pairs]
+    )
+    for mine, steps, alone, alone_steps in pairs:
+        p, g, m, v = alone
+        sparse_adam(p, g, m, v, rows, lr=0.01, bias_correction=mode, row_steps=alone_steps, **OPTIONS)
+        for a, b in zip(mine, alone, strict=True):
+            torch.testing.assert_close(a, b, rtol=1e-6, atol=1e-7)
+            assert torch.equal(a[~rows], b[~rows])
+        assert steps is None or torch.equal(steps, alone_steps)
+    assert not torch.equal(pairs[0][0][0][rows], pairs[0][0][3][rows])
 
 
 @pytest.mark.parametrize("mode", MODES)

@@ -44,7 +44,7 @@ def test_what_stood_beyond_the_count_does_not_matter():
     images = []
     for before in (200, 3):
         model.decode(front_camera(), torch.arange(before))
-        model.fixed._steps[256][1].positions[100:].copy_(front_camera().center)  # where no direction is
+        model.fixed._steps[256, 0].at.positions[100:].copy_(front_camera().center)  # where no direction is
         found = model.decode(front_camera(), torch.arange(50, 90))
         found.means.sum().backward()
         images.append([found.opacities.detach().clone(), model.mlp_opacity[0].weight.grad.clone()])
@@ -104,7 +104,7 @@ def test_random_draws_are_centred_and_new_at_each_step():
     seen = []
     for _ in range(2):
         model.decode(front_camera(), torch.arange(100))
-        at: FixedRows = model.fixed._steps[256][1]
+        at: FixedRows = model.fixed._steps[256, 0].at
         seen.append(at.random.clone())
         assert float(at.random.abs().max()) <= 0.5
         assert abs(float(at.random.mean())) < 0.02
@@ -135,7 +135,7 @@ def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(kind, monk
         found = model.decode(front_camera(), torch.arange(30))
         assert found.extras["rate"].bits.requires_grad
     assert caplog.messages == ["training goes on without CUDA graphs, slower: operation not permitted"]
-    assert model.fixed._rows_held() == 0
+    assert model.fixed._rows_held("positions") == 0
 
 
 @pytest.fixture(scope="module")

@@ -13,11 +13,13 @@ from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_sce
 
 from splatwizard_core.api import (
     SH,
+    Camera,
     CapabilityError,
     ConfigError,
     Feature,
     GaussianInputs,
     RasterOptions,
+    RenderResult,
     ScoreSpec,
     ShapeError,
 )
@@ -293,3 +295,46 @@ def test_registry_entry_declares_what_the_class_offers():
     assert entry.load() is StandardRasterizer
     assert {Feature[name].name for name in entry.declared["features"]} == StandardRasterizer.info.features
     assert StandardRasterizer.info.speed > ReferenceRasterizer.info.speed
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_opacity_gradients_of_fragments_are_those_of_autograd_pixel_by_pixel(dtype):
+    g, camera = fragment_scene(dtype)
+    truth = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(2)).to(dtype)
+
+    def pixels(**asked: bool) -> tuple[torch.Tensor, RenderResult]:
+        result = StandardRasterizer().render(g, camera.to(dtype=dtype), RasterOptions(**asked))
+        return (result.image - truth).square().mean(dim=0) / (32 * 32), result
+
+    parts, _ = pixels()
+    expected = torch.zeros(len(g), 2, dtype=dtype)
+    for part in parts.flatten():
+        (gradient,) = torch.autograd.grad(part, g.opacities, retain_graph=True)
+        gradient = gradient * g.opacities.detach()
+        expected += torch.stack([gradient.square(), (gradient != 0).to(dtype)], dim=1)
+    parts, result = pixels(fragment_grad=True, grad2d=True)
+    parts.sum().backward()
+    assert result.fragment_grad is not None
+    assert result.absgrad2d is None
+    assert torch.equal(result.fragment_grad.value[:, 1], expected[:, 1])
+    assert torch.allclose(result.fragment_grad.value[:, 0], expected[:, 0], rtol=1e-3, atol=0)
+
+
+def fragment_scene(dtype: torch.dtype) -> tuple[GaussianInputs, Camera]:
+    """Twenty Gaussians in front of a camera of 32 x 32 pixels; opacities require a gradient."""
+    r = torch.Generator().manual_seed(1)
+
+    def draw(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=r, dtype=torch.float64).to(dtype)
+
+    means = torch.cat([2 * draw(20, 2) - 1, 2 * draw(20, 1) + 3], dim=1)
+    quats = torch.nn.functional.normalize(draw(20, 4) - 0.5, dim=1)
+    opacities = (0.9 * draw(20) + 0.05).requires_grad_()
+    g = GaussianInputs(means, opacities, 0.3 * draw(20, 3) + 0.05, quats, colors=draw(20, 3))
+    return g, Camera(32, 32, 40.0, 40.0, 16.0, 16.0, torch.eye(3), torch.zeros(3))
+
+
+def test_opacity_gradients_and_absolute_gradients_exclude_each_other():
+    g, camera = fragment_scene(torch.float32)
+    with pytest.raises(ConfigError, match="ask for one of them"):
+        StandardRasterizer().render(g, camera, RasterOptions(fragment_grad=True, absgrad=True))

@@ -230,6 +230,24 @@ def test_no_pictures_when_none_are_wanted(make_run):
     assert page(make_run(), pictures=False).all("img") == []
 
 
+def test_scenes_in_3d_are_linked_from_where_the_page_lies(make_run, tmp_path):
+    runs = [make_run(rate, out=tmp_path / "out & more") for rate in ("r1", "r2", "r3")]
+
+    def links(path, *of):
+        write_page(collect(list(of)), path, PageOptions(pictures=False))
+        return [a["href"] for a in Page(path.read_text()).all("a") if not a["href"].startswith("#")]
+
+    assert links(runs[0] / "report.html", runs[0]) == []
+    for run in runs[:2]:
+        (run / "scene.html").write_text("")
+    assert links(runs[0] / "report.html", runs[0]) == ["scene.html"]
+    above = tmp_path / "report.html"
+    found = links(above, *runs)
+    assert len(found) == 2
+    assert all("%20%26%20" in address and address.endswith("/scene.html") for address in found)
+    assert "In 3D:" in Page(above.read_text()).text
+
+
 def test_the_page_is_written_whole_or_not_at_all(make_run, tmp_path):
     target = tmp_path / "report.html"
     target.write_text("before")

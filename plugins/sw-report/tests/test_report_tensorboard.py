@@ -86,7 +86,7 @@ def test_without_the_package_it_is_named(monkeypatch, tmp_path):
 
 def test_a_configuration_without_the_key_is_as_it_was():
     assert "log" not in PipelineParams().model_dump()
-    assert PipelineParams(log=LogParams(tensorboard=True)).model_dump()["log"] == {"tensorboard": True}
+    assert PipelineParams(log=LogParams(tensorboard=True)).model_dump()["log"] == {"tensorboard": True, "view": 0}
 
 
 def test_tensorboards_own_library_reads_what_was_written(tmp_path):

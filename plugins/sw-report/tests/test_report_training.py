@@ -105,3 +105,24 @@ def test_a_record_cannot_lead_to_other_folders(make_run, name):
     found = log_path(collect([directory]).runs[0])
     assert found.parent in (directory, directory.parent / name)
     assert found.parent.parent in (directory.parent, directory.parent.parent)
+
+
+def test_evaluations_are_curves_over_seconds_of_training(tmp_path):
+    lines = [{"stage": 0, "step": n, "metrics": {"psnr": 20 + n}, "train_s": n / 2} for n in (1, 2, 3)]
+    lines += [{"stage": 0, "step": 3, "loss": 1.0}, {"stage": 0, "step": 4, "metrics": {"psnr": 9}}]  # without seconds
+    (tmp_path / "log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    assert read_training(tmp_path / "log.jsonl").quality == {"psnr": [(0.5, 21.0), (1.0, 22.0), (1.5, 23.0)]}
+
+
+def test_the_page_draws_quality_over_seconds(make_run):
+    directory = make_run("r1", keep=("log",))
+    with (directory / "log.jsonl").open("a") as file:
+        for step in (301, 302):
+            line = {"stage": 0, "step": step, "metrics": {"ssim": 0.5, "psnr": step / 10}, "train_s": step / 100}
+            file.write(json.dumps(line) + "\n")
+    runs = collect([directory]).runs
+    charts, _ = training_charts(runs, looks_of(runs))
+    captions = [figure.caption for figure in charts.figures]
+    assert captions[1] == "PSNR of the test views over seconds of training, evaluation not counted"
+    assert captions[2].startswith("SSIM")
+    assert "seconds of training" in str(charts.figures[1].svg)

@@ -276,6 +276,19 @@ def test_housekeeping_is_no_part_of_the_training_time(toy):
     assert outcome.stage_seconds == {"toy": outcome.train_s}
 
 
+def test_an_evaluation_stands_beside_the_seconds_of_training_so_far(toy, tmp_path):
+    def slow(*_):
+        time.sleep(0.02)
+        return {"psnr": 20.0}
+
+    outcome = toy.train(iterations=20, evaluate=slow, directory=tmp_path, ppl=PipelineParams(eval_every=5))
+    lines = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    seconds = [line["train_s"] for line in lines if "metrics" in line]
+    assert len(seconds) == 4
+    assert seconds == sorted(seconds)
+    assert 0 < seconds[0] < seconds[-1] <= outcome.train_s
+
+
 def test_a_record_has_what_the_log_shows(toy, tmp_path):
     records = []
     ppl = PipelineParams(log_every=7)

@@ -36,6 +36,9 @@ if TYPE_CHECKING:
     from splatwizard_native.files import write_json as write_json
     from splatwizard_native.fused.adam import AdamUpdate as AdamUpdate
     from splatwizard_native.fused.adam import adam_steps as adam_steps
+    from splatwizard_native.fused.in_backward import end_offer as end_offer
+    from splatwizard_native.fused.in_backward import offer_update as offer_update
+    from splatwizard_native.fused.in_backward import offered_update as offered_update
     from splatwizard_native.fused.photometric import Padding as Padding
     from splatwizard_native.fused.photometric import photometric as photometric
     from splatwizard_native.interrupt import InterruptGuard as InterruptGuard
@@ -53,6 +56,7 @@ if TYPE_CHECKING:
     from splatwizard_native.random_states import preserved_random_states as preserved_random_states
     from splatwizard_native.random_states import restore_random_states as restore_random_states
     from splatwizard_native.random_states import seeded as seeded
+    from splatwizard_native.random_states import sums_vary_on_cuda as sums_vary_on_cuda
     from splatwizard_native.scalars import Verdict as Verdict
     from splatwizard_native.scalars import read_scalars as read_scalars
     from splatwizard_native.settings import cache_root as cache_root
@@ -73,13 +77,14 @@ MODULES = {
     ),
     "lending": "lend",
     "fused.adam": "AdamUpdate adam_steps",
+    "fused.in_backward": "end_offer offer_update offered_update",
     "fused.photometric": "Padding photometric",
     "interrupt": "InterruptGuard",
     "machine": "describe_machine",
     "memory": "MemoryMeter peak_rss_bytes reset_peak_rss rss_bytes synchronize",
     "module": "NativeModule",
     "progress": "Bar duration track",
-    "random_states": "capture_random_states preserved_random_states restore_random_states seeded",
+    "random_states": "capture_random_states preserved_random_states restore_random_states seeded sums_vary_on_cuda",
     "scalars": "Verdict read_scalars",
     "settings": "cache_root",
     "strict_json": "dump_strict load_strict",

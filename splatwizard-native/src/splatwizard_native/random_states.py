@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import random
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
 import torch
+
+from splatwizard_native.errors import ForeseenError
 
 
 def capture_random_states() -> dict[str, Any]:
@@ -47,9 +50,46 @@ def preserved_random_states() -> Iterator[None]:
 
 
 @contextmanager
-def seeded(seed: int) -> Iterator[None]:
-    """Seed the process-wide generators in the block ; afterwards they are as before."""
-    with preserved_random_states():
+def _one_order_of_sums() -> Iterator[None]:
+    """Let torch, and the kernels that ask it, add in an order that no timing decides; afterwards as before.
+
+    An operation that has no such order raises RuntimeError and names itself.
+    """
+    os.environ.setdefault("CUBLAS_WORKSPACE_CONFIG", ":4096:8")  # read at the first product on a GPU
+    settings: Any = torch.utils.deterministic
+    asked, only_warned = (
+        torch.are_deterministic_algorithms_enabled(),
+        torch.is_deterministic_algorithms_warn_only_enabled(),
+    )
+    filled = settings.fill_uninitialized_memory
+    torch.use_deterministic_algorithms(True)
+    settings.fill_uninitialized_memory = False  # no kernel here reads what it has not written
+    try:
+        yield
+    finally:
+        settings.fill_uninitialized_memory = filled
+        torch.use_deterministic_algorithms(asked, warn_only=only_warned)
+
+
+def sums_vary_on_cuda(what: str, tensor: torch.Tensor) -> None:
+    """Raise ForeseenError where deterministic algorithms are asked for, and these sums of a GPU have no fixed order.
+
+    what    the sums, as a user knows them
+    tensor  of the device that adds them
+    """
+    if tensor.is_cuda and torch.are_deterministic_algorithms_enabled():
+        raise ForeseenError(
+            f"deterministic=true: the sums of {what} have no fixed order on a GPU; leave it out, or train on the CPU"
+        )
+
+
+@contextmanager
+def seeded(seed: int, *, deterministic: bool = False) -> Iterator[None]:
+    """Seed the process-wide generators in the block; afterwards they are as before.
+
+    deterministic   also `torch.use_deterministic_algorithms` in the block: equal draws then give equal bits on a GPU
+    """
+    with preserved_random_states(), _one_order_of_sums() if deterministic else nullcontext():
         digest = hashlib.sha256(f"{seed}/global".encode()).digest()
         random.seed(digest)
         np.random.seed(int.from_bytes(digest[:4], "little"))

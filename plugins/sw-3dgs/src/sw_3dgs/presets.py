@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
+from sw_gaussians.fast import FAST
 from sw_gaussians.quick import QUICK
 
 from sw_codecs.models.rate_points import QUANTIZED_RATES
@@ -18,6 +19,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "absgrad": {"densify.absgrad": True, "densify.grad_threshold": 8e-4},
     # 3DGS-MCMC (arXiv 2404.09591): density control by relocation and noise up to `mcmc.cap` Gaussians.
     "mcmc": {"mcmc.enabled": True},
+    # A third of the steps: density control by budget and score, opacities halved instead of reset.
+    "fast": FAST,
     "quick": QUICK,
 }
 

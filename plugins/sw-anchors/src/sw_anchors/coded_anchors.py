@@ -6,81 +6,34 @@ quantisation, and the rate of a sample of the visible anchors. A method adds the
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
-from sw_anchors.fused_ops import anchor_values, take_rows, widen
+from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
+from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_anchors.noisy_values import Noise, Tables, noisy_values
-from sw_codecs.entropy.rates import gaussian_bits
+from sw_anchors.pool_rows import bernoulli_rows
+from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import Camera, GaussianInputs
+    from splatwizard_core.api import Camera, GaussianInputs, Rasterizer
     from sw_anchors.fixed_decoder import FixedDecoder
+    from sw_anchors.pool_rows import PoolRows
 
 FULL, QUANTIZED, ENTROPY = "full precision", "quantized training", "entropy training"
 """Phases of training: raw values; noise of fixed steps; noise of predicted steps, with a rate."""
 
 MASK_THRESHOLD = 0.01
+SMALLEST_SCALE = 1e-9
+"""Floor of a predicted deviation, as published."""
 INITIAL_MASK_LOGIT = 1.0
-
-Triple = tuple[Tensor, Tensor, Tensor]
-
-
-@dataclass(frozen=True)
-class AnchorContext:
-    """Prediction of a context model for V anchors: a triple for each of `shape.GROUPS`, in the units of the values.
-
-    means, scales   [V,C] of each group: mean and standard deviation of every number; scales may be <= 0 (see `rate`)
-    steps           [V,1] of each group: quantiser step of the anchor
-    own_bits        scalar, differentiable: bits of all that the context model itself stores, if it has come along
-    """
-
-    means: Triple
-    scales: Triple
-    steps: Triple
-    own_bits: Tensor | None = None
-
-
-@dataclass(frozen=True)
-class AnchorForecast:
-    """Prediction of a context model in training: steps of all V anchors, distributions of a sample once it is drawn.
-
-    steps       [V,3] quantiser step of each group; differentiable
-    own_bits    as in AnchorContext
-    hidden      [V,H] what `sample` starts from, or None; rows of the sample are taken from it
-    sample      (rows [S] of the V, their rows of `hidden`, their values [S,C]) -> means and scales [S,C]; the columns
-                are those of all groups side by side
-    """
-
-    steps: Tensor
-    own_bits: Tensor | None
-    hidden: Tensor | None
-    sample: Callable[[Tensor, Tensor | None, Tensor], tuple[Tensor, Tensor]]
-
-
-@dataclass(frozen=True)
-class AnchorRate:
-    """Rate of the anchors of one view; `RenderResult.extras["rate"]` in the entropy phase.
-
-    bits        scalar, differentiable: bits a number over a sample of visible, kept anchors, times the share of visible
-                anchors that are kept; 0 for an empty sample
-    by_group    [3] bits of features, scales and offsets in the sample, detached
-    numbers     scalar: how many numbers the sample has
-    own_bits    of the context
-    """
-
-    bits: Tensor
-    by_group: Tensor
-    numbers: Tensor
-    own_bits: Tensor | None = None
 
 
 class CodedAnchors(AnchorModel):
@@ -101,6 +54,9 @@ class CodedAnchors(AnchorModel):
 
     HAS_FIXED_FORM: ClassVar[bool] = True
     """Whether `sw_anchors.fixed_step` computes what a training step of this class does."""
+
+    SAMPLES_ALL: ClassVar[bool] = False
+    """Whether the rate is of a sample of all anchors, not of the visible ones; then there is `pool_rate`."""
 
     def __init__(
         self,
@@ -134,12 +90,13 @@ class CodedAnchors(AnchorModel):
         self.sample, self.smallest_probability = sample, smallest_probability
         self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
+        self._order: tuple[Tensor, Tensor] | None = None
         self._groups: dict[tuple[Any, ...], Triple] = {}
         self.fixed: FixedDecoder | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """A copy decodes by itself: graphs of a GPU belong to one model."""
-        return {**self.__dict__, "fixed": None}
+        """A copy decodes by itself: graphs of a GPU belong to one model. It sorts anew."""
+        return {**self.__dict__, "fixed": None, "_order": None}
 
     # Positions
 
@@ -169,6 +126,18 @@ class CodedAnchors(AnchorModel):
         """Codes [N,3] of the anchors on the 16-bit lattice, and where they are taken to be [N,3]."""
         codes = position_codes(self.anchors, self.bounds)
         return codes, coded_positions(codes, self.bounds)
+
+    @torch.no_grad()
+    def visible_anchors(self, camera: Camera, rasterizer: Rasterizer) -> Tensor:
+        """As of AnchorModel. In training on a GPU neighbours follow one another, whose gradients meet in the same cells
+        of grids and planes: kernels add those up before they write."""
+        if not (self.training and self.device.type == "cuda"):
+            return super().visible_anchors(camera, rasterizer)
+        codes = self.codes()
+        if self._order is None or self._order[0] is not codes:
+            self._order = codes, torch.argsort(interleave(codes))
+        order = self._order[1]
+        return order[rasterizer.visible_filter(self.balls(), camera).index_select(0, order) > 0]
 
     # Masks
 
@@ -241,6 +210,19 @@ class CodedAnchors(AnchorModel):
     def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
         """Predict for training from rows of `context_rows`, without waiting for a GPU."""
         raise NotImplementedError
+
+    def forecast_pool(self, parts: tuple[Tensor, ...], pool: tuple[Tensor, ...]) -> AnchorForecast:
+        """As `forecast_at`, and of the sample of all anchors what `pool_rate` takes; rows of `context_rows` of both."""
+        raise NotImplementedError
+
+    def pool_rate(self, pool: PoolRows, forecast: AnchorForecast) -> AnchorRate:
+        """Estimate the bits of a sample of all anchors, with the forecast of `forecast_pool`."""
+        raise NotImplementedError
+
+    @torch.no_grad()
+    def pool_sample(self, size: int) -> tuple[Tensor, Tensor]:
+        """Draw a sample of all anchors into `size` places, see `pool_rows.bernoulli_rows`."""
+        return bernoulli_rows(self.uniform(size), self.num_rows, self.sample)
 
     def step_key(self) -> tuple[Any, ...]:
         """Plain values that decide which operators a step of training runs."""
@@ -321,6 +303,10 @@ class CodedAnchors(AnchorModel):
         return torch.rand(shape, generator=self.noise if own else None, device=self.device)
 
     def sampled(self, count: int) -> Tensor:
+        """[S] int64: those of `count` visible anchors whose bits are counted in this step."""
+        return self.draw_sample(count)
+
+    def draw_sample(self, count: int) -> Tensor:
         """[S] int64: a sample of `count` anchors, drawn on the host: to count it, one would wait for a GPU."""
         on_host = self.noise is None or self.noise.device.type == "cpu"
         where = "cpu" if on_host else self.device
@@ -380,15 +366,11 @@ class CodedAnchors(AnchorModel):
         x, step, mask = taken[:3]
         hidden = taken[3] if len(taken) > 3 else None
         mean, scale = forecast.sample(drawn, hidden, x)
-        # What is not kept counts for nothing; an anchor's three coordinates of an offset share its mask.
-        widths = self.shape.widths
-        alone = counted[:, None].expand(-1, widths[0] + widths[1])
-        factors = torch.cat([alone, mask[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
-        step = self.widened(step)
-        bits = gaussian_bits(x, mean, scale.clamp(min=1e-9), step, p_min=self.smallest_probability) * factors
-        numbers = counted.sum() * sum(widths)
-        by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
-        return AnchorRate(bits.sum() * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
+        bits, by_group = sample_bits(
+            x, mean, scale, step, mask, counted, p_min=self.smallest_probability, smallest_scale=SMALLEST_SCALE
+        )
+        numbers = counted.sum() * sum(self.shape.widths)
+        return AnchorRate(bits * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
 
     # State
 
@@ -403,9 +385,3 @@ class CodedAnchors(AnchorModel):
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         super().load_state_dict_extra(extra)
         self.phase = str(extra["phase"])
-
-
-def triple(parts: Iterable[Tensor]) -> Triple:
-    """Tensors of the three groups in their order."""
-    first, second, third = parts
-    return first, second, third

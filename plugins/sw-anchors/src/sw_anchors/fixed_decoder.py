@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 import logging
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -17,7 +18,9 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
-from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of
+from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
+from sw_anchors.fused_ops import put_rows
+from sw_anchors.pool_rows import PoolRows
 from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
 if TYPE_CHECKING:
@@ -28,6 +31,15 @@ log = logging.getLogger(__name__)
 SMALLEST = 256
 KEPT = 16
 """Capacities whose steps are kept; views of one scene ask for fewer."""
+
+
+@dataclass(frozen=True)
+class _Prepared:
+    """A step of one size, what it reads of the visible anchors, and of a sample of all."""
+
+    step: FixedStep
+    at: FixedRows
+    pool: PoolRows | None
 
 
 class FixedDecoder:
@@ -45,7 +57,7 @@ class FixedDecoder:
         self._graphs = graphs
         self._failed = False
         self._pool: tuple[int, int] | None = None
-        self._steps: dict[int, tuple[FixedStep, FixedRows]] = {}
+        self._steps: dict[tuple[int, int], _Prepared] = {}
         self._key: tuple[Any, ...] = ()
         self._watched = Watched([])
         self._shared: dict[str, Tensor] = {}
@@ -58,8 +70,10 @@ class FixedDecoder:
         parts = model.context_rows() if model.phase == ENTROPY else ()
         if self._failed or parts is None:
             return None
+        pooled = model.SAMPLES_ALL and model.phase == ENTROPY
+        places = capacity_of(sample_capacity(model.num_rows, model.sample)) if pooled else 0
         try:
-            step, at = self._prepared(model, parts, capacity_of(len(rows)))
+            prepared = self._prepared(model, parts, capacity_of(len(rows)), places)
         except RuntimeError as error:
             self._failed = True
             log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
@@ -67,34 +81,38 @@ class FixedDecoder:
             self._drop()
             torch.cuda.empty_cache()
             return None
+        sources = [getattr(model, name) for name in PARAMETERS]
+        at, pool = prepared.at, prepared.pool
         with torch.no_grad():
             at.load(model, camera, rows, parts)
-        sources = [getattr(model, name) for name in PARAMETERS]
-        results, others = _Decoded.found(step, rows, self._watched.learning, sources)
-        return inputs_of(at, rows, (results, others))
+            if pool is not None:
+                pool.load(model, [source.detach() for source in sources], parts)
+        places_of = (rows,) if pool is None else (rows, pool.rows)
+        results, others = _Decoded.found(prepared.step, places_of, self._watched.learning, sources)
+        return inputs_of(model, at, rows, (results, others))
 
-    def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int) -> tuple[FixedStep, FixedRows]:
+    def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
         key = (*model.step_key(), *(part.shape[1:] for part in parts))
-        if key != self._key or not self._watched.unchanged() or capacity > self._rows_held():
+        room = capacity <= self._rows_held("positions") and places <= self._rows_held("pool counted")
+        if key != self._key or not self._watched.unchanged() or not room:
             self._drop()
             self._key, self._watched = key, Watched.of(model, {*model.ROWS, "bounds"})
-        found = self._steps.get(capacity)
+        found = self._steps.get((capacity, places))
         if found is None:
             if len(self._steps) >= KEPT:
                 held = self._shared
                 self._drop()
                 self._shared = held
-            found = self._steps[capacity] = self._prepare(model, parts, capacity)
+            found = self._steps[capacity, places] = self._prepare(model, parts, capacity, places)
         return found
 
-    def _prepare(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int) -> tuple[FixedStep, FixedRows]:
+    def _prepare(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
         self.captures += 1
-        size = max(self._rows_held(), 1 << (capacity - 1).bit_length())
 
-        def rows_like(name: str, tensor: Tensor) -> Tensor:
+        def rows_like(name: str, tensor: Tensor, count: int = capacity) -> Tensor:
             if name not in self._shared:
-                self._shared[name] = tensor.new_zeros(size, *tensor.shape[1:])
-            return self._shared[name][:capacity]
+                self._shared[name] = tensor.new_zeros(1 << (count - 1).bit_length(), *tensor.shape[1:])
+            return self._shared[name][:count]
 
         with torch.no_grad():
             weights = model.mask_weights()
@@ -110,17 +128,32 @@ class FixedDecoder:
                 tuple(rows_like(f"part {i}", part) for i, part in enumerate(parts)),
                 rows_like("random", model.features.new_zeros(0, numbers + 1)).view(-1),
             )
-        compute = functools.partial(decode_rows, model, at)
-        inputs = [*at.parameters, *self._watched.learning]
+            pool = None
+            if places:
+                counted = rows_like("pool counted", at.count.new_zeros(0), places)
+                pool = PoolRows(
+                    rows_like("pool rows", torch.zeros(0, dtype=torch.int64, device=model.device), places),
+                    counted,
+                    counted.new_zeros(()),
+                    tuple(
+                        rows_like(f"pool {name}", getattr(model, name).detach().flatten(1), places).requires_grad_()
+                        for name in PARAMETERS
+                    ),
+                    tuple(rows_like(f"pool part {i}", part, places) for i, part in enumerate(parts)),
+                    rows_like("pool random", model.features.new_zeros(0, numbers), places).view(-1),
+                )
+        compute = functools.partial(decode_rows, model, at, pool)
+        inputs = [*at.parameters, *(() if pool is None else pool.parameters), *self._watched.learning]
         if not self._graphs:
-            return PlainStep(compute, inputs), at
+            return _Prepared(PlainStep(compute, inputs), at, pool)
         with torch.cuda.device(model.device):
             if self._pool is None:
                 self._pool = torch.cuda.graph_pool_handle()
-            return CapturedStep(compute, inputs, self._pool), at
+            return _Prepared(CapturedStep(compute, inputs, self._pool), at, pool)
 
-    def _rows_held(self) -> int:
-        held = self._shared.get("positions")
+    def _rows_held(self, name: str) -> int:
+        """Rows of a shared tensor: without the phase that it belongs to there is none."""
+        held = self._shared.get(name)
         return 0 if held is None else len(held)
 
     def _drop(self) -> None:
@@ -138,21 +171,21 @@ class _Decoded(torch.autograd.Function):
 
     @classmethod
     def found(
-        cls, step: FixedStep, rows: Tensor, networks: list[Tensor], sources: list[Tensor]
+        cls, step: FixedStep, rows: tuple[Tensor, ...], networks: list[Tensor], sources: list[Tensor]
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """(differentiable results, others)."""
+        """(differentiable results, others). rows: of the visible anchors, and perhaps of a sample of all."""
         counts: list[int] = []
         found = cls.apply(step, rows, networks, counts, *sources)  # type: ignore[no-untyped-call]
         return found[: counts[0]], found[counts[0] :]
 
     @staticmethod
     def forward(
-        ctx: Any, step: FixedStep, rows: Tensor, networks: list[Tensor], counts: list[int], *sources: Tensor
+        ctx: Any, step: FixedStep, rows: tuple[Tensor, ...], networks: list[Tensor], counts: list[int], *sources: Tensor
     ) -> tuple[Tensor, ...]:
         results, others = step.forward()
         ctx.step, ctx.networks, ctx.count = step, networks, len(results)
         ctx.shapes = [source.shape for source in sources]
-        ctx.save_for_backward(rows)
+        ctx.save_for_backward(*rows)
         ctx.set_materialize_grads(False)
         counts.append(len(results))
         results, others = tuple(each.detach() for each in results), tuple(each.detach() for each in others)
@@ -162,13 +195,17 @@ class _Decoded(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
-        (rows,) = ctx.saved_tensors
+        rows, *others = ctx.saved_tensors
+        count = len(ctx.shapes)
         grads = ctx.step.backward(slopes[: ctx.count])
-        add_gradients(ctx.networks, grads[len(ctx.shapes) :])
-        found = [
-            None if grad is None else grad.new_zeros(shape[0], *grad.shape[1:]).index_copy_(0, rows, grad[: len(rows)])
-            for grad, shape in zip(grads, ctx.shapes, strict=False)
-        ]
+        add_gradients(ctx.networks, grads[count * (1 + len(others)) :])
+        found = put_rows(rows, grads[:count], ctx.shapes[0][0])
+        for i, others_rows in enumerate(others, 1):
+            for j, grad in enumerate(grads[count * i : count * (i + 1)]):
+                into = found[j]
+                if grad is not None:
+                    into = grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None else into
+                    found[j] = into.index_add_(0, others_rows, grad)
         shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
         return None, None, None, None, *shaped
 

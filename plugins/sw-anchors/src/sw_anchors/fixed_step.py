@@ -17,9 +17,11 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
-from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED, AnchorRate
-from sw_anchors.fused_ops import anchor_values
+from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
+from sw_anchors.forecasts import AnchorRate
+from sw_anchors.fused_ops import load_rows, noisy_rows
 from sw_anchors.neural_gaussians import visible_gaussians
+from sw_anchors.pool_rows import PoolRows
 from sw_anchors.step_graphs import Found
 from sw_anchors.view_networks import network_outputs
 
@@ -61,9 +63,7 @@ class FixedRows:
         pairs += [(getattr(model, name).detach(), mine) for name, mine in zip(PARAMETERS, self.parameters, strict=True)]
         if weights is not None and self.weights is not None:
             pairs.append((weights, self.weights))
-        for source, mine in pairs:
-            flat = source if source.dim() == mine.dim() else source.flatten(1)
-            torch.index_select(flat, 0, rows, out=mine.detach()[:v])
+        load_rows(rows, [source for source, _ in pairs], [mine.detach() for _, mine in pairs])
         self.draw(model)
 
     def draw(self, model: CodedAnchors) -> None:
@@ -72,36 +72,38 @@ class FixedRows:
         self.random.uniform_(-0.5, 0.5, generator=model.noise if own else None)
 
 
-def decode_rows(model: CodedAnchors, at: FixedRows) -> Found:
+def decode_rows(model: CodedAnchors, at: FixedRows, pool: PoolRows | None) -> Found:
     """Compute all that does not depend on which Gaussians are visible; rows beyond the count have masks 0.
 
     Returns (the three outputs of the networks, offsets [C,k,3], scales [C,6], masks [C,k], then in the entropy phase
     bits and, if the context has any, own bits of `AnchorRate`), and (by_group and numbers of the rate).
+
+    pool    what the rate is of; None: a sample of the visible anchors
     """
-    features, log_scales, offsets, logits = at.parameters
-    capacity, k = logits.shape
-    values, masks = anchor_values(
-        None, features, log_scales, offsets.view(capacity, k, 3), logits, at.weights, MASK_THRESHOLD
+    capacity, k = at.parameters[-1].shape
+    noise, draws = torch.split(at.random, [len(at.random) - capacity, capacity])
+    steps: Tensor | None = None
+    if model.phase == QUANTIZED:
+        steps = model.base_steps_like(noise)[None] * model.noise_factor
+    elif model.phase == ENTROPY:
+        forecast = model.forecast_at(at.parts) if pool is None else model.forecast_pool(at.parts, pool.parts)
+        steps = forecast.steps
+    values, (own, scales, shifts), masks, kept = noisy_rows(
+        at.parameters, at.weights, at.count, None if steps is None else noise, steps, MASK_THRESHOLD
     )
     valid = (torch.arange(capacity, device=values.device) < at.count).to(values)
-    masks = masks * valid[:, None]
-    noise, draws = torch.split(at.random, [values.numel(), capacity])
     rate: list[Tensor] = []
     rate_counts: tuple[Tensor, ...] = ()
-    if model.phase == QUANTIZED:
-        values = torch.addcmul(values, noise.view_as(values), model.wide_base_steps(values))
-    elif model.phase == ENTROPY:
-        forecast = model.forecast_at(at.parts)
-        steps = model.widened(forecast.steps)
-        values = torch.addcmul(values, noise.view_as(values), steps)
-        kept = masks.detach().amax(dim=1)
-        drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
-        counted = kept.index_select(0, drawn) * is_drawn
-        share = kept.sum() / at.count.clamp(min=1)
-        found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
+    if model.phase == ENTROPY:
+        if pool is None:
+            drawn, is_drawn = sample_of(draws + 0.5, valid, model.sample)
+            counted = kept.index_select(0, drawn) * is_drawn
+            share = kept.sum() / at.count.clamp(min=1)
+            found_rate = model.rate_of(drawn, values, forecast, masks, counted, share)
+        else:
+            found_rate = model.pool_rate(pool, forecast)
         rate = [found_rate.bits] + ([] if found_rate.own_bits is None else [found_rate.own_bits])
         rate_counts = found_rate.by_group, found_rate.numbers
-    own, scales, shifts = torch.split(values, list(model.shape.widths), dim=1)
     # What is not valid may stand at the camera's centre, where a direction is none.
     positions = torch.where(valid[:, None] > 0, at.positions, at.center + 1)
     networks = (model.mlp_opacity, model.mlp_cov, model.mlp_color)
@@ -132,14 +134,15 @@ def sample_capacity(capacity: int, share: float) -> int:
     return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
 
 
-def inputs_of(at: FixedRows, rows: Tensor, found: Found) -> GaussianInputs:
+def inputs_of(model: CodedAnchors, at: FixedRows, rows: Tensor, found: Found) -> GaussianInputs:
     """The Gaussians with opacity > 0, from what `decode_rows` found; anchors `rows` are those that were loaded.
 
     Waits for the device once, for their number.
     """
     (alpha, geometry, color, offsets, scales, masks, *rate), counts = found
     spawned = visible_gaussians(alpha, geometry, color, at.positions, offsets, scales, masks)
-    extras: dict[str, Any] = {"anchors": AnchorSelection(rows, spawned.all_opacities[: len(rows)], spawned.drawn)}
+    seen = spawned.alphas if model.COUNTS_MASKED else spawned.all_opacities
+    extras: dict[str, Any] = {"masks": masks, "anchors": AnchorSelection(rows, seen[: len(rows)], spawned.drawn)}
     if rate:
         extras["rate"] = AnchorRate(rate[0], counts[0], counts[1], rate[1] if len(rate) > 1 else None)
     return GaussianInputs(

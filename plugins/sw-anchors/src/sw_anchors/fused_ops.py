@@ -6,11 +6,16 @@ are taken once each, so nothing has to be summed (indexing a CUDA tensor sorts i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+
+from sw_anchors import row_kernels
+from sw_anchors.row_kernels import NoisyRows, SampleBits, fit_kernels
+from sw_codecs.entropy.rates import gaussian_bits
 
 
 def anchor_values(
@@ -31,6 +36,73 @@ def anchor_values(
     found = _Values.apply(rows, features, log_scales, offsets, mask_logits, mask_weights, threshold)  # type: ignore[no-untyped-call]
     values, masks = found
     return values, masks
+
+
+def noisy_rows(
+    parameters: Sequence[Tensor],
+    mask_weights: Tensor | None,
+    valid: Tensor,
+    noise: Tensor | None,
+    steps: Tensor | None,
+    threshold: float,
+) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor], Tensor, Tensor]:
+    """Numbers and masks of C anchors, of which the first `valid` hold; those of others mean nothing, their masks are 0.
+
+    parameters      features [C,F], log_scales [C,6], offsets [C,3k], mask_logits [C,k]
+    mask_weights    [C,1] or None, as of `anchor_values`; `threshold` likewise
+    valid           scalar float
+    noise           [C (F+6+3k)] that the steps multiply, or None
+    steps           [C,3] or [1,3] of the groups; differentiable if [C,3]
+
+    Returns (values [C,F+6+3k], the same by group, masks [C,k], [C] whether any mask of an anchor is 1).
+    """
+    features, log_scales, offsets, logits = parameters
+    if fit_kernels(*parameters):
+        values, *groups, masks, kept = NoisyRows.apply(*parameters, mask_weights, valid, noise, steps, threshold)  # type: ignore[no-untyped-call]
+        return values, (groups[0], groups[1], groups[2]), masks, kept
+    capacity, k = logits.shape
+    values, masks = anchor_values(
+        None, features, log_scales, offsets.view(capacity, k, 3), logits, mask_weights, threshold
+    )
+    masks = masks * (torch.arange(capacity, device=values.device) < valid).to(values)[:, None]
+    widths = [features.shape[1], 6, 3 * k]
+    if noise is not None and steps is not None:
+        wide = torch.cat([step.expand(-1, width) for step, width in zip(steps.split(1, 1), widths, strict=True)], dim=1)
+        values = torch.addcmul(values, noise.view_as(values), wide)
+    own, scales, shifts = torch.split(values, widths, dim=1)
+    return values, (own, scales, shifts), masks, masks.detach().amax(dim=1)
+
+
+def sample_bits(
+    x: Tensor,
+    mean: Tensor,
+    scale: Tensor,
+    steps: Tensor,
+    masks: Tensor,
+    counted: Tensor,
+    *,
+    p_min: float,
+    smallest_scale: float,
+) -> tuple[Tensor, Tensor]:
+    """(bits of S anchors, differentiable; the same by group [3]) under Gaussians.
+
+    x, mean, scale      [S,F+6+3k]; scales below `smallest_scale` are taken for that
+    steps               [S,3] widths of the bins by group
+    masks               [S,k] factors of the bits of an offset
+    counted             [S] factors of the bits of all other numbers
+
+    The derivative by the bits must not be negative.
+    """
+    if x.dtype == torch.float32 and fit_kernels(x):
+        bits, by_group = SampleBits.apply(x, mean, scale, steps, masks, counted, p_min, smallest_scale)  # type: ignore[no-untyped-call]
+        return bits, by_group
+    offsets = 3 * masks.shape[1]
+    widths = [x.shape[1] - 6 - offsets, 6, offsets]
+    alone = counted[:, None].expand(-1, widths[0] + widths[1])
+    factors = torch.cat([alone, masks[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
+    wide = torch.cat([step.expand(-1, width) for step, width in zip(steps.split(1, 1), widths, strict=True)], dim=1)
+    each = gaussian_bits(x, mean, scale.clamp(min=smallest_scale), wide, p_min=p_min) * factors
+    return each.sum(), torch.stack([part.sum() for part in each.detach().split(widths, dim=1)])
 
 
 class _Values(torch.autograd.Function):
@@ -78,21 +150,42 @@ def take_rows(rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
     return found
 
 
+def load_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+    """Copy rows [V] (int64) of each source [N,...], flat, into the first V rows of its target [V or more, ...]."""
+    if fit_kernels(*sources) and fit_kernels(*into):
+        row_kernels.load_rows(rows, sources, into)
+        return
+    for source, mine in zip(sources, into, strict=True):
+        flat = source if source.dim() == mine.dim() else source.flatten(1)
+        torch.index_select(flat, 0, rows, out=mine[: len(rows)])
+
+
+def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list[Tensor | None]:
+    """For each source [V or more,...] `count` rows of zeros, of which `rows` [V] are its first V; None for None."""
+    given = [source for source in sources if source is not None]
+    if fit_kernels(*given):
+        found = iter(row_kernels.scatter_rows(rows, given, count))
+        return [None if source is None else next(found) for source in sources]
+    return [
+        None if s is None else s.new_zeros(count, *s.shape[1:]).index_copy_(0, rows, s[: len(rows)]) for s in sources
+    ]
+
+
 class _TakeRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
         ctx.save_for_backward(rows)
         ctx.count = len(tensors[0])
+        if fit_kernels(*tensors):
+            return tuple(row_kernels.take_rows(rows, tensors))
         return tuple(t.index_select(0, rows) for t in tensors)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
         (rows,) = ctx.saved_tensors
-        return None, *(
-            g.new_zeros(ctx.count, *g.shape[1:]).index_copy_(0, rows, g) if needed else None
-            for g, needed in zip(grads, ctx.needs_input_grad[1:], strict=True)
-        )
+        wanted = zip(grads, ctx.needs_input_grad[1:], strict=True)
+        return None, *put_rows(rows, [grad if needed else None for grad, needed in wanted], ctx.count)
 
 
 def widen(steps: Tensor, group: Tensor, one_hot: Tensor) -> Tensor:

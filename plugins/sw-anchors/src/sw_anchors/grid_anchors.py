@@ -15,7 +15,8 @@ from torch import Tensor, nn
 
 from splatwizard_core.api import SceneError
 from sw_anchors.anchors import linear_layers, two_layers
-from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
+from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.forecasts import AnchorContext, AnchorForecast
 from sw_anchors.lattice import TOP
 from sw_anchors.shape import AnchorShape
 from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid

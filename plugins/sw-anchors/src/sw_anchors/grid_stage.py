@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from sw_anchors.coded_anchors import ENTROPY, QUANTIZED, AnchorRate
+from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
+from sw_anchors.forecasts import AnchorRate
 from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.grid_params import GridAnchorParams
 from sw_anchors.phase_switch import PhaseSwitch

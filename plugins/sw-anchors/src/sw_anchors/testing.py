@@ -19,6 +19,7 @@ from sw_anchors.fixed_decoder import FixedDecoder, capacity_of
 from sw_anchors.fixed_step import FixedRows
 from sw_anchors.fused_ops import mean_product
 from sw_anchors.growth import accumulate_anchor_statistics
+from sw_anchors.pool_rows import PoolRows
 
 PHASES = (FULL, QUANTIZED, ENTROPY)
 
@@ -67,16 +68,26 @@ def _one_step(
     device, capacity = model.device, capacity_of(count)
     generator = torch.Generator().manual_seed(count)
     rows = torch.randperm(model.num_rows, generator=generator)[:count].sort().values.to(device)
+    capacity = max(capacity, capacity_of(model.num_rows))
     noise = torch.rand(capacity, sum(model.shape.widths), generator=generator).to(device)
     draws = torch.rand(capacity, generator=generator).to(device)
 
-    def fill(at: FixedRows, _: Any) -> None:
-        at.random.copy_(torch.cat([noise.flatten(), draws]) - 0.5)
+    def fill(at: FixedRows | PoolRows, _: Any) -> None:
+        count = len(at.parameters[0])
+        parts = [noise[:count].flatten()] + ([draws[:count]] if isinstance(at, FixedRows) else [])
+        at.random.copy_(torch.cat(parts) - 0.5)
+
+    def pool(size: int) -> tuple[Tensor, Tensor]:
+        drawn = torch.nonzero(draws[: model.num_rows] < sample).squeeze(1)
+        rest = drawn.new_full((size - len(drawn),), model.num_rows - 1)
+        return torch.cat([drawn, rest]), (torch.arange(size, device=device) < len(drawn)).to(noise)
 
     with (
         mock.patch.object(FixedRows, "draw", fill),
+        mock.patch.object(PoolRows, "draw", fill),
+        mock.patch.object(model, "pool_sample", pool),
         mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
-        mock.patch.object(model, "_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
+        mock.patch.object(model, "draw_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
     ):
         inputs = model.decode(camera, rows)
     image = rasterizer.render(inputs, camera, RasterOptions(grad2d=True))

@@ -6,7 +6,8 @@ from collections.abc import Iterable
 from typing import Any, Literal
 
 import torch
-from sw_anchors.coded_anchors import AnchorContext, AnchorForecast, CodedAnchors
+from sw_anchors.coded_anchors import CodedAnchors
+from sw_anchors.forecasts import AnchorContext, AnchorForecast
 from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer

@@ -7,12 +7,28 @@ from splatwizard_native import NativeModule
 CODECS = NativeModule(
     name="sw_codecs",
     package="sw_codecs",
-    sources=("kernels/binding.cpp", "kernels/binding_sites.cpp", "kernels/binding_cuda.cpp"),
-    kernels=("kernels/grid.cpp", "kernels/signs.cpp", "kernels/sites.cpp", "kernels/huffman.cpp", "kernels/nearest.cpp"),
+    sources=(
+        "kernels/binding.cpp",
+        "kernels/binding_sites.cpp",
+        "kernels/binding_cuda.cpp",
+        "kernels/binding_planes.cpp",
+    ),
+    kernels=(
+        "kernels/grid.cpp",
+        "kernels/signs.cpp",
+        "kernels/sites.cpp",
+        "kernels/huffman.cpp",
+        "kernels/nearest.cpp",
+    ),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/grid.cu", "kernels/cuda/signs.cu"),
+    cuda_sources=(
+        "kernels/cuda/grid.cu",
+        "kernels/cuda/signs.cu",
+        "kernels/cuda/plane_bits.cu",
+        "kernels/cuda/triplane.cu",
+    ),
     cflags=("-ffp-contract=off",),  # a place is rounded as torch rounds it
     seconds=20,
-    without="hash grids and planes are looked up by torch operations, Huffman codes decoded by a loop, codebooks searched "
-    "whole: slower",
+    without="hash grids and planes are looked up by torch operations, Huffman codes decoded by a loop, codebooks "
+    "searched whole: slower",
 )

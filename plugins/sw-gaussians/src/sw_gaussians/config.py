@@ -1,6 +1,6 @@
 """Hyper-parameters of training explicit Gaussians. Defaults are those of the Splatwizard paper."""
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -70,6 +70,39 @@ class MCMC(Params):
         return {"opacity": self.init_opacity, "scale_factor": self.init_scale} if self.enabled else {}
 
 
+class Fast(Params):
+    """Parts of fast training, each off by default; the preset `fast` of 3dgs turns on what pays."""
+
+    densify: Literal["threshold", "budget"] = Field(
+        "threshold",
+        description="threshold: density control of 3DGS; budget: drawn by a score, as many as a budget allows",
+    )
+    score: Literal["opacity_variance", "gradient"] = Field(
+        "opacity_variance",
+        description="of the draw: variance of the opacity gradient (LiteGS), or screen-space gradient",
+    )
+    cap: int = Field(1_000_000, ge=1, description="Gaussians that the budget rises to, linearly until densify.stop")
+    growth: float = Field(
+        1.0,
+        ge=0,
+        description="new Gaussians for each one over densify.grad_threshold, at most; 0: the cap alone counts",
+    )
+    opacity: Literal["reset", "halve"] = Field(
+        "reset", description="every densify.reset_interval: reset: to at most densify.reset_opacity; halve: by half"
+    )
+    sh_every: int = Field(
+        1, ge=1, description="steps between updates of SH bands 1 to 3, on the sum of their gradients"
+    )
+    morton: bool = Field(False, description="put Gaussians in Morton order at each densification (with budget)")
+    resolution: Literal["none", "dash"] = Field(
+        "none", description="dash: begin with small pictures, whole ones from densify.stop on (DashGaussian)"
+    )
+    resolution_rounding: Literal["real", "floor"] = Field(
+        "real", description="scales of pictures: real: any; floor: whole ones, as published"
+    )
+    resolution_start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
+
+
 class Loss(Params):
     """The photometric loss."""
 
@@ -89,4 +122,12 @@ class GaussianTraining(OptimizationParams):
     lr: LearningRates = Field(LearningRates(), description="step sizes")
     densify: Densify = Field(Densify(), description="adaptive density control")
     mcmc: MCMC = Field(MCMC(), description="density control of 3DGS-MCMC, off by default")
+    fast: Fast = Field(Fast(), description="parts of fast training, off by default")
     loss: Loss = Field(Loss(), description="photometric loss")
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values but those of `fast` where it is off: trainings of before it existed are still found."""
+        content = super().identity()
+        if self.fast == Fast():
+            del content["fast"]
+        return content

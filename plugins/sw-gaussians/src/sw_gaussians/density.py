@@ -99,11 +99,13 @@ def densify_and_prune(
     )
 
 
-def split_children(model: GaussianModel, parents: Tensor, count: int) -> dict[str, Tensor]:
+def split_children(
+    model: GaussianModel, parents: Tensor, count: int, *, shrink: float | None = None
+) -> dict[str, Tensor]:
     """Rows of `count` children of each of `parents` [P]: all first children, all second, ...; tensors [count P, ...].
 
     A child lies at centre + R (scales * z) with z from the model's stream of splits, has the parent's scales divided
-    by 0.8 count, and the rest unchanged; those of a surfel, of two scales, stay in its plane.
+    by `shrink` (None: 0.8 count), and the rest unchanged; those of a surfel, of two scales, stay in its plane.
     """
     rows = {
         name: parameter.detach()[parents].repeat(count, *[1] * (parameter.dim() - 1))
@@ -116,7 +118,7 @@ def split_children(model: GaussianModel, parents: Tensor, count: int) -> dict[st
     if offsets.shape[1] == 2:
         offsets = torch.nn.functional.pad(offsets, (0, 1))  # children of a surfel stay in its plane
     rows["means"] = rows["means"] + rotate(rows["quats"], offsets)
-    rows["log_scales"] = (scales / (0.8 * count)).log()
+    rows["log_scales"] = (scales / (shrink or 0.8 * count)).log()
     return rows
 
 

@@ -61,9 +61,12 @@ def draw(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
 
     The random numbers are drawn on the CPU, so that every device draws the same rows.
     """
-    at = torch.rand(count, generator=generator, dtype=torch.float64).to(weights.device)
-    cumulated = weights.double().cumsum(0)
-    return torch.searchsorted(cumulated, at * cumulated[-1], right=True).clamp_max(len(weights) - 1)
+    at = torch.rand(count, generator=generator, dtype=torch.float64)
+    # On a GPU the sum of a scan has one order only in torch's slow form, of N x N terms.
+    place = "cpu" if torch.are_deterministic_algorithms_enabled() else weights.device
+    cumulated = weights.to(place, torch.float64).cumsum(0)
+    rows = torch.searchsorted(cumulated, at.to(place) * cumulated[-1], right=True).clamp_max(len(weights) - 1)
+    return rows.to(weights.device)
 
 
 @torch.no_grad()

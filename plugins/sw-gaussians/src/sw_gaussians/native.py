@@ -1,4 +1,4 @@
-"""The native module of training Gaussians: sparse Adam on the CPU, statistics and normals on CUDA."""
+"""The native module of training Gaussians: sparse Adam, and on CUDA statistics and normals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ GAUSSIANS = NativeModule(
     sources=("kernels/binding.cpp", "kernels/binding_cuda.cpp"),
     kernels=("kernels/sparse_adam.cpp",),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
-    cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/disagreement.cu"),
+    cuda_sources=("kernels/cuda/statistics.cu", "kernels/cuda/sparse_adam.cu", "kernels/cuda/disagreement.cu"),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
     seconds=10,
     without="sparse Adam, gradient statistics and normal losses run on torch operations: the same numbers, slower",

@@ -28,6 +28,14 @@ def register_tasks(registry: Registry) -> None:
     registry.add("add-position-noise", "sw_gaussians.mcmc_tasks:AddNoise",
                  summary="shake the means of faint Gaussians after each update (3DGS-MCMC)", factory=True)  # fmt: skip
 
+    registry.add("collect-opacity-gradients", "sw_gaussians.fragments:collect_opacity_gradients",
+                 summary="add up opacity gradients and their squares over fragments (needs fragment_grad)",
+                 factory=False)  # fmt: skip
+    registry.add("densify-to-budget", "sw_gaussians.fast_tasks:DensifyToBudget",
+                 summary="prune, and grow by a score within a budget (LiteGS)", factory=True)  # fmt: skip
+    registry.add("halve-opacity", "sw_gaussians.fast_tasks:HalveOpacity",
+                 summary="halve every opacity and let Adam start afresh (LiteGS)", factory=True)  # fmt: skip
+
 
 @hookimpl
 def register_pruners(registry: Registry) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
+import torch
+
 from splatwizard_core.api import (
     ConfigError,
     LossPack,
@@ -15,17 +17,22 @@ from splatwizard_core.api import (
     StageContext,
     photometric_loss,
 )
+from sw_gaussians import fast_tasks, fragments, tasks
 from sw_gaussians import mcmc_tasks as mcmc
-from sw_gaussians import tasks
+from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
 from sw_gaussians.config import GaussianTraining
+from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.moments import keep_moments
+from sw_gaussians.resolution import by_resolution
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 from sw_gaussians.statistics import collect_statistics
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
     from splatwizard_core.api import (
+        CameraSampler,
         OptimizationParams,
         PipelineParams,
         RenderResult,
@@ -36,10 +43,16 @@ if TYPE_CHECKING:
     )
 
 
+READERS = (collect_statistics, fragments.collect_opacity_gradients)
+"""Tasks that leave all gradients alone, and read none of spherical harmonics."""
+
+
 class ThreeDGSStage(Stage):
     """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
 
     name = "3dgs"
+    fuses_updates: bool = False
+    """Whether spherical harmonics are updated in the backward pass where nothing else asks for their gradients."""
 
     def __init__(self, opt: GaussianTraining) -> None:
         super().__init__(opt)
@@ -48,9 +61,16 @@ class ThreeDGSStage(Stage):
                 "sparse_adam leaves hidden Gaussians as they are, which the regularisers of mcmc.enabled must reach: "
                 "set one of the two"
             )
+        budget = opt.fast.densify == "budget"
+        if budget and opt.mcmc.enabled:
+            raise ConfigError("mcmc.enabled and fast.densify=budget are two density controls: set one of them")
+        self._fragments = budget and opt.fast.score == "opacity_variance"
+        if self._fragments and opt.densify.absgrad:
+            raise ConfigError("densify.absgrad does not go with fast.score=opacity_variance: set fast.score=gradient")
         self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         self._optimizer: SplatOptimizer | None = None
+        self._post: Scheduler | None = None
         self.white = False  # known when the stage begins; a plan can be printed without a scene
 
     def steps(self, steps: int) -> int:
@@ -62,7 +82,22 @@ class ThreeDGSStage(Stage):
         model = context.model
         if hasattr(model, "split_seed"):
             model.split_seed = context.generator("split").initial_seed()
+        if self._fragments:
+            fragments.add_buffer(model)
         return model
+
+    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
+        sampler, fast = super().create_sampler(scene, generator), self.config.fast
+        if fast.resolution == "none":
+            return sampler
+        return by_resolution(
+            sampler,
+            scene,
+            full_at=self.steps(self.config.densify.stop),
+            every=self.steps(self.config.densify.interval),
+            most=fast.resolution_start,
+            rounding=fast.resolution_rounding,
+        )
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         lr = self.config.lr
@@ -74,10 +109,15 @@ class ThreeDGSStage(Stage):
             ParamGroup("log_scales", lr=lr.scales),
             ParamGroup("quats", lr=lr.quats),
         ]
-        if self.config.sparse_adam == "off":
-            self._optimizer = SplatOptimizer(model, groups)
+        sparse, every = self.config.sparse_adam, self.config.fast.sh_every
+        if sparse == "off":
+            self._optimizer = (
+                CadencedOptimizer(model, groups, every=every) if every > 1 else FusingOptimizer(model, groups)
+            )
+        elif every > 1:
+            self._optimizer = SparseCadencedOptimizer(model, groups, every=every, bias_correction=sparse)
         else:
-            self._optimizer = SparseSplatOptimizer(model, groups, bias_correction=self.config.sparse_adam)
+            self._optimizer = SparseSplatOptimizer(model, groups, bias_correction=sparse)
         return self._optimizer
 
     def finish(self, model: SplatModel, scene: Scene) -> SplatModel:
@@ -85,6 +125,8 @@ class ThreeDGSStage(Stage):
         if self._optimizer is not None and self._optimizer.model is model:
             keep_moments(model, self._optimizer)
         self._optimizer = None
+        if self._fragments:
+            fragments.drop_buffer(model)
         return model
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
@@ -108,6 +150,7 @@ class ThreeDGSStage(Stage):
         )
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
+        self._post = scheduler
         if self.config.mcmc.enabled:
             self._register_mcmc(scheduler)
             return
@@ -117,11 +160,19 @@ class ThreeDGSStage(Stage):
             collect_statistics,
             name="collect gradient statistics",
         )
-        scheduler.register_task(
-            self.when(range(densify.start, densify.stop, densify.interval)),
-            self.densification(),
-            name="prune and densify",
-        )
+        if self._fragments:
+            scheduler.register_task(
+                self.when(range(densify.stop)), fragments.collect_opacity_gradients, name="collect opacity gradients"
+            )
+        when = self.when(range(densify.start, densify.stop, densify.interval))
+        if self.config.fast.densify == "budget":
+            scheduler.register_task(when, self._densify_to_budget(), name="densify to budget")
+        else:
+            scheduler.register_task(when, self.densification(), name="prune and densify")
+        if self.config.fast.opacity == "halve":
+            halve = self.when(range(0, densify.stop, densify.reset_interval))
+            scheduler.register_task(halve, fast_tasks.HalveOpacity(), name="halve opacity")
+            return
         reset_opacity = tasks.ResetOpacity(ceiling=densify.reset_opacity)
         if self.white and 0 < densify.white_reset < densify.stop:
             # Against white, faint Gaussians in empty space cost nothing at first and hide the object later.
@@ -147,6 +198,22 @@ class ThreeDGSStage(Stage):
             pause_after_reset=self.steps(densify.pause_after_reset),
         )
 
+    def _densify_to_budget(self) -> fast_tasks.DensifyToBudget:
+        densify, fast = self.config.densify, self.config.fast
+        rounds = range(self.steps(densify.start), self.steps(densify.stop), self.steps(densify.interval))
+        return fast_tasks.DensifyToBudget(
+            first=rounds.start,
+            last=rounds[-1] if rounds else rounds.start,
+            interval=rounds.step,
+            cap=fast.cap,
+            growth=fast.growth,
+            score=fast.score,
+            grad_threshold=densify.grad_threshold,
+            percent_dense=densify.percent_dense,
+            min_opacity=densify.min_opacity,
+            morton=fast.morton,
+        )
+
     def _register_mcmc(self, scheduler: Scheduler) -> None:
         chain = self.config.mcmc
         when = self.when(range(chain.start, chain.stop, chain.interval))
@@ -155,12 +222,28 @@ class ThreeDGSStage(Stage):
         scheduler.register_task(when, grow, name="grow")
 
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
-        if self._options is None or self._options.background is not background:
+        if self.fuses_updates:
+            self._offer_updates(step)
+        # The variance of opacity gradients costs time in the backward pass; the last step asks for all there is.
+        fragment = self._fragments and (step < self.steps(self.config.densify.stop) or step >= self.iterations)
+        options = self._options
+        if options is None or options.background is not background or options.fragment_grad != fragment:
             statistics, absgrad = not self.config.mcmc.enabled, self.config.densify.absgrad
-            self._options = RasterOptions(
-                background=background, grad2d=statistics and not absgrad, absgrad=statistics and absgrad
+            self._options = options = RasterOptions(
+                background=background,
+                grad2d=statistics and not absgrad,
+                absgrad=statistics and absgrad,
+                fragment_grad=fragment,
             )
-        return self._options
+        return options
+
+    def _offer_updates(self, step: int) -> None:
+        """Offer this step's updates to the backward pass, if no task but the statistics sees gradients."""
+        if type(self) is not ThreeDGSStage or not isinstance(self._optimizer, FusingOptimizer) or self._post is None:
+            return  # a stage made of this one may draw twice, or read gradients in its loss
+        due = (entry.task for entry in self._post.registrations if entry.due(step))
+        if step < self.config.iterations and torch.is_grad_enabled() and all(task in READERS for task in due):
+            self._optimizer.offer()
 
     def loss(self, model: SplatModel, view: View, result: RenderResult, background: Tensor, step: int) -> LossPack:
         truth = view.image(background, result.image.device)

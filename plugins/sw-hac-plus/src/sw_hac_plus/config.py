@@ -70,7 +70,6 @@ class HACPlusConfig(Choosing, GridAnchorParams):
     bound_margin: Literal["hac", "extent", "none"] = Field(
         "hac", description="room around the anchors in the box of the hash grid; hac: as published; extent: 10 %"
     )
-    graphs: bool = Field(True, description="no effect: the rate of HAC++ samples all anchors, which no graph does yet")
     lr: HACPlusLearningRates = Field(HACPlusLearningRates(), description="step sizes")
     phases: HACPlusPhases = Field(HACPlusPhases(), description="when training turns to noise, and to a rate")
     rate_term: HACPlusRateTerm = Field(HACPlusRateTerm(), description="rate term of the loss")

@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
-from sw_anchors.coded_anchors import MASK_THRESHOLD, AnchorForecast, AnchorRate
-from sw_anchors.fused_ops import anchor_values, widen
+from sw_anchors.coded_anchors import MASK_THRESHOLD
+from sw_anchors.forecasts import AnchorForecast, AnchorRate
+from sw_anchors.fused_ops import anchor_values, noisy_rows
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
 from sw_anchors.voxel_lattice import voxel_integers, voxel_positions
@@ -23,6 +24,8 @@ from sw_codecs.entropy.rates import gaussian_bits, mixture_bits
 from sw_codecs.quantizers.rounding import add_noise
 
 if TYPE_CHECKING:
+    from sw_anchors.pool_rows import PoolRows
+
     from splatwizard_core.api import Camera, GaussianInputs
 
 SMALLEST_SCALE = 1e-9
@@ -33,11 +36,11 @@ SMALLEST_SCALE = 1e-9
 class PoolForecast(AnchorForecast):
     """An AnchorForecast whose sample is drawn from all anchors of the model.
 
-    rows            [S] int64, the sample
+    rows            [S] int64, the sample; None: whoever asked has its rows
     sample_steps    [S,3] quantiser steps of it; `hidden` is that of the sample too
     """
 
-    rows: Tensor
+    rows: Tensor | None
     sample_steps: Tensor
 
 
@@ -51,7 +54,7 @@ class HACPlusAnchors(GridAnchors):
     """
 
     COUNTS_MASKED = True
-    HAS_FIXED_FORM = False  # its sample is of all anchors, and its masks have a gradient through scales
+    SAMPLES_ALL = True
 
     def __init__(
         self, *tensors: Tensor, channel: ChannelMixture | None, anchor_gradient: bool = True, **kwargs: Any
@@ -87,16 +90,20 @@ class HACPlusAnchors(GridAnchors):
 
     def forecast(self, rows: Tensor) -> PoolForecast:
         """Predict steps of the anchors `rows`, and for a sample of all anchors what their bits are counted with."""
-        drawn = super().sampled(self.num_rows)
-        both = torch.cat([rows, drawn])
-        features, bits = self._looked_up(tuple(part.index_select(0, both) for part in self.context_rows()))
+        drawn, parts = self.draw_sample(self.num_rows), self.context_rows()
+        found = self.forecast_pool(*(tuple(part.index_select(0, each) for part in parts) for each in (rows, drawn)))
+        return dataclasses.replace(found, rows=drawn)
+
+    def forecast_pool(self, parts: tuple[Tensor, ...], pool: tuple[Tensor, ...]) -> PoolForecast:
+        both = tuple(torch.cat(pair) for pair in zip(parts, pool, strict=True))
+        features, bits = self._looked_up(both)
         first, last = linear_layers(self.mlp_grid)
         hidden = torch.relu(first(features))
         part = slice(self._distributions, self._distributions + 3)
         steps = torch.tanh(nn.functional.linear(hidden, last.weight[part], last.bias[part]))
         steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
-        visible, sampled = torch.split(steps, [len(rows), len(drawn)])
-        return PoolForecast(visible, bits, hidden[len(rows) :], self._no_sample, drawn, sampled)
+        visible, sampled = torch.split(steps, [len(parts[0]), len(pool[0])])
+        return PoolForecast(visible, bits, hidden[len(parts[0]) :], self._no_sample, None, sampled)
 
     @property
     def _distributions(self) -> int:
@@ -117,17 +124,30 @@ class HACPlusAnchors(GridAnchors):
         Masked anchors and offsets have no bits, but count as numbers. What is drawn in this view is no matter.
         """
         assert isinstance(forecast, PoolForecast)
+        assert forecast.rows is not None
         if not len(forecast.rows):
             nothing = self.mask_logits.new_zeros(())
             return AnchorRate(nothing, nothing.new_zeros(3), nothing, forecast.own_bits)
         values, masks = anchor_values(
             forecast.rows, self.features, self.log_scales, self.offsets, self.mask_logits, None, MASK_THRESHOLD
         )
-        steps = widen(forecast.sample_steps, *self._columns(values))
-        values = add_noise(values, steps, self.uniform(*values.shape))
-        bits = self._bits(values, steps, forecast) * self._shares(masks)
+        values = add_noise(values, self.widened(forecast.sample_steps), self.uniform(*values.shape))
+        return self._rate_of(values, masks, values.new_ones(len(values)), forecast)
+
+    def pool_rate(self, pool: PoolRows, forecast: AnchorForecast) -> AnchorRate:
+        assert isinstance(forecast, PoolForecast)
+        values, _, masks, _ = noisy_rows(
+            pool.parameters, None, pool.size, pool.random, forecast.sample_steps, MASK_THRESHOLD
+        )
+        return self._rate_of(values, masks, pool.counted, forecast)
+
+    def _rate_of(self, values: Tensor, masks: Tensor, counted: Tensor, forecast: PoolForecast) -> AnchorRate:
+        """Estimate the bits of noisy values [S,C] of anchors; those that are not counted [S] are as if not there."""
+        steps = self.widened(forecast.sample_steps)
+        bits = self._bits(values, steps, forecast) * (self._shares(masks) * counted[:, None])
         by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
-        return AnchorRate(bits.sum() / bits.numel(), by_group, by_group.new_full((), bits.numel()), forecast.own_bits)
+        numbers = counted.sum() * values.shape[1]
+        return AnchorRate(bits.sum() / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
 
     def _shares(self, masks: Tensor) -> Tensor:
         """[S,C] factors of the bits: whether the anchor is there, for an offset times its mask; with gradient."""

@@ -21,7 +21,8 @@ def to_gaussians(scene: GaussianScene) -> GaussianModel:
 
 def from_gaussians(model: GaussianModel) -> GaussianScene:
     """The scene of a model: its active SH bands, quaternions normalised. A copy where the model is not on the CPU."""
-    columns = {name: getattr(model, name).detach().cpu().float().numpy() for name in model.RAW}
+    # Trained rows may lie column after column, and writers look at the bytes of a row.
+    columns = {name: getattr(model, name).detach().cpu().float().contiguous().numpy() for name in model.RAW}
     scales, flat = columns["log_scales"], columns["log_scales"].shape[1] == 2
     if flat:
         scales = np.concatenate([scales, np.full((len(scales), 1), FLAT, np.float32)], axis=1)

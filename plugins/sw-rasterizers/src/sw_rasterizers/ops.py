@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -10,12 +11,16 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import Camera, GradBuffer
+from splatwizard_native import AdamUpdate, end_offer, offered_update
 from sw_rasterizers.native import MODULE
 
 INPUTS = (
     "means", "opacities", "scales", "quats", "cov3d", "sh", "sh_dc", "sh_rest", "colors", "features", "scale_factors",
 )  # fmt: skip
 """Differentiable inputs in the order in which the ops take them and return their gradients."""
+
+UPDATED = ("sh_dc", "sh_rest")
+"""Inputs for which the backward pass on CUDA can do Adam's step (`splatwizard_native.offer_update`)."""
 
 FORWARD_STAGES = ("project", "sort", "bin", "blend")
 BACKWARD_STAGES = ("blend_backward", "project_backward")
@@ -40,6 +45,8 @@ class Flag(enum.IntFlag):
     FLASH = 8192  # CUDA only
     TENSOR_CORES = 16384
     BYTES = 32768
+    ORDERED = 131072
+    FRAGMENTS = 262144  # with ABSGRAD: other sums in its two columns
 
 
 @dataclass
@@ -80,6 +87,9 @@ class Call:
     counts: list[int] = field(default_factory=list)
     channels: tuple[int, int] = (3, 0)  # colours and features, for the backward pass on CUDA
     drawn: _Drawn | None = None  # on its way from one node to the next
+    updates: dict[str, tuple[Tensor, AdamUpdate]] = field(
+        default_factory=dict
+    )  # that the backward pass may do, on CUDA
 
     def settings(self) -> tuple[Any, ...]:
         return self.camera, self.width, self.height, self.sh_degree, self.scale_modifier, self.eps2d, int(self.flags)
@@ -154,10 +164,14 @@ class _Project(torch.autograd.Function):
         *stored, flags = ctx.saved_tensors
         tensors = [stored.pop(0) if present else None for present in ctx.present]
         wanted = [*ctx.needs_input_grad[2:], call.grad2d is not None, call.absgrad2d is not None]
+        updated, rates = _updates(call, wanted)
         found, seconds = torch.ops.sw_rasterizers.project_backward(
-            *tensors, call.geom_indices, *call.settings(), flags, rows.contiguous(), wanted
+            *tensors, call.geom_indices, *call.settings(), flags, rows.contiguous(), wanted, updated, rates
         )
         call.seconds.update(zip(BACKWARD_STAGES[1:], seconds, strict=False))
+        for param, _ in call.updates.values():
+            end_offer(param)
+            torch.autograd.graph.increment_version(param)  # the kernel writes behind autograd's back
         return _hand_out(call, found, wanted)
 
 
@@ -191,6 +205,31 @@ class _Blend(torch.autograd.Function):
         )  # fmt: skip
         call.seconds.update(zip(BACKWARD_STAGES, seconds, strict=False))
         return None, rows
+
+
+def _updates(call: Call, wanted: list[bool]) -> tuple[list[Tensor], list[float]]:
+    """Tensors and rates of the updates that the kernel does, of sh_dc, of sh_rest; no gradient of theirs is wanted."""
+    if not call.updates:
+        return [], []
+    tensors: list[Tensor] = []
+    rates: list[float] = []
+    for name in UPDATED:
+        if name not in call.updates:
+            tensors += [torch.empty(0)] * 3
+            rates += [0.0] * 6
+            continue
+        _, u = call.updates[name]
+        wanted[INPUTS.index(name)] = False
+        tensors += [u.param, u.exp_avg, u.exp_avg_sq]
+        rates += [
+            u.lr / (1 - u.beta1**u.step),
+            1 - u.beta1,
+            u.beta2,
+            1 - u.beta2,
+            1 / math.sqrt(1 - u.beta2**u.step),
+            u.eps,
+        ]
+    return tensors, rates
 
 
 def _hand_out(call: Call, found: list[Tensor], wanted: list[bool]) -> tuple[Tensor | None, ...]:
@@ -249,6 +288,11 @@ def rasterize(call: Call, tensors: dict[str, Tensor | None]) -> tuple[Tensor, Te
         drawn = _draw(call, [None if x is None else x.detach().contiguous() for x in inputs])
         return drawn.image, drawn.radii, drawn.alpha, drawn.median
     if means.is_cuda:
+        for name in UPDATED:
+            param = tensors.get(name)
+            update = None if param is None else offered_update(param)
+            if param is not None and update is not None:
+                call.updates[name] = param, update
         return _Blend.apply(call, _Project.apply(call, dummy, *inputs))  # type: ignore[no-any-return]
     return _Rasterize.apply(call, dummy, *inputs)  # type: ignore[no-any-return]
 

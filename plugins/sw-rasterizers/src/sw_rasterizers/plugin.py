@@ -8,11 +8,12 @@ PROFILES = ["3dgs", "dgr-exact"]
 STANDARD_FEATURES = [
     "BACKWARD", "ANTIALIAS", "ABSGRAD", "VISIBLE_FILTER", "COV3D", "COLORS_ND", "EXTRA_FEATURES", "SPLIT_SH",
     "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM", "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "TIGHT_TILES",
-    "FLOAT64", "DETERMINISTIC",
+    "FLOAT64", "DETERMINISTIC", "FRAGMENT_GRAD",
 ]  # fmt: skip
 
-# Sums over pixels are atomic there: their order, and so their last bits, vary from run to run.
-ON_CUDA = {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
+ON_CUDA = {"lacks": ["FLOAT64"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
+# Some sums are always atomic there: their order, and so their last bits, vary from run to run.
+ATOMIC_ON_CUDA = {**ON_CUDA, "lacks": ["FLOAT64", "DETERMINISTIC"]}
 # Name -> (target, summary, features, speed). The same kernels under the names of what needs them; the speeds only rank
 # the others below `standard`, which serves whatever nobody asks for by name, codebooks excepted.
 STANDARD = {
@@ -25,7 +26,10 @@ STANDARD = {
     "accel": (
         "variants:AccelRasterizer",
         "the kernels of standard for training: split SH, exact tiles (Taming 3DGS)",
-        ["BACKWARD", "ABSGRAD", "VISIBLE_FILTER", "SPLIT_SH", "TIGHT_TILES", "COLORS_ND", "FLOAT64", "DETERMINISTIC"],
+        [
+            "BACKWARD", "ABSGRAD", "VISIBLE_FILTER", "SPLIT_SH", "TIGHT_TILES", "COLORS_ND", "FLOAT64", "DETERMINISTIC",
+            "FRAGMENT_GRAD",
+        ],
         44,
     ),
     "depth": (
@@ -105,7 +109,7 @@ def register_rasterizers(registry: Registry) -> None:
         features=SURFEL_FEATURES,
         needs=["SURFEL"],
         available="sw_rasterizers.native:unavailable",
-        on={"cuda": {"lacks": ["FLOAT64", "DETERMINISTIC"], "available": "sw_rasterizers.native:unavailable_on_cuda"}},
+        on={"cuda": ATOMIC_ON_CUDA},
         profiles=PROFILES,
         exactness="exact",
         speed=50,
@@ -136,7 +140,7 @@ def register_rasterizers(registry: Registry) -> None:
             features=[*STANDARD_FEATURES, *scores],
             combos_forbidden=[combo for combo in SCORING_FORBIDDEN if combo[1] in scores],
             available="sw_rasterizers.native:unavailable",
-            on={"cuda": ON_CUDA},
+            on={"cuda": ATOMIC_ON_CUDA},
             profiles=PROFILES,
             exactness="exact",
             speed=speed,

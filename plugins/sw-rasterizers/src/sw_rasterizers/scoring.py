@@ -96,7 +96,9 @@ class ScoreRasterizer(StandardRasterizer):
             return
         MODULE.load()
         # Maps and features change no score: they are not asked for.
-        call = self._call(g, cam, replace(opt, depth=frozenset(), alpha=False, absgrad=False, grad2d=False))
+        call = self._call(
+            g, cam, replace(opt, depth=frozenset(), alpha=False, absgrad=False, fragment_grad=False, grad2d=False)
+        )
         sh = g.sh
         tensors = (
             g.means, g.opacities, g.scales, g.quats, g.cov3d, None if sh is None else sh.dense,

@@ -12,6 +12,7 @@ from splatwizard_core.api import (
     AccumOutput,
     Camera,
     CapabilityError,
+    ConfigError,
     Feature,
     GaussianInputs,
     GradBuffer,
@@ -50,7 +51,7 @@ class StandardRasterizer:
         call = self._call(g, cam, opt)
         if g.colors is not None and g.colors.shape[1] == 0 and g.features is None and not opt.depth:
             raise ShapeError("GaussianInputs.colors has no channel: there is nothing to draw", actual=g.colors.shape)
-        if opt.absgrad and g.means.is_cuda:
+        if (opt.absgrad or opt.fragment_grad) and g.means.is_cuda:
             _check_absgrad(g, call.flags)
         sh = g.sh
         image, radii, alpha, median = rasterize(
@@ -91,7 +92,8 @@ class StandardRasterizer:
             depth={name: depth[name] for name in sorted(opt.depth)},
             features=None if g.features is None else image[at:],
             grad2d=call.grad2d,
-            absgrad2d=call.absgrad2d,
+            absgrad2d=call.absgrad2d if opt.absgrad else None,
+            fragment_grad=call.absgrad2d if opt.fragment_grad else None,
             stats=RasterStats(
                 n_visible=visible,
                 n_pairs=pairs,
@@ -121,7 +123,8 @@ class StandardRasterizer:
     def _call(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> Call:
         flags = _flags(
             opt.profile, opt.clamp_grad, frozenset(opt.depth), opt.antialias, opt.clamp_color,
-            opt.features_detach_geometry, opt.absgrad, opt.alpha, self.count,
+            opt.features_detach_geometry, opt.absgrad, opt.fragment_grad, opt.alpha, self.count,
+            torch.are_deterministic_algorithms_enabled(),
         )  # fmt: skip
         watch = torch.is_grad_enabled()
         background = opt.background_of(3 if g.colors is None else g.colors.shape[1], cam, g.means)
@@ -137,20 +140,21 @@ class StandardRasterizer:
             visible=_as_bytes(g.visible),
             background=None if background is None else background.detach().contiguous(),
             grad2d=GradBuffer() if watch and opt.grad2d else None,
-            absgrad2d=GradBuffer() if watch and opt.absgrad else None,
+            absgrad2d=GradBuffer() if watch and (opt.absgrad or opt.fragment_grad) else None,
         )
 
 
 def _check_absgrad(g: GaussianInputs, flags: Flag) -> None:
-    """On CUDA channels are blended eight at a time, and an absolute value of a sum is not one of its parts."""
+    """Refuse more channels than are blended at once on CUDA: the absolute value of a sum is not that of its parts."""
+    asked = "fragment_grad" if Flag.FRAGMENTS in flags else "absgrad"
     channels = 3 if g.colors is None else g.colors.shape[1]
     channels += (Flag.INVERSE_DEPTH in flags) + (Flag.ACCUMULATED_DEPTH in flags)
     channels += 0 if g.features is None else g.features.shape[1]
     if channels > CUDA_CHANNELS:
         raise CapabilityError(
-            f"absgrad on CUDA is offered for up to {CUDA_CHANNELS} channels of colours, depths and features together, "
+            f"{asked} on CUDA is offered for up to {CUDA_CHANNELS} channels of colours, depths and features together, "
             f"here are {channels}",
-            missing=frozenset({"ABSGRAD"}),
+            missing=frozenset({asked.upper()}),
         )
 
 
@@ -163,10 +167,14 @@ def _flags(
     clamp_color: bool,
     detach_features: bool,
     absgrad: bool,
+    fragments: bool,
     alpha: bool,
     count: bool,
+    ordered: bool,
 ) -> Flag:
-    """The switches of the kernels that these options stand for."""
+    """The switches of the kernels that these options stand for. Raises ConfigError for two that exclude each other."""
+    if absgrad and fragments:
+        raise ConfigError("absgrad and fragment_grad take the place of each other: ask for one of them")
     quirks = profile == "dgr-exact"
     flags = Flag(0)
     for asked, flag in (
@@ -179,9 +187,11 @@ def _flags(
         (bool(depth & {"accumulated", "expected"}), Flag.ACCUMULATED_DEPTH),
         ("median" in depth, Flag.MEDIAN_DEPTH),
         (detach_features, Flag.DETACH_FEATURES),
-        (absgrad, Flag.ABSGRAD),
+        (absgrad or fragments, Flag.ABSGRAD),
+        (fragments, Flag.FRAGMENTS),
         (alpha or "expected" in depth, Flag.ALPHA_MAP),
         (count, Flag.COUNT),
+        (ordered, Flag.ORDERED),
     ):
         if asked:
             flags |= flag

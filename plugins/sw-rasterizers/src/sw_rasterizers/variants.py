@@ -38,8 +38,8 @@ class IndexedRasterizer(StandardRasterizer):
 
     The projection reads scales and quaternions through the index, forward and backward, and `shared_colors` the SH
     coefficients: what a Gaussian gets of its own is a colour. Gradients of codebook rows are sums over their users: in
-    a fixed order on the CPU, for any number of threads; on CUDA those of shapes are atomic, as are the sums of the
-    kernels in front of them. Source: C3DGS (arXiv 2401.02436).
+    a fixed order on the CPU, for any number of threads; on CUDA those of shapes are atomic, unless torch is asked for
+    deterministic algorithms: then shapes are gathered. Source: C3DGS (arXiv 2401.02436).
     """
 
     info = RasterizerInfo.declared(plugin.register_rasterizers, "c3dgs")
@@ -52,7 +52,9 @@ class IndexedRasterizer(StandardRasterizer):
         """As `standard`; `RenderResult.inputs` are the inputs as they came. Raises ShapeError for a wrong index too."""
         self.info.check_request(g, opt)
         self._check_shapes(g)
-        drawn = replace(g)
+        # Sums over the users of a shape are atomic on CUDA; torch's, of gathered rows, have an order where it is asked.
+        gathers = g.means.is_cuda and torch.are_deterministic_algorithms_enabled()
+        drawn = g.gathered(colors=False) if gathers else replace(g)
         if g.sh is not None and g.sh.codebook is not None and g.sh.indices is not None:
             segments = self._tables.segments(g.sh.indices, len(g.sh.codebook))
             center = cam.center.to(g.means)

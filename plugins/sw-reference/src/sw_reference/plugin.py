@@ -16,7 +16,7 @@ def register_rasterizers(registry: Registry) -> None:
             "SPLIT_SH", "INDEXED_SH", "INDEXED_GEOM", "NO_COLOR_CLAMP", "DEPTH_INVERSE", "DEPTH_ACCUM",
             "DEPTH_EXPECTED", "DEPTH_MEDIAN", "ALPHA_MAP", "SCORE_HITS", "SCORE_OPACITY", "SCORE_OPACITY_T",
             "SCORE_BLEND", "SCORE_BLEND_MAX", "SCORE_GAMMA", "SCORE_DIST", "SCORE_PIXEL_WEIGHT",
-            "SCORE_GRAD_SQ", "FISHER", "FLOAT64", "SURFEL", "NORMALS", "DISTORTION",
+            "SCORE_GRAD_SQ", "FISHER", "FLOAT64", "SURFEL", "NORMALS", "DISTORTION", "DETERMINISTIC",
         ],
         # Surfels have a low-pass of their own, and the scores are those of ellipsoids.
         combos_forbidden=[

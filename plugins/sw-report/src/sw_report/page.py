@@ -5,10 +5,12 @@ from __future__ import annotations
 import base64
 import hashlib
 import importlib.metadata
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
+from urllib.parse import quote
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
@@ -37,6 +39,9 @@ from sw_report.runs import Collection, Run
 from sw_report.truth import EVEN_VIEWS, SceneOpener, Truth
 
 FILE_NAME = "report.html"
+SCENE_PAGE = "scene.html"
+"""Of a run directory: the scene in 3D."""
+MOST_LINKS = 40
 PICTURES = "Renders beside the ground truth"
 BYTES = "Bytes by section"
 VIEWS = "Scores view by view"
@@ -64,11 +69,14 @@ class PageOptions:
 
 def write_page(collection: Collection, path: Path, options: PageOptions | None = None) -> None:
     """Write the page about these runs, atomically."""
-    write_atomic(path, render_page(collection, options or PageOptions()))
+    write_atomic(path, render_page(collection, options or PageOptions(), path.parent))
 
 
-def render_page(collection: Collection, options: PageOptions) -> str:
-    """Return the HTML text. Raises UserInputError for an anchor that no run is of."""
+def render_page(collection: Collection, options: PageOptions, folder: Path | None = None) -> str:
+    """Return the HTML text. Raises UserInputError for an anchor that no run is of.
+
+    folder  where the page will lie, for its links to the scenes in 3D beside the records; None: no links
+    """
     runs = collection.runs
     single = len(runs) == 1 and not runs[0].repeats
     sections = _single_sections(runs[0], options) if single else _many_sections(runs, options)
@@ -88,6 +96,7 @@ def render_page(collection: Collection, options: PageOptions) -> str:
         version=importlib.metadata.version("splatwizard-core"),
         figures=_key_figures(runs[0]) if single else [],
         notes=collection.notes,
+        scenes=[] if folder is None else scene_links(runs, folder),
         contents=[(section.id, section.short or section.title) for section in sections],
         sections=sections,
         style=Markup(style),
@@ -96,6 +105,17 @@ def render_page(collection: Collection, options: PageOptions) -> str:
         gain=GAIN,
         side=LONGEST_SIDE if single else LONGEST_SIDE_OF_MANY,
     )
+
+
+def scene_links(runs: Sequence[Run], folder: Path) -> list[tuple[str, str]]:
+    """Return (address relative to `folder`, name) of the pages in 3D that sw-viewer left beside the records."""
+    found = []
+    for run in runs:
+        page = run.directory / SCENE_PAGE
+        if page.is_file():
+            name = "Look at it in 3D" if len(runs) == 1 else f"{run.label} on {run.facts.scene}"
+            found.append((quote(os.path.relpath(page, folder).replace(os.sep, "/")), name))
+    return found[:MOST_LINKS]
 
 
 def _unique(values: Sequence[str]) -> list[str]:

@@ -221,17 +221,23 @@ def _training_figures(drawn: Sequence[Drawn]) -> list[Figure]:
     figures = []
 
     def add(caption: str, title: str, pick: Callable[[TrainingCurves], Sequence[tuple[float, float]]],
-            *, log: bool = False) -> None:  # fmt: skip
+            *, log: bool = False, over: str = "step") -> None:  # fmt: skip
         lines = [
             Series(d.name, [Point(x, y) for x, y in pick(d.curves) if y > 0 or not log], d.style, marks=False,
                    dash=d.dash)
             for d in drawn
         ]  # fmt: skip
+        within = borders if over == "step" else []
         if any(len(s.points) > 1 for s in lines):
-            figures.append(Figure(caption, Chart(title, lines, "step", y_log=log, borders=borders).draw()))
+            figures.append(Figure(caption, Chart(title, lines, over, y_log=log, borders=within).draw()))
 
     add("Training loss (logarithmic, means of neighbouring steps)", "Training loss over steps", lambda c: c.loss,
         log=True)  # fmt: skip
+    for name in sorted({name for d in drawn for name in d.curves.quality}, key=lambda name: (name != "psnr", name)):
+        style = metric_style(name)
+        add(f"{style.label} of the test views over seconds of training, evaluation not counted",
+            f"{style.heading} over seconds of training", lambda c, name=name: c.quality.get(name, []),  # type: ignore[misc]
+            over="seconds of training")  # fmt: skip
     counted = {key for d in drawn for key in d.curves.counts}
     for key in sorted(counted, key=lambda key: (key != "num_gaussians", key)):
         caption = f"Number of {numbers.unit(key)}"

@@ -29,6 +29,7 @@ class TrainingCurves:
     lines       of the log that hold a loss
     damaged     lines that could not be read
     missing     why there is no curve, else None
+    quality     metric -> (seconds of training, value) of the evaluations while it trained; none without `eval_every`
     """
 
     loss: list[tuple[float, float]]
@@ -38,6 +39,7 @@ class TrainingCurves:
     damaged: int = 0
     missing: str | None = None
     scalars: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
+    quality: dict[str, list[tuple[float, float]]] = field(default_factory=dict)
 
 
 def log_path(run: Run) -> Path:
@@ -54,6 +56,7 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
     losses: list[tuple[float, float]] = []
     counts: dict[str, list[tuple[float, float]]] = {}
     scalars: dict[str, list[tuple[float, float]]] = {}
+    quality: dict[str, list[tuple[float, float]]] = {}
     stages: list[tuple[int, int]] = []
     damaged, before, last = 0, 0, 0
     if not path.is_file():
@@ -77,9 +80,13 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
                 for key in entry:
                     if key.startswith("num_") and _is_number(entry[key]):
                         counts.setdefault(key, []).append((float(last), float(entry[key])))
-                for name, value in _scalars(entry):
+                for name, value in _numbers(entry.get("scalars")):
                     if name in scalars or len(scalars) < MOST_CURVES:
                         scalars.setdefault(name, []).append((float(last), value))
+                if _is_number(entry.get("train_s")):
+                    for name, value in _numbers(entry.get("metrics")):
+                        if name in quality or len(quality) < MOST_CURVES:
+                            quality.setdefault(name, []).append((float(entry["train_s"]), value))
     except OSError as error:
         return TrainingCurves([], {}, [], missing=clean(f"log.jsonl: {error.strerror}"))
     if not (losses or counts or scalars):
@@ -91,6 +98,7 @@ def read_training(path: Path, points: int = POINTS) -> TrainingCurves:
         len(losses),
         damaged,
         scalars={name: thin(values, points) for name, values in scalars.items()},
+        quality={name: thin(values, points) for name, values in quality.items()},
     )
 
 
@@ -118,9 +126,8 @@ def _entry(line: str) -> dict[str, Any] | None:
     return entry if fine else None
 
 
-def _scalars(entry: dict[str, Any]) -> list[tuple[str, float]]:
-    """Return the points of curves in a line; what is no number is none."""
-    found = entry.get("scalars")
+def _numbers(found: object) -> list[tuple[str, float]]:
+    """Return the points of curves that a line has under a key; what is no number is none."""
     pairs = found.items() if isinstance(found, dict) else ()
     return [(clean(name)[:LONGEST_NAME], float(value)) for name, value in pairs if _is_number(value)]
 

@@ -25,7 +25,7 @@ from splatwizard_core.plugins import load_plugins
 )  # fmt: skip
 @takes_choices
 def export(file: Path, out: Path, exporter: str | None, as_json: bool, chosen: Choices) -> None:
-    """Decode FILE (.swz or .ply) and write it to OUT in another format, such as .ply."""
+    """Decode FILE (.swz, .ply or another format) and write it to OUT in the format of its suffix, such as .ply."""
     from splatwizard_core.runs.decode import export_model
     from splatwizard_core.runs.measure import opener
 

@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 @click.command(short_help="a method's plan as a table")
 @click.argument("method", type=name_of("method"))
 @shared.options(
-    click.option(
-        "--preset", metavar="NAME", type=PRESET,
-        help="Named values of the method.  [default: paper, or what --config says]",
-    ),
+    click.option("--preset", metavar="NAME", type=PRESET,
+                 help="Named values of the method.  [default: paper, or what --config says]"),
     shared.scene_option, shared.rate_option, shared.config_option, shared.set_option,
     click.option("--verbose", is_flag=True, help="Also the first and last step and the number of executions."),
     shared.json_option, shared.debug_option,
@@ -49,13 +47,10 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
         pre, post = build_schedulers(stage, resolved.ppl)
         if as_json:
             plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations, verbose=verbose)
-            found.append(
-                {
-                    "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from,
-                    "taught_by": list(stage.taught_by), "provided_by": stage_parts(origins, stage, resolved.ppl),
-                    "plan": plan,
-                }
-            )  # fmt: skip
+            found.append({
+                "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from, "plan": plan,
+                "taught_by": list(stage.taught_by), "provided_by": stage_parts(origins, stage, resolved.ppl),
+            })  # fmt: skip
             continue
         own = origins.of(stage)
         notes = _notes(stage, (entry.distribution, entry.version), own)

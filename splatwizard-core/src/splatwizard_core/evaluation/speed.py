@@ -72,11 +72,7 @@ class SpeedReport:
 
 
 def measure_speed(
-    render: Callable[[View], Tensor],
-    views: Sequence[View],
-    device: torch.device | str,
-    *,
-    repeats: int = 1,
+    render: Callable[[View], Tensor], views: Sequence[View], device: torch.device | str, *, repeats: int = 1
 ) -> SpeedReport:
     """Draw `views` by the protocol and report how fast that was.
 

@@ -49,6 +49,7 @@ class Feature(enum.Flag):
     TIGHT_TILES = enum.auto()
     FLOAT64 = enum.auto()
     DETERMINISTIC = enum.auto()
+    FRAGMENT_GRAD = enum.auto()
     UINT8_OUT = enum.auto()
 
     @property
@@ -71,6 +72,7 @@ class Feature(enum.Flag):
             asked,
             cls.geometry_of(g),
             cls.BACKWARD if g.requires_grad() else None,
+            cls.DETERMINISTIC if torch.are_deterministic_algorithms_enabled() else None,
             cls.EXTRA_FEATURES if g.features is not None else None,
             cls.COLORS_ND if g.colors is not None and g.colors.shape[-1] != 3 else None,
             cls.INDEXED_SH if g.sh is not None and g.sh.codebook is not None else None,
@@ -89,11 +91,9 @@ class Feature(enum.Flag):
 
 
 _DEPTHS = {
-    "inverse": Feature.DEPTH_INVERSE,
-    "accumulated": Feature.DEPTH_ACCUM,
-    "expected": Feature.DEPTH_EXPECTED,
+    "inverse": Feature.DEPTH_INVERSE, "accumulated": Feature.DEPTH_ACCUM, "expected": Feature.DEPTH_EXPECTED,
     "median": Feature.DEPTH_MEDIAN,
-}
+}  # fmt: skip
 _SCORES = {
     kind: Feature[f"SCORE_{kind.upper()}"]
     for kind in ("hits", "opacity", "opacity_T", "blend", "blend_max", "gamma", "dist", "grad_sq")
@@ -123,6 +123,7 @@ def _of_options(opt: RasterOptions) -> Feature:
     return _all_of(
         Feature.ANTIALIAS if opt.antialias else None,
         Feature.ABSGRAD if opt.absgrad else None,
+        Feature.FRAGMENT_GRAD if opt.fragment_grad else None,
         Feature.NORMALS if opt.normals else None,
         Feature.DISTORTION if opt.distortion else None,
         Feature.ALPHA_MAP if opt.alpha else None,

@@ -50,6 +50,7 @@ class RasterOptions:
     eps2d           low-pass added to both diagonal entries of the 2-D covariance, px^2
     depth           any of "inverse", "accumulated", "expected", "median"
     grad2d, absgrad densification statistics, filled by the backward pass, NDC units
+    fragment_grad   sums of squared opacity gradients, filled by the backward pass; not together with absgrad
     clamp_grad      "exact": no gradient where alpha is clamped at 0.99; "pass": as the original
     """
 
@@ -65,6 +66,7 @@ class RasterOptions:
     clamp_color: bool = True
     grad2d: bool = False
     absgrad: bool = False
+    fragment_grad: bool = False
     clamp_grad: str = "exact"
     features_detach_geometry: bool = False
     scores: tuple[ScoreSpec, ...] = ()
@@ -149,6 +151,7 @@ class RenderResult:
     distortion  [1,H,W] | None
     features    [E,H,W] | None
     grad2d, absgrad2d   .value [N,2] in NDC units, valid after backward | None
+    fragment_grad       .value [N,2], likewise: over pixels, sum of (o dL/do)^2 of opacity o; how many they are | None
     scores      ScoreSpec.name -> [N] float32 (hits: int32)
     fisher      [N,21] | None: upper triangle, row by row, of the sum over pixels and channels of g g^T,
                 g = d image / d (mean, log scale)
@@ -165,6 +168,7 @@ class RenderResult:
     features: Tensor | None = None
     grad2d: GradBuffer | None = None
     absgrad2d: GradBuffer | None = None
+    fragment_grad: GradBuffer | None = None
     scores: dict[str, Tensor] = field(default_factory=dict)
     fisher: Tensor | None = None
     stats: RasterStats = field(default_factory=RasterStats)

@@ -126,7 +126,8 @@ class ResolvedConfig:
         config = self.config_content()
         for name in type(self.config).ENCODING:
             config.pop(name, None)
-        run = self.ppl.model_dump(mode="json", include={"seed", "random_background", "clamp_render", "raster"})
+        told = {"seed", "random_background", "clamp_render", "deterministic", "raster"}
+        run = self.ppl.model_dump(mode="json", include=told)
         return {"method": self.method, "config": config, "pipeline": run, "scene": self.scene_options}
 
     def config_content(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ LOG = "log.jsonl"
 ENCODED = "scene.swz"
 RENDERS = "renders"
 # A file that says that something is finished goes first when a directory is cleared.
-OWN_FILES = (STEPS, FILE_NAME, CHECKPOINTS, CONFIG, LOG, ENCODED, RENDERS, "truth", "report.html")
+OWN_FILES = (STEPS, FILE_NAME, CHECKPOINTS, CONFIG, LOG, ENCODED, RENDERS, "truth", "scene.html", "report.html")
 
 
 @dataclass(frozen=True)

@@ -196,11 +196,11 @@ def opener(path: Path, session: Session) -> Callable[[], Opened]:
     return open_file
 
 
-def open_subject(path: Path, session: Session, resolved: ResolvedConfig) -> quality.Subject:
-    """Open the model of a .swz or .ply, then its scene; what draws it is as the run and the file ask."""
+def open_subject(path: Path, session: Session, resolved: ResolvedConfig, scene: Scene | None = None) -> quality.Subject:
+    """Open a model, then its scene (None: the configured one); what draws it is as the run and the file ask."""
     model, raster, _, static = opener(path, session)()
     model.check_finite()
-    scene = session.scene(resolved)
+    scene = scene or session.scene(resolved)
     rasterizer = session.rasterizer(resolved, quality.suggested_rasterizers(raster))
     with torch.no_grad():
         model.prepare()

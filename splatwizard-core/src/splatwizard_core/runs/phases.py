@@ -101,10 +101,7 @@ class StageParts:
 
 
 def phases_of_run(
-    plugins: PluginManager,
-    training: Mapping[str, Any],
-    encoding: Mapping[str, Any],
-    measured: Mapping[str, Any],
+    plugins: PluginManager, training: Mapping[str, Any], encoding: Mapping[str, Any], measured: Mapping[str, Any]
 ) -> list[dict[str, Any]]:
     """Return all phases of a run from the facts of its steps."""
     computed = (n for n, m in measured["metrics"].items() if m["per_view"] or m["mean"] is not None)

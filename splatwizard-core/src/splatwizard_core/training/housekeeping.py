@@ -87,6 +87,9 @@ class Housekeeping:
         """Do everything that is due after this step."""
         run, ppl, model = self.run, self.run.ppl, self.trainer.model
         last = record.step == self.trainer.stage.iterations or self.trainer.stopped
+        due = run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0
+        if due:
+            synchronize(self.trainer.device)  # what is still at work there belongs to the training
         self.clock.stop()
         try:
             self._bar.advance(1, loss=record.total, **{model.ROW_LABEL: record.num_rows})
@@ -94,7 +97,7 @@ class Housekeeping:
                 with preserved_random_states():
                     run.on_step(model, record)
             self._log_step(record)
-            if run.evaluate is not None and ppl.eval_every and record.step % ppl.eval_every == 0:
+            if due and run.evaluate is not None:
                 self._evaluate(run.evaluate, record.step)
             if not last and record.step % ppl.checkpoint_every == 0:
                 self.save()
@@ -145,7 +148,6 @@ class Housekeeping:
 
     def _evaluate(self, evaluate: Evaluate, step: int) -> None:
         model = self.trainer.model
-        synchronize(self.trainer.device)
         modes = {module: module.training for module in model.modules()}
         # Peak memory is that of the loop alone; an evaluation measures memory of its own.
         with self.run.meter.excluded(), preserved_random_states(), torch.no_grad():
@@ -156,7 +158,8 @@ class Housekeeping:
                 for module, mode in modes.items():
                     module.training = mode
         if metrics:
-            self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics))
+            seconds = {**self.run.progress.stage_seconds, self.name: self.clock.seconds}
+            self.run.run_log.write(self.trainer.index, step, metrics=dict(metrics), train_s=sum(seconds.values()))
 
     def _log_step(self, record: StepRecord) -> None:
         for task, said in record.said:

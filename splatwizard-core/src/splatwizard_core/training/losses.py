@@ -21,12 +21,7 @@ class LossPack:
 
 
 def photometric_loss(
-    image: Tensor,
-    target: Tensor,
-    *,
-    lambda_dssim: float = 0.2,
-    clamp: bool = False,
-    padding: Padding = "same",
+    image: Tensor, target: Tensor, *, lambda_dssim: float = 0.2, clamp: bool = False, padding: Padding = "same"
 ) -> LossPack:
     """Return the 3DGS loss (1 - lambda) mean|image - target| + lambda (1 - SSIM).
 

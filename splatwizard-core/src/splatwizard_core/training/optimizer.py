@@ -95,16 +95,18 @@ class SplatOptimizer:
             param = _parameter(self.model, name)
             if param.grad is None:
                 continue
-            state = self.states.get(name)
-            if state is None:
-                # As torch.optim.Adam: moments exist from the first update on.
-                state = self.states[name] = AdamState(0, {"exp_avg": _zeros(param), "exp_avg_sq": _zeros(param)})
+            state = self.states.get(name) or self.fresh_state(name, param)
             state.step += 1
             group, moments = self.groups[group_name], state.tensors
             yield name, AdamUpdate(
                 param.data, param.grad, moments["exp_avg"], moments["exp_avg_sq"],
                 lr=group.lr, beta1=group.betas[0], beta2=group.betas[1], eps=group.eps, step=state.step,
             )  # fmt: skip
+
+    def fresh_state(self, name: str, param: Tensor) -> AdamState:
+        """Give a parameter zero moments and return its state; as in torch.optim.Adam there are none before."""
+        self.states[name] = AdamState(0, {"exp_avg": _zeros(param), "exp_avg_sq": _zeros(param)})
+        return self.states[name]
 
     def update(self, updates: Sequence[AdamUpdate]) -> None:
         """Do these updates, densely."""
@@ -151,16 +153,18 @@ class SplatOptimizer:
     def keep_rows(self, model: SplatModel, mask: Tensor, *, carry_grad: bool = False) -> None:
         """Remove the primitives where `mask` [N] bool is False; moments follow, step counters stay.
 
+        mask        or [M] int64, the rows that stay, each once, in the order that they are to have
         carry_grad  keep the survivors' gradient rows, so that they are updated in this step (Trimming the Fat)
         """
-        if mask.dtype != torch.bool or mask.shape != (model.num_rows,):
+        ordered = mask.dtype == torch.int64
+        if not ordered and (mask.dtype != torch.bool or mask.shape != (model.num_rows,)):
             raise ShapeError(
                 f"keep_rows needs a bool mask [{model.num_rows}], got {mask.dtype} {list(mask.shape)}",
                 actual=mask.shape,
                 expected=(model.num_rows,),
             )
-        index = mask.nonzero().squeeze(1)
-        everything = index.numel() == mask.numel()
+        index = mask if ordered else mask.nonzero().squeeze(1)
+        everything = not ordered and index.numel() == mask.numel()
 
         def kept(tensor: Tensor) -> Tensor:
             return tensor if everything else tensor.index_select(0, index)

@@ -54,6 +54,7 @@ class LogParams(Params):
     """Programs that a training is logged for besides log.jsonl: observers of `run_started` read it."""
 
     tensorboard: bool = Field(False, description="write the curves for TensorBoard too, into tensorboard/ of the run")
+    view: int = Field(0, ge=0, le=65535, description="port where sw-viewer shows the training; 0: nowhere")
 
 
 class PipelineParams(Params):
@@ -70,18 +71,19 @@ class PipelineParams(Params):
     eval_every: int = Field(0, ge=0, description="steps between evaluations on the test views; 0: only at the end")
     random_background: bool = Field(False, description="a fresh background colour per step in training")
     clamp_render: bool = Field(False, description="clamp the render to [0,1] before the loss (inria 2024)")
+    deterministic: bool = Field(False, description="equal runs give equal bits on CUDA too; slower, more memory")
     profile: Literal["none", "stages"] = Field("none", description="stages: time each stage of a step")
     raster: RasterParams = Field(RasterParams(), description="which rasterizers may serve")
     log: LogParams = Field(LogParams(), description="where else the training is logged")
 
     @model_serializer(mode="wrap")
     def _given(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in handler(self).items() if key != "log" or self.log != LogParams()}
+        told = {"log": self.log != LogParams(), "deterministic": self.deterministic}
+        return {key: value for key, value in handler(self).items() if told.get(key, True)}
 
 
-_types = typing.get_type_hints(SceneOptions)
-_fields: dict[str, Any] = {f.name: (_types[f.name], f.default) for f in dataclasses.fields(SceneOptions)}
-del _fields["seed"]
+_fields: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(SceneOptions) if f.name != "seed"}
+_fields = {name: (typing.get_type_hints(SceneOptions)[name], default) for name, default in _fields.items()}
 SceneParams = create_model("SceneParams", __base__=Params, **_fields)
 """How the scene is read: `SceneOptions` as a block, without the seed of its start points, which is the run's."""
 
@@ -98,8 +100,7 @@ class OptimizationParams(Params):
 
     iterations: int = Field(30_000, ge=1, description="steps; plans keep their ranges, tasks past the end never fire")
     scale_schedule: bool = Field(
-        False,
-        description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run",
+        False, description="multiply plan bounds, intervals and lr max_steps by iterations / those of a full run"
     )
 
     @property

@@ -116,7 +116,7 @@ class TrainingRun:
         self.meter.start()
         model: SplatModel | None = None
         first = 0
-        with seeded(self.ppl.seed):
+        with seeded(self.ppl.seed, deterministic=self.ppl.deterministic):
             trainer = None if self.store is None else self.store.restored(self._resumed)
             if trainer is None:
                 self.run_log.clear()

@@ -152,12 +152,7 @@ def _overlap(a: Registration, b: Registration, total: int | None) -> bool:
 
 
 def format_plan(
-    pre: Any,
-    post: Any,
-    total: int | None = None,
-    *,
-    verbose: bool = False,
-    origin: Callable[[Any], str] | None = None,
+    pre: Any, post: Any, total: int | None = None, *, verbose: bool = False, origin: Callable[[Any], str] | None = None
 ) -> str:
     """Return the plan that will be executed as a table Stage | Task | Plan, one row a registration.
 

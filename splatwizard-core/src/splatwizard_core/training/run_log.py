@@ -19,7 +19,8 @@ class RunLog:
     """Appends lines to a file; None as the path: keeps nothing.
 
     Lines have "stage" (index) and "step", then what is logged: "loss", "parts", "lr", "seconds" and the model's
-    `counts()`, "scalars" (curves of tasks); or "task" (its name) and what it "said"; or "metrics" (an evaluation).
+    `counts()`, "scalars" (curves of tasks); or "task" (its name) and what it "said"; or "metrics" (an evaluation),
+    after "train_s" seconds of training.
     """
 
     def __init__(self, path: Path | None) -> None:

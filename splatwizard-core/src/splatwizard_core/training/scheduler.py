@@ -46,13 +46,7 @@ class Scheduler:
         self._step: int | None = None  # while a step's tasks run
 
     def register_task(
-        self,
-        when: When,
-        task: Callable[..., Any],
-        *,
-        priority: int = 0,
-        name: str | None = None,
-        log: bool = False,
+        self, when: When, task: Callable[..., Any], *, priority: int = 0, name: str | None = None, log: bool = False
     ) -> None:
         """Run `task` at the steps of `when`.
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from splatwizard_native import sums_vary_on_cuda
 from sw_codecs.native import CODECS
 
 if TYPE_CHECKING:
@@ -84,6 +85,7 @@ def add_sign_gradients(
 
     On the CPU they are summed in the order of the places, for any number of threads; on CUDA sums are atomic.
     """
+    sums_vary_on_cuda("grids of signs", x)
     first, to_features = 0, to_features.contiguous()
     for (axes, levels), table in zip(grids, tables, strict=True):
         torch.ops.sw_codecs.signs_backward(x, axes, table, to_features, first, *levels)
@@ -102,4 +104,5 @@ class _Lookup(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (x,) = ctx.saved_tensors
+        sums_vary_on_cuda("hash grids", x)
         return torch.ops.sw_codecs.backward(x, gradient.contiguous(), *ctx.shape, *ctx.levels), None, None

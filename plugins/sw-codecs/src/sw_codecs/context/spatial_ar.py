@@ -20,6 +20,7 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.context import wavefront
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.context.plane_fields import NEIGHBORS
+from sw_codecs.context.plane_kernels import fit_kernels, plane_bits
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_codecs.entropy.rates import laplace_bits, lower_bound
 
@@ -136,8 +137,9 @@ VALUES_AT_ONCE = 1 << 20
 class _JointBits(torch.autograd.Function):
     """Planes per scale [K,C,H,W], then weight and bias of each layer of K networks -> bits of all values.
 
-    Derivatives are taken on the way there, some channels at a time: bits are a sum, so backward only scales them. What
-    layers hold, 380 bytes a value, is then there for one part at a time; an anchor has 30 values.
+    Derivatives are taken on the way there: bits are a sum, so backward only scales them. On CUDA one kernel does it
+    all; elsewhere some channels at a time, since what layers hold, 380 bytes a value, is then there for one part at a
+    time; an anchor has 30 values.
     The incoming derivative must not be negative, as of a loss that has bits as a term: it decides nothing here about
     what pulls a probability off its floor.
     """
@@ -148,6 +150,10 @@ class _JointBits(torch.autograd.Function):
         k, channels = planes[0].shape[:2]
         planes_learn, learns = any(ctx.needs_input_grad[1 : 1 + scales]), any(ctx.needs_input_grad)
         flat = torch.cat([p.reshape(-1) for p in parameters]).view(k, -1)
+        if fit_kernels(planes):
+            sums, to_planes = plane_bits(planes, flat, planes_learn=planes_learn)
+            ctx.save_for_backward(sums, *to_planes)
+            return sums[:, -2].sum()
         at_once = max(1, VALUES_AT_ONCE // max(1, k * sum(plane.shape[2] * plane.shape[3] for plane in planes)))
         total, found = flat.new_zeros(()), []
         for start in range(0, channels, at_once):

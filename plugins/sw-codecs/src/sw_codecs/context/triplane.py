@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from sw_codecs.context.plane_kernels import fit_kernels, look_up, look_up_backward
 from sw_codecs.context.principal_frame import UNIT, PrincipalFrame
 from sw_codecs.exact_native import EXACT
 from sw_codecs.native import CODECS
@@ -152,6 +153,10 @@ class _Sampled(torch.autograd.Function):
         n, channels = len(cells), planes[0].shape[1]
         ctx.save_for_backward(cells, weights)
         ctx.shapes = [plane.shape for plane in planes]
+        ctx.on_gpu = fit_kernels(planes)
+        if ctx.on_gpu:
+            ctx.planes = [plane.detach() for plane in planes]
+            return look_up(cells, weights, planes, GAIN if rounded else 0)
         tables = [plane.movedim(1, 3).reshape(-1, channels) for plane in planes]  # [3 H W, C]
         if rounded:
             tables = [torch.round(table * GAIN).div_(GAIN) for table in tables]
@@ -174,6 +179,8 @@ class _Sampled(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         cells, weights = ctx.saved_tensors
+        if ctx.on_gpu:
+            return None, None, None, *look_up_backward(cells, weights, grad, ctx.planes)
         if ctx.by_kernel:
             rows_of = [k * h * w for k, _, h, w in ctx.shapes]
             tables = torch.ops.sw_codecs.sites_backward(

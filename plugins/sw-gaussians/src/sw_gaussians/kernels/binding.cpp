@@ -52,7 +52,10 @@ void sparse_adam(const at::Tensor& param, const at::Tensor& grad, const at::Tens
 TORCH_LIBRARY(splatwizard_gaussians, m) {
   m.def("sparse_adam(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, Tensor mask,"
         " Tensor(d!)? row_steps, float lr, float beta1, float beta2, float eps) -> ()");
-  // On CUDA alone, see binding_cuda.cpp.
+  // On CUDA alone, see binding_cuda.cpp. Of no elements in row_steps: no bias correction. Returns the places of those
+  // that the kernel cannot take, which are left as they were.
+  m.def("sparse_adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs,"
+        " Tensor(d!)[] row_steps, Tensor mask, float[] lrs, float[] beta1s, float[] beta2s, float[] epss) -> int[]");
   m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
         " Tensor(c!) max_radii) -> ()");
   m.def("disagreement(Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center) -> Tensor");

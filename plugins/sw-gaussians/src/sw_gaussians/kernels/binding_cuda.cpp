@@ -8,8 +8,12 @@
 #include <c10/cuda/CUDAStream.h>
 #include <torch/library.h>
 
+#include <algorithm>
+#include <cmath>
+#include <initializer_list>
 #include <tuple>
 #include <utility>
+#include <vector>
 
 #include "cuda/kernels.h"
 
@@ -44,6 +48,55 @@ void view_statistics(const at::Tensor& gradients, const at::Tensor& radii, const
                        max_radii.mutable_data_ptr<float>(), count},
                       c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
+// Whether the kernel can update this parameter: float32, contiguous and aligned, on the mask's GPU, a row a mark.
+bool fits_sparse_adam(const at::Tensor& mask, const at::Tensor& steps,
+                      std::initializer_list<const at::Tensor*> tensors) {
+  const at::Tensor& param = **tensors.begin();
+  for (const at::Tensor* tensor : tensors)
+    if (tensor->device() != mask.device() || tensor->scalar_type() != at::kFloat || !tensor->is_contiguous() ||
+        tensor->sizes() != param.sizes() || reinterpret_cast<uintptr_t>(tensor->const_data_ptr()) % 16 != 0)
+      return false;
+  if (param.dim() == 0 || param.size(0) != mask.size(0) || param.numel() >= (mask.size(0) << 20)) return false;
+  return steps.numel() == 0 || (steps.device() == mask.device() && steps.scalar_type() == at::kInt &&
+                                steps.is_contiguous() && steps.numel() == mask.size(0));
+}
+
+std::vector<int64_t> sparse_adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
+                                      const std::vector<at::Tensor>& exp_avgs,
+                                      const std::vector<at::Tensor>& exp_avg_sqs,
+                                      const std::vector<at::Tensor>& row_steps, const at::Tensor& mask,
+                                      at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s,
+                                      at::ArrayRef<double> beta2s, at::ArrayRef<double> epss) {
+  const size_t count = params.size();
+  TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
+                  row_steps.size() == count && lrs.size() == count && beta1s.size() == count &&
+                  beta2s.size() == count && epss.size() == count,
+              "sparse_adam: lists of different lengths");
+  TORCH_CHECK(mask.is_cuda() && mask.scalar_type() == at::kBool && mask.is_contiguous() && mask.dim() == 1,
+              "sparse_adam: mask must be a contiguous bool tensor [N] on a GPU, got ", mask.toString());
+  const c10::cuda::CUDAGuard guard(mask.device());
+  std::vector<int64_t> left;
+  std::vector<kernels::SparseAdamTensor> tensors;
+  for (size_t i = 0; i < count; ++i) {
+    if (!fits_sparse_adam(mask, row_steps[i], {&params[i], &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
+      left.push_back(int64_t(i));
+      continue;
+    }
+    tensors.push_back({params[i].mutable_data_ptr<float>(), grads[i].const_data_ptr<float>(),
+                       exp_avgs[i].mutable_data_ptr<float>(), exp_avg_sqs[i].mutable_data_ptr<float>(),
+                       row_steps[i].numel() > 0 ? row_steps[i].mutable_data_ptr<int32_t>() : nullptr,
+                       mask.size(0) > 0 ? params[i].numel() / mask.size(0) : 0, float(lrs[i]),
+                       float(std::log(beta1s[i])), float(std::log(beta2s[i])), float(1. - beta1s[i]),
+                       float(beta2s[i]), float(1. - beta2s[i]), float(epss[i])});
+  }
+  for (size_t first = 0; first < tensors.size(); first += kernels::kSparseAdamTensors)
+    kernels::sparse_adam(tensors.data() + first,
+                         int(std::min<size_t>(kernels::kSparseAdamTensors, tensors.size() - first)),
+                         mask.const_data_ptr<bool>(), mask.size(0), c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return left;
 }
 
 kernels::Surface surface_of(const at::Tensor& depth, const at::Tensor& normals, const at::Tensor& alpha,
@@ -89,6 +142,7 @@ std::tuple<at::Tensor, at::Tensor> disagreement_backward(const at::Tensor& grad,
 }  // namespace
 
 TORCH_LIBRARY_IMPL(splatwizard_gaussians, CUDA, m) {
+  m.impl("sparse_adam_many", sparse_adam_many);
   m.impl("view_statistics", view_statistics);
   m.impl("disagreement", disagreement);
   m.impl("disagreement_backward", disagreement_backward);

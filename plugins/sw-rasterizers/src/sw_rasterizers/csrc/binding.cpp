@@ -262,8 +262,8 @@ TORCH_LIBRARY(sw_rasterizers, m) {
   m.def(
       "project_backward(Tensor means, Tensor opacities, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? sh, "
       "Tensor? sh_dc, Tensor? sh_rest, Tensor? colors, Tensor? features, Tensor? scale_factors, Tensor? geom_indices, float[] camera, int width, int height, "
-      "int sh_degree, float scale_modifier, float eps2d, int flags, Tensor drawn, Tensor rows, bool[13] wanted) "
-      "-> (Tensor[] gradients, float[] seconds)");
+      "int sh_degree, float scale_modifier, float eps2d, int flags, Tensor drawn, Tensor rows, bool[13] wanted, "
+      "Tensor(a!)[] updated, float[] rates) -> (Tensor[] gradients, float[] seconds)");
   m.def(
       "visible_radii(Tensor means, Tensor? scales, Tensor? quats, Tensor? cov3d, Tensor? scale_factors, Tensor? geom_indices, "
       "Tensor? visible, float[] camera, int width, int height, float scale_modifier, float eps2d) -> Tensor");

@@ -36,6 +36,8 @@ enum Flag : int64_t {  // mirrored in ops.py
   kTensorCores = 16384,
   kBytes = 32768,
   kForScores = 65536,  // between the ops on CUDA: with kSave, nothing that only the backward pass needs
+  kOrdered = 131072,   // CUDA: sums of the backward pass in one order; on the CPU they always are
+  kFragments = 262144,
 };
 
 template <class S>
@@ -167,6 +169,7 @@ struct Inputs {
     s.inverse_depth = flags & kInverseDepth;
     s.accumulated_depth = flags & kAccumulatedDepth, s.median_depth = flags & kMedianDepth;
     s.detach_features = flags & kDetachFeatures, s.absgrad = flags & kAbsgrad;
+    s.fragments = flags & kFragments;
     s.threads = at::get_num_threads();
     s.most_pairs = most_pairs() / (means.is_cpu() && (flags & kSave) ? 2 : 1);
     return s;

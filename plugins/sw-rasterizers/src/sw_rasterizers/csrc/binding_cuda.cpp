@@ -155,7 +155,7 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   const bool absgrad = flags & kAbsgrad, median = flags & kMedianDepth;
   const int length = row_length(channels.total(), absgrad, median);
   const Tensor row_memory = at::zeros({gaussians, length}, image_gradient.options().requires_grad(false));
-  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
+  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
   Image image{};
   image.channels = channels.total(), image.color_channels = channels.colors;
   image.background = data<float>(background);
@@ -166,9 +166,24 @@ std::tuple<Tensor, std::vector<double>> blend_backward_on_cuda(
   const ImageGradient gradient{data<float>(image_gradient), data<float>(alpha_gradient), data<float>(median_gradient)};
   const Splats splats = splats_of(saved[kShape], saved[kChannelRows]);
   const bool general = channels.total() != 3 || channels.colors != 3 || median;
-  if (saved[kSplat].numel() > 0)
+  Ordered ordered{};
+  Tensor pair_sums;
+  Grouped pairs_of_splat, pixels_of_gaussian;
+  const int64_t pairs = saved[kSplat].numel();
+  if ((flags & kOrdered) && pairs > 0) {
+    ordered.pairs = pairs, ordered.splats = saved[kShape].size(0), ordered.gaussians = gaussians;
+    pair_sums = at::empty({pairs, pair_row_length(general, absgrad)}, row_memory.options());
+    ordered.pair_sums = data<float>(pair_sums);
+    pairs_of_splat = Grouped(saved[kSplat], ordered.splats, stream);
+    ordered.pairs_of_splat = pairs_of_splat.groups();
+    if (gradient.median != nullptr) {
+      pixels_of_gaussian = Grouped(saved[kMedianSplat], gaussians, stream);
+      ordered.pixels_of_gaussian = pixels_of_gaussian.groups();
+    }
+  }
+  if (pairs > 0)
     blend_backward(view, flags & kPassClamp, splats, {data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])},
-                   image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, stream);
+                   image, general, gradient, flags & kDetachFeatures ? channels.features : 0, rows, ordered, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
   return {row_memory, clock.seconds()};
@@ -180,7 +195,8 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
     const OptionalTensor& colors, const OptionalTensor& features, const OptionalTensor& scale_factors,
     const OptionalTensor& geom_indices, at::ArrayRef<double> camera, int64_t width, int64_t height, int64_t sh_degree,
     double scale_modifier, double eps2d, int64_t flags, const Tensor& drawn,
-    const Tensor& row_memory, std::array<bool, kWantedCount> wanted) {
+    const Tensor& row_memory, std::array<bool, kWantedCount> wanted, const std::vector<Tensor>& updated,
+    at::ArrayRef<double> rates) {
   const OptionalTensor none;
   const Inputs in{means,    opacities, scales, quats,     cov3d,          sh,    sh_dc, sh_rest, colors,
                   features, none,      none,   sh_degree, scale_modifier, eps2d, flags, 3,  scale_factors,
@@ -234,8 +250,25 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
   };
   out.grad2d = screen(kWantGrad2d);
   out.absgrad2d = screen(kWantAbsgrad2d);
-  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median};
-  if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, stream);
+  const Rows rows{data<float>(row_memory), length, channels.total(), absgrad, median, (flags & kFragments) != 0};
+  TORCH_CHECK(updated.size() == 0 || (updated.size() == 6 && rates.size() == 12),
+              "sw_rasterizers: Adam in the backward pass takes three tensors and six numbers for each of sh_dc, sh_rest");
+  ShAdam adam{};
+  for (size_t i = 0; i < updated.size(); i += 3) {
+    const OptionalTensor& like = i == 0 ? in.sh_dc : in.sh_rest;
+    if (updated[i].numel() == 0) continue;
+    TORCH_CHECK(like.has_value() && updated[i].data_ptr() == like->data_ptr(),
+                "sw_rasterizers: Adam in the backward pass is of the tensors that were drawn");
+    for (size_t k = i; k < i + 3; ++k)
+      TORCH_CHECK(updated[k].is_contiguous() && updated[k].sizes() == like->sizes() &&
+                      updated[k].scalar_type() == at::kFloat && updated[k].device() == means.device() &&
+                      reinterpret_cast<uintptr_t>(updated[k].data_ptr()) % 16 == 0,
+                  "sw_rasterizers: parameter and moments must be contiguous float32 of shape ", like->sizes());
+    const double* r = rates.data() + 2 * i;
+    (i == 0 ? adam.dc : adam.rest) = {data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
+                                      float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
+  }
+  if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, adam, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   clock.mark();
   return {std::move(grads), clock.seconds()};

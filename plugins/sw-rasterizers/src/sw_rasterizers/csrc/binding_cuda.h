@@ -264,6 +264,36 @@ struct Binned {
   }
 };
 
+// Items by the group that each one names, negative: none; in the order of their numbers within a group.
+class Grouped {
+ public:
+  Grouped() = default;
+  Grouped(const Tensor& group_of, int64_t groups, cudaStream_t stream)
+      : start_(at::empty({groups + 1}, group_of.options())) {
+    const int64_t count = group_of.numel();
+    void* sorted_keys = nullptr;
+    if (count > 0) {
+      const size_t scratch = sort_pairs_scratch(int(count), true);
+      Layout layout;
+      const size_t keys[2] = {layout.add(size_t(count), 4), layout.add(size_t(count), 4)};
+      const size_t items[2] = {layout.add(size_t(count), 4), layout.add(size_t(count), 4)};
+      const size_t scratch_at = layout.add(scratch, 1);
+      memory_ = cuda_bytes(layout.bytes, group_of.options());
+      number_keys(count, data<int32_t>(group_of), uint32_t(groups), place<uint32_t>(memory_, keys[0]),
+                  place<int32_t>(memory_, items[0]), stream);
+      sort_pairs(place<char>(memory_, scratch_at), scratch, int(count), std::bit_width(uint64_t(groups)), true,
+                 place<char>(memory_, keys[0]), place<char>(memory_, keys[1]), place<int32_t>(memory_, items[0]),
+                 place<int32_t>(memory_, items[1]), &sorted_keys, &items_, stream);
+    }
+    find_tiles(int(count), int(groups), sorted_keys, true, data<int32_t>(start_), stream);
+  }
+  Groups groups() const { return {data<int32_t>(start_), items_}; }
+
+ private:
+  Tensor memory_, start_;
+  int32_t* items_ = nullptr;
+};
+
 // Image, radii, alpha, median depth, state for the backward pass, counts, seconds of the stages; see binding_cuda.cpp.
 using Rendered = std::tuple<Tensor, Tensor, Tensor, Tensor, std::vector<Tensor>, std::vector<int64_t>,
                             std::vector<double>>;

@@ -40,7 +40,8 @@ struct Settings {
   bool original_jacobian = false;  // gradient of the Jacobian's clamp as in the original kernels
   bool inverse_depth = false, accumulated_depth = false, median_depth = false;
   bool detach_features = false;
-  bool absgrad = false;
+  bool absgrad = false;    // two more sums a pair: |dL/du|, |dL/dv|
+  bool fragments = false;  // with absgrad, those two are the sum of (o dL/do)^2 over the fragments, and their number
   int threads = 1;
   int64_t most_pairs = 0;  // (splat, tile) pairs that a call may have; beyond, none are listed
 };
@@ -55,7 +56,7 @@ template <class S>
 struct Gradients {  // null: not asked for
   S *means, *opacities, *scales, *quats, *cov3d, *sh_dc, *sh_rest, *colors, *features, *scale_factors;
   int64_t sh_dc_stride, sh_rest_stride;
-  S *grad2d, *absgrad2d;  // [N][2], NDC units
+  S *grad2d, *absgrad2d;  // [N][2], NDC units; with `fragments` the second holds their sums as they are
   S* shape_sums;          // [shape_groups(N, shapes)][shapes][kShapeSums], on the CPU, where shapes are shared
 };
 

@@ -51,13 +51,13 @@ std::tuple<at::Tensor, at::Tensor> photometric(const at::Tensor& x, const at::Te
   const cudaStream_t stream = c10::cuda::getCurrentCUDAStream();
   const auto real = x.options().requires_grad(false);
   const at::Tensor means = at::empty({3}, real);
-  const at::Tensor sums = at::empty({int64_t(sizeof(kernels::PhotometricSums))}, real.dtype(at::kByte));
+  const at::Tensor sums = at::empty({2 + 2 * kernels::photometric_blocks(args)}, real);  // the counter, and each block's
   at::Tensor slopes = at::empty({with_grad ? 3 * x.numel() : 0}, real);
   args.offset = offset;
   args.slopes = with_grad ? slopes.mutable_data_ptr<float>() : nullptr;
-  C10_CUDA_CHECK(cudaMemsetAsync(sums.data_ptr(), 0, sizeof(kernels::PhotometricSums), stream));
-  kernels::photometric(args, static_cast<kernels::PhotometricSums*>(sums.data_ptr()), means.mutable_data_ptr<float>(),
-                       stream);
+  C10_CUDA_CHECK(cudaMemsetAsync(sums.data_ptr(), 0, sizeof(float2), stream));
+  auto* const places = static_cast<float2*>(sums.data_ptr());
+  kernels::photometric(args, {reinterpret_cast<unsigned*>(places), places + 1}, means.mutable_data_ptr<float>(), stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return {means, slopes};
 }

@@ -1,11 +1,11 @@
-// Lookup in a grid of signs, and its gradient by the signs: a thread a place and level, as in grid.cu. Four features,
+// Lookup in a grid of signs, and its gradient by the signs: a thread a place, or some places, and level. Four features,
 // as published, are one load and one atomic sum of sixteen bytes.
 #include "kernels.h"
 
 namespace sw_grid::cuda {
 namespace {
 
-constexpr int kThreads = 256;
+constexpr int kThreads = 256, kRunThreads = 64, kRun = 8;
 
 template <int D>
 __device__ __forceinline__ void corners(const Signs& at, int64_t n, int level, int32_t* entries, float* weights) {
@@ -51,14 +51,14 @@ __device__ __forceinline__ void add_four(float* to, float a, float b, float c, f
 #endif
 }
 
-template <int D, bool kFour>
+template <int D>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(const __grid_constant__ Signs at, const float* gradient, float* table) {
   const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x;
-  const int level = int(blockIdx.y), features = kFour ? 4 : at.features;
+  const int level = int(blockIdx.y), features = at.features;
   if (n >= at.count) return;
   const float* from = gradient + n * at.row + level * features;
-  float own[kFour ? 4 : kMaxFeatures];
+  float own[kMaxFeatures];
   bool any = false;
   for (int k = 0; k < features; ++k) own[k] = from[k], any |= own[k] != 0.f;
   if (!any) return;
@@ -70,11 +70,55 @@ __global__ void __launch_bounds__(kThreads)
     const float weight = weights[corner];
     if (weight == 0.f) continue;
     float* entry = table + int64_t(entries[corner]) * features;
-    if constexpr (kFour)
-      add_four(entry, weight * own[0], weight * own[1], weight * own[2], weight * own[3]);
-    else
-      for (int k = 0; k < features; ++k) atomicAdd(entry + k, weight * own[k]);
+    for (int k = 0; k < features; ++k) atomicAdd(entry + k, weight * own[k]);
   }
+}
+
+// The same of four features, for some places that follow one another: those in one cell share its sums, which makes
+// fewer of them wait for the same entries.
+template <int D>
+__global__ void __launch_bounds__(kRunThreads)
+    backward_fours_kernel(const __grid_constant__ Signs at, const float* gradient, float* table) {
+  const int64_t first = (int64_t(blockIdx.x) * kRunThreads + threadIdx.x) * kRun;
+  const int64_t last = first + kRun < at.count ? first + kRun : at.count;
+  const int level = int(blockIdx.y);
+  constexpr int kCorners = 1 << D;
+  float sums[kCorners][4] = {};
+  int32_t held[kCorners];
+#pragma unroll
+  for (int corner = 0; corner < kCorners; ++corner) held[corner] = -1;
+  const auto flush = [&] {
+#pragma unroll
+    for (int corner = 0; corner < kCorners; ++corner) {
+      const float* sum = sums[corner];
+      if (sum[0] != 0.f || sum[1] != 0.f || sum[2] != 0.f || sum[3] != 0.f)
+        add_four(table + int64_t(held[corner]) * 4, sum[0], sum[1], sum[2], sum[3]);
+    }
+  };
+  for (int64_t n = first; n < last; ++n) {
+    const float4 own = *reinterpret_cast<const float4*>(gradient + n * at.row + level * 4);
+    if (own.x == 0.f && own.y == 0.f && own.z == 0.f && own.w == 0.f) continue;
+    float weights[kCorners];
+    int32_t entries[kCorners];
+    corners<D>(at, n, level, entries, weights);
+    bool same = true;
+#pragma unroll
+    for (int corner = 0; corner < kCorners; ++corner) same &= entries[corner] == held[corner];
+    if (!same) {
+      flush();
+#pragma unroll
+      for (int corner = 0; corner < kCorners; ++corner) {
+        held[corner] = entries[corner];
+        sums[corner][0] = sums[corner][1] = sums[corner][2] = sums[corner][3] = 0.f;
+      }
+    }
+#pragma unroll
+    for (int corner = 0; corner < kCorners; ++corner) {
+      sums[corner][0] += weights[corner] * own.x, sums[corner][1] += weights[corner] * own.y;
+      sums[corner][2] += weights[corner] * own.z, sums[corner][3] += weights[corner] * own.w;
+    }
+  }
+  flush();
 }
 
 dim3 grid_of(const Signs& at) { return {unsigned((at.count + kThreads - 1) / kThreads), unsigned(at.levels.count)}; }
@@ -88,9 +132,15 @@ void signs_lookup(const Signs& at, bool four, const float* table, float* found, 
 }
 
 void signs_backward(const Signs& at, bool four, const float* gradient, float* table, cudaStream_t stream) {
-  const auto kernel = at.axes == 2 ? (four ? backward_kernel<2, true> : backward_kernel<2, false>)
-                                   : (four ? backward_kernel<3, true> : backward_kernel<3, false>);
-  kernel<<<grid_of(at), kThreads, 0, stream>>>(at, gradient, table);
+  if (four) {
+    const int64_t runs = (at.count + kRun - 1) / kRun;
+    const dim3 blocks(unsigned((runs + kRunThreads - 1) / kRunThreads), unsigned(at.levels.count));
+    const auto kernel = at.axes == 2 ? backward_fours_kernel<2> : backward_fours_kernel<3>;
+    kernel<<<blocks, kRunThreads, 0, stream>>>(at, gradient, table);
+  } else {
+    const auto kernel = at.axes == 2 ? backward_kernel<2> : backward_kernel<3>;
+    kernel<<<grid_of(at), kThreads, 0, stream>>>(at, gradient, table);
+  }
 }
 
 }  // namespace sw_grid::cuda

@@ -18,6 +18,22 @@ struct Statistics {
 
 void statistics(const Statistics& args, cudaStream_t stream);
 
+// Adam of the marked rows of a [rows, width] parameter; 16-byte aligned.
+struct SparseAdamTensor {
+  float* param;
+  const float* grad;
+  float* exp_avg;
+  float* exp_avg_sq;
+  int32_t* row_steps;  // [rows] updates of each row so far, counted up; null: no bias correction
+  int64_t width;       // below 2^20
+  float lr, log_beta1, log_beta2;
+  float one_minus_beta1, beta2, one_minus_beta2, eps;
+};
+
+constexpr int kSparseAdamTensors = 16;  // of one launch
+
+void sparse_adam(const SparseAdamTensor* tensors, int count, const bool* mask, int64_t rows, cudaStream_t stream);
+
 // Normals that were drawn beside those of a depth map, both in the camera's frame; all maps [height, width].
 struct Surface {
   const float* depth;    // camera z, 0 = no surface

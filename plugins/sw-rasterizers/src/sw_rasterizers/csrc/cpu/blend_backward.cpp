@@ -153,14 +153,19 @@ struct TileBackward {
     sum.xy += mx * dy;
     sum.yy += my * dy;
     if constexpr (kAbsgrad) {
-      sum.absolute[0] += absolute(constant<V>(2) * a * mx + b * my);
-      sum.absolute[1] += absolute(b * mx + constant<V>(2) * c * my);
+      if (settings.fragments) {
+        sum.absolute[0] += moment * moment;
+        sum.absolute[1] += select(touched, constant<V>(1), zero);
+      } else {
+        sum.absolute[0] += absolute(constant<V>(2) * a * mx + b * my);
+        sum.absolute[1] += absolute(b * mx + constant<V>(2) * c * my);
+      }
     }
   }
 
   void write_row(Workspace& w, const Sums& sum, S* out) const {
     // A = -Ka log2(e)/2 and so on: absgrad goes back to natural units.
-    const V ln2 = constant<V>(kLn2);
+    const V ln2 = constant<V>(settings.fragments ? 1 : kLn2);
     V packs[kPlainColumns] = {sum.v0,
                               sum.x,
                               sum.y,

@@ -111,8 +111,9 @@ struct ChunkBackward {
       scatter_rows<V, 2>(ndc, out.grad2d, 2, rows, lanes);
     }
     if (out.absgrad2d != nullptr) {
-      const V ndc[2] = {half_width * sum(kMoments + 3), half_height * sum(kMoments + 4)};
-      scatter_rows<V, 2>(ndc, out.absgrad2d, 2, rows, lanes);
+      V found[2] = {sum(kMoments + 3), sum(kMoments + 4)};
+      if (!settings.fragments) found[0] *= half_width, found[1] *= half_height;
+      scatter_rows<V, 2>(found, out.absgrad2d, 2, rows, lanes);
     }
   }
 

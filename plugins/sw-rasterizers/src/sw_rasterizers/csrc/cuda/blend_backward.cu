@@ -5,9 +5,13 @@
 // constant, moments of v = dL/dsigma are enough; the derivatives are put together in project_backward.
 //
 // A block walks a tile's whole list, or on small images a piece of it, from the state that `blend_few` kept there.
+//
+// kOrdered: the sums of the four warps are put together in shared memory and kept for each pair; a second kernel adds up
+// those of each splat. No atomics, so that equal calls give equal bits; more memory and time.
 #include <climits>
 
 #include "../blend.h"
+#include "groups.h"
 #include "kernels.h"
 #include "splat.h"
 #include "warp_sums.h"
@@ -52,12 +56,28 @@ struct Chunk {  // the channels of one launch
   bool alpha;    // the gradient of the alpha map enters here
 };
 
+// What a warp, and a pair, has sums of: moments, channels of the chunk, absgrad.
 template <bool kGeneral, bool kAbsgrad>
+struct Sums {
+  static constexpr int kColors = kGeneral ? kMaxChunk : 3, kAt = kMomentSums + kColors;
+  static constexpr int kCount = kAt + (kAbsgrad ? 2 : 0);
+
+  // Column of the row: the moments, this chunk's channels, absgrad behind all channels; -1: nothing to add.
+  __device__ static __forceinline__ int column(int index, const Chunk& chunk, int channels) {
+    return index < 0 ? -1
+           : index < kMomentSums ? index
+           : index < kAt ? (index - kMomentSums < chunk.count ? chunk.first + index : -1)
+                         : kMomentSums + channels + index - kAt;
+  }
+};
+
+template <bool kGeneral, bool kAbsgrad, bool kOrdered>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(View<float> view, Splats splats, TileLists lists, Image image, ImageGradient gradient, Chunk chunk,
-                    float clamp_limit, Rows rows) {
-  constexpr int kColors = kGeneral ? kMaxChunk : 3, kAt = kMomentSums + kColors;
-  constexpr int kSums = kAt + (kAbsgrad ? 2 : 0);
+                    float clamp_limit, Rows rows, float* pair_sums) {
+  using Layout = Sums<kGeneral, kAbsgrad>;
+  constexpr int kColors = Layout::kColors, kAt = Layout::kAt, kSums = Layout::kCount;
+  __shared__ float own[kOrdered ? kWarps : 1][kOrdered ? kThreads : 1][kSums];
   __shared__ float4 shape[2][kThreads];
   __shared__ float blue[kThreads];
   __shared__ int gaussian[kThreads];
@@ -118,11 +138,7 @@ __global__ void __launch_bounds__(kThreads)
 
   constexpr bool kPlain = !kGeneral && !kAbsgrad;
   const int index = kPlain ? column_index(lane_index()) : spread_index<kSums>(lane_index());
-  // Column of the row: the moments, this chunk's channels, absgrad behind all channels; -1: nothing to add.
-  const int column = index < 0 ? -1
-                     : index < kMomentSums ? index
-                     : index < kAt ? (index - kMomentSums < chunk.count ? chunk.first + index : -1)
-                                   : kMomentSums + rows.channels + index - kAt;
+  const int column = Layout::column(index, chunk, rows.channels);
 
   for (int stop = int(block_last); stop > from; stop -= kThreads) {  // list positions [stop - kThreads, stop)
     unsigned mask = 0;
@@ -139,6 +155,9 @@ __global__ void __launch_bounds__(kThreads)
           colors[threadIdx.x][k] =
               k < chunk.count ? splats.channels[int64_t(slot) * image.channels + chunk.first + k] : 0.f;
     }
+    if constexpr (kOrdered)
+      for (int w = 0; w < kWarps; ++w)
+        for (int k = 0; k < kSums; ++k) own[w][threadIdx.x][k] = 0.f;
 #pragma unroll
     for (int b = 0; b < kBoxes; ++b) {
       const unsigned word = __ballot_sync(kAllLanes, mask >> b & 1);
@@ -188,9 +207,13 @@ __global__ void __launch_bounds__(kThreads)
           const float moment = unclamped <= clamp_limit ? -(unclamped * alpha_gradient) : 0.f;
           const float along_y = moment * dy;
           v0 += moment, vy += along_y, vyy += along_y * dy;
-          if constexpr (kAbsgrad) {  // A = -Ka log2(e)/2 and so on: back to natural units
-            sums[kAt] += float(kLn2) * fabsf(2.f * s0.z * dx * moment + s0.w * along_y);
-            sums[kAt + 1] += float(kLn2) * fabsf(s0.w * dx * moment + 2.f * s1.x * along_y);
+          if constexpr (kAbsgrad) {
+            if (rows.fragments) {
+              sums[kAt] += moment * moment, sums[kAt + 1] += touched ? 1.f : 0.f;
+            } else {  // A = -Ka log2(e)/2 and so on: back to natural units
+              sums[kAt] += float(kLn2) * fabsf(2.f * s0.z * dx * moment + s0.w * along_y);
+              sums[kAt + 1] += float(kLn2) * fabsf(s0.w * dx * moment + 2.f * s1.x * along_y);
+            }
           }
         }
         if (!any_touched) continue;
@@ -201,12 +224,43 @@ __global__ void __launch_bounds__(kThreads)
           sums[0] = v0, sums[1] = v0 * dx, sums[2] = vy, sums[3] = sums[1] * dx, sums[4] = vy * dx, sums[5] = vyy;
           total = spread_sums<kSums>(sums);
         }
-        if (column >= 0) atomicAdd(rows.base + int64_t(gaussian[k]) * rows.stride + column, total);
+        if constexpr (kOrdered) {
+          if (index >= 0) own[warp_index()][k][index] = total;
+        } else {
+          if (column >= 0) atomicAdd(rows.base + int64_t(gaussian[k]) * rows.stride + column, total);
+        }
       }
     }
     __syncthreads();
+    if constexpr (kOrdered) {
+      static_assert(kWarps == 4);
+      if (position >= from) {
+        float* to = pair_sums + (int64_t(begin) + position) * kSums;
+        const int k = int(threadIdx.x);
+        for (int i = 0; i < kSums; ++i) to[i] = (own[0][k][i] + own[1][k][i]) + (own[2][k][i] + own[3][k][i]);
+      }
+    }
   }
 }
+
+// Where the sums of a splat go: each has a row of its own.
+template <bool kGeneral, bool kAbsgrad>
+struct PutRow {
+  const float2* tail;
+  Chunk chunk;
+  Rows rows;
+  __device__ __forceinline__ void operator()(int64_t splat, int index, float total) const {
+    const int column = Sums<kGeneral, kAbsgrad>::column(index, chunk, rows.channels);
+    if (column >= 0) rows.base[int64_t(__float_as_int(tail[splat].y)) * rows.stride + column] += total;
+  }
+};
+struct PutColumn {
+  Rows rows;
+  int column;
+  __device__ __forceinline__ void operator()(int64_t gaussian, int, float total) const {
+    rows.base[gaussian * rows.stride + column] += total;
+  }
+};
 
 // The median depth is the depth of one splat: its pixel's gradient goes straight to that Gaussian.
 __global__ void median_kernel(int64_t pixels, const int32_t* median_splat, const float* gradient, Rows rows,
@@ -215,28 +269,55 @@ __global__ void median_kernel(int64_t pixels, const int32_t* median_splat, const
   if (i < pixels && median_splat[i] >= 0) atomicAdd(rows.base + median_splat[i] * rows.stride + column, gradient[i]);
 }
 
+template <bool kGeneral, bool kAbsgrad>
+void run_chunks(const View<float>& view, unsigned blocks, float clamp_limit, const Splats& splats,
+                const TileLists& lists, const Image& image, const ImageGradient& gradient, int detached,
+                const Rows& rows, const Ordered& ordered, cudaStream_t stream) {
+  constexpr int kStep = Sums<kGeneral, kAbsgrad>::kColors, kSums = Sums<kGeneral, kAbsgrad>::kCount;
+  const int geometry = image.channels - detached;
+  for (int first = 0; first < image.channels; first += kStep) {
+    const int count = image.channels - first < kStep ? image.channels - first : kStep;
+    const int influence = geometry - first < 0 ? 0 : (geometry - first < count ? geometry - first : count);
+    const Chunk chunk{first, count, influence, first == 0 && gradient.alpha != nullptr};
+    if (ordered.pair_sums == nullptr) {
+      backward_kernel<kGeneral, kAbsgrad, false><<<blocks, kThreads, 0, stream>>>(
+          view, splats, lists, image, gradient, chunk, clamp_limit, rows, nullptr);
+      continue;
+    }
+    // Zeros for the pairs that no block gets to.
+    cudaMemsetAsync(ordered.pair_sums, 0, size_t(ordered.pairs) * kSums * sizeof(float), stream);
+    backward_kernel<kGeneral, kAbsgrad, true><<<blocks, kThreads, 0, stream>>>(
+        view, splats, lists, image, gradient, chunk, clamp_limit, rows, ordered.pair_sums);
+    sum_groups<kSums>(ordered.splats, ordered.pairs_of_splat, ordered.pair_sums,
+                      PutRow<kGeneral, kAbsgrad>{splats.tail, chunk, rows}, stream);
+  }
+}
+
 }  // namespace
+
+int pair_row_length(bool general, bool absgrad) {
+  return general ? (absgrad ? Sums<true, true>::kCount : Sums<true, false>::kCount)
+                 : (absgrad ? Sums<false, true>::kCount : Sums<false, false>::kCount);
+}
 
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
                     const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
-                    cudaStream_t stream) {
+                    const Ordered& ordered, cudaStream_t stream) {
   const int64_t tiles = int64_t(view.tiles_x()) * view.tiles_y();
   const unsigned blocks = unsigned(image.pieces.where != nullptr ? image.pieces.count : tiles);
-  const float clamp_limit = pass_clamp ? 3e38f : float(kAlphaMax);
-  const auto kernel = general ? (rows.absgrad ? backward_kernel<true, true> : backward_kernel<true, false>)
-                              : (rows.absgrad ? backward_kernel<false, true> : backward_kernel<false, false>);
-  const int step = general ? kMaxChunk : 3, geometry = image.channels - detached;
-  for (int first = 0; first < image.channels; first += step) {
-    const int count = general && image.channels - first < kMaxChunk ? image.channels - first : step;
-    const int influence = geometry - first < 0 ? 0 : (geometry - first < count ? geometry - first : count);
-    const Chunk chunk{first, count, influence, first == 0 && gradient.alpha != nullptr};
-    kernel<<<blocks, kThreads, 0, stream>>>(view, splats, lists, image, gradient, chunk, clamp_limit, rows);
-  }
-  if (gradient.median != nullptr) {
+  const auto run = general ? (rows.absgrad ? run_chunks<true, true> : run_chunks<true, false>)
+                           : (rows.absgrad ? run_chunks<false, true> : run_chunks<false, false>);
+  run(view, blocks, pass_clamp ? 3e38f : float(kAlphaMax), splats, lists, image, gradient, detached, rows, ordered,
+      stream);
+  if (gradient.median == nullptr) return;
+  const int column = row_length(rows.channels, rows.absgrad, true) - 1;
+  if (ordered.pair_sums != nullptr) {
+    sum_groups<1>(ordered.gaussians, ordered.pixels_of_gaussian, gradient.median, PutColumn{rows, column}, stream);
+  } else {
     constexpr int kBlock = 256;
     const int64_t pixels = int64_t(view.width) * view.height;
-    median_kernel<<<unsigned(ceil_div(pixels, kBlock)), kBlock, 0, stream>>>(
-        pixels, image.median_splat, gradient.median, rows, row_length(rows.channels, rows.absgrad, true) - 1);
+    median_kernel<<<unsigned(ceil_div(pixels, kBlock)), kBlock, 0, stream>>>(pixels, image.median_splat,
+                                                                             gradient.median, rows, column);
   }
 }
 

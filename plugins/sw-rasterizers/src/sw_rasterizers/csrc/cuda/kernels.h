@@ -69,6 +69,7 @@ struct Rows {
   int64_t stride;
   int channels;
   bool absgrad, median;
+  bool fragments = false;  // with absgrad, the two are the sum of (o dL/do)^2 over the fragments, and their number
 };
 
 // Where an image has fewer tiles than this, a block a tile leaves most of the GPU idle and the longest list decides how
@@ -104,6 +105,21 @@ struct ImageGradient {
   const float* median;  // [H][W] or null
 };
 
+// Items by what they belong to, in the order of their numbers: those of group k are item[start[k]] .. item[start[k+1]-1].
+struct Groups {
+  const int32_t* start;
+  const int32_t* item;
+};
+
+// Where sums are to have one order: memory for the sums of each pair, and the pairs of each splat. All null: atomics.
+struct Ordered {
+  float* pair_sums;  // [pairs][pair_row_length]
+  int64_t pairs, splats;
+  Groups pairs_of_splat;
+  Groups pixels_of_gaussian;  // by median depth, if that has a gradient
+  int64_t gaussians;
+};
+
 struct TileLists {
   const int32_t* start;  // [tiles + 1]
   const int32_t* splat;  // [pairs]
@@ -135,6 +151,9 @@ void sort_pairs(void* scratch, size_t bytes, int count, int key_bits, bool wide,
                 int32_t* values, int32_t* values_scratch, void** sorted_keys, int32_t** sorted_values,
                 cudaStream_t stream);
 void find_tiles(int count, int tiles, const void* keys, bool wide, int32_t* start, cudaStream_t stream);
+// to[i] = keys[i], or `none` where that is negative; numbers[i] = i.
+void number_keys(int64_t count, const int32_t* keys, uint32_t none, uint32_t* to, int32_t* numbers,
+                 cudaStream_t stream);
 
 void blend(const View<float>& view, const Splats& splats, const TileLists& lists, const Image& image,
            bool general, Counters* counters, const uint32_t* depth, cudaStream_t stream);
@@ -148,9 +167,22 @@ void blend_tcgs(const View<float>& view, const Splats& splats, const TileLists& 
 // The last `detached` channels do not influence the geometry; `pass_clamp`: the gradient passes the clamp of alpha.
 void blend_backward(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
                     const Image& image, bool general, const ImageGradient& gradient, int detached, const Rows& rows,
-                    cudaStream_t stream);
+                    const Ordered& ordered, cudaStream_t stream);
+int pair_row_length(bool general, bool absgrad);
+
+// Adam of a [N, ...] tensor where its gradient is found, which is then never written. Formula and names: adam.cu of
+// splatwizard-native. 16-byte aligned; all null: the gradient is written.
+struct RowAdam {
+  float *param, *exp_avg, *exp_avg_sq;
+  float step_size, one_minus_beta1, beta2, one_minus_beta2, inv_bias2, eps;
+};
+struct ShAdam {
+  RowAdam dc, rest;  // [N, 1, 3] and [N, 3, 8 or 15, 3]
+  bool any() const { return dc.param != nullptr || rest.param != nullptr; }
+};
+
 void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
                       const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
-                      cudaStream_t stream);
+                      const ShAdam& adam, cudaStream_t stream);
 
 }  // namespace sw::cuda

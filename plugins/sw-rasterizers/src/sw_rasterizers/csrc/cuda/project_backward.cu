@@ -35,10 +35,10 @@ __device__ __forceinline__ void write_shape_gradient(const Gaussians<float>& g, 
   }
 }
 
-template <bool kCov3d>
+template <bool kCov3d, bool kAdam>
 __global__ void __launch_bounds__(kThreads)
     project_backward_kernel(View<float> view, Gaussians<float> g, Settings settings, Channels channels,
-                            const uint8_t* flags, Rows rows, Gradients<float> out) {
+                            const uint8_t* flags, Rows rows, Gradients<float> out, ShAdam adam) {
   __shared__ float staged[kWarps * kWarp * kRestFloats];
   const int64_t n = int64_t(blockIdx.x) * kThreads + threadIdx.x, first = n - lane_index();
   if (first >= g.count) return;
@@ -120,18 +120,24 @@ __global__ void __launch_bounds__(kThreads)
       reinterpret_cast<float2*>(to)[n] = make_float2(half[0] * pixels[0], half[1] * pixels[1]);
     };
     if (out.grad2d != nullptr) ndc(out.grad2d, screen);
-    if (out.absgrad2d != nullptr) ndc(out.absgrad2d, absolute_screen);
+    if (out.absgrad2d != nullptr && rows.fragments)
+      reinterpret_cast<float2*>(out.absgrad2d)[n] = make_float2(absolute_screen[0], absolute_screen[1]);
+    else if (out.absgrad2d != nullptr)
+      ndc(out.absgrad2d, absolute_screen);
   }
-  write_sh_gradient(g, out, first, basis, color, shared);
+  write_sh_gradient<kAdam>(g, out, first, basis, color, shared, adam);
 }
 
 }  // namespace
 
 void project_backward(const View<float>& view, const Gaussians<float>& g, const Settings& settings,
                       const Channels& channels, const uint8_t* flags, const Rows& rows, const Gradients<float>& out,
-                      cudaStream_t stream) {
-  const auto kernel = g.cov3d != nullptr ? project_backward_kernel<true> : project_backward_kernel<false>;
-  kernel<<<unsigned(ceil_div(g.count, kThreads)), kThreads, 0, stream>>>(view, g, settings, channels, flags, rows, out);
+                      const ShAdam& adam, cudaStream_t stream) {
+  const auto kernel =
+      g.cov3d != nullptr ? (adam.any() ? project_backward_kernel<true, true> : project_backward_kernel<true, false>)
+                         : (adam.any() ? project_backward_kernel<false, true> : project_backward_kernel<false, false>);
+  kernel<<<unsigned(ceil_div(g.count, kThreads)), kThreads, 0, stream>>>(view, g, settings, channels, flags, rows, out,
+                                                                         adam);
 }
 
 }  // namespace sw::cuda

@@ -34,7 +34,19 @@ size_t scratch_bytes(int count) {
   return bytes;
 }
 
+__global__ void number_kernel(int64_t count, const int32_t* keys, uint32_t none, uint32_t* to, int32_t* numbers) {
+  const int64_t i = int64_t(blockIdx.x) * blockDim.x + threadIdx.x;
+  if (i < count) to[i] = keys[i] < 0 ? none : uint32_t(keys[i]), numbers[i] = int32_t(i);
+}
+
 }  // namespace
+
+void number_keys(int64_t count, const int32_t* keys, uint32_t none, uint32_t* to, int32_t* numbers,
+                 cudaStream_t stream) {
+  constexpr int kThreads = 256;
+  if (count > 0)
+    number_kernel<<<unsigned((count + kThreads - 1) / kThreads), kThreads, 0, stream>>>(count, keys, none, to, numbers);
+}
 
 size_t depth_order_scratch(int count) { return scratch_bytes<uint32_t>(count); }
 

@@ -18,14 +18,14 @@ struct Photometric {
   float* slopes;       // [3, planes, height, width] d total / d (E[x], E[x^2], E[xy]) of each window, or null
 };
 
-// All zeros before `photometric`.
 struct PhotometricSums {
-  double l1, ssim;
-  unsigned blocks_done, padding;
+  unsigned* blocks_done;  // 0 before `photometric`
+  float2* of_block;       // [photometric_blocks] sums of |x-y| and of the SSIM map, whatever before
 };
+int64_t photometric_blocks(const Photometric& args);
 
 // means [3]: the total, the mean of |x-y|, the mean of the SSIM map.
-void photometric(const Photometric& args, PhotometricSums* sums, float* means, cudaStream_t stream);
+void photometric(const Photometric& args, const PhotometricSums& sums, float* means, cudaStream_t stream);
 // grad [planes, height, width] = *scale d total / d x, from the slopes.
 void photometric_backward(const Photometric& args, const float* scale, float* grad, cudaStream_t stream);
 

@@ -75,7 +75,7 @@ __device__ __forceinline__ void blur_column(const float (*from)[kTile], int firs
 constexpr int kTasks = kHalo * kTile / 4;  // of the horizontal blur
 
 __global__ void __launch_bounds__(kThreads)
-    forward_kernel(Photometric a, PhotometricSums* sums, float* means, float ssim_scale) {
+    forward_kernel(Photometric a, PhotometricSums sums, float* means, float ssim_scale) {
   __shared__ __align__(16) float x_tile[kHalo][kPitch], y_tile[kHalo][kPitch];
   __shared__ __align__(16) float moments[5][kHalo][kTile];  // x, y, x^2, y^2, xy, blurred along rows
   __shared__ float partial[2][kThreads / 32];
@@ -139,20 +139,37 @@ __global__ void __launch_bounds__(kThreads)
   }
   if (threadIdx.x % 32 == 0) partial[0][threadIdx.x / 32] = l1, partial[1][threadIdx.x / 32] = ssim;
   __syncthreads();
-  if (threadIdx.x != 0) return;
-  for (int w = 1; w < kThreads / 32; ++w) l1 += partial[0][w], ssim += partial[1][w];
-  atomicAdd(&sums->l1, double(l1));
-  atomicAdd(&sums->ssim, double(ssim));
-  __threadfence();
-  if (atomicAdd(&sums->blocks_done, 1u) == gridDim.x * gridDim.y * gridDim.z - 1) {
+  const unsigned blocks = gridDim.x * gridDim.y * gridDim.z;
+  __shared__ bool is_last;
+  if (threadIdx.x == 0) {
+    for (int w = 1; w < kThreads / 32; ++w) l1 += partial[0][w], ssim += partial[1][w];
+    sums.of_block[(blockIdx.z * gridDim.y + blockIdx.y) * gridDim.x + blockIdx.x] = make_float2(l1, ssim);
     __threadfence();
-    const volatile PhotometricSums* all = sums;
-    const double pixels = double(a.planes) * a.height * a.width;
-    const double counted = double(a.planes) * (a.height - 2 * lost) * (a.width - 2 * lost);
-    const double mean_l1 = all->l1 / pixels, mean_ssim = all->ssim / counted;
-    means[0] = float(a.l1_weight * mean_l1 + a.ssim_weight * mean_ssim + a.offset);
-    means[1] = float(mean_l1), means[2] = float(mean_ssim);
+    is_last = atomicAdd(sums.blocks_done, 1u) == blocks - 1;
   }
+  __syncthreads();
+  if (!is_last) return;
+  // The last block adds up those of all, in one order: equal images give equal bits.
+  __threadfence();
+  double total[2] = {};
+  for (unsigned i = threadIdx.x; i < blocks; i += kThreads) {
+    const float2 block = __ldcg(sums.of_block + i);
+    total[0] += double(block.x), total[1] += double(block.y);
+  }
+  __shared__ double totals[2][kThreads / 32];
+#pragma unroll
+  for (int k = 0; k < 2; ++k) {
+    for (int step = 16; step > 0; step /= 2) total[k] += __shfl_xor_sync(0xffffffffu, total[k], step);
+    if (threadIdx.x % 32 == 0) totals[k][threadIdx.x / 32] = total[k];
+  }
+  __syncthreads();
+  if (threadIdx.x != 0) return;
+  for (int w = 1; w < kThreads / 32; ++w) total[0] += totals[0][w], total[1] += totals[1][w];
+  const double pixels = double(a.planes) * a.height * a.width;
+  const double counted = double(a.planes) * (a.height - 2 * lost) * (a.width - 2 * lost);
+  const double mean_l1 = total[0] / pixels, mean_ssim = total[1] / counted;
+  means[0] = float(a.l1_weight * mean_l1 + a.ssim_weight * mean_ssim + a.offset);
+  means[1] = float(mean_l1), means[2] = float(mean_ssim);
 }
 
 __global__ void __launch_bounds__(kThreads)
@@ -198,7 +215,12 @@ float l1_scale(const Photometric& a) {
 
 }  // namespace
 
-void photometric(const Photometric& args, PhotometricSums* sums, float* means, cudaStream_t stream) {
+int64_t photometric_blocks(const Photometric& args) {
+  const dim3 blocks = grid(args);
+  return int64_t(blocks.x) * blocks.y * blocks.z;
+}
+
+void photometric(const Photometric& args, const PhotometricSums& sums, float* means, cudaStream_t stream) {
   const int lost = args.valid ? 2 * kRadius : 0;
   const double counted = double(args.planes) * (args.height - lost) * (args.width - lost);
   forward_kernel<<<grid(args), kThreads, 0, stream>>>(args, sums, means, float(args.ssim_weight / counted));

@@ -1,0 +1,152 @@
+"""The preset `fast` of 3DGS: its plan, its parts one by one, what it leaves as it was, and that it resumes."""
+
+import pytest
+import torch
+from sw_gaussians.cadence import CadencedOptimizer
+from sw_gaussians.config import Fast, GaussianTraining
+from sw_gaussians.fast import FAST
+from sw_gaussians.resolution import ResolutionSampler
+from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.start import gaussians_from_points
+
+from splatwizard_core.errors import ConfigError
+from splatwizard_core.plugins import load_plugins
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+from splatwizard_core.runs.config import resolve
+from splatwizard_core.scene.dataset import SceneOptions
+from splatwizard_core.scene.loading import load_scene
+from splatwizard_core.scene.scene import Scene
+from splatwizard_core.streams import stream
+from splatwizard_core.training.params import PipelineParams
+from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.scheduler import build_schedulers, format_plan
+from sw_3dgs.method import ThreeDGS
+
+PLAN = """\
+Stage | Task                        | Plan
+------+-----------------------------+----------------------
+Pre   | update lr                   | range(10000)
+Pre   | increase SH degree          | range(0, 10000, 1000)
+Post  | collect gradient statistics | range(8000)
+Post  | collect opacity gradients   | range(8000)
+Post  | densify to budget           | range(300, 8000, 250)
+Post  | halve opacity               | range(0, 8000, 2000)"""
+STEPS = 60
+SHORT = {
+    "iterations": STEPS, "densify.interval": 5_000, "fast.sh_every": 3, "fast.resolution": "dash", "fast.cap": 1_500,
+    "densify.reset_interval": 10_000, "lr.sh_dc": 2e-2, "lr.opacity": 0.1,
+}  # fmt: skip
+"""Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40."""
+
+
+def stage_of(**sets) -> ThreeDGSStage:
+    return ThreeDGSStage(resolve(ThreeDGS, "fast", sets={k.replace("__", "."): v for k, v in sets.items()}).config)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return load_scene("demo:tiny", SceneOptions(init_points=600), load_plugins())
+
+
+def train(scene: Scene, *, directory=None, stop_after=None, seed=0, **sets):
+    made = ThreeDGS(load_plugins(), resolve(ThreeDGS, "fast", sets={**SHORT, **sets}).config)
+    return TrainingRun(
+        made.stages(),
+        lambda: made.create_model(scene, stream(seed, "init")),
+        scene,
+        PipelineParams(seed=seed, checkpoint_every=1000),
+        NegotiatedRasterizer(load_plugins(), device="cpu"),
+        directory=directory,
+        identity={},
+        trained=lambda name: pytest.fail(f"asked for '{name}'"),
+        stop_after=stop_after,
+    ).train()
+
+
+@pytest.fixture(scope="module")
+def trained(scene):
+    return train(scene)
+
+
+def test_the_plan_is_a_third_of_the_papers():
+    assert format_plan(*build_schedulers(stage_of(), PipelineParams())) == PLAN
+
+
+def test_the_plan_scales_with_the_steps():
+    half = format_plan(*build_schedulers(stage_of(iterations=5_000), PipelineParams()))
+    assert "range(150, 4000, 125)" in half
+    assert "range(0, 4000, 1000)" in half
+
+
+@pytest.mark.parametrize(
+    ("sets", "gone", "come"),
+    [
+        ({"fast__densify": "threshold"}, "densify to budget", "prune and densify"),
+        ({"fast__opacity": "reset"}, "halve opacity", "reset opacity"),
+        ({"fast__score": "gradient"}, "collect opacity gradients", "densify to budget"),
+    ],
+)
+def test_each_task_can_be_left_out(sets, gone, come):
+    plan = format_plan(*build_schedulers(stage_of(**sets), PipelineParams()))
+    assert gone not in plan
+    assert come in plan
+
+
+def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_last_step():
+    stage, black = stage_of(), torch.zeros(3)
+    asked = [stage.raster_options(step, black).fragment_grad for step in (1, 7_999, 8_000, 9_999, 10_000)]
+    assert asked == [True, True, False, False, True]
+    assert not stage_of(fast__score="gradient").raster_options(1, black).fragment_grad
+
+
+def test_parts_are_off_unless_asked_for(scene):
+    stage, model = ThreeDGSStage(GaussianTraining()), gaussians_from_points(scene.points)
+    assert not isinstance(stage.create_optimizer(model, scene), CadencedOptimizer)
+    assert not isinstance(stage.create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
+    on = stage_of(fast__sh_every=16, fast__resolution="dash")
+    assert isinstance(on.create_optimizer(model, scene), CadencedOptimizer)
+    assert isinstance(on.create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
+
+
+def test_trainings_without_any_part_keep_their_identity():
+    assert "fast" not in resolve(ThreeDGS, "paper").config.identity()
+    assert resolve(ThreeDGS, "paper", sets={"fast.morton": True}).config.identity()["fast"]["morton"]
+
+
+@pytest.mark.parametrize("sets", [{"mcmc__enabled": True}, {"densify__absgrad": True}])
+def test_what_does_not_go_together_is_said_before_anything_runs(sets):
+    with pytest.raises(ConfigError, match="fast"):
+        stage_of(**sets)
+
+
+def test_every_part_is_a_key_of_its_own():
+    names = {key.partition(".")[2] for key in FAST if key.startswith("fast.")}
+    assert names <= set(Fast.model_fields)
+
+
+@pytest.mark.pipeline
+def test_it_grows_learns_and_leaves_no_buffer_behind(scene, trained):
+    model = trained.model
+    assert len(scene.points) < model.num_rows <= 1_500
+    assert "fragments" not in model.state_dict()
+    start = gaussians_from_points(scene.points)
+    assert loss(model, scene) < 0.8 * loss(start, scene)
+
+
+def loss(model, scene) -> float:
+    rasterizer, view = NegotiatedRasterizer(load_plugins(), device="cpu"), scene.test[0]
+    stage = stage_of()
+    with torch.no_grad():
+        drawn = rasterizer.render(
+            model.gaussians(view.camera, rasterizer), view.camera, stage.raster_options(9_000, None)
+        )
+        return float((drawn.image - view.image()).square().mean())
+
+
+@pytest.mark.pipeline
+def test_a_training_that_was_stopped_ends_as_one_that_was_not(scene, trained, tmp_path):
+    with pytest.raises(TrainingStopped):
+        train(scene, directory=tmp_path, stop_after=27)
+    resumed = train(scene, directory=tmp_path)
+    for name, tensor in trained.model.state_dict().items():
+        assert torch.equal(tensor, resumed.model.state_dict()[name]), name

@@ -1,0 +1,106 @@
+"""The CUDA kernels for rows of anchors against torch operations."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from sw_anchors import fused_ops
+from sw_anchors.fused_ops import load_rows, noisy_rows, put_rows, sample_bits, take_rows
+from sw_anchors.native import ANCHORS
+
+ON_CUDA = ANCHORS.available(cuda=True)
+pytestmark = [pytest.mark.cuda, pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))]
+
+
+@pytest.fixture
+def both_forms(monkeypatch):
+    """Calls a function with the kernels, then without, and compares the tensors that it returns."""
+
+    def compare(function, tolerance):
+        forms = []
+        for kernels in (True, False):
+            if not kernels:
+                monkeypatch.setattr(fused_ops, "fit_kernels", lambda *_: False)
+            forms.append(function())
+        for one, other in zip(*forms, strict=True):
+            limit = tolerance * float(other.abs().max()) if other.numel() else 0.0
+            torch.testing.assert_close(one, other, rtol=tolerance, atol=limit + 1e-9)
+
+    return compare
+
+
+def drawer(seed):
+    generator = torch.Generator().manual_seed(seed)
+    return lambda *shape: torch.randn(shape, generator=generator).to("cuda")
+
+
+@pytest.mark.parametrize(("n", "v"), [(1000, 333), (40, 1), (5, 0), (7, 7)])
+def test_rows_are_taken_loaded_and_put_back(both_forms, n, v):
+    draw = drawer(0)
+    sources = [draw(n, 3), draw(n, 50), draw(n, 10, 3), draw(n, 1), draw(n, 70)[:, :33]]
+    cells = torch.arange(n * 8, dtype=torch.int32, device="cuda").view(n, 2, 4)
+    rows = torch.randperm(n, generator=torch.Generator().manual_seed(1))[:v].to("cuda")
+    slopes = [draw(v, *source.shape[1:]) for source in sources]
+
+    def compute():
+        leaves = [source.detach().clone().requires_grad_() for source in sources]
+        taken = take_rows(rows, *leaves)
+        grads = torch.autograd.grad(taken, leaves, slopes)
+        into = [torch.zeros(v + 3, 3, device="cuda"), torch.zeros(v + 3, 2, 4, dtype=torch.int32, device="cuda")]
+        load_rows(rows, [sources[0], cells], into)
+        put = put_rows(rows, [slopes[1], None, slopes[3]], n)
+        assert put[1] is None
+        return [*(each.detach() for each in taken), *grads, into[0], into[1].float(), put[0], put[2]]
+
+    both_forms(compute, 0.0)
+
+
+@pytest.mark.parametrize("features", [50, 33, 1])
+@pytest.mark.parametrize(("capacity", "valid"), [(700, 650), (1, 1), (9, 0), (0, 0)])
+@pytest.mark.parametrize("noisy", ["own steps", "one step", "none"])
+@pytest.mark.parametrize("weighted", [True, False])
+def test_noisy_rows_and_their_gradients_are_those_of_torch(both_forms, features, capacity, valid, noisy, weighted):
+    draw, k = drawer(2), 10 if features > 1 else 1
+    tensors = [draw(capacity, width) for width in (features, 6, 3 * k, k)]
+    weights = draw(capacity, 1).abs() if weighted else None
+    noise = draw(capacity * (features + 6 + 3 * k)) if noisy != "none" else None
+    steps = {"own steps": draw(capacity, 3), "one step": draw(1, 3), "none": None}[noisy]
+    count = torch.tensor(float(valid), device="cuda")
+    slopes = [
+        draw(capacity, features + 6 + 3 * k),
+        draw(capacity, features + 4)[:, :-4],
+        draw(capacity, 6),
+        draw(capacity, k),
+    ]
+
+    def compute():
+        leaves = [tensor.detach().clone().requires_grad_() for tensor in tensors]
+        own = steps.detach().clone().requires_grad_(noisy == "own steps") if steps is not None else None
+        values, groups, masks, kept = noisy_rows(leaves, weights, count, noise, own, 0.3)
+        total = sum((a * b).sum() for a, b in zip((values, groups[0], groups[1], masks), slopes, strict=True))
+        learning = [*leaves, *([own] if noisy == "own steps" else [])]
+        return [
+            values.detach(),
+            *(g.detach() for g in groups),
+            masks.detach(),
+            kept,
+            *torch.autograd.grad(total, learning),
+        ]
+
+    both_forms(compute, 1e-5)
+
+
+@pytest.mark.parametrize(("count", "features", "k"), [(500, 50, 10), (1, 50, 10), (33, 7, 1), (0, 50, 10)])
+def test_bits_of_a_sample_and_their_gradients_are_those_of_torch(both_forms, count, features, k):
+    draw, numbers = drawer(3), features + 6 + 3 * k
+    x, mean = 3 * draw(count, numbers), 3 * draw(count, numbers)
+    scale = draw(count, numbers)  # half of them below the floor
+    steps, counted = draw(count, 3).abs() + 0.05, (draw(count) > -0.5).float()
+    masks = (draw(count, k) > -0.5).float()
+
+    def compute():
+        leaves = [each.detach().clone().requires_grad_() for each in (x, mean, scale, steps, masks)]
+        bits, by_group = sample_bits(*leaves, counted, p_min=1e-6, smallest_scale=1e-9)
+        return [bits.detach(), by_group, *torch.autograd.grad(0.5 * bits, leaves)]
+
+    both_forms(compute, 1e-4)

@@ -1,0 +1,60 @@
+"""Kernels of CUDA for learned planes in training: their bits under spatial models, and lookup at kept sites."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from sw_codecs.native import CODECS
+
+MOST_SIZES = 4
+"""Planes of so many sizes are taken: `kScales` of kernels/plane_bits.h and kernels/triplane.h."""
+
+
+def fit_kernels(planes: Sequence[Tensor]) -> bool:
+    """Whether there are kernels for these planes [K,C,H,W], one for each size: float32 on CUDA; loads them.
+
+    Some of their sums are atomic, so there are none where torch is asked for deterministic algorithms.
+    """
+    if not 0 < len(planes) <= MOST_SIZES or not all(p.is_cuda and p.dtype == torch.float32 for p in planes):
+        return False
+    if any(p.numel() >= 1 << 31 for p in planes) or torch.are_deterministic_algorithms_enabled():
+        return False
+    return CODECS.has_cuda()
+
+
+def plane_bits(planes: Sequence[Tensor], parameters: Tensor, *, planes_learn: bool) -> tuple[Tensor, list[Tensor]]:
+    """Bits of planes [K,C,H,W] per size and all derivatives, in one pass.
+
+    parameters  [K,1058] of each orientation's `SpatialAr`: weight and bias of each layer
+
+    Returns ([K,1060]: derivatives by the parameters, the bits, 0; derivatives by the planes of each size, or none).
+    """
+    found: tuple[Tensor, list[Tensor]] = torch.ops.sw_codecs.plane_bits(
+        [plane.contiguous() for plane in planes], parameters.contiguous(), planes_learn
+    )
+    return found
+
+
+def look_up(cells: Tensor, weights: Tensor, planes: Sequence[Tensor], gain: float) -> Tensor:
+    """Features [n, sizes * 3 C] of planes [3,C,H,W] at sites, as of `triplane.PlaneSites`; no gradient.
+
+    gain    planes are rounded to multiples of 1 / gain; 0: they are not
+    """
+    found: Tensor = torch.ops.sw_codecs.triplane_lookup(
+        cells.contiguous(), weights.contiguous(), [plane.contiguous() for plane in planes], gain
+    )
+    return found
+
+
+def look_up_backward(cells: Tensor, weights: Tensor, slopes: Tensor, planes: Sequence[Tensor]) -> list[Tensor]:
+    """Derivatives by the planes, from those by the features [n, sizes * 3 C]. Fastest if neighbours follow each other.
+
+    planes      for their shapes alone
+    """
+    found: list[Tensor] = torch.ops.sw_codecs.triplane_backward(
+        cells.contiguous(), weights.contiguous(), slopes.contiguous(), list(planes)
+    )
+    return found

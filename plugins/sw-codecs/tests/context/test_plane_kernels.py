@@ -1,0 +1,121 @@
+"""The CUDA kernels of learned planes against torch operations."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from sw_codecs.context import spatial_ar, triplane
+from sw_codecs.context.plane_kernels import fit_kernels
+from sw_codecs.context.spatial_ar import SpatialAr
+from sw_codecs.context.triplane import PlaneSites, Triplane
+from sw_codecs.native import CODECS
+
+ON_CUDA = CODECS.available(cuda=True)
+needs_gpu = pytest.mark.skipif(ON_CUDA is not None, reason=str(ON_CUDA))
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def close(found, expected, tolerance=1e-4):
+    """Within a share of the largest number: sums of thousands of products."""
+    for one, other in zip(found, expected, strict=True):
+        torch.testing.assert_close(one, other, rtol=tolerance, atol=tolerance * float(other.abs().max()) + 1e-7)
+
+
+def test_there_are_no_kernels_on_a_cpu():
+    assert not fit_kernels([torch.zeros(3, 2, 4, 4)])
+    assert not fit_kernels([])
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize(
+    ("orientations", "channels", "sizes", "spread"),
+    [
+        (3, 72, ((9, 9), (18, 18)), 1.0),
+        (3, 5, ((61, 61), (122, 122)), 4.0),
+        (2, 3, ((7, 13),), 40.0),  # far from every mean: probabilities at their floor
+        (1, 1, ((1, 1),), 1.0),
+        (3, 1, ((1, 3), (2, 1), (128, 1), (1, 129)), 2.0),
+    ],
+)
+@pytest.mark.parametrize("planes_learn", [True, False])
+def test_bits_of_planes_are_those_of_torch(orientations, channels, sizes, spread, planes_learn, monkeypatch):
+    draw = generator()
+    networks = torch.nn.ModuleList(SpatialAr(draw) for _ in range(orientations))
+    with torch.no_grad():
+        for parameter in networks.parameters():
+            parameter.add_(0.3 * torch.randn(parameter.shape, generator=draw))
+    networks = networks.to("cuda")
+    planes = [spread * torch.randn(orientations, channels, *size, generator=draw).to("cuda") for size in sizes]
+    planes = [plane.requires_grad_(planes_learn) for plane in planes]
+    leaves = [*networks.parameters(), *(planes if planes_learn else [])]
+    found = []
+    for kernel in (True, False):
+        if not kernel:
+            monkeypatch.setattr(spatial_ar, "fit_kernels", lambda _: False)
+        bits = SpatialAr.joint_bits(list(networks), planes)
+        found.append((bits.detach(), *torch.autograd.grad(2 * bits, leaves)))
+    close(*found)
+    assert all(each.data_ptr() % 16 == 0 for each in found[0][1:] if each.numel())  # as the optimizer's kernel asks
+
+
+@pytest.mark.cuda
+@needs_gpu
+@pytest.mark.parametrize(
+    ("count", "resolution", "channels", "multiples", "repeats"),
+    [
+        (5000, 20, 72, (1, 2), 1),
+        (3001, 9, 8, (1, 2, 4), 5),
+        (77, 7, 5, (1,), 3),
+        (1, 1, 4, (1, 2), 1),
+        (0, 3, 8, (1, 2), 1),
+    ],
+)
+@pytest.mark.parametrize("rounded", [True, False])
+def test_a_triplane_and_its_gradients_are_those_of_torch(
+    count, resolution, channels, multiples, repeats, rounded, monkeypatch
+):
+    draw = generator(1)
+    planes = Triplane(resolution, channels, multiples, generator=draw)
+    with torch.no_grad():
+        for plane in planes.planes:
+            plane.normal_(generator=draw)
+    places = torch.randint(0, (1 << 20) + 1, (count, 3), generator=draw).repeat_interleave(repeats, dim=0)
+    slopes = torch.randn(len(places), planes.width, generator=draw)
+    slopes[count // 3 : count // 3 + 2] = 0  # rows beyond the count of a step have none
+    planes, slopes = planes.to("cuda"), slopes.to("cuda")
+    sites = PlaneSites(*(part.to("cuda") for part in planes.to("cuda").sites(places.to("cuda"))))
+    found = []
+    for kernel in (True, False):
+        if not kernel:
+            monkeypatch.setattr(triplane, "fit_kernels", lambda _: False)
+        features = planes.at_sites(sites, rounded=rounded)
+        found.append((features.detach(), *torch.autograd.grad((features * slopes).sum(), list(planes.planes))))
+    close(*found) if count else None
+    assert found[0][0].shape == found[1][0].shape
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_deterministic_algorithms_have_no_atomic_sums():
+    plane = torch.zeros(3, 2, 4, 4, device="cuda")
+    assert fit_kernels([plane])
+    torch.use_deterministic_algorithms(True)
+    try:
+        assert not fit_kernels([plane])
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+@pytest.mark.cuda
+@needs_gpu
+def test_planes_without_values_have_no_bits():
+    networks, plane = [SpatialAr().to("cuda") for _ in range(3)], torch.zeros(3, 4, 0, 0, device="cuda")
+    bits = SpatialAr.joint_bits(networks, [plane])
+    (slope,) = torch.autograd.grad(bits, networks[0].layers[0].weight)
+    assert float(bits) == 0
+    assert not bool(slope.any())

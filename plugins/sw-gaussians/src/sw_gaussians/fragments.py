@@ -1,0 +1,61 @@
+"""Statistics of opacity gradients over fragments: where a Gaussian's pixels disagree about how opaque it should be."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import GaussianModel, RenderResult
+
+BUFFER = "fragments"
+"""Buffer [N,3] of a model: sum of g, sum of g^2, number of fragments, with g = o dL/do of one pixel of one view."""
+LEAST_CLEAR = 1e-6
+"""Floor of 1 - opacity where the derivative by the logit is turned into that by the opacity."""
+
+
+def add_buffer(model: GaussianModel) -> None:
+    """Give a model the buffer, zero, as one of its rows: it follows them wherever they go, and into checkpoints."""
+    if BUFFER not in model.ROWS:
+        model.register_buffer(BUFFER, model.means.new_zeros(model.num_rows, 3))
+        model.ROWS = (*model.ROWS, BUFFER)
+
+
+def drop_buffer(model: GaussianModel) -> None:
+    """Take the buffer from a model again; nothing happens to one without it."""
+    if BUFFER in model.ROWS:
+        model.ROWS = tuple(name for name in model.ROWS if name != BUFFER)
+        delattr(model, BUFFER)
+
+
+@torch.no_grad()
+def opacity_variance(fragments: Tensor) -> Tensor:
+    """Score Gaussians by the variance of the gradient by their opacity, times its square and the fragments.
+
+    fragments   [N,3] as `BUFFER`
+
+    Returns [N] float32 >= 0: n max(0, sum g^2 / (n + 1) - (sum g / (n + 1))^2) with g = o dL/do. A gradient that all
+    fragments share moves the opacity; one that changes sign between them calls for another Gaussian.
+    Source: LiteGS (arXiv 2503.01199), with squares of single fragments.
+    """
+    total, squares, count = fragments.double().unbind(1)
+    mean = total / (count + 1)
+    return (squares / (count + 1) - mean * mean).clamp_min_(0).mul_(count).float()
+
+
+def collect_opacity_gradients(model: GaussianModel, result: RenderResult) -> None:
+    """Schedule task: add this view's opacity gradients to `BUFFER`, which `add_buffer` has made.
+
+    Raises ValueError for a stage that does not render them (`RasterOptions(fragment_grad=True)`). A step whose gradient
+    of the opacities another task has taken is left out.
+    """
+    if result.fragment_grad is None or BUFFER not in model.ROWS:
+        raise ValueError(
+            "opacity gradients need a stage that renders them, with RasterOptions(fragment_grad=True), and a model "
+            "with the buffer of sw_gaussians.fragments.add_buffer (of 3DGS: with fast.densify=budget)"
+        )
+    gradient = model.opacity_logits.grad
+    if gradient is None:
+        return
+    sums: Tensor = model.get_buffer(BUFFER)
+    sums[:, 0].add_(gradient / (1 - model.opacities.detach()).clamp_min_(LEAST_CLEAR))  # do/dlogit = o (1 - o)
+    sums[:, 1:].add_(result.fragment_grad.value)

@@ -1,0 +1,217 @@
+"""A resolution schedule: training begins with small pictures, which cost less and hold what is learned first.
+
+Source: DashGaussian (arXiv 2503.18402); `s` is how many times smaller the side of a picture is.
+"""
+
+from __future__ import annotations
+
+import bisect
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
+
+import torch
+from torch import Tensor
+
+from splatwizard_core.api import CameraSampler, View
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Scene
+
+LEVELS = 32
+"""Steps of spectral content between the first and the full resolution."""
+HALVINGS = 24
+"""Of the interval in which a scale is searched: finer than a pixel of any picture."""
+ENERGY = 4.0
+"""The first pictures hold one part in so many of the sum of all amplitudes."""
+
+Rounding = Literal["real", "floor"]
+
+
+def amplitudes(picture: Tensor) -> Tensor:
+    """Amplitudes of the spectrum of [C,H,W], summed over channels, DC in the middle: [H,W] float32."""
+    return torch.fft.fftshift(torch.fft.fft2(picture).abs().sum(dim=0))
+
+
+class Spectrum:
+    """Sums of amplitudes [H,W] in windows around their middle, each found at once."""
+
+    def __init__(self, amplitude: Tensor) -> None:
+        self.height, self.width = amplitude.shape
+        table = amplitude.new_zeros(self.height + 1, self.width + 1, dtype=torch.float64)
+        table[1:, 1:] = amplitude.double().cumsum(0).cumsum(1)
+        self._table = table.cpu()
+
+    def within(self, scale: float) -> float:
+        """Sum of the window of floor(H / scale) x floor(W / scale) bins."""
+        h, w = max(1, int(self.height / scale)), max(1, int(self.width / scale))
+        y, x = self.height // 2 - h // 2, self.width // 2 - w // 2
+        t = self._table
+        return float(t[y + h, x + w] - t[y, x + w] - t[y + h, x] + t[y, x])
+
+    def scale_of(self, energy: float) -> float:
+        """Return the largest scale >= 1 whose window holds at least this sum."""
+        low, high = 0.0, 1.0  # of 1 / scale
+        for _ in range(HALVINGS):
+            middle = (low + high) / 2
+            if middle > 0 and self.within(1 / middle) < energy:
+                low = middle
+            else:
+                high = middle
+        return 1 / high
+
+
+@dataclass(frozen=True)
+class ResolutionPlan:
+    """Scales over time: at step `times[k]` the pictures are `scales[k]` times smaller; in between, and 1 at the end.
+
+    times   ascending, the first one 0, the last one the step from which pictures are whole
+    scales  descending, the last one 1
+    """
+
+    times: tuple[int, ...]
+    scales: tuple[float, ...]
+
+    def scale(self, step: int) -> float:
+        """Return the scale at a step: between two levels the number of pixels, 1 / scale^2, is linear."""
+        at = bisect.bisect_right(self.times, step)
+        if at >= len(self.times):
+            return 1.0
+        t0, t1 = self.times[at - 1], self.times[at]
+        p0, p1 = self.scales[at - 1] ** -2, self.scales[at] ** -2
+        return float((p0 + (step - t0) / (t1 - t0) * (p1 - p0)) ** -0.5)
+
+
+def resolution_plan(spectra: Sequence[Spectrum], mean: Spectrum, *, full_at: int, most: float = 4.0) -> ResolutionPlan:
+    """Return when pictures have which scale, by what their spectra hold.
+
+    spectra     of each picture, for the first scale
+    mean        of the mean of their amplitudes
+    full_at     step from which pictures are whole
+    most        largest scale
+    """
+    first = min([most, *(s.scale_of(s.within(1) / ENERGY) for s in spectra)])
+    if first <= 1 or full_at <= 0:
+        return ResolutionPlan((0,), (1.0,))
+    least, total = mean.within(first), mean.within(1)
+    times, scales = [0], [first]
+    for k in range(1, LEVELS):
+        energy = least + (total - least) * k / (LEVELS - 1)
+        time = math.floor(full_at * math.log(energy / least) / math.log(total / least))
+        scale = 1.0 if k == LEVELS - 1 else min(scales[-1], mean.scale_of(energy))
+        if time > times[-1]:
+            times.append(time)
+            scales.append(scale)
+        else:
+            scales[-1] = scale
+    times[-1], scales[-1] = full_at, 1.0
+    return ResolutionPlan(tuple(times), tuple(scales))
+
+
+@torch.no_grad()
+def plan_of_views(
+    views: Sequence[View], *, full_at: int, most: float = 4.0, background: Tensor | None = None
+) -> ResolutionPlan:
+    """Return the plan of these training views; pictures of other sizes count at the size of the median."""
+    sizes = sorted((view.camera.height * view.camera.width, view.camera.height, view.camera.width) for view in views)
+    _, height, width = sizes[len(sizes) // 2]
+    spectra, total = [], torch.zeros(height, width)
+    for view in views:
+        device = view.kept_on
+        picture = shrunk(view.image(background, device), height, width)
+        amplitude = amplitudes(picture)
+        spectra.append(Spectrum(amplitude))
+        total = total.to(device) + amplitude
+    return resolution_plan(spectra, Spectrum(total / len(views)), full_at=full_at, most=most)
+
+
+def shrunk(image: Tensor, height: int, width: int) -> Tensor:
+    """[C,H,W] at another size, bilinear with antialiasing; itself where it has that size."""
+    if image.shape[-2:] == (height, width):
+        return image
+    return torch.nn.functional.interpolate(
+        image[None], (height, width), mode="bilinear", antialias=True, align_corners=False
+    )[0]
+
+
+class SmallerView(View):
+    """A view as it looks at a lower resolution; the field of view stays."""
+
+    def __init__(self, view: View, width: int, height: int) -> None:
+        super().__init__(view.camera.resized(width, height), view.name)
+        self.whole = view
+
+    def image(self, background: Tensor | None = None, device: torch.device | str = "cpu") -> Tensor:
+        """float32 [3,h,w] in 0..1 on `device`, made of the whole picture each time."""
+        return shrunk(self.whole.image(background, device), self.camera.height, self.camera.width)
+
+
+class ResolutionSampler(CameraSampler):
+    """Draws views as the sampler inside does, and hands them out at the resolution of the step.
+
+    inner       draws
+    make_plan   () -> ResolutionPlan, asked at the first step: it reads all pictures, which is training time
+    every       the scale is read anew only every so many steps, so that statistics in between are of one resolution
+    rounding    "real": any scale; "floor": whole ones, as published
+    """
+
+    def __init__(
+        self, inner: CameraSampler, make_plan: Callable[[], ResolutionPlan], *, every: int, rounding: Rounding = "real"
+    ) -> None:
+        self.inner, self.every, self.rounding = inner, every, rounding
+        self.views, self.generator = inner.views, inner.generator
+        self._make_plan = make_plan
+        self._plan: ResolutionPlan | None = None
+        self._scale = 1.0
+        self._smaller: dict[View, SmallerView] = {}
+
+    @property
+    def plan(self) -> ResolutionPlan:
+        """The scales over time."""
+        if self._plan is None:
+            self._plan = self._make_plan()
+        return self._plan
+
+    def scale(self, step: int) -> float:
+        """Return how many times smaller the pictures of a step are."""
+        scale = self.plan.scale((step - 1) // self.every * self.every)
+        return float(math.floor(scale)) if self.rounding == "floor" else scale
+
+    def next(self, step: int) -> View:
+        """Return the view of this step at the resolution of this step."""
+        view, scale = self.inner.next(step), self.scale(step)
+        if scale <= 1:
+            self._smaller.clear()
+            return view
+        if scale != self._scale:
+            self._scale = scale
+            self._smaller.clear()
+        if view not in self._smaller:
+            camera = view.camera
+            width, height = max(1, int(camera.width / scale)), max(1, int(camera.height / scale))
+            self._smaller[view] = SmallerView(view, width, height)
+        return self._smaller[view]
+
+    def state_dict(self) -> dict[str, Any]:
+        return self.inner.state_dict()
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.inner.load_state_dict(state)
+
+
+def by_resolution(
+    inner: CameraSampler, scene: Scene, *, full_at: int, every: int, most: float = 4.0, rounding: Rounding = "real"
+) -> ResolutionSampler:
+    """Return a sampler that hands out what `inner` draws by the resolution schedule of a scene.
+
+    full_at     step from which pictures are whole
+    every       steps between two looks at the schedule: the interval of densification
+    most        times that the first pictures are smaller, at most
+    """
+    return ResolutionSampler(
+        inner,
+        lambda: plan_of_views(scene.train, full_at=full_at, most=most, background=scene.background),
+        every=every,
+        rounding=rounding,
+    )

@@ -1,0 +1,34 @@
+"""A training step of HAC++ in tensors of fixed sizes, as a GPU replays it, equals that on any number of anchors."""
+
+import copy
+
+import pytest
+import torch
+from hac_plus_models import PLUGINS, make
+from sw_anchors.testing import check_fixed_decoder
+from sw_reference.testing.raster_scenes import front_camera
+
+from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
+
+RASTERIZER = NegotiatedRasterizer(PLUGINS, device="cpu")
+N = 150
+
+
+def trained(device="cpu", **values):
+    model = make(N, **values).to(device)
+    with torch.no_grad():
+        for parameter in model.mlp_opacity.parameters():
+            parameter.mul_(3)  # opacities of both signs
+    return model.requires_grad_(True)
+
+
+@pytest.mark.parametrize(("channel", "counts"), [("full", (0, 90)), ("none", (60,))])
+def test_fixed_sizes_change_neither_values_nor_gradients(channel, counts):
+    check_fixed_decoder(lambda: trained(channel__kind=channel), front_camera(), RASTERIZER, counts=counts)
+
+
+@pytest.mark.cuda
+def test_graphs_change_neither_values_nor_gradients():
+    gpu = NegotiatedRasterizer(PLUGINS, device="cuda")
+    model = trained("cuda")
+    check_fixed_decoder(lambda: copy.deepcopy(model), front_camera().to("cuda"), gpu, counts=(0, 90, 60), graphs=True)

@@ -1,0 +1,169 @@
+"""Explicit Gaussians as the compact bytes that the page unpacks (page/data.js): quantized, ordered, deflated.
+
+A Gaussian takes 19 bytes and 3 a coefficient of the bands above 0, before deflate:
+
+    place       3 x 16 bit, between the bounds of its chunk of 256 neighbours (Morton order)
+    rotation    32 bit, smallest three of (w,x,y,z): index of the largest, 3 x 10 bit
+    scales      3 x 10 bit, logarithmic; at most `LOG_RANGE` below the largest
+    colour      11 + 11 + 10 bit, of 0.5 + SH_0 dc
+    opacity     8 bit
+    bands 1-3   8 bit a coefficient, one step a band
+"""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from sw_gaussians.surfels import as_ellipsoids
+
+from splatwizard_core.api import GaussianModel, SceneError, SplatModel
+
+CHUNK = 256
+LOG_RANGE = 14.0
+"""Largest minus least log scale that is told apart: e^-14 of the largest Gaussian is below any pixel."""
+SH_0 = 0.28209479177387814
+LEAST_STEP = 0.008
+"""Of a coefficient: a finer one changes no 8-bit colour."""
+FAINTEST = 1 / 255
+"""Gaussians with less opacity are drawn by no rasterizer."""
+
+
+@dataclass(frozen=True)
+class Packed:
+    """Gaussians for the page: their bytes as text, and the numbers that are needed to unpack them."""
+
+    text: str
+    facts: dict[str, Any]
+    means: NDArray[np.float32]  # [n,3], of those that are kept
+
+
+def explicit(model: SplatModel) -> GaussianModel:
+    """Return the Gaussians of a model, surfels as thin ellipsoids. Raises SceneError if they depend on the camera."""
+    if not isinstance(model, GaussianModel):
+        raise SceneError(
+            f"a {type(model).__name__} has no fixed Gaussians, as the page holds: they depend on the camera; "
+            "`sw view` draws it on this machine"
+        )
+    return as_ellipsoids(model)
+
+
+def solid_means(model: GaussianModel) -> NDArray[np.float32]:
+    """Return the means [n,3] of the Gaussians that can be drawn: finite, and not too faint."""
+    means: NDArray[np.float32] = model.means[_drawable(model)].detach().float().cpu().numpy()
+    return means
+
+
+@torch.no_grad()
+def _drawable(model: GaussianModel) -> torch.Tensor:
+    keep = torch.sigmoid(model.opacity_logits) >= FAINTEST
+    for value in (getattr(model, name) for name in model.RAW):
+        keep &= torch.isfinite(value).flatten(1).all(dim=1) if value.dim() > 1 else torch.isfinite(value)
+    return keep
+
+
+def pack(model: SplatModel) -> Packed:
+    """Quantize, order and deflate the Gaussians of a model, those that are finite and not too faint to be drawn.
+
+    Raises SceneError if they depend on the camera, or if none is left.
+    """
+    found = explicit(model)
+    with torch.no_grad():
+        keep = _drawable(found)
+        means, logits, log_scales, quats = (
+            getattr(found, name)[keep].detach().float().cpu().numpy()
+            for name in ("means", "opacity_logits", "log_scales", "quats")
+        )
+        bands = (found.active_sh_degree + 1) ** 2 - 1
+        dc = found.sh_dc[keep, 0].detach().float().cpu().numpy()
+        rest = found.sh_rest[keep, :bands].detach().float().cpu().numpy()
+    if not len(means):
+        raise SceneError("the model has no Gaussian that could be drawn, so there is nothing to show")
+    order = morton_order(means)
+    places, bounds = _places(means[order])
+    scales, scale_range = _scales(log_scales[order])
+    colors, color_range = _colors(dc[order])
+    coefficients, steps = _coefficients(rest[order], found.active_sh_degree)
+    opacities = np.round(255 / (1 + np.exp(-logits[order].astype(np.float64)))).astype(np.uint8)
+    parts = (bounds, _rotations(quats[order]), colors, scales, *places, opacities, coefficients)
+    packed = zlib.compress(b"".join(np.ascontiguousarray(part).tobytes() for part in parts), 9)
+    facts = {
+        "count": len(means), "chunk": CHUNK, "degree": found.active_sh_degree,
+        "scales": scale_range, "colors": color_range, "bands": steps,
+    }  # fmt: skip
+    return Packed(base64.b64encode(packed).decode("ascii"), facts, means[order])
+
+
+def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Return rows so that neighbours [N,3] follow each other: by the interleaved bits of 21-bit coordinates."""
+    low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
+    cells = ((means - low) / np.maximum(high - low, 1e-30) * (2**21 - 1)).astype(np.uint64)
+    spread = cells & np.uint64(0x1FFFFF)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):  # fmt: skip
+        spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
+    code = spread[:, 0] | (spread[:, 1] << np.uint64(1)) | (spread[:, 2] << np.uint64(2))
+    return np.argsort(code, kind="stable")
+
+
+def _places(means: NDArray[np.float32]) -> tuple[list[NDArray[np.uint16]], NDArray[np.float32]]:
+    """Return x, y, z as [N] each, and the bounds [chunks,6]: least and largest x, y, z."""
+    starts = np.arange(0, len(means), CHUNK)
+    low, high = (np.repeat(f.reduceat(means, starts), CHUNK, axis=0)[: len(means)] for f in (np.minimum, np.maximum))
+    share = (means - low).astype(np.float64) / np.maximum(high - low, 1e-30)
+    cells = np.round(share * 65535).astype(np.uint16)
+    bounds = np.concatenate([low[::CHUNK], high[::CHUNK]], axis=1)
+    return [cells[:, k] for k in range(3)], bounds
+
+
+def _scales(log_scales: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
+    high = float(log_scales.max())
+    low = max(float(log_scales.min()), high - LOG_RANGE)
+    step = max(high - low, 1e-6) / 1023
+    cells = np.round((log_scales.clip(low, high) - low) / step).clip(0, 1023).astype(np.uint32)
+    return _packed_bits(cells, (0, 10, 20)), [low, step]
+
+
+def _colors(dc: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
+    base = 0.5 + SH_0 * dc.astype(np.float64)
+    low, high = float(base.min()), float(base.max())
+    share = (base - low) / max(high - low, 1e-6)
+    cells = np.round(share * np.array([2047, 2047, 1023])).astype(np.uint32)
+    return _packed_bits(cells, (0, 11, 22)), [low, max(high - low, 1e-6) / 2047]
+
+
+def _coefficients(rest: NDArray[np.float32], degree: int) -> tuple[NDArray[np.uint8], list[float]]:
+    """Return the bytes [N,3K] (a coefficient's three colours together), and the step of each band."""
+    cells = np.full(rest.shape, 128, np.uint8)
+    steps = []
+    for band in range(1, degree + 1):
+        of_band = slice(band**2 - 1, (band + 1) ** 2 - 1)
+        step = max(float(np.abs(rest[:, of_band]).max()) / 127, LEAST_STEP)
+        cells[:, of_band] = (np.round(rest[:, of_band] / step) + 128).clip(0, 255).astype(np.uint8)
+        steps.append(step)
+    return cells.reshape(len(rest), -1), steps
+
+
+def _rotations(quats: NDArray[np.float32]) -> NDArray[np.uint32]:
+    """Code [N,4] (w,x,y,z) of any norm: index of the largest part, then the others, each in -1/sqrt(2)..1/sqrt(2)."""
+    norms = np.linalg.norm(quats, axis=1, keepdims=True)
+    unit = np.where(norms > 0, quats / np.maximum(norms, 1e-30), np.array([1, 0, 0, 0], np.float32))
+    largest = np.abs(unit).argmax(axis=1)
+    unit = unit * np.where(np.take_along_axis(unit, largest[:, None], axis=1) < 0, -1, 1)
+    others = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])[largest]
+    three = np.take_along_axis(unit, others, axis=1) * np.sqrt(2)
+    cells = (np.round(three * 511) + 511).clip(0, 1022).astype(np.uint32)
+    return _packed_bits(np.concatenate([largest[:, None], cells], axis=1), (30, 20, 10, 0))
+
+
+def _packed_bits(fields: NDArray[Any], shifts: tuple[int, ...]) -> NDArray[np.uint32]:
+    """Put the fields of each row [N,F] into one word, each at its shift."""
+    words: NDArray[np.uint32] = np.bitwise_or.reduce(fields.astype(np.uint32) << np.array(shifts, np.uint32), axis=1)
+    return words

@@ -1,0 +1,95 @@
+// The page: unpacks the scene, draws when something moved, and offers cameras. `#camera=N&size=WxH&still` draws camera N
+// alone at that size, once and exactly, and says so in the title: for tests and for pictures.
+const find = id => document.getElementById(id);
+const facts = JSON.parse(find('facts').textContent);
+const asked = new URLSearchParams(location.hash.slice(1));
+const still = asked.has('still');
+
+function fail(error) {
+  find('told').textContent = error.message || String(error);
+  find('told').hidden = false;
+  document.documentElement.dataset.state = 'failed';
+}
+
+async function begin() {
+  const canvas = find('canvas');
+  const gaussians = gaussiansFrom(await unpacked(find('gaussians').textContent), facts);
+  find('gaussians').remove();
+  const sources = { vertex: find('vertex').textContent.trim(), fragment: find('fragment').textContent.trim() };
+  const renderer = new Renderer(canvas, gaussians, facts, sources, still);
+  const worker = new Worker(URL.createObjectURL(new Blob([find('worker').textContent], { type: 'text/javascript' })));
+  worker.postMessage({ means: gaussians.means }, [gaussians.means.buffer]);
+
+  let sorting = 0, number = 0, wanted = false, drawing = 0, share = 1, last = 0, rest = 0;
+  const eye = new Eye(facts, () => { wanted = true; again(); });
+
+  function sort() {  // one order at a time; the newest place is asked for when it is there
+    if (sorting || !wanted) return;
+    const { R, tau } = eye.pose;
+    sorting = ++number, wanted = false;
+    worker.postMessage({ forward: R.slice(6), offset: tau[2], nearest: facts.near, number });
+  }
+
+  function again() { drawing ||= requestAnimationFrame(draw); }
+
+  function draw(now) {
+    drawing = 0;
+    const moving = wanted || sorting;
+    sort();
+    const fixed = asked.get('size')?.match(/^(\d+)x(\d+)$/);
+    const ratio = fixed || still ? 1 : Math.min(2, devicePixelRatio) * share;
+    const [width, height] = fixed ? [+fixed[1], +fixed[2]] : [canvas.clientWidth, canvas.clientHeight];
+    if (fixed) canvas.style.cssText = `width:${width}px;height:${height}px`;
+    const pixels = [width, height].map(length => Math.max(1, Math.round(length * ratio)));
+    if (renderer.count) {
+      renderer.draw(eye.pose, eye.lens(...pixels), ...pixels);
+      said();
+    }
+    clearTimeout(rest);
+    if (moving && !still) {  // a frame that takes over 50 ms is drawn smaller until the eye rests
+      if (now - last > 50 && now - last < 1000) share = Math.max(0.3, share * 0.85);
+      rest = setTimeout(() => { if (share < 1) { share = 1; again(); } }, 250);
+    }
+    last = now;
+  }
+
+  function said() {
+    const data = document.documentElement.dataset;
+    data.firstFrame ||= performance.now().toFixed(1);
+    data.frames = Number(data.frames || 0) + 1;
+    data.state = sorting || wanted ? 'sorting' : 'drawn';
+    if (still && data.state === 'drawn') document.title = `still ${find('camera').value}`;
+  }
+
+  worker.onmessage = ({ data }) => {
+    if (data.number === sorting) sorting = 0;
+    renderer.take(data.sorted);
+    again();
+  };
+  worker.onerror = fail;
+
+  const list = find('camera');
+  facts.cameras.forEach((camera, i) => list.add(new Option(camera.name, i)));
+  const show = i => {
+    list.value = (i + facts.cameras.length) % facts.cameras.length;
+    eye.pivot = facts.pivot;
+    eye.show(facts.cameras[list.value]);
+  };
+  list.addEventListener('change', () => show(Number(list.value)));
+  const fly = find('fly');
+  const commands = {
+    '[': () => show(Number(list.value) - 1), ']': () => show(Number(list.value) + 1), r: () => show(Number(list.value)),
+    f: () => { eye.orbits = !eye.orbits; fly.setAttribute('aria-pressed', String(!eye.orbits)); },
+    h: () => { find('help').hidden = !find('help').hidden; }, '?': () => commands.h(),
+  };
+  for (const [id, key] of [['before', '['], ['after', ']'], ['reset', 'r'], ['fly', 'f'], ['more', 'h']]) {
+    find(id).addEventListener('click', () => { commands[key](); });
+  }
+  listen(canvas, eye, commands);
+  canvas.addEventListener('webglcontextlost', () => fail(new Error('The GPU was taken away: load the page again.')));
+  new ResizeObserver(again).observe(canvas);
+  if (still) document.body.classList.add('still');
+  show(Math.min(facts.cameras.length - 1, Math.max(0, Number(asked.get('camera')) || 0)));
+}
+
+begin().catch(fail);

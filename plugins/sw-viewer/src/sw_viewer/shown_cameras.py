@@ -1,0 +1,102 @@
+"""Cameras for a viewer: those of a scene, or some around a model of which nothing else is known."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from splatwizard_core.api import Camera, Scene, View
+
+MOST = 64
+"""Cameras of a scene that are offered, spread evenly."""
+SIZE = (960, 720)
+FIELD = math.radians(50)
+"""Horizontal field of view of cameras that are made up."""
+
+
+@dataclass(frozen=True)
+class NamedCamera:
+    """A camera and what a list calls it."""
+
+    name: str
+    camera: Camera
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """Places that a viewer starts from.
+
+    cameras     the first is where it starts
+    up          [3] unit length, world
+    pivot       [3] what the eye turns around, world
+    size        distance of the cameras from the pivot, world units
+    """
+
+    cameras: Sequence[NamedCamera]
+    up: NDArray[np.float64]
+    pivot: NDArray[np.float64]
+    size: float
+
+
+def cameras_of(scene: Scene, most: int = MOST) -> list[NamedCamera]:
+    """Return the test cameras, then those of the training that are no test cameras, each evenly spread."""
+    tested = {view.name for view in scene.test}
+    train = [view for view in scene.train if view.name not in tested]
+    kept = [*_evenly(scene.test, most)]
+    kept += _evenly(train, most - len(kept))
+    return [NamedCamera(f"{view.name} ({'test' if view.name in tested else 'train'})", view.camera) for view in kept]
+
+
+def surroundings_of(scene: Scene) -> Surroundings:
+    """Return the places of a scene; the pivot is the point that its cameras look at."""
+    cameras = [view.camera for view in (*scene.train, *scene.test)]
+    up = np.mean([-camera.R[1].double().cpu().numpy() for camera in cameras], axis=0)
+    if np.linalg.norm(up) < 1e-3:  # cameras all around: no direction is up more than another
+        up = -cameras[0].R[1].double().cpu().numpy()
+    centers = np.stack([camera.center.double().cpu().numpy() for camera in cameras])
+    forwards = np.stack([camera.R[2].double().cpu().numpy() for camera in cameras])
+    pivot = looked_at(centers, forwards, scene.extent)
+    size = float(np.linalg.norm(centers - pivot, axis=1).mean())
+    return Surroundings(cameras_of(scene), up / np.linalg.norm(up), pivot, size)
+
+
+def looked_at(centers: NDArray[np.float64], forwards: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
+    """Return the point [3] that is nearest to the optical axes [V,3]; `extent` ahead where they are parallel."""
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V,3,3] onto the plane across the axis
+    total = across.sum(axis=0)
+    if np.linalg.cond(total) < 1e4:
+        point: NDArray[np.float64] = np.linalg.solve(total, np.einsum("vij,vj->i", across, centers))
+        if ((point - centers) * forwards).sum(axis=1).mean() > 0:
+            return point
+    ahead: NDArray[np.float64] = (centers + extent * forwards).mean(axis=0)
+    return ahead
+
+
+def surroundings_about(means: NDArray[np.float32]) -> Surroundings:
+    """Return eight cameras around the middle of Gaussians [N,3]; up is -y, as in pictures of COLMAP scenes."""
+    points = means.astype(np.float64)
+    pivot = np.median(points, axis=0)
+    radius = max(float(np.percentile(np.linalg.norm(points - pivot, axis=1), 80)), 1e-3)
+    up = np.array([0.0, -1.0, 0.0])
+    distance = 1.6 * radius / math.tan(FIELD / 2)
+    cameras = []
+    for i in range(8):
+        angle = 2 * math.pi * i / 8
+        away = np.array([math.sin(angle), -0.35, -math.cos(angle)])
+        eye = pivot + distance * away / np.linalg.norm(away)
+        camera = Camera.look_at(
+            *(torch.from_numpy(v).float() for v in (eye, pivot, up)), width=SIZE[0], height=SIZE[1], fov_x=FIELD
+        )
+        cameras.append(NamedCamera(f"around, {45 * i} degrees", camera))
+    return Surroundings(cameras, up, pivot, distance)
+
+
+def _evenly(found: Sequence[View], most: int) -> list[View]:
+    if len(found) <= most or most < 2:
+        return list(found[: max(most, 0)])
+    return [found[round(i * (len(found) - 1) / (most - 1))] for i in range(most)]

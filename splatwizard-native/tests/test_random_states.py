@@ -1,0 +1,57 @@
+"""Random generators and the order of sums: set within a block, and afterwards as before."""
+
+import os
+import random
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from splatwizard_native import ForeseenError, seeded, sums_vary_on_cuda
+
+
+def drawn() -> list[float]:
+    return [random.random(), float(np.random.rand()), float(torch.rand(()))]
+
+
+def test_a_seed_holds_in_the_block_alone():
+    state = drawn()
+    with seeded(3):
+        first = drawn()
+    with seeded(3):
+        assert drawn() == first
+    with seeded(4):
+        assert drawn() != first
+    assert drawn() != state
+
+
+@pytest.mark.parametrize("warn_only", [False, True])
+@pytest.mark.parametrize("before", [False, True])
+def test_torch_is_asked_for_one_order_in_the_block_alone(before, warn_only, monkeypatch):
+    monkeypatch.delenv("CUBLAS_WORKSPACE_CONFIG", raising=False)
+    torch.use_deterministic_algorithms(before, warn_only=warn_only)
+    try:
+        with seeded(0, deterministic=True):
+            assert torch.are_deterministic_algorithms_enabled()
+            assert not torch.is_deterministic_algorithms_warn_only_enabled()
+            assert not torch.utils.deterministic.fill_uninitialized_memory
+            assert os.environ["CUBLAS_WORKSPACE_CONFIG"] == ":4096:8"
+        assert torch.are_deterministic_algorithms_enabled() == before
+        assert torch.is_deterministic_algorithms_warn_only_enabled() == warn_only
+        assert torch.utils.deterministic.fill_uninitialized_memory
+        with seeded(0):
+            assert torch.are_deterministic_algorithms_enabled() == before
+    finally:
+        torch.use_deterministic_algorithms(False)
+
+
+def test_sums_without_an_order_are_refused_by_name_on_a_gpu_alone():
+    on_gpu = SimpleNamespace(is_cuda=True)
+    sums_vary_on_cuda("hash grids", on_gpu)
+    with seeded(0, deterministic=True):
+        sums_vary_on_cuda("hash grids", torch.zeros(1))
+        with pytest.raises(
+            ForeseenError, match="deterministic=true: the sums of hash grids have no fixed order on a GPU"
+        ):
+            sums_vary_on_cuda("hash grids", on_gpu)
