@@ -4,9 +4,12 @@
 
 The Gaussians are those of benchmarks/scene.py, written as a .ply and given to `sw run --init` with 0 steps on the tiny
 demo scene. Seconds are those of the record: encoding once, decoding in a fresh process; the whole command also makes
-scores and codebooks: minutes for a million on a CPU, which shorter loops spare (`--set mesongs:codec.settings.vq_steps=20
---set c3dgs:color.iterations=10 --set c3dgs:shape.iterations=20`). SH coefficients made here are noise in every direction,
-of which a search of codebooks leaves nothing out; those of a trained scene (--ply) take less.
+scores and codebooks: minutes for a million on a CPU. Shorter loops spare that where only the file matters:
+
+    --set mesongs:codec.settings.vq_steps=10 --set c3dgs:color.iterations=5 --set c3dgs:shape.iterations=10
+
+SH coefficients made here are noise in every direction, of which a search of codebooks leaves nothing out; those of a
+trained scene (--ply) take less.
 """
 
 from __future__ import annotations
