@@ -9,10 +9,19 @@ import torch
 from sw_reference.testing.raster_gradients import run
 from sw_reference.testing.raster_scenes import RasterCase, cast_inputs, draw_scene
 
-from splatwizard_core.api import SH, CapabilityError, Feature, GaussianInputs, RasterizerInfo, RasterOptions
+from splatwizard_core.api import (
+    SH,
+    CapabilityError,
+    Feature,
+    GaussianInputs,
+    RasterizerInfo,
+    RasterOptions,
+    ScoreSpec,
+)
 from splatwizard_native import seeded
 from sw_rasterizers import plugin
 from sw_rasterizers.native import unavailable_on_cuda
+from sw_rasterizers.scoring import KINDS, PupRasterizer
 from sw_rasterizers.standard import StandardRasterizer
 from sw_rasterizers.variants import IndexedRasterizer
 
@@ -37,6 +46,8 @@ CASES = {
 def drawn(name: str):
     if name == "codebooks":
         return drawn_from_codebooks()
+    if name == "scores":
+        return scores()
     options, changes = CASES[name]
     g, cam = draw_scene(replace(MANY, **changes), 3, torch.float32)
     g = cast_inputs(g, torch.float32, "cuda")
@@ -77,7 +88,21 @@ def drawn_from_codebooks():
     return {"image": result.image.detach(), **{name: leaf.grad for name, leaf in leaves.items()}}
 
 
-@pytest.mark.parametrize("name", [pytest.param(name, marks=ON_GPU) for name in [*CASES, "codebooks"]])
+def scores():
+    g, cam = draw_scene(MANY, 3, torch.float32)
+    weight = torch.rand(cam.height, cam.width, generator=torch.Generator().manual_seed(1))
+    specs = [ScoreSpec(kind, kind) for kind in KINDS]
+    specs += [ScoreSpec("tested", "opacity_T", rule="tested"), ScoreSpec("weighted", "hits", weight)]
+    specs += [ScoreSpec("squares", "grad_sq", weight)]
+    opt = RasterOptions(scores=tuple(specs), fisher=True)
+    g, cam = cast_inputs(g, torch.float32, "cuda"), cam.to("cuda")
+    found = PupRasterizer().accumulate(g, [cam, cam], opt)
+    alone = PupRasterizer().accumulate(g, [cam, cam], replace(opt, fisher=False))
+    assert found.fisher is not None
+    return {**found.scores, "fisher": found.fisher, **{f"{name} alone": x for name, x in alone.scores.items()}}
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=ON_GPU) for name in [*CASES, "codebooks", "scores"]])
 def test_five_calls_give_the_same_bits_and_the_values_of_the_fast_sums(name):
     fast = drawn(name)
     with seeded(0, deterministic=True):
@@ -91,7 +116,7 @@ def test_five_calls_give_the_same_bits_and_the_values_of_the_fast_sums(name):
         assert error <= 1e-5, f"{key}: relative error {error:.3g}"
 
 
-@pytest.mark.parametrize("name", ["standard", "accel", "depth", "c3dgs"])
+@pytest.mark.parametrize("name", ["standard", "accel", "depth", "c3dgs", "speedy", "pup"])
 def test_what_draws_with_ordered_sums_says_so(name):
     info = RasterizerInfo.declared(plugin.register_rasterizers, name)
     for device in ("cpu", "cuda"):
@@ -100,7 +125,7 @@ def test_what_draws_with_ordered_sums_says_so(name):
         info.on("cuda").check_offered(Feature.FLOAT64)
 
 
-@pytest.mark.parametrize("name", ["2dgs", "speedy", "flash"])
+@pytest.mark.parametrize("name", ["2dgs", "flash"])
 def test_what_has_atomic_sums_on_a_gpu_is_refused_by_name(name):
     info = RasterizerInfo.declared(plugin.register_rasterizers, name).on("cuda")
     with pytest.raises(CapabilityError, match=f"'{name}' does not offer DETERMINISTIC"):

@@ -6,14 +6,21 @@ all three are one product, and the gradient is written down (benchmarks/train_an
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from sw_anchors.native import ANCHORS
+
 Networks = tuple[nn.Sequential, nn.Sequential, nn.Sequential]
 """Opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs."""
+
+
+MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 162_112
+"""That the CUDA kernel has room for, and the shared memory of its blocks: see kernels/cuda/networks.h."""
 
 
 def network_outputs(
@@ -32,11 +39,30 @@ def parameters_of(networks: Networks) -> list[Tensor]:
     return [p for network in networks for layer in (network[0], network[2]) for p in (layer.weight, layer.bias)]
 
 
+def fit_kernel(positions: Tensor, features: Tensor, parameters: Sequence[Tensor]) -> bool:
+    """Whether there is a CUDA kernel for these networks, whose weights must fit into a block's memory; loads it."""
+    if not all(t.is_cuda and t.dtype == torch.float32 for t in (positions, features, *parameters)):
+        return False
+    hidden, outputs = {len(bias) for bias in parameters[1::4]}, [len(bias) for bias in parameters[3::4]]
+    if len(hidden) > 1 or max(hidden) > MOST_HIDDEN or features.shape[1] > MOST_FEATURES or features.stride(1) != 1:
+        return False
+    if any(count > most for count, most in zip(outputs, MOST_OUTPUTS, strict=True)):
+        return False
+    room = torch.cuda.get_device_properties(features.device).shared_memory_per_block_optin
+    return room >= BLOCK_BYTES and ANCHORS.has_cuda()
+
+
 class _Outputs(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, center: Tensor, positions: Tensor, features: Tensor, *parameters: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
+        ctx.by_kernel = not ctx.needs_input_grad[1] and fit_kernel(positions, features, parameters)
+        if ctx.by_kernel:
+            inputs = (center.contiguous(), positions.contiguous(), features)
+            alpha, geometry, color = torch.ops.sw_anchors.view_networks(*inputs, list(parameters))
+            ctx.save_for_backward(*inputs, alpha, *parameters)
+            return alpha, geometry, color
         first, last = parameters[0::4], parameters[2::4]
         toward = positions - center
         distance = torch.linalg.vector_norm(toward, dim=1, keepdim=True)
@@ -57,6 +83,11 @@ class _Outputs(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, to_alpha: Tensor, to_geometry: Tensor, to_color: Tensor) -> tuple[Tensor | None, ...]:
+        if ctx.by_kernel:
+            inputs, alpha, parameters = ctx.saved_tensors[:3], ctx.saved_tensors[3], ctx.saved_tensors[4:]
+            slopes = [slope.contiguous() for slope in (to_alpha, to_geometry, to_color)]
+            found = torch.ops.sw_anchors.view_networks_backward(*inputs, list(parameters), alpha, slopes)
+            return None, None, *found
         direction, distance, context, weights, hidden, alpha, *last = ctx.saved_tensors
         outputs = (to_alpha * (1 - alpha * alpha), to_geometry, to_color)
         to_hidden = torch.empty_like(hidden)

@@ -12,8 +12,6 @@ STANDARD_FEATURES = [
 ]  # fmt: skip
 
 ON_CUDA = {"lacks": ["FLOAT64"], "available": "sw_rasterizers.native:unavailable_on_cuda"}
-# Some sums are always atomic there: their order, and so their last bits, vary from run to run.
-ATOMIC_ON_CUDA = {**ON_CUDA, "lacks": ["FLOAT64", "DETERMINISTIC"]}
 # Name -> (target, summary, features, speed). The same kernels under the names of what needs them; the speeds only rank
 # the others below `standard`, which serves whatever nobody asks for by name, codebooks excepted.
 STANDARD = {
@@ -109,7 +107,8 @@ def register_rasterizers(registry: Registry) -> None:
         features=SURFEL_FEATURES,
         needs=["SURFEL"],
         available="sw_rasterizers.native:unavailable",
-        on={"cuda": ATOMIC_ON_CUDA},
+        # Its sums are always atomic there: their order, and so their last bits, vary from run to run.
+        on={"cuda": {**ON_CUDA, "lacks": ["FLOAT64", "DETERMINISTIC"]}},
         profiles=PROFILES,
         exactness="exact",
         speed=50,
@@ -140,7 +139,7 @@ def register_rasterizers(registry: Registry) -> None:
             features=[*STANDARD_FEATURES, *scores],
             combos_forbidden=[combo for combo in SCORING_FORBIDDEN if combo[1] in scores],
             available="sw_rasterizers.native:unavailable",
-            on={"cuda": ATOMIC_ON_CUDA},
+            on={"cuda": ON_CUDA},
             profiles=PROFILES,
             exactness="exact",
             speed=speed,

@@ -54,7 +54,8 @@ class ScoreRasterizer(StandardRasterizer):
     """The standard rasterizer, with scores and Fisher blocks; a subclass for each name that is registered.
 
     Sums are formed per tile in the dtype of the Gaussians and across tiles and views in float64; on the CPU they are
-    bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies.
+    bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies,
+    unless torch is asked for deterministic algorithms.
     No score is differentiable, and none touches a gradient.
     """
 

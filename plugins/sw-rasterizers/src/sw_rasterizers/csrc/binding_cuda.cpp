@@ -265,8 +265,9 @@ std::tuple<std::vector<Tensor>, std::vector<double>> project_backward_on_cuda(
                       reinterpret_cast<uintptr_t>(updated[k].data_ptr()) % 16 == 0,
                   "sw_rasterizers: parameter and moments must be contiguous float32 of shape ", like->sizes());
     const double* r = rates.data() + 2 * i;
-    (i == 0 ? adam.dc : adam.rest) = {data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
-                                      float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
+    RowAdam& of = i == 0 ? adam.dc : adam.rest;
+    of = RowAdam{data<float>(updated[i]), data<float>(updated[i + 1]), data<float>(updated[i + 2]),
+                 float(r[0]), float(r[1]), float(r[2]), float(r[3]), float(r[4]), float(r[5])};
   }
   if (n > 0) project_backward(view, g, in.settings(), channels, data<uint8_t>(drawn), rows, out, adam, stream);
   C10_CUDA_KERNEL_LAUNCH_CHECK();

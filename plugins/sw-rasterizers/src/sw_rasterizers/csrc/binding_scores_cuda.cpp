@@ -51,9 +51,19 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
   const auto view = View<float>::from(camera.data(), int(width), int(height));
   const Splats splats = splats_of(saved[kShape], saved[kChannelRows]);
   const TileLists lists{data<int32_t>(saved[kTileStart]), data<int32_t>(saved[kSplat])};
+  Ordered ordered{};
+  Tensor pair_sums;
+  Grouped pairs_of_splat;
+  if (flags & kOrdered) {
+    ordered.pairs = saved[kSplat].numel(), ordered.splats = saved[kShape].size(0);
+    const int64_t floats = blocks.has_value() ? kFisherParts * kFisherSums : kScoreParts;
+    pair_sums = at::empty({ordered.pairs, floats}, means.options().requires_grad(false));
+    pairs_of_splat = Grouped(saved[kSplat], ordered.splats, stream);
+    ordered.pair_sums = data<float>(pair_sums), ordered.pairs_of_splat = pairs_of_splat.groups();
+  }
   Totals to{};
   const Scores<float> contributions = asked.select<float>(false, to.of);
-  if (contributions.count > 0) score_pixels(view, splats, lists, contributions, to, stream);
+  if (contributions.count > 0) score_pixels(view, splats, lists, contributions, to, ordered, stream);
 
   Image image{};
   image.background = data<float>(in.background);
@@ -61,11 +71,11 @@ void accumulate_scores(const Tensor& means, const Tensor& opacities, const Optio
   image.transmittance = data<float>(saved[kTransmittance]), image.last = data<int32_t>(saved[kLast]);
   const bool pass_clamp = flags & kPassClamp;
   const Scores<float> squares = asked.select<float>(true, to.of);
-  if (squares.count > 0) square_derivatives(view, pass_clamp, splats, lists, image, squares, to, stream);
+  if (squares.count > 0) square_derivatives(view, pass_clamp, splats, lists, image, squares, to, ordered, stream);
   if (blocks.has_value()) {
     const int64_t used = saved[kShape].size(0);
     const Tensor rows = at::zeros({used, kFisherSums}, means.options().requires_grad(false));
-    fisher_sums(view, pass_clamp, splats, lists, image, data<float>(rows), stream);
+    fisher_sums(view, pass_clamp, splats, lists, image, data<float>(rows), ordered, stream);
     fisher_blocks(view, in.gaussians<float>(), in.settings(), int(used), splats, data<uint8_t>(saved[kFlags]),
                   data<float>(rows), data<double>(blocks.value()), stream);
   }

@@ -5,6 +5,7 @@
 #include "../blend.h"
 #include "../sh.h"
 #include "gather.h"
+#include "groups.h"
 #include "score_kernels.h"
 #include "splat.h"
 #include "warp_sums.h"
@@ -23,11 +24,13 @@ struct PixelState {
   int64_t at;
 };
 
-// kForFisher: rows of sums a splat; else totals of the Gaussians.
+// kForFisher: rows of sums a splat; else totals of the Gaussians. `pair_sums`, if given, takes each warp's part instead,
+// of all sums of a row or of the one score.
 template <bool kForFisher>
 __global__ void __launch_bounds__(kThreads)
     sensitivity_kernel(View<float> view, Splats splats, TileLists lists, Image image, float clamp_limit, float* rows,
-                       const __grid_constant__ Scores<float> scores, const __grid_constant__ Totals totals) {
+                       const __grid_constant__ Scores<float> scores, const __grid_constant__ Totals totals,
+                       float* pair_sums) {
   constexpr int kLights = kForFisher ? 3 : 1;  // channels apart, or their sum
   __shared__ float4 shape[2][kThreads];
   __shared__ float blue[kThreads];
@@ -128,14 +131,22 @@ __global__ void __launch_bounds__(kThreads)
         if (!any_touched) continue;
         if constexpr (kForFisher) {
           const float total = spread_sums<kFisherSums>(sums);
-          if (column >= 0) atomicAdd(rows + int64_t(target[k]) * kFisherSums + column, total);
+          if (column < 0) continue;
+          if (pair_sums != nullptr)
+            pair_sums[((int64_t(begin) + at) * kWarps + warp_index()) * kFisherSums + column] = total;
+          else
+            atomicAdd(rows + int64_t(target[k]) * kFisherSums + column, total);
         } else {
           const double opacity = exp_2(s1.y);
           for (int s = 0; s < scores.count; ++s) {
             const float* map = scores.of[s].weight;
             float total = map == nullptr ? sums[0] + sums[1] : sums[0] * map[pixel[0].at] + sums[1] * map[pixel[1].at];
             total = spread_sums<1>(&total);
-            if (lane_index() == 0 && total != 0.f) atomicAdd(totals.of[s] + target[k], opacity * opacity * total);
+            if (lane_index() != 0 || total == 0.f) continue;
+            if (pair_sums != nullptr)
+              pair_sums[(int64_t(begin) + at) * kWarps + warp_index()] = float(opacity * opacity * total);
+            else
+              atomicAdd(totals.of[s] + target[k], opacity * opacity * total);
           }
         }
       }
@@ -201,15 +212,42 @@ float clamp_limit(bool pass_clamp) { return pass_clamp ? 3e38f : float(kAlphaMax
 }  // namespace
 
 void square_derivatives(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
-                        const Image& image, const Scores<float>& scores, const Totals& totals, cudaStream_t stream) {
-  sensitivity_kernel<false><<<tiles_of(view), kThreads, 0, stream>>>(view, splats, lists, image,
-                                                                     clamp_limit(pass_clamp), nullptr, scores, totals);
+                        const Image& image, const Scores<float>& scores, const Totals& totals, const Ordered& ordered,
+                        cudaStream_t stream) {
+  if (ordered.pair_sums == nullptr) {
+    sensitivity_kernel<false><<<tiles_of(view), kThreads, 0, stream>>>(
+        view, splats, lists, image, clamp_limit(pass_clamp), nullptr, scores, totals, nullptr);
+    return;
+  }
+  for (int s = 0; s < scores.count; ++s) {
+    Scores<float> one;
+    one.of[one.count++] = scores.of[s];
+    cudaMemsetAsync(ordered.pair_sums, 0, size_t(ordered.pairs) * kWarps * sizeof(float), stream);
+    sensitivity_kernel<false><<<tiles_of(view), kThreads, 0, stream>>>(
+        view, splats, lists, image, clamp_limit(pass_clamp), nullptr, one, {}, ordered.pair_sums);
+    sum_groups<1, kWarps>(ordered.splats, ordered.pairs_of_splat, ordered.pair_sums,
+                          PutTotal{splats.tail, totals.of[s]}, stream);
+  }
 }
 
+namespace {
+struct PutFisher {
+  float* rows;
+  __device__ __forceinline__ void operator()(int64_t splat, int which, float total) const {
+    rows[splat * kFisherSums + which] += total;
+  }
+};
+}  // namespace
+
 void fisher_sums(const View<float>& view, bool pass_clamp, const Splats& splats, const TileLists& lists,
-                 const Image& image, float* rows, cudaStream_t stream) {
-  sensitivity_kernel<true>
-      <<<tiles_of(view), kThreads, 0, stream>>>(view, splats, lists, image, clamp_limit(pass_clamp), rows, {}, {});
+                 const Image& image, float* rows, const Ordered& ordered, cudaStream_t stream) {
+  static_assert(kFisherParts == kWarps);
+  if (ordered.pair_sums != nullptr)
+    cudaMemsetAsync(ordered.pair_sums, 0, size_t(ordered.pairs) * (kWarps * kFisherSums * sizeof(float)), stream);
+  sensitivity_kernel<true><<<tiles_of(view), kThreads, 0, stream>>>(
+      view, splats, lists, image, clamp_limit(pass_clamp), rows, {}, {}, ordered.pair_sums);
+  if (ordered.pair_sums != nullptr)
+    sum_groups<kFisherSums, kWarps>(ordered.splats, ordered.pairs_of_splat, ordered.pair_sums, PutFisher{rows}, stream);
 }
 
 void fisher_blocks(const View<float>& view, const Gaussians<float>& g, const Settings& settings, int count,

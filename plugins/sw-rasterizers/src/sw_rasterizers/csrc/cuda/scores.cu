@@ -1,8 +1,10 @@
 // Contribution sums: a block of 8 warps a tile, a warp a box of 8 x 4 pixels, front to back as in `blend`.
 //
-// A warp adds up each score over its 32 pixels and adds the sums to the Gaussian's totals, in float64: counts are exact
-// whatever the order, the rest varies in its last bits from run to run.
+// A warp adds up each score over its 32 pixels and adds the sums to the Gaussian's totals, in float64: counts and maxima
+// are exact whatever the order, the rest varies in its last bits from run to run. Where sums are to have one order, these
+// are formed one score a launch: a warp leaves its part at the pair, and those of a splat are added up in a second kernel.
 #include "../blend.h"
+#include "groups.h"
 #include "score_kernels.h"
 #include "splat.h"
 
@@ -41,7 +43,7 @@ __device__ __forceinline__ float pixel_value(const Score<float>& score, float co
 
 __global__ void __launch_bounds__(kThreads)
     score_kernel(View<float> view, Splats splats, TileLists lists, const __grid_constant__ Scores<float> scores,
-                 const __grid_constant__ Totals totals) {
+                 const __grid_constant__ Totals totals, float* pair_sums) {
   __shared__ float4 shape[2][kThreads];
   __shared__ int gaussian[kThreads];
   __shared__ unsigned words[kBoxes][kWords];  // bit i of word w: splat 32 w + i reaches the box
@@ -101,6 +103,10 @@ __global__ void __launch_bounds__(kThreads)
           if (lane_index() == s) mine = total;
         }
         if (lane_index() >= scores.count || mine == 0.f) continue;
+        if (pair_sums != nullptr) {  // of the one score
+          pair_sums[(int64_t(first) + k) * kScoreParts + box] = mine;
+          continue;
+        }
         double* to = totals.of[lane_index()] + gaussian[k];
         if (scores.of[lane_index()].kind != kBlendMax)
           atomicAdd(to, double(mine));
@@ -115,9 +121,27 @@ __global__ void __launch_bounds__(kThreads)
 }  // namespace
 
 void score_pixels(const View<float>& view, const Splats& splats, const TileLists& lists, const Scores<float>& scores,
-                  const Totals& totals, cudaStream_t stream) {
+                  const Totals& totals, const Ordered& ordered, cudaStream_t stream) {
+  static_assert(kScoreParts == kBoxes);
   const unsigned tiles = unsigned(view.tiles_x()) * unsigned(view.tiles_y());
-  score_kernel<<<tiles, kThreads, 0, stream>>>(view, splats, lists, scores, totals);
+  if (ordered.pair_sums == nullptr) {
+    score_kernel<<<tiles, kThreads, 0, stream>>>(view, splats, lists, scores, totals, nullptr);
+    return;
+  }
+  for (int s = 0; s < scores.count; ++s) {
+    Scores<float> one;
+    one.of[one.count++] = scores.of[s];
+    Totals to{};
+    to.of[0] = totals.of[s];
+    if (scores.of[s].kind == kBlendMax || (scores.of[s].kind == kHits && scores.of[s].weight == nullptr)) {
+      score_kernel<<<tiles, kThreads, 0, stream>>>(view, splats, lists, one, to, nullptr);
+      continue;
+    }
+    cudaMemsetAsync(ordered.pair_sums, 0, size_t(ordered.pairs) * kScoreParts * sizeof(float), stream);
+    score_kernel<<<tiles, kThreads, 0, stream>>>(view, splats, lists, one, to, ordered.pair_sums);
+    sum_groups<1, kScoreParts>(ordered.splats, ordered.pairs_of_splat, ordered.pair_sums,
+                               PutTotal{splats.tail, to.of[0]}, stream);
+  }
 }
 
 }  // namespace sw::cuda
