@@ -45,11 +45,12 @@ __device__ __forceinline__ void add(float* to, const Some<kWidth>& some) {
 #if __CUDA_ARCH__ >= 900
   if constexpr (kWidth == 4) {
     atomicAdd(reinterpret_cast<float4*>(to), make_float4(some.at[0], some.at[1], some.at[2], some.at[3]));
-    return;
-  }
+  } else
 #endif
+  {
 #pragma unroll
-  for (int i = 0; i < kWidth; ++i) atomicAdd(to + i, some.at[i]);
+    for (int i = 0; i < kWidth; ++i) atomicAdd(to + i, some.at[i]);
+  }
 }
 
 // Thread number -> what it takes: a site or run of sites, a pair, the first of its channels.
