@@ -110,7 +110,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Summary:
-    """Speed of one training, milliseconds of the GPU a step and loss of its last phase, peak in GB."""
+    """Outcome of one training: speed, milliseconds of the GPU a step and loss of its last phase, peak in GB."""
 
     method: str
     rate: float
