@@ -14,13 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import SceneError
-from sw_anchors.anchors import linear_layers, two_layers
+from sw_anchors.anchors import linear_layers
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.forecasts import AnchorContext, AnchorForecast
 from sw_anchors.lattice import TOP
 from sw_anchors.predicted_steps import predicted_steps
 from sw_anchors.shape import AnchorShape
 from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
+from sw_codecs.context.two_layers import two_layers
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
