@@ -282,6 +282,8 @@ ROWS = [
     Row("config 3dgs --only xyzzy", "no key of 3dgs holds 'xyzzy'"),
     Row("compare", "Missing argument"),
     Row("compare {run}", "--published"),
+    Row("compare {grey.swz} {new}", "there is no such file"),
+    Row("compare {grey.swz} {grey.swz} --cameras {notes.txt}", "not a JSON file of cameras"),
     Row("compare {hollow} --published", "hollow"),
     # Sweeps; more of them in the tests of sw-bench.
     Row("bench {nowhere}.toml", "cannot read the plan {nowhere}.toml: No such file"),

@@ -155,7 +155,7 @@ def test_refining_brings_the_pictures_nearer(cameras: list[Camera]):
         for camera in cameras[::3]:
             ours = RASTERIZER.render(baked.gaussians(camera, RASTERIZER), camera, OPTIONS).image
             wanted = RASTERIZER.render(model.gaussians(camera, RASTERIZER), camera, OPTIONS).image
-            total += float(((ours - wanted) ** 2).mean())
+            total += ((ours - wanted) ** 2).mean().item()
         return total
 
     before, means = error(), baked.means.detach().clone()

@@ -31,7 +31,7 @@ MODULES = {
     "training.scheduler": "build_schedulers",
     "training.params": "SceneParams",
     "coding.container": "decoded_limit",
-    "evaluation.evaluate": "png_names render_view save_png",
+    "evaluation.evaluate": "png_names render_options render_view save_png suggested_rasterizers",
     "evaluation.metrics": "MetricInfo short_reason",
     "errors": "RunLockedError",
     "rendering.negotiation": "NegotiatedRasterizer",

@@ -30,8 +30,10 @@ from splatwizard_core.cli.setup import takes_choices as takes_choices
 from splatwizard_core.coding.container import decoded_limit as decoded_limit
 from splatwizard_core.errors import RunLockedError as RunLockedError
 from splatwizard_core.evaluation.evaluate import png_names as png_names
+from splatwizard_core.evaluation.evaluate import render_options as render_options
 from splatwizard_core.evaluation.evaluate import render_view as render_view
 from splatwizard_core.evaluation.evaluate import save_png as save_png
+from splatwizard_core.evaluation.evaluate import suggested_rasterizers as suggested_rasterizers
 from splatwizard_core.evaluation.metrics import MetricInfo as MetricInfo
 from splatwizard_core.evaluation.metrics import short_reason as short_reason
 from splatwizard_core.plugins.check import Check as Check

@@ -1,30 +1,73 @@
-"""`sw compare`: what was measured, beside what was published."""
+"""`sw compare`: two files of any format beside each other, or what was measured beside what was published."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from splatwizard_core.tooling import debug_option, json_option, options, print_facts
+from splatwizard_core.tooling import (
+    EXISTING,
+    Choices,
+    debug_option,
+    device_option,
+    images_option,
+    json_option,
+    options,
+    print_facts,
+    scene_option,
+    set_option,
+    takes_choices,
+)
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import Camera, View
+    from sw_report.compared_models import OpenedFile
+
+GENERATED, SIZE = 12, (512, 512)
+"""Number and size of the pictures where neither a scene nor cameras are given."""
 
 
-@click.command(short_help="a run beside published figures")
-@click.argument("folders", metavar="RUN...", nargs=-1, required=True, type=click.Path())
+@click.command(short_help="two files; a run beside published figures")
+@click.argument("paths", metavar="A B | RUN...", nargs=-1, required=True, type=click.Path())
 @options(
-    click.option("--published", is_flag=True, help="Compare with published figures of the same data set and scene."),
+    scene_option, images_option, set_option,
+    click.option(
+        "--cameras", type=EXISTING, metavar="FILE",
+        help="JSON of the cameras to draw from (README of sw-render).  [default: the scene's test views; without a "
+        "scene 12 cameras around the Gaussians]",
+    ),
+    click.option("--published", is_flag=True, help="Compare runs with published figures of their data set and scene."),
     click.option("--own", is_flag=True, help="Published figures of the measured methods alone."),
-    json_option, debug_option,
+    device_option, json_option, debug_option,
 )  # fmt: skip
-def compare(folders: tuple[str, ...], published: bool, own: bool, as_json: bool) -> None:
-    """Compare every run under RUN... with published figures, scene by scene, and means over whole data sets.
+@takes_choices
+def compare(
+    paths: tuple[str, ...], cameras: Path | None, published: bool, own: bool, as_json: bool, chosen: Choices
+) -> None:
+    """Compare two files of any format or method, or run directories: bytes, attributes, and what they show.
 
-    Each figure is told with its source and year, and with what differs between its protocol and the run's. Figures that
-    were not re-read at their source are marked.
+    Errors of attributes are those of B, of explicit Gaussians; rows are matched in order, or each with the nearest that
+    is most alike where the order differs. The PSNR is that of B's pictures against A's, as each file asks to be drawn;
+    on a scene (--scene, or that of a run directory) also of both against the test pictures.
+
+    With --published every run under RUN... is put beside published figures, scene by scene, and means over whole data
+    sets. Each figure is told with its source and year, and with what differs between its protocol and the run's.
+    Figures that were not re-read at their source are marked.
     """
-    if not published:
-        raise click.UsageError("say what to compare with: --published takes the published figures")
+    if published:
+        _beside_published(paths, own, as_json)
+        return
+    if len(paths) != 2:
+        raise click.UsageError("give two files (or run directories) A and B, or --published with any number of runs")
+    if own:
+        raise click.UsageError("--own is for --published")
+    print_facts(_compared(Path(paths[0]), Path(paths[1]), cameras, chosen), as_json, _tell)
+
+
+def _beside_published(folders: tuple[str, ...], own: bool, as_json: bool) -> None:
     from sw_report.beside_tables import beside_tables, to_dict
     from sw_report.printed import print_tables
     from sw_report.runs import collect
@@ -36,3 +79,85 @@ def compare(folders: tuple[str, ...], published: bool, own: bool, as_json: bool)
         print_tables([(table.title, table.drawn()) for table in tables], facts["notes"])
 
     print_facts({"tables": [to_dict(table) for table in tables], "notes": collection.notes}, as_json, told)
+
+
+def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> dict[str, Any]:
+    import torch
+
+    from splatwizard_core.api import GaussianModel, UserInputError
+    from splatwizard_core.tooling import load_plugins, open_session
+    from sw_report.attribute_errors import attribute_errors
+    from sw_report.compared_models import compare_pictures, open_file
+
+    for path in (a, b):
+        if not path.exists():
+            raise UserInputError(f"{path}: there is no such file or folder")
+    config = next((path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()), None)
+    if config is not None:
+        chosen = replace(chosen, config_file=str(config))
+    resolved = chosen.resolve_without_method()
+    session = open_session(resolved, load_plugins())
+    scene = session.scene(resolved) if chosen.scene is not None or config is not None else None
+    background = torch.zeros(3) if scene is None else scene.background
+    left, right = (open_file(path, session, resolved, background) for path in (a, b))
+    test = [] if scene is None or camera_file is not None else scene.test
+    places = [view.camera for view in test] or _places(camera_file, left, right)
+    seen_from = f"test views of {scene.name}" if scene is not None and test else "around the Gaussians"
+    seen_from = seen_from if camera_file is None else str(camera_file)
+    errors = None
+    explicit = isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel)
+    if isinstance(left.model, GaussianModel) and isinstance(right.model, GaussianModel):
+        errors = attribute_errors(left.model, right.model)
+    reason = None if errors else "no finite Gaussians" if explicit else "the Gaussians depend on the camera"
+    return {
+        "a": left.facts(),
+        "b": right.facts(),
+        "attributes": errors and errors.as_dict(),
+        "no_attributes": reason,
+        "cameras": seen_from,
+        "psnr": compare_pictures(left, right, places, _with_pictures(test)),
+    }
+
+
+def _places(camera_file: Path | None, left: OpenedFile, right: OpenedFile) -> list[Camera]:
+    """Cameras of a file, or around the Gaussians of whichever model is explicit."""
+    from sw_gaussians.camera_files import read_cameras
+    from sw_gaussians.camera_paths import around
+
+    from splatwizard_core.api import GaussianModel, UserInputError
+
+    if camera_file is not None:
+        return read_cameras(camera_file).cameras
+    for model in (left.model, right.model):
+        if isinstance(model, GaussianModel):
+            return around(model.means, model.opacities, GENERATED, SIZE)
+    raise UserInputError("the Gaussians of both depend on the camera: give --scene SCENE or --cameras FILE")
+
+
+def _with_pictures(views: list[View]) -> list[View] | None:
+    return views if views and all(view.load is not None for view in views) else None
+
+
+def _tell(facts: dict[str, Any]) -> None:
+    from splatwizard_core.tooling import print_table
+
+    a, b, psnr, attributes = facts["a"], facts["b"], facts["psnr"], facts["attributes"]
+    rows = [["file", a["file"], b["file"]], ["format or method", a["kind"], b["kind"]]]
+    rows.append(["bytes", f"{a['bytes']:,}", f"{b['bytes']:,} ({b['bytes'] / max(a['bytes'], 1):.3g} x)"])
+    for name in sorted({*a["counts"], *b["counts"]}):
+        rows.append([name.removeprefix("num_"), *(f"{each['counts'].get(name, 0):,}" for each in (a, b))])
+    if "a_to_pictures" in psnr:
+        rows.append(["PSNR, dB", f"{psnr['a_to_pictures']:.2f}", f"{psnr['b_to_pictures']:.2f}"])
+    print_table(["", "A", "B"], rows)
+    seen = f"{psnr['views']} cameras ({facts['cameras']})"
+    click.echo(f"B against A: {psnr['mean']:.2f} dB, at least {psnr['least']:.2f} dB, from {seen}")
+    if attributes is None:
+        click.echo(f"no errors of attributes: {facts['no_attributes']}")
+        return
+    errors = [[name, f"{e['rms']:.3g}", f"{e['max']:.3g}"] for name, e in attributes["errors"].items()]
+    how = "in order" if attributes["matched"] == "in order" else "with the nearest that is most alike"
+    click.echo(f"errors of {attributes['rows']:,} Gaussians, matched {how}:")
+    print_table(["", "RMS", "largest"], errors, right=2)
+    if attributes["unpaired"] or any(attributes["left_out"]):
+        left_out = " and ".join(f"{n:,}" for n in attributes["left_out"])
+        click.echo(f"of B {100 * attributes['unpaired']:.1f} % are nobody's partner; not finite: {left_out}")

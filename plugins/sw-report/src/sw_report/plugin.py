@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 @hookimpl
 def register_commands(registry: Registry) -> None:
     registry.add("report", "sw_report.command:report", position=4.7, summary="tables, curves, BD-rates, one HTML page")
-    registry.add("compare", "sw_report.compare:compare", position=4.8, summary="a run beside published figures")
+    registry.add(
+        "compare", "sw_report.compare:compare", position=4.8, summary="two files; a run beside published figures"
+    )
 
 
 @hookimpl

@@ -1,0 +1,103 @@
+"""Two models of any files, drawn from the same cameras: how much what they show differs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from torch import Tensor
+
+from splatwizard_core.api import Camera, GaussianModel, RasterOptions, SplatModel, UserInputError, track
+from splatwizard_core.tooling import (
+    NegotiatedRasterizer,
+    ResolvedConfig,
+    Session,
+    open_model,
+    render_options,
+    render_view,
+    suggested_rasterizers,
+)
+
+if TYPE_CHECKING:
+    from splatwizard_core.api import View
+
+MOST_PSNR = 100.0
+"""Told of pictures that are equal, dB: that of an error of 1e-5."""
+
+
+@dataclass(frozen=True)
+class OpenedFile:
+    """A model of a file, and what draws it as the file asks."""
+
+    path: Path
+    kind: str
+    model: SplatModel
+    rasterizer: NegotiatedRasterizer
+    options: RasterOptions
+
+    def picture(self, camera: Camera) -> Tensor:
+        """[3,H,W] in 0 .. 1."""
+        found = render_view(self.model, camera.to(self.model.device), self.rasterizer, self.options)
+        return found.image.clamp(0, 1)
+
+    def facts(self) -> dict[str, Any]:
+        """Name, format or method, bytes and counts."""
+        degree = self.model.active_sh_degree if isinstance(self.model, GaussianModel) else None
+        return {
+            "file": str(self.path), "kind": self.kind, "bytes": self.path.stat().st_size,
+            "counts": self.model.counts(), "sh_degree": degree,
+        }  # fmt: skip
+
+
+def open_file(path: Path, session: Session, resolved: ResolvedConfig, background: Tensor) -> OpenedFile:
+    """Open a file of any format or method, or the file of a run directory. Raises UserInputError, BitstreamError."""
+    if path.is_dir():
+        path = path / "scene.swz"
+        if not path.is_file():
+            raise UserInputError(f"{path.parent} is no finished run directory, it has no scene.swz: name a file")
+    plugins = session.plugins
+    importer = plugins.importers.of_suffix(path)
+    if importer is not None:
+        gaussians = plugins.read_gaussians(path)
+        model: SplatModel = gaussians.to(session.device).eval().requires_grad_(False)
+        kind, raster = importer, dict(gaussians.origin.get("raster", {}))
+    else:
+        model, reader = open_model(path, plugins, session.device)
+        kind, raster = reader.method, reader.raster
+    model.check_finite()
+    model.prepare()
+    rasterizer = session.rasterizer(resolved, suggested_rasterizers(raster))
+    return OpenedFile(path, kind, model, rasterizer, render_options(raster, background.to(session.device)))
+
+
+def compare_pictures(a: OpenedFile, b: OpenedFile, cameras: list[Camera], views: list[View] | None) -> dict[str, Any]:
+    """PSNR of B against A, mean and least over the cameras, dB; with `views` also of each against its pictures.
+
+    views   whose cameras they are, with pictures, or None
+    """
+    between, to_truth = [], ([], [])  # type: tuple[list[float], tuple[list[float], list[float]]]
+    with track("compare", total=len(cameras), unit="views") as bar:
+        for i, camera in enumerate(cameras):
+            pictures = a.picture(camera), b.picture(camera)
+            between.append(psnr(*pictures))
+            if views is not None:
+                truth = views[i].image(a.options.background, a.model.device)
+                for values, picture in zip(to_truth, pictures, strict=True):
+                    values.append(psnr(picture, truth))
+            bar.advance()
+    found: dict[str, Any] = {"views": len(cameras), "mean": _mean(between), "least": min(between)}
+    if views is not None:
+        found |= {"a_to_pictures": _mean(to_truth[0]), "b_to_pictures": _mean(to_truth[1])}
+    return found
+
+
+def psnr(a: Tensor, b: Tensor) -> float:
+    """PSNR of two pictures in 0 .. 1, dB, at most MOST_PSNR."""
+    error = float(((a - b) ** 2).mean())
+    return min(MOST_PSNR, -10 * math.log10(error)) if error > 0 else MOST_PSNR
+
+
+def _mean(values: list[float]) -> float:
+    return sum(values) / len(values)

@@ -1,0 +1,158 @@
+"""`sw compare A B`: errors that are put into a file are found again, whatever order and format it is in."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from sw_gaussians.ply import export_ply, load_ply
+from sw_report.attribute_errors import attribute_errors
+
+from splatwizard_core.api import GaussianModel, rgb_to_dc
+from splatwizard_core.cli.main import main
+
+GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
+
+
+def model_of(n: int = 200, degree: int = 1, seed: int = 0) -> GaussianModel:
+    g = torch.Generator().manual_seed(seed)
+    return GaussianModel.from_tensors(
+        torch.randn(n, 3, generator=g), 0.4 * torch.randn(n, 1, 3, generator=g),
+        0.1 * torch.randn(n, (degree + 1) ** 2 - 1, 3, generator=g), torch.randn(n, generator=g),
+        0.3 * torch.randn(n, 3, generator=g) - 2.5, torch.randn(n, 4, generator=g),
+    )  # fmt: skip
+
+
+def changed(model: GaussianModel, rows: torch.Tensor | None = None, **by: torch.Tensor | float) -> GaussianModel:
+    """The model with values added to attributes, and its rows in another order."""
+    values = {name: getattr(model, name).detach() + by.get(name, 0.0) for name in model.RAW}
+    return GaussianModel.from_tensors(*(value if rows is None else value[rows] for value in values.values()))
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> dict[str, Any]:
+    assert main(["compare", *map(str, arguments), "--json"]) == 0
+    facts: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return facts
+
+
+def test_known_errors_are_measured():
+    a = model_of()
+    b = changed(a, means=torch.tensor([3e-3, 0.0, 4e-3]), log_scales=-0.01, sh_dc=float(rgb_to_dc(torch.tensor(0.52))),
+                sh_rest=0.03)  # fmt: skip
+    found = attribute_errors(a, b)
+    assert found is not None
+    assert (found.matched, found.rows, found.unpaired, found.left_out) == ("in order", 200, 0, (0, 0))
+    errors = found.errors
+    assert errors["position"].rms == pytest.approx(5e-3, rel=1e-3)
+    assert errors["log_scale"].max == pytest.approx(0.01, rel=1e-3)
+    assert errors["covariance"].rms == pytest.approx(1 - np.exp(-0.02), rel=1e-3)
+    assert errors["color"].rms == pytest.approx(0.02, rel=1e-3)
+    assert errors["sh"].rms == pytest.approx(0.03 * np.sqrt(3 / 15), rel=1e-3)  # of 15 coefficients 3 are there
+    assert errors["opacity"].max < 1e-6
+
+
+def test_another_order_and_equal_rotations_make_no_error():
+    a = model_of()
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(5))
+    b = changed(a, order)
+    with torch.no_grad():
+        b.quats.mul_(-2)  # the same rotations
+    found = attribute_errors(a, b)
+    assert found is not None
+    assert (found.matched, found.unpaired) == ("nearest", 0)
+    assert max(error.max for error in found.errors.values()) < 1e-5
+    # Of two at nearly one place the alike one is the partner, not the nearest.
+    twins = changed(a, torch.cat([torch.arange(200), torch.arange(200)]))
+    with torch.no_grad():
+        twins.means[200:] += 1e-5
+        twins.sh_dc[200:] += 1.0
+    found = attribute_errors(changed(a, means=1e-5), twins)
+    assert found is not None
+    assert found.errors["color"].max < 1e-5
+    assert found.unpaired == 0.5
+
+
+def test_what_is_not_finite_is_left_out_and_surfels_are_flat():
+    a, b = model_of(), model_of()
+    with torch.no_grad():
+        b.means[3] = torch.nan
+    found = attribute_errors(a, b)
+    assert found is not None
+    assert (found.rows, found.left_out) == (200, (0, 1))
+    with torch.no_grad():
+        b.means.fill_(torch.nan)
+    assert attribute_errors(a, b) is None
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("files")
+    a = model_of(60)
+    export_ply(a, folder / "a.ply")
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(5))
+    export_ply(changed(a, order, sh_dc=0.1), folder / "b.ply")
+    return folder
+
+
+def test_two_files_without_a_scene_are_seen_from_all_sides(capsys, monkeypatch, folder: Path):
+    monkeypatch.setattr("sw_report.compare.SIZE", (48, 32))
+    same = run(capsys, folder / "a.ply", folder / "a.ply")
+    assert same["psnr"] == {"views": 12, "mean": 100, "least": 100}
+    facts = run(capsys, folder / "a.ply", folder / "b.ply")
+    assert facts["b"] == {"file": str(folder / "b.ply"), "kind": "ply", "bytes": (folder / "b.ply").stat().st_size,
+                          "counts": {"num_gaussians": 60}, "sh_degree": 1}  # fmt: skip
+    assert 20 < facts["psnr"]["least"] <= facts["psnr"]["mean"] < 60
+    assert facts["attributes"]["errors"]["color"]["rms"] == pytest.approx(0.1 * 0.2820948, rel=1e-4)
+    assert facts["attributes"]["errors"]["position"]["max"] < 1e-6
+    assert main(["compare", str(folder / "a.ply"), str(folder / "b.ply")]) == 0
+    told = capsys.readouterr().out
+    assert "matched with the nearest that is most alike" in told
+    assert f"{facts['psnr']['mean']:.2f} dB" in told
+
+
+def test_on_a_scene_both_stand_beside_the_pictures(capsys, folder: Path):
+    facts = run(capsys, folder / "a.ply", folder / "b.ply", "--scene", "demo:tiny")
+    assert facts["psnr"]["views"] == 2
+    assert {"a_to_pictures", "b_to_pictures"} <= set(facts["psnr"])
+    assert facts["psnr"]["a_to_pictures"] < facts["psnr"]["mean"]
+
+
+def test_models_without_attributes_are_seen_by_given_cameras(tmp_path: Path, capsys, folder: Path):
+    anchors = GOLDEN / "hac_exact_v2.swz"
+    assert main(["compare", str(anchors), str(anchors)]) == 2
+    assert "give --scene SCENE or --cameras FILE" in capsys.readouterr().err
+    entry = {"width": 32, "height": 24, "fx": 30, "fy": 30, "position": [0, -3, 0.5],
+             "rotation": [[1, 0, 0], [0, 0, 1], [0, -1, 0]]}  # fmt: skip
+    (tmp_path / "c.json").write_text(json.dumps([entry]))
+    facts = run(capsys, anchors, folder / "a.ply", "--cameras", tmp_path / "c.json")
+    assert facts["attributes"] is None
+    assert facts["no_attributes"] == "the Gaussians depend on the camera"
+    assert facts["psnr"]["views"] == 1
+
+
+def test_a_run_directory_brings_its_scene(tmp_path: Path, capsys, folder: Path):
+    (tmp_path / "config.toml").write_text('method = "3dgs"\nscene = "demo:tiny"\niterations = 3\n')
+    arguments = ["encode", str(folder / "a.ply"), "--method", "3dgs", "--rate", "r6", "--out"]
+    assert main([*arguments, str(tmp_path / "scene.swz")]) == 0
+    capsys.readouterr()
+    facts = run(capsys, tmp_path, folder / "a.ply")
+    assert facts["cameras"] == "test views of demo-tiny"
+    assert facts["psnr"]["mean"] == 100
+    assert facts["a"]["kind"] == "3dgs"
+    assert load_ply(folder / "a.ply").num_rows == facts["attributes"]["rows"]
+
+
+@pytest.mark.parametrize(("arguments", "told"), [
+    (["{}/a.ply"], "give two files"), (["{}/a.ply", "{}/b.ply", "{}/a.ply"], "give two files"),
+    (["{}/a.ply", "{}/none.ply"], "there is no such file"), (["{}/a.ply", "{}/b.ply", "--own"], "--own is for"),
+    (["{}/a.ply", "{}"], "has no scene.swz"), (["{}/a.ply", "{}/b.ply", "--cameras", "{}/a.ply"], "not a JSON file"),
+])  # fmt: skip
+def test_wrong_input_is_told_in_a_line(capsys, folder: Path, arguments: list[str], told: str):
+    assert main(["compare", *(argument.format(folder) for argument in arguments)]) == 2
+    said = capsys.readouterr()
+    assert told in " ".join(said.err.split())
+    assert "Traceback" not in said.err
