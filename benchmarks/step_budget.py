@@ -1,4 +1,4 @@
-"""Where a training step of 3DGS goes on a GPU: phases of the device, gaps in which it waits for the host, and variants.
+"""Budget of a training step of 3DGS on a GPU: phases of the device, gaps in which it waits for the host, and variants.
 
     python benchmarks/step_budget.py [--sizes 2000@64x48,250000@799x532,1000000@799x532] [--steps 120]
 
@@ -88,7 +88,7 @@ def scene_of(n: int, width: int, height: int, device: str) -> tuple[GaussianMode
 
 
 def setting(variant: str) -> AbstractContextManager[None]:
-    """What a variant's steps run in."""
+    """Return the block that a variant's steps run in."""
     return seeded(0, deterministic=variant == "deterministic")
 
 

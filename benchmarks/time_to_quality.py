@@ -5,7 +5,8 @@
 
 A scene is FOLDER[:PICTURES]. Seconds are those of the training loop: statistics, sorting, resizing and spectra count,
 reading pictures, evaluation and checkpoints do not. PSNR and SSIM are means over the held-out views, peak MiB that of
-torch's allocator on a GPU, else of the process. Several seeds are given as mean and half the spread.
+torch's allocator on a GPU, else of the process. FILE also has `cpu_seconds`, of all threads: on a CPU that is shared
+they tell more. Several seeds are given as mean and half the spread.
 
 --parts     also `fast` with each of its parts left out
 --also      a further variant, NAME=PRESET,KEY=VALUE,KEY=VALUE
@@ -23,6 +24,7 @@ import multiprocessing
 import statistics
 import sys
 import tempfile
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, field, replace
@@ -113,6 +115,7 @@ def trained(job: Job) -> dict[str, Any]:
         )  # fmt: skip
         return {name: metric.mean for name, metric in found.metrics.items() if metric.mean is not None}
 
+    began = time.process_time()
     with tempfile.TemporaryDirectory() as folder_of_log:
         log = Path(folder_of_log, "log.jsonl")
         outcome = TrainingRun(
@@ -125,6 +128,7 @@ def trained(job: Job) -> dict[str, Any]:
     return {
         "steps": outcome.steps,
         "seconds": outcome.train_s,
+        "cpu_seconds": time.process_time() - began,
         **measure(outcome.model),
         "gaussians": outcome.model.num_rows,
         "peak_mib": outcome.peak_memory / MIB,

@@ -14,7 +14,7 @@ goes into which part, forward and backward together (a backward operator counts 
 and kernels launched; and how often the host waits for the GPU (on a CPU: operators that would make it wait). The
 profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that wait (CUDA only).
 --graphs on,off trains twice, with the decoding as CUDA graphs and without, and prints both with the loss at the end.
---fused off,on trains twice, without and with the kernels for rows of anchors, bits of planes and lookups in triplanes.
+--fused off,on trains twice, without and with the kernels for rows and networks of anchors, bits and lookups of planes.
 Rows at the end compare the last phase of all trainings, and on a GPU the peak of their memory with that of HAC.
 
 3DGS beside: the Gaussians that all anchors spawn for one view, thinned at random until views draw as many on average
@@ -43,7 +43,7 @@ os.environ.setdefault("TEARDOWN_CUPTI", "0")
 
 import torch
 from step_parts import SECTION, kernel_times, longest_kernels, report
-from sw_anchors import fused_ops
+from sw_anchors import fused_ops, view_networks
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc
@@ -135,6 +135,7 @@ def kernels_off() -> Iterator[None]:
     with ExitStack() as stack:
         for module in (fused_ops, spatial_ar, triplane):
             stack.enter_context(mock.patch.object(module, "fit_kernels", return_value=False))
+        stack.enter_context(mock.patch.object(view_networks, "fit_kernel", return_value=False))
         yield
 
 

@@ -115,10 +115,11 @@ def test_two_deterministic_trainings_give_the_same_bits(values):
             assert torch.equal(moment, other_states[name].tensors[key]), (name, key)
 
 
-@pytest.mark.parametrize("values", [DENSE, {**DENSE, "sh_interval": 5}, CHAIN], ids=["dense", "bands", "mcmc"])
+@pytest.mark.parametrize("values", [DENSE, CHAIN], ids=["dense", "mcmc"])
 def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeypatch):
     """Adam makes a step of a tiny gradient as large as of any: what rounding moves is bounded by the learning rate."""
-    config, outcomes, fused = ThreeDGSConfig.model_validate(values), [], []
+    # The degree rises to 3 within the steps: every band is trained, and has been zero before.
+    config, outcomes, fused = ThreeDGSConfig.model_validate({**values, "sh_interval": 10}), [], []
     step = FusingOptimizer.step
 
     def spy(self, result=None):
@@ -137,6 +138,7 @@ def test_updates_in_the_backward_pass_are_those_of_the_optimizer(values, monkeyp
     plain, other = outcomes
     for name, parameter in plain.model.named_parameters():
         mine, theirs = parameter.detach(), dict(other.model.named_parameters())[name].detach()
+        assert float(mine.norm()) > 0
         assert float((mine - theirs).norm() / mine.norm()) < 1e-5, name
         assert plain.optimizer.states[name].step == other.optimizer.states[name].step == 50
     assert float(plain.model.sh_dc.detach().std()) > 0

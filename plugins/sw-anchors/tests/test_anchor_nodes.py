@@ -2,12 +2,13 @@
 
 import pytest
 import torch
-from sw_anchors.anchors import two_layers
 from sw_anchors.fixed_step import sample_capacity
 from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, widen
 from sw_anchors.neural_gaussians import spawn
 from sw_anchors.noisy_values import Noise, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
+
+from sw_codecs.context.two_layers import two_layers
 
 
 def written_out(center, positions, features, offsets, scales, masks, networks):

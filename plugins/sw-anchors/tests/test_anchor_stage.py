@@ -8,6 +8,7 @@ from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.params import AnchorGrowth, AnchorParams, CodedAnchorLearningRates, CodedAnchorParams
 from sw_anchors.stage import AnchorStage, CodedAnchorStage
+from sw_gaussians.resolution import ResolutionSampler
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
@@ -173,3 +174,14 @@ def test_only_anchors_with_a_lattice_are_trained():
 def test_a_rate_that_never_decays_is_constant():
     stage = CodedAnchorStage(CodedAnchorParams(lr=CodedAnchorLearningRates(max_steps=100)))
     assert stage.learning_rates(50)["mlp_cov"] == pytest.approx(0.004)
+
+
+def test_pictures_may_begin_small():
+    plain, small = AnchorParams(), AnchorParams(pictures={"schedule": "dash"})
+    scene = scene_of()
+    assert not isinstance(AnchorStage(plain).create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
+    sampler = AnchorStage(small).create_sampler(scene, stream(0, "sampler"))
+    assert isinstance(sampler, ResolutionSampler)
+    assert sampler.every == small.growth.interval
+    assert "pictures" not in plain.identity()
+    assert small.identity()["pictures"]["schedule"] == "dash"

@@ -297,8 +297,8 @@ def test_registry_entry_declares_what_the_class_offers():
     assert StandardRasterizer.info.speed > ReferenceRasterizer.info.speed
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_opacity_gradients_of_fragments_are_those_of_autograd_pixel_by_pixel(dtype):
+def test_opacity_gradients_of_fragments_are_those_of_autograd_pixel_by_pixel():
+    dtype = torch.float32
     g, camera = fragment_scene(dtype)
     truth = torch.rand(3, 32, 32, generator=torch.Generator().manual_seed(2)).to(dtype)
 

@@ -103,7 +103,7 @@ def test_every_key_of_3dgs_can_be_set_and_a_wrong_one_is_told():
     with pytest.raises(ConfigError, match=r"did you mean 'densify\.start'"):
         stage_of(base__densify__strat=3)
     with pytest.raises(ConfigError, match="preset"):
-        stage_of(base__preset="fast")
+        stage_of(base__preset="fastest")
 
 
 @pytest.mark.parametrize("name", [*SpeedySplat.PRESETS])
@@ -265,3 +265,9 @@ def test_a_soft_removal_leaves_no_gradient(counted):
     with torch.no_grad():
         post.exec(9000, with_result(task))
     assert all(parameter.grad is None for parameter in task.model.parameters())
+
+
+def test_the_fast_preset_of_3dgs_keeps_the_order_of_removals():
+    _, post = build_schedulers(stage_of(base__preset="fast"), PipelineParams())
+    names = [r.name for r in post.registrations]
+    assert names[-4:] == ["densify to budget", "soft prune", "halve opacity", "hard prune"]

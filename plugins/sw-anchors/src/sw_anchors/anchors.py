@@ -23,6 +23,7 @@ from splatwizard_core.api import (
 )
 from sw_anchors.neural_gaussians import GEOMETRY, spawn
 from sw_anchors.shape import AnchorShape
+from sw_codecs.context.two_layers import two_layers
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Rasterizer
@@ -310,21 +311,6 @@ class AnchorModel(AnchorSplats):
     def load_state_dict_extra(self, extra: dict[str, Any]) -> None:
         """Inverse of `state_dict_extra`."""
         self.voxel_size = float(extra["voxel_size"])
-
-
-def two_layers(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
-    """Network inputs -> hidden, ReLU -> outputs; all weights uniform within 1/sqrt(fan-in), as torch's default."""
-    # skip_init: torch's own initialisation would draw from the global generator.
-    layers: list[nn.Linear] = [
-        nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
-        for size in ((inputs, hidden), (hidden, outputs))
-    ]
-    for layer in layers:
-        bound = 1 / math.sqrt(layer.in_features)
-        for parameter in layer.parameters():
-            with torch.no_grad():
-                parameter.copy_(torch.rand(parameter.shape, generator=generator) * 2 * bound - bound)
-    return nn.Sequential(layers[0], nn.ReLU(), layers[1])
 
 
 def linear_layers(network: nn.Sequential) -> tuple[nn.Linear, nn.Linear]:

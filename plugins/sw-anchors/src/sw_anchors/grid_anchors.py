@@ -14,12 +14,14 @@ import torch
 from torch import Tensor, nn
 
 from splatwizard_core.api import SceneError
-from sw_anchors.anchors import linear_layers, two_layers
+from sw_anchors.anchors import linear_layers
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.forecasts import AnchorContext, AnchorForecast
 from sw_anchors.lattice import TOP
+from sw_anchors.predicted_steps import predicted_steps
 from sw_anchors.shape import AnchorShape
 from sw_codecs.context.hash_grid import GridPlaces, MixedHashGrid
+from sw_codecs.context.two_layers import two_layers
 
 if TYPE_CHECKING:
     from splatwizard_core.api import Scene
@@ -118,14 +120,14 @@ class GridAnchors(CodedAnchors):
     def forecast_at(self, parts: tuple[Tensor, ...]) -> AnchorForecast:
         features, bits = self._looked_up(parts)
         first, last = linear_layers(self.mlp_grid)
-        hidden = torch.relu(first(features))
         # All anchors have noise of their own steps; the rest of the last layer is for the sample.
         widths = self.shape.outputs[:6]
         count = sum(widths)
         sizes = [count, 3, len(last.bias) - count - 3]
         weights, biases = torch.split(last.weight, sizes), torch.split(last.bias, sizes)
-        steps = torch.tanh(torch.nn.functional.linear(hidden, weights[1], biases[1]))
-        steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
+        parameters = (first.weight, first.bias, weights[1], biases[1])
+        base = self.base_steps_like(features)
+        steps, hidden = predicted_steps(features, parameters, base, offset=1.0, smallest=SMALLEST_STEP)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None

@@ -11,14 +11,15 @@ ANCHORS = NativeModule(
         "kernels/binding.cpp",
         "kernels/binding_heads.cpp",
         "kernels/binding_values.cpp",
+        "kernels/binding_steps.cpp",
         "kernels/binding_cuda.cpp",
         "kernels/binding_rows.cpp",
         "kernels/binding_networks.cpp",
     ),
-    kernels=("kernels/spawn.cpp", "kernels/heads.cpp", "kernels/values.cpp"),
+    kernels=("kernels/spawn.cpp", "kernels/heads.cpp", "kernels/values.cpp", "kernels/steps.cpp"),
     headers=("kernels/*.h", "kernels/cuda/*.h"),
     cuda_sources=("kernels/cuda/spawn.cu", "kernels/cuda/rows.cu", "kernels/cuda/networks.cu"),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps sqrt and division out of vector code
-    seconds=15,
+    seconds=20,
     without="anchors are decoded by torch operations: the same numbers, slower",
 )

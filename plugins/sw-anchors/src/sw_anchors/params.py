@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import Field
 
@@ -64,6 +64,16 @@ class AnchorLoss(Params):
     volume: float = Field(0.01, ge=0, description="weight of the mean volume of a drawn Gaussian (product of scales)")
 
 
+class Pictures(Params):
+    """Sizes of the training pictures over time."""
+
+    schedule: Literal["none", "dash"] = Field(
+        "none", description="dash: begin with small pictures, whole ones from growth.stop on (DashGaussian)"
+    )
+    rounding: Literal["real", "floor"] = Field("real", description="scales: real: any; floor: whole ones, as published")
+    start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
+
+
 class AnchorParams(OptimizationParams):
     """Hyper-parameters of a method on anchors, to be subclassed."""
 
@@ -74,6 +84,14 @@ class AnchorParams(OptimizationParams):
     lr: AnchorLearningRates = Field(AnchorLearningRates(), description="step sizes")
     growth: AnchorGrowth = Field(AnchorGrowth(), description="growing and pruning of anchors")
     loss: AnchorLoss = Field(AnchorLoss(), description="distortion and regularisers")
+    pictures: Pictures = Field(Pictures(), description="sizes of the training pictures")
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
+        content = super().identity()
+        if self.pictures == Pictures():
+            del content["pictures"]
+        return content
 
 
 class CodedAnchorParams(AnchorParams):

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from sw_gaussians.learning_rate import exponential_lr
+from sw_gaussians.resolution import by_resolution
 
 from splatwizard_core.api import (
     LossPack,
@@ -29,9 +30,18 @@ from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
 if TYPE_CHECKING:
+    import torch
     from torch import Tensor
 
-    from splatwizard_core.api import OptimizationParams, PipelineParams, Scene, Scheduler, SplatModel, View
+    from splatwizard_core.api import (
+        CameraSampler,
+        OptimizationParams,
+        PipelineParams,
+        Scene,
+        Scheduler,
+        SplatModel,
+        View,
+    )
 
 
 class AnchorStage(Stage):
@@ -67,6 +77,19 @@ class AnchorStage(Stage):
         return model
 
     # Optimizer
+
+    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
+        sampler, pictures, growth = super().create_sampler(scene, generator), self.opt.pictures, self.opt.growth
+        if pictures.schedule == "none":
+            return sampler
+        return by_resolution(
+            sampler,
+            scene,
+            full_at=self.steps(growth.stop),
+            every=self.steps(growth.interval),
+            most=pictures.start,
+            rounding=pictures.rounding,
+        )
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:
         """Decay exponentially from `init` at step 0 to `final` at `max_steps` of the full run (None: lr.max_steps)."""

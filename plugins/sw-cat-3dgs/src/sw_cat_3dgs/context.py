@@ -15,6 +15,7 @@ import torch
 from sw_anchors.anchors import linear_layers
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, Triple, triple
 from sw_anchors.lattice import low_and_step
+from sw_anchors.predicted_steps import predicted_steps
 from sw_anchors.shape import AnchorShape
 from torch import Tensor, nn
 
@@ -22,6 +23,7 @@ from sw_codecs.context.channel_ar import ChannelAr
 from sw_codecs.context.principal_frame import PrincipalFrame
 from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.context.triplane import GAIN, PlaneSites, Triplane
+from sw_codecs.context.two_layers import two_layers
 from sw_codecs.quantizers.rounding import add_noise
 
 STEP_OFFSET = 1.1
@@ -68,7 +70,7 @@ class CatContext(nn.Module):
         super().__init__()
         self.shape = shape
         self.triplane = Triplane(0, shape.channels, shape.multiples)
-        self.network = _network(self.triplane.width, shape.hidden, sum(shape.outputs), generator)
+        self.network = two_layers(self.triplane.width, shape.hidden, sum(shape.outputs), generator, start="xavier")
         refined = {"scales": 6, "offsets": 3 * shape.offsets} if shape.refine else {}
         self.slices = ChannelAr(shape.slices, refined, hidden=shape.slice_hidden, generator=generator)
         self.arms = nn.ModuleList(SpatialAr(generator) for _ in range(PLANES))
@@ -164,11 +166,16 @@ class CatContext(nn.Module):
         All anchors have noise of their own steps; means and scales are computed for the sample alone.
         """
         first, last = linear_layers(self.network)
-        hidden = torch.relu(first(self.triplane.at_sites(sites, rounded=self.rounded)))
         widths = self.shape.outputs[:-1]
         weights = torch.split(last.weight, [sum(widths), PLANES])
         biases = torch.split(last.bias, [sum(widths), PLANES])
-        steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
+        if base_steps.is_cuda:  # where a product of the planes is cheaper than one of all features
+            hidden = torch.relu(self.triplane.projected(sites, first.weight, first.bias, rounded=self.rounded))
+            steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
+        else:
+            features = self.triplane.at_sites(sites, rounded=self.rounded)
+            parameters = (first.weight, first.bias, weights[1], biases[1])
+            steps, hidden = predicted_steps(features, parameters, base_steps, offset=STEP_OFFSET)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
@@ -208,17 +215,3 @@ class CatContext(nn.Module):
         values = [add_noise(GAIN * plane, plane.new_ones(()), noise(*plane.shape)) for plane in planes]
         total = SpatialAr.joint_bits(self.spatial_models, values)
         return total * (channels / count)
-
-
-def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator) -> nn.Sequential:
-    """inputs -> hidden, ReLU -> outputs; Xavier-uniform weights, no biases at first."""
-    layers: list[nn.Linear] = [
-        nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
-        for size in ((inputs, hidden), (hidden, outputs))
-    ]
-    for layer in layers:
-        bound = math.sqrt(6 / (layer.in_features + layer.out_features))
-        with torch.no_grad():
-            layer.weight.copy_(torch.rand(layer.weight.shape, generator=generator) * 2 * bound - bound)
-            layer.bias.zero_()
-    return nn.Sequential(layers[0], nn.ReLU(), layers[1])

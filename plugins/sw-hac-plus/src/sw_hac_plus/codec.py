@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING
 
 import torch
 from sw_anchors import grid_predictors, grid_sections
-from sw_anchors.anchors import two_layers
 from sw_anchors.attribute_sections import AttributeCoder, AttributeDecoder, AttributeEncoder, Block
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.header import read_integers
@@ -20,6 +19,7 @@ from sw_anchors.voxel_lattice import VoxelGeometry, add_voxels, kept_voxels, rea
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.context.channel_mixture import PARTS, ChannelMixture
+from sw_codecs.context.two_layers import two_layers
 from sw_hac_plus.predictors import PREDICTORS, Predictor
 
 if TYPE_CHECKING:

@@ -9,12 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import torch
-from sw_anchors.anchors import two_layers
 from sw_anchors.attribute_sections import AttributeDecoder, AttributeEncoder
 from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.grid_predictors import PREDICTORS
 from sw_anchors.grid_sections import SECTIONS, add_grid, add_header, read_grid, read_header, settled_copy, walk
 from sw_anchors.sections import add_geometry, add_networks, kept_geometry, read_geometry, read_networks
+
+from sw_codecs.context.two_layers import two_layers
 
 if TYPE_CHECKING:
     from sw_anchors.grid_anchors import GridAnchors

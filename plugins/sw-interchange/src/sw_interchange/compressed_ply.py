@@ -60,6 +60,10 @@ def read_compressed_ply(source: Source, limits: Limits, report: ReadReport) -> G
     tables = read_tables(source.data, header, ("chunk", "vertex", *(["sh"] if k else [])), name)
     bounds = _bounds(tables["chunk"])
     chunk = np.arange(count) >> 8
+    if any(tables["vertex"].dtype[each].str[1:] != "u4" for each in PACKED):
+        raise BitstreamError(
+            f"{name}: the packed properties of a compressed .ply are unsigned integers", section="vertex"
+        )
     words = [np.asarray(tables["vertex"][each]).astype(np.uint32) for each in PACKED]
     colour, alpha = _four_bytes(words[3])
     colours = _within(colour / np.float32(255), bounds[4][chunk], bounds[5][chunk])
@@ -88,8 +92,7 @@ def _bounds(chunks: Table) -> list[Array]:
 
 
 def _within(share: Array, low: Array, high: Array) -> Array:
-    with np.errstate(all="ignore"):  # bounds of strangers may be any number
-        return low * (1 - share) + high * share
+    return low * (1 - share) + high * share
 
 
 def _three(words: Words) -> Array:

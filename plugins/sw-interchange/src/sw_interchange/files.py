@@ -9,6 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from splatwizard_core.api import BitstreamError, SceneError, UserInputError, replacing
 from sw_interchange.frames import axes_of, in_frame
 from sw_interchange.known_formats import Format, detect, format_named, format_of_suffix
@@ -114,14 +116,15 @@ def _decoded(source: Source, name: str | None, limits: Limits, frame: str | None
     chosen = detect(source) if name is None else format_named(name)
     report = ReadReport(chosen.name, bytes=len(source.data))
     try:
-        scene = chosen.load("reader")(source, limits, report)
+        with np.errstate(all="ignore"):  # numbers of strangers overflow; `cleaned` sees what became of them
+            scene = chosen.load("reader")(source, limits, report)
         scene = cleaned(scene, report, strict=strict, name=source.name)
     except MemoryError as error:
         raise BitstreamError(f"{source.name}: there is not enough memory for it") from error
     report.stored_frame = scene.frame
     if scene.num_gaussians == 0 and chosen.name != "ply":
         raise SceneError(f"{source.name}: holds no Gaussian")
-    return scene if frame is None else in_frame(scene, frame)
+    return scene if frame is None else in_frame(scene, frame, in_place=True)
 
 
 def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tuple[list[bytes], WriteReport]:

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from splatwizard_core.api import UserInputError
 from sw_interchange.bands import COEFFICIENTS, Array
+from sw_interchange.threads import each_of, rows_of
 
 if TYPE_CHECKING:
     from sw_interchange.scene import GaussianScene
@@ -36,14 +37,17 @@ def axes_of(frame: str) -> Matrix:
     return columns
 
 
-def in_frame(scene: GaussianScene, frame: str) -> GaussianScene:
-    """The same scene, its numbers in the axes of `frame`. Raises UserInputError for no frame."""
+def in_frame(scene: GaussianScene, frame: str, *, in_place: bool = False) -> GaussianScene:
+    """The same scene, its numbers in the axes of `frame`. Raises UserInputError for no frame.
+
+    in_place    the arrays of `scene` may be changed, which saves copies
+    """
     if frame == scene.frame:
         return scene
     matrix = axes_of(frame).T @ axes_of(scene.frame)
     if np.count_nonzero(matrix - np.diag(np.diag(matrix))) == 0:
-        flipped_scene = flipped(scene, *(int(sign) for sign in np.diag(matrix)))
-        return replace(flipped_scene, frame=frame)
+        flip = flipped_in_place if in_place else flipped
+        return replace(flip(scene, *(int(sign) for sign in np.diag(matrix))), frame=frame)
     return replace(transformed(scene, matrix), frame=frame)
 
 
@@ -62,6 +66,21 @@ def flipped(scene: GaussianScene, sx: int, sy: int, sz: int) -> GaussianScene:
         quats=scene.quats * np.array([1, sy * sz, sx * sz, sx * sy], np.float32),
         sh_rest=scene.sh_rest * sh_signs(sx, sy, sz)[: scene.sh_rest.shape[1], None],
     )
+
+
+def flipped_in_place(scene: GaussianScene, sx: int, sy: int, sz: int) -> GaussianScene:
+    """Do as `flipped`, in the arrays of the scene."""
+    turned = np.flatnonzero(sh_signs(sx, sy, sz)[: scene.sh_rest.shape[1]] < 0)
+
+    def some(rows: slice) -> None:
+        scene.means[rows] *= np.array([sx, sy, sz], np.float32)
+        scene.quats[rows] *= np.array([1, sy * sz, sx * sz, sx * sy], np.float32)
+        for k in turned:
+            part = scene.sh_rest[rows, k]
+            np.negative(part, out=part)
+
+    each_of(some, rows_of(scene.num_gaussians))
+    return scene
 
 
 def transformed(

@@ -146,8 +146,8 @@ class GaussianScene:
         """The highest band, 0..4."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
 
-    def select(self, rows: npt.NDArray[Any]) -> GaussianScene:
-        """The Gaussians of an index or mask [N], in that order."""
+    def select(self, rows: npt.NDArray[Any] | slice) -> GaussianScene:
+        """The Gaussians of an index or mask [N], in that order; views of those of a slice."""
         names = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
         return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
@@ -178,14 +178,17 @@ def cleaned(scene: GaussianScene, report: ReadReport, *, strict: bool, name: str
 
     strict  raise BitstreamError instead of dropping rows
     """
-    with np.errstate(all="ignore"):
-        sums = scene.means.sum(1) + scene.quats.sum(1) + scene.sh_dc.sum(1)
-        sound = np.isfinite(sums) | (
-            np.isfinite(scene.means).all(1) & np.isfinite(scene.quats).all(1) & np.isfinite(scene.sh_dc).all(1)
-        )
-        if scene.sh_rest.size:
-            flat = scene.sh_rest.reshape(len(sound), -1)
-            sound &= np.isfinite(flat.sum(1)) | np.isfinite(flat).all(1)
+    sound = np.ones(scene.num_gaussians, bool)
+    for values in (
+        scene.means,
+        scene.quats,
+        scene.sh_dc,
+        scene.sh_rest.reshape(len(sound), 3 * scene.sh_rest.shape[1]),
+    ):
+        with np.errstate(all="ignore"):
+            total = values.sum()  # one that is no number makes the sum none
+        if not np.isfinite(total):
+            sound &= np.isfinite(values).all(1)
     sound &= ~np.isnan(scene.opacity_logits)
     sound &= ~(np.isnan(scene.log_scales) | (scene.log_scales == np.inf)).any(1)
     if not sound.all():

@@ -33,7 +33,7 @@ class SpzOptions(Options):
     version         3 is read most widely, 4 is smaller and quicker; 2 has coarse rotations
     fractional_bits of a coordinate; less where the scene is larger than 2^(23 - bits)
     sh1_bits, sh_bits  of a coefficient of band 1, of the others
-    level           of the compressor; None: 6 of gzip, 3 of zstd
+    level           of the compressor; None: 3
     frame           "RUB", or "raw": the numbers as they are in a .ply
     antialiased     None: as the scene says
     """
@@ -178,14 +178,13 @@ def write_spz(scene: GaussianScene, options: SpzOptions, report: WriteReport) ->
     if scene.sh_degree > 3 and options.version < 4:
         report.lost.append("SH degree 4: version 4 holds it")
         scene = scene.with_degree(3)
-    stored = scene if options.frame == "raw" else scene.in_frame("RUB")
-    bits = _fractional_bits(stored, options, report)
-    planes = encode_fields(stored, options, bits, report)
+    bits = _fractional_bits(scene, options, report)
+    planes = encode_fields(scene, options, bits, report)
     antialiased = scene.antialiased if options.antialiased is None else options.antialiased
     flags = ANTIALIASED if antialiased else 0
     head = MAGIC + struct.pack("<IIBBB", options.version, scene.num_gaussians, scene.sh_degree, bits, flags)
     if options.version < 4:
-        return packing.deflate([head + b"\0", *planes], options.level or 6)
+        return packing.deflate([head + b"\0", *planes], options.level or 3)
     planes = [plane for plane in planes if len(plane)]
     frames = packing.zstd(planes, options.level or 3)
     table = b"".join(struct.pack("<QQ", len(frame), len(plane)) for frame, plane in zip(frames, planes, strict=True))

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from sw_interchange.bands import COEFFICIENTS, Array
+from sw_interchange.frames import flipped
 from sw_interchange.quats import from_smallest_three, smallest_three
 from sw_interchange.scene import GaussianScene, WriteReport, logit_of_byte, sigmoid
 from sw_interchange.threads import each_of, rows_of
@@ -85,7 +86,7 @@ def _smallest_three(raw: Bytes) -> Array:
 
 
 def encode_fields(scene: GaussianScene, options: SpzOptions, fractional_bits: int, report: WriteReport) -> list[bytes]:
-    """Six planes of a scene that is in the axes of the file; SH may be empty. What is clamped is counted."""
+    """Six planes of a scene in RDF; SH may be empty. What is clamped is counted."""
     n, k = scene.num_gaussians, scene.sh_rest.shape[1]
     sizes = field_sizes(n, options.version, scene.sh_degree)
     planes = [np.empty((n, size // n), np.uint8) for size in sizes]
@@ -96,16 +97,18 @@ def encode_fields(scene: GaussianScene, options: SpzOptions, fractional_bits: in
     report.count("sh_dc", np.abs(scene.sh_dc) > 0.5 / COLOUR_SCALE)
 
     def some(rows: slice) -> int:
-        planes[0][rows] = _position_codes(scene.means[rows], fractional_bits)
+        some_scene = scene.select(rows)  # turned part by part: a copy of it all would take as long as the rest
+        some_scene = some_scene if options.frame == "raw" else flipped(some_scene, 1, -1, -1)
+        planes[0][rows] = _position_codes(some_scene.means, fractional_bits)
         planes[1][rows, 0] = np.floor(255 * sigmoid(scene.opacity_logits[rows]) + np.float32(0.5))
         planes[2][rows] = _byte(255 * (np.float32(COLOUR_SCALE) * scene.sh_dc[rows] + np.float32(0.5)))
         planes[3][rows] = _byte(16 * (scene.log_scales[rows] + 10))
         coded = _first_three_codes if options.version == 2 else _smallest_three_codes
-        planes[4][rows] = coded(scene.quats[rows])
+        planes[4][rows] = coded(some_scene.quats)
         if not k:
             return 0
         # floor((round(128 v) + 128 + step / 2) / step) * step, in place.
-        part = scene.sh_rest[rows].reshape(-1, 3 * k)
+        part = some_scene.sh_rest.reshape(-1, 3 * k)
         beyond = int(np.count_nonzero(np.abs(part) > 1))
         codes = part * np.float32(128)
         codes += np.copysign(np.float32(0.5), codes)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from sw_finetuning.pruning import PruneByScore
+from sw_gaussians.fast_tasks import DensifyToBudget, HalveOpacity
 from sw_gaussians.statistics import collect_statistics
 from sw_gaussians.tasks import PruneAndDensify, ResetOpacity
 from sw_gaussians.wrapped_stage import WrappedStage
@@ -60,8 +61,9 @@ class SpeedySplatStage(WrappedStage):
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         super().register_post_task(scheduler, ppl, opt)
-        scheduler.reprioritise(PruneAndDensify, DENSIFY)
-        scheduler.reprioritise(ResetOpacity, RESET)
+        for densifies, resets in ((PruneAndDensify, ResetOpacity), (DensifyToBudget, HalveOpacity)):
+            scheduler.reprioritise(densifies, DENSIFY)
+            scheduler.reprioritise(resets, RESET)
         soft, hard = self.config.prune.soft, self.config.prune.hard
         statistics = self.pruner.uses_statistics
         if self.soft_plan and soft > 0:

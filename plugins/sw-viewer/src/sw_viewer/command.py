@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ def view(
     --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser:
     pip install 'sw-viewer[viser]'; --html does not.
     """
-    from sw_viewer.entries import about_page, find_entries, open_entry
+    from sw_viewer.entries import about_page, find_entries, fixed_gaussians, open_entry
 
     plugins = load_plugins()
     entries = {entry.label: entry for path in paths for entry in find_entries(path)}
@@ -65,7 +66,8 @@ def view(
             raise click.UsageError(f"--html writes one model, here are {len(entries)}: name a file or a run directory")
         (entry,) = entries.values()
         opened = open_entry(entry, chosen, plugins)
-        write_page(opened.drawing.model, page, about_page(opened), opened.around)
+        model, note = fixed_gaussians(opened)
+        write_page(model, page, replace(about_page(opened), note=note), opened.around)
         facts: dict[str, Any] = {"file": str(page), "bytes": page.stat().st_size}
         print_facts(facts, as_json, f"{facts['bytes']:,} bytes: {page}")
         return

@@ -5,9 +5,18 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from sw_gaussians.baking import bake
 from sw_render.drawing import Drawing
 
-from splatwizard_core.api import ContainerReader, GaussianModel, PluginManager, Protocol, Scene, UserInputError
+from splatwizard_core.api import (
+    ContainerReader,
+    GaussianModel,
+    PluginManager,
+    Protocol,
+    Scene,
+    SplatModel,
+    UserInputError,
+)
 from splatwizard_core.tooling import Choices, NegotiatedRasterizer, open_session, open_subject
 from sw_viewer.packing import solid_means
 from sw_viewer.page_file import MADE_UP, About
@@ -87,16 +96,28 @@ def open_entry(entry: Entry, chosen: Choices, plugins: PluginManager) -> Opened:
     return Opened(entry, drawing, around, has_scene)
 
 
-def about_page(opened: Opened, title: str | None = None) -> About:
+def fixed_gaussians(opened: Opened) -> tuple[SplatModel, str]:
+    """Return a model for a page, and a sentence about its Gaussians and cameras.
+
+    Gaussians that depend on the camera are fitted at the training cameras of the scene, if there is one.
+    """
+    drawing = opened.drawing
+    if isinstance(drawing.model, GaussianModel) or not opened.has_scene:
+        return drawing.model, "" if opened.has_scene else MADE_UP
+    cameras = [view.camera for view in drawing.scene.train]
+    baked = bake(drawing.model, cameras, drawing.rasterizer, drawing.options)
+    return baked, f"The method's Gaussians depend on the camera; these were fitted at {len(cameras)} training cameras."
+
+
+def about_page(opened: Opened) -> About:
     """Return the facts that the HTML page of an opened model tells."""
     file, drawing = opened.entry.file, opened.drawing
     encoded = file.suffix == ".swz"
     options = drawing.rasterizer.decided(drawing.options)
     red, green, blue = drawing.scene.background.tolist()
-    note = "" if opened.has_scene else MADE_UP
     return About(
-        title or drawing.scene.name, ContainerReader.open(file).method if encoded else None, file.stat().st_size,
-        (red, green, blue), options.eps2d, options.antialias, note,
+        drawing.scene.name, ContainerReader.open(file).method if encoded else None, file.stat().st_size,
+        (red, green, blue), options.eps2d, options.antialias,
     )  # fmt: skip
 
 

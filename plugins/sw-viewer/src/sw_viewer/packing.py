@@ -48,7 +48,7 @@ def explicit(model: SplatModel) -> GaussianModel:
     if not isinstance(model, GaussianModel):
         raise SceneError(
             f"a {type(model).__name__} has no fixed Gaussians, as the page holds: they depend on the camera; "
-            "`sw view` draws it on this machine"
+            "`sw bake` fits fixed ones, `sw view` draws it here"
         )
     return as_ellipsoids(model)
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 @hookimpl
 def register_commands(registry: Registry) -> None:
-    registry.add("view", "sw_viewer.command:view", position=4.6, summary="look at decoded models in the browser")
+    registry.add("view", "sw_viewer.command:view", position=4.65, summary="look at decoded models in the browser")
 
 
 @hookimpl

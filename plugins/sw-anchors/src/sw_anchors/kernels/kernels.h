@@ -10,6 +10,8 @@
 //   heads_backward   all gradients, `to` as of spawn_backward, `to_features` [n, features]; sums of weights the same for
 //                    any number of threads
 //   noisy_values     values of some anchors with noise, and all numbers of a sample of these
+//   predicted_steps  quantiser steps [count,3], the hidden layer and tanh of the outputs; backward: of `to_steps` and
+//                    `to_hidden`, sums the same for any number of threads
 #pragma once
 
 #include <splatwizard/dispatch.h>
@@ -17,6 +19,7 @@
 
 #include "heads.h"
 #include "spawn.h"
+#include "steps.h"
 #include "values.h"
 
 #define SW_DECLARE_ANCHORS(arch)                                                                                  \
@@ -41,6 +44,11 @@
                     const splatwizard::Parallel& parallel);                                                     \
   void noisy_values_backward(const sw_anchors::Rows& from, const sw_anchors::RowValues& slope,                  \
                              const sw_anchors::RowGradients& to, const splatwizard::Parallel& parallel);        \
+  void predicted_steps(const sw_anchors::StepNetwork& of, float* hidden, float* tangents, float* steps,         \
+                       const splatwizard::Parallel& parallel);                                                  \
+  void predicted_steps_backward(const sw_anchors::StepNetwork& of, const float* hidden, const float* tangents,  \
+                                const float* to_steps, const float* to_hidden,                                  \
+                                const sw_anchors::StepGradients& to, const splatwizard::Parallel& parallel);    \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_ANCHORS)
 #undef SW_DECLARE_ANCHORS

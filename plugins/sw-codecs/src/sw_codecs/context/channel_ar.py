@@ -7,7 +7,6 @@ Source: CAT-3DGS (arXiv 2503.00357), channel-wise model; exact form: the exact m
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
@@ -16,6 +15,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from sw_codecs.context.integer_mlp import IntegerMlp
+from sw_codecs.context.two_layers import two_layers
 
 
 class ChannelAr(nn.Module):
@@ -41,7 +41,7 @@ class ChannelAr(nn.Module):
         self.starts = tuple(sum(self.slices[:i]) for i in range(len(self.slices)))
         self.networks = nn.ModuleDict()
         for name, inputs, outputs in self.sizes():
-            self.networks[name] = _network(inputs, hidden, 2 * outputs, generator)
+            self.networks[name] = two_layers(inputs, hidden, 2 * outputs, generator, start="silent")
 
     def sizes(self) -> list[tuple[str, int, int]]:
         """(name, inputs, values predicted) of each network: "slice1", "slice2", ..., then the refined attributes."""
@@ -75,17 +75,6 @@ class ChannelAr(nn.Module):
             name: IntegerMlp.from_module(network, output_scale=units.get(name, 1.0))
             for name, network in self.networks.items()
         }
-
-
-def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator | None) -> nn.Sequential:
-    first, last = (nn.utils.skip_init(nn.Linear, *size) for size in ((inputs, hidden), (hidden, outputs)))
-    bound = 1 / math.sqrt(inputs)
-    for parameter in first.parameters():
-        with torch.no_grad():
-            parameter.copy_(torch.rand(parameter.shape, generator=generator) * 2 * bound - bound)
-    for parameter in last.parameters():
-        nn.init.zeros_(parameter)
-    return nn.Sequential(first, nn.ReLU(), last)
 
 
 class _Refined(torch.autograd.Function):

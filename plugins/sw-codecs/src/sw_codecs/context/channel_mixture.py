@@ -8,7 +8,6 @@ context; exact form: the exact mode of the codec library.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import cast
 
@@ -16,6 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp, to_fixed
+from sw_codecs.context.two_layers import two_layers
 
 LEAK = 41
 """Slope of the networks below zero, in 1/4096: 0.01 as published, so that integers have it too."""
@@ -51,7 +51,10 @@ class ChannelMixture(nn.Module):
         self.networks = nn.ModuleDict()
         for i, (start, size) in enumerate(zip(self.starts, self.slices, strict=True)):
             if start + context:
-                network = _network(start + context, hidden or PARTS * size, PARTS * size, generator)
+                network = two_layers(
+                    start + context, hidden or PARTS * size, PARTS * size, generator,
+                    activation=nn.LeakyReLU(LEAK / (1 << FRACTION)),
+                )  # fmt: skip
                 with torch.no_grad():
                     cast(nn.Linear, network[2]).bias[size : 2 * size] = scale
                 self.networks[f"slice{i}"] = network
@@ -130,20 +133,6 @@ class ExactChannelMixture:
         first, last = self._layers[f"slice{index}"]
         hidden = first(torch.cat([known, context], dim=1) if self._context else known)
         return last(torch.where(hidden < 0, (LEAK * hidden) >> FRACTION, hidden))
-
-
-def _network(inputs: int, hidden: int, outputs: int, generator: torch.Generator | None) -> nn.Sequential:
-    """inputs -> hidden, leaky ReLU -> outputs; weights and biases uniform within 1/sqrt(fan-in)."""
-    layers: list[nn.Linear] = [
-        nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
-        for size in ((inputs, hidden), (hidden, outputs))
-    ]
-    for layer in layers:
-        bound = 1 / math.sqrt(layer.in_features)
-        for parameter in layer.parameters():
-            with torch.no_grad():
-                parameter.copy_(torch.rand(parameter.shape, generator=generator) * 2 * bound - bound)
-    return nn.Sequential(layers[0], nn.LeakyReLU(LEAK / (1 << FRACTION)), layers[1])
 
 
 def _arrays(layer: nn.Module) -> tuple:

@@ -31,10 +31,16 @@ inline Vec load(const float* p) {
 }
 inline Vec least(Vec a, Vec b) { return a < b ? a : b; }
 inline Vec most(Vec a, Vec b) { return a > b ? a : b; }
+#ifdef __clang__
+#define SW_SHUFFLED(v, ...) __builtin_shufflevector(v, v, __VA_ARGS__)
+#else
+#define SW_SHUFFLED(v, ...) __builtin_shuffle(v, Mask{__VA_ARGS__})
+#endif
+
 inline float least(Vec v) {
-  v = least(v, __builtin_shuffle(v, Mask{4, 5, 6, 7, 0, 1, 2, 3}));
-  v = least(v, __builtin_shuffle(v, Mask{2, 3, 0, 1, 6, 7, 4, 5}));
-  v = least(v, __builtin_shuffle(v, Mask{1, 0, 3, 2, 5, 4, 7, 6}));
+  v = least(v, SW_SHUFFLED(v, 4, 5, 6, 7, 0, 1, 2, 3));
+  v = least(v, SW_SHUFFLED(v, 2, 3, 0, 1, 6, 7, 4, 5));
+  v = least(v, SW_SHUFFLED(v, 1, 0, 3, 2, 5, 4, 7, 6));
   return v[0];
 }
 

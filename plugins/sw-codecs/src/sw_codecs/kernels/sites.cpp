@@ -1,4 +1,5 @@
 // Features of places on planes, and their gradient by the planes, on the CPU.
+#include <algorithm>
 #include <atomic>
 
 #include "kernels.h"
@@ -6,6 +7,12 @@
 namespace SW_ARCH {
 
 using namespace sw_sites;
+
+namespace {
+
+constexpr int TOGETHER = 32;  // channels whose gradients are summed on the stack
+
+}  // namespace
 
 bool sites_lookup(const Sites& at, const float* const* tables, float* found, const splatwizard::Parallel& parallel) {
   const int width = kPlanes * at.channels;
@@ -45,11 +52,14 @@ void sites_backward(const Sites& at, const float* gradient, float* const* tables
         float* rows[kCorners];
         for (int corner = 0; corner < kCorners; ++corner)
           rows[corner] = tables[scale] + int64_t(at.cells[place + corner]) * at.channels;
-        for (int c = 0; c < at.channels; ++c) {
-          float total = 0.f;  // a plane is in its own feature and all finer ones
-          for (int finer = at.scales - 1 - scale; finer >= 0; --finer) total += from[finer * width + c];
+        for (int first = 0; first < at.channels; first += TOGETHER) {
+          const int some = std::min(TOGETHER, at.channels - first);
+          float total[TOGETHER] = {};  // a plane is in its own feature and all finer ones
+          for (int finer = at.scales - 1 - scale; finer >= 0; --finer)
+            for (int c = 0; c < some; ++c) total[c] += from[finer * width + first + c];
           // One after the other: cells of a place may be the same.
-          for (int corner = 0; corner < kCorners; ++corner) rows[corner][c] += w[corner] * total;
+          for (int corner = 0; corner < kCorners; ++corner)
+            for (int c = 0; c < some; ++c) rows[corner][first + c] += w[corner] * total[c];
         }
       }
     }

@@ -1,0 +1,54 @@
+"""Quantiser steps that a context network predicts for all visible anchors: one node, a kernel on the CPU."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sw_anchors.native import ANCHORS
+
+
+def predicted_steps(
+    features: Tensor,
+    parameters: tuple[Tensor, Tensor, Tensor, Tensor],
+    base: Tensor,
+    *,
+    offset: float,
+    smallest: float = -math.inf,
+) -> tuple[Tensor, Tensor]:
+    """(steps [V,3], hidden layer [V,H]) from features [V,I]; differentiable.
+
+    parameters  weight [H,I] and bias [H] of the layer with ReLU, weight [3,H] and bias [3] of the outputs t
+    base        [3]: a step is base max(offset + tanh(t), smallest)
+    """
+    given = (features, *parameters, base)
+    if all(t.dtype == torch.float32 and t.device.type == "cpu" for t in given) and ANCHORS.try_load():
+        found: tuple[Tensor, Tensor] = _ByKernel.apply(base, offset, smallest, features, *parameters)  # type: ignore[no-untyped-call]
+        return found
+    weight, bias, last, last_bias = parameters
+    hidden = torch.relu(torch.nn.functional.linear(features, weight, bias))
+    steps = offset + torch.tanh(torch.nn.functional.linear(hidden, last, last_bias))
+    return (steps if math.isinf(smallest) else steps.clamp(min=smallest)) * base, hidden
+
+
+class _ByKernel(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, base: Tensor, offset: float, smallest: float, *inputs: Tensor) -> tuple[Tensor, Tensor]:
+        features, *parameters = (t.contiguous() for t in inputs)
+        ctx.bounds = offset, smallest
+        steps, hidden, tangents = torch.ops.sw_anchors.predicted_steps(features, parameters, base, offset, smallest)
+        ctx.save_for_backward(base, features, *parameters, hidden, tangents)
+        return steps, hidden
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, to_steps: Tensor, to_hidden: Tensor) -> tuple[Tensor | None, ...]:
+        base, features, *parameters, hidden, tangents = ctx.saved_tensors
+        found = torch.ops.sw_anchors.predicted_steps_backward(
+            features, parameters, base, *ctx.bounds, hidden, tangents, to_steps.contiguous(), to_hidden.contiguous()
+        )
+        return None, None, None, *found
