@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -20,7 +21,7 @@ REPORTED = ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdow
     shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
     shared.seed_option, shared.resume_option, shared.changed_plan_option, shared.json_option, shared.debug_option,
     click.option("--view", is_flag=False, flag_value=8080, type=click.IntRange(1, 65535), metavar="[PORT]",
-                 help="Show the training in the browser, where a viewer is installed.  [default: not; without PORT: 8080]"),
+                 help="Show the training in the browser, by a viewer's package.  [default: not; without PORT: 8080]"),
 )  # fmt: skip
 @takes_choices
 def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, view: int | None, chosen: Choices) -> None:
@@ -34,7 +35,7 @@ def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, view
         chosen = replace(chosen, below={"log.view": view})
     resolved, session = open_training_session(chosen, plugins)
     trained, directory = train_only(session, RunRequest(only(resolved), out, resume, allow_changed_plan))
-    facts = {"directory": str(directory), "counts": trained.model.counts()}
+    facts: dict[str, Any] = {"directory": str(directory), "counts": trained.model.counts()}
     facts |= {name: trained.facts[name] for name in REPORTED}
     told = f"{facts['steps']:,} steps in {facts['train_s']:.1f} s, {shared.counted(facts['counts'])}: {directory}"
     shared.print_facts(facts, as_json, told)
