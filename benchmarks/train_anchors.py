@@ -110,7 +110,7 @@ class Phase:
 
 @dataclass(frozen=True)
 class Summary:
-    """What one training came to: speed, milliseconds of the GPU a step and loss of its last phase, peak in GB."""
+    """Outcome of one training: speed, milliseconds of the GPU a step and loss of its last phase, peak in GB."""
 
     method: str
     rate: float

@@ -16,7 +16,7 @@ from result_records import RECORDS, read
 
 @dataclass(frozen=True)
 class Claim:
-    """What a paper says of a method on one data set: so many times smaller for so much PSNR, dB."""
+    """Claim of a paper for a method on one data set: so many times smaller for so much PSNR, dB."""
 
     data: str
     ratio: float

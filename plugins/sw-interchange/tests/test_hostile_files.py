@@ -161,6 +161,7 @@ BAD = {
     "ksplat with a count that is too large": (ksplat_with(4096 + 4, b"\xff" * 4), "ksplat"),
     "ksplat with other buckets": (ksplat_with(4096 + 36, b"\2"), "ksplat"),
     "sog that is no archive": (b"PK\3\4" + bytes(200), "sog"),
+    "sog with a file without a name": (sog_with(quats__webp=None).replace(b"scales.webp", b"\0cales.webp"), "sog"),
     "sog without meta.json": (sog_with(meta__json=None), "sog"),
     "sog without an image": (sog_with(quats__webp=None), "sog"),
     "sog with a path": (sog_with({"quats.files": ["../quats.webp"]}), "sog"),

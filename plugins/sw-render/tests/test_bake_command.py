@@ -55,3 +55,15 @@ def test_wrong_input_is_told_in_a_line(tmp_path: Path, capsys):
     assert main(["bake", str(GOLDEN / "hac_exact_v2.swz"), str(tmp_path / "o.xyz"), "--scene", "demo:tiny"]) == 2
     assert "no installed exporter writes '.xyz' files" in " ".join(capsys.readouterr().err.split())
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.cuda
+def test_a_gpu_bakes_what_the_cpu_bakes(tmp_path: Path, capsys):
+    found = {}
+    for device in ("cpu", "cuda"):
+        arguments = ["bake", str(GOLDEN / "hac_exact_v2.swz"), str(tmp_path / f"{device}.ply"), "--scene", "demo:tiny"]
+        assert main([*arguments, "--device", device, "--refine", "3", "--json"]) == 0
+        found[device] = json.loads(capsys.readouterr().out)
+    assert found["cpu"]["counts"] == found["cuda"]["counts"]
+    cpu, cuda = (each["psnr"]["baked_at_test"] for each in found.values())
+    assert cuda == pytest.approx(cpu, abs=0.05)  # sums in another order, three steps of Adam

@@ -18,12 +18,13 @@ from sw_anchors.view_networks import Networks, parameters_of
 
 def fits_kernel(positions: Tensor, tensors: tuple[Tensor | None, ...], networks: Networks) -> bool:
     """Whether there is a kernel for these tensors [V, ...] and networks; loads it. Positions must not learn."""
-    given = [positions, *(t for t in tensors if t is not None), *parameters_of(networks)]
+    parameters = parameters_of(networks)
+    given = [positions, *(t for t in tensors if t is not None), *parameters]
     if any(t.device.type != "cpu" or t.dtype != torch.float32 for t in given):
         return False
     if positions.requires_grad and torch.is_grad_enabled():
         return False
-    return len({len(network[0].bias) for network in networks}) == 1 and ANCHORS.try_load()
+    return len({len(bias) for bias in parameters[1::4]}) == 1 and ANCHORS.try_load()
 
 
 def spawn_by_kernel(

@@ -14,8 +14,8 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sw_anchors import row_kernels
-from sw_anchors.row_kernels import MixtureBits, NoisyRows, SampleBits, fit_kernels
-from sw_codecs.entropy import rates
+from sw_anchors.row_kernels import NoisyRows, SampleBits, fit_kernels
+from sw_codecs.entropy.rates import gaussian_bits
 
 
 def anchor_values(
@@ -101,35 +101,8 @@ def sample_bits(
     alone = counted[:, None].expand(-1, widths[0] + widths[1])
     factors = torch.cat([alone, masks[:, :, None].expand(-1, -1, 3).flatten(1)], dim=1)
     wide = torch.cat([step.expand(-1, width) for step, width in zip(steps.split(1, 1), widths, strict=True)], dim=1)
-    each = rates.gaussian_bits(x, mean, scale.clamp(min=smallest_scale), wide, p_min=p_min) * factors
+    each = gaussian_bits(x, mean, scale.clamp(min=smallest_scale), wide, p_min=p_min) * factors
     return each.sum(), torch.stack([part.sum() for part in each.detach().split(widths, dim=1)])
-
-
-def mixture_bits(
-    x: Tensor,
-    means: tuple[Tensor, Tensor],
-    scales: tuple[Tensor, Tensor],
-    logits: tuple[Tensor, Tensor],
-    steps: Tensor,
-    factors: Tensor,
-    *,
-    p_min: float,
-    smallest_scale: float,
-) -> Tensor:
-    """Sum of the bits of numbers x [S,F] under mixtures of two Gaussians, times factors [S]; differentiable.
-
-    means, scales, logits   [S,F] of both; scales below `smallest_scale` are taken for that
-    steps                   [S] widths of the bins
-
-    The derivative by the bits must not be negative.
-    """
-    if x.dtype == torch.float32 and fit_kernels(x):
-        total: Tensor = MixtureBits.apply(x, steps, factors, p_min, smallest_scale, *means, *scales, *logits)  # type: ignore[no-untyped-call]
-        return total
-    both = (
-        torch.stack(each, dim=-1) for each in (logits, means, [scale.clamp(min=smallest_scale) for scale in scales])
-    )
-    return (rates.mixture_bits(x, *both, steps[:, None], p_min=p_min) * factors[:, None]).sum()
 
 
 class _Values(torch.autograd.Function):

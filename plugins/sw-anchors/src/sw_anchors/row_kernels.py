@@ -97,7 +97,7 @@ class SampleBits(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         given = (each.contiguous() for each in (x, mean, scale, steps, counted, masks))
         bits, *slopes = torch.ops.sw_anchors.sample_bits(*given, p_min, smallest_scale)
-        ctx.save_for_backward(*(slopes if ctx.needs_input_grad[5] else slopes[:-1]))
+        ctx.save_for_backward(*slopes)
         by_group = bits.sum(dim=0)
         ctx.mark_non_differentiable(by_group)
         return by_group.sum(), by_group
@@ -105,27 +105,4 @@ class SampleBits(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, slope: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
-        found = torch._foreach_mul(ctx.saved_tensors, slope)
-        return *found, *[None] * (8 - len(found))
-
-
-class MixtureBits(torch.autograd.Function):
-    """`fused_ops.mixture_bits` by one kernel, which takes the derivatives on its way; backward only scales them."""
-
-    @staticmethod
-    def forward(
-        ctx: Any, x: Tensor, steps: Tensor, factors: Tensor, p_min: float, smallest_scale: float, *parts: Tensor
-    ) -> Tensor:
-        rows = [each if each.stride(1) == 1 else each.contiguous() for each in (x, *parts)]
-        bits, *slopes = torch.ops.sw_anchors.mixture_bits(
-            rows[0], rows[1:3], rows[3:5], rows[5:], steps.contiguous(), factors.contiguous(), p_min, smallest_scale
-        )
-        ctx.save_for_backward(*slopes)
-        total: Tensor = bits.sum()
-        return total
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, slope: Tensor) -> tuple[Tensor | None, ...]:
-        x, *parts, steps, factors = torch._foreach_mul(ctx.saved_tensors, slope)
-        return x, steps, factors, None, None, *parts
+        return *torch._foreach_mul(ctx.saved_tensors, slope), None, None, None

@@ -169,13 +169,9 @@ class CatContext(nn.Module):
         widths = self.shape.outputs[:-1]
         weights = torch.split(last.weight, [sum(widths), PLANES])
         biases = torch.split(last.bias, [sum(widths), PLANES])
-        if base_steps.is_cuda:  # where a product of the planes is cheaper than one of all features
-            hidden = torch.relu(self.triplane.projected(sites, first.weight, first.bias, rounded=self.rounded))
-            steps = (STEP_OFFSET + torch.tanh(nn.functional.linear(hidden, weights[1], biases[1]))) * base_steps
-        else:
-            features = self.triplane.at_sites(sites, rounded=self.rounded)
-            parameters = (first.weight, first.bias, weights[1], biases[1])
-            steps, hidden = predicted_steps(features, parameters, base_steps, offset=STEP_OFFSET)
+        features = self.triplane.at_sites(sites, rounded=self.rounded)
+        parameters = (first.weight, first.bias, weights[1], biases[1])
+        steps, hidden = predicted_steps(features, parameters, base_steps, offset=STEP_OFFSET)
 
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None

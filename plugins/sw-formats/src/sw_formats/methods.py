@@ -16,8 +16,8 @@ class TrainedScene(Stage):
     """The trained scene as it is: no step."""
 
     name = "trained scene"
-    iterations = 0  # type: ignore[assignment]  # a property of Stage, here a constant
-    starts_from = "3dgs"  # type: ignore[assignment]
+    iterations = 0  # a property of Stage, here a constant
+    starts_from = "3dgs"
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         """Return one that updates nothing: a stage has an optimizer, also without a step."""

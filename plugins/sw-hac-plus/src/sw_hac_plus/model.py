@@ -13,13 +13,14 @@ import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
 from sw_anchors.coded_anchors import MASK_THRESHOLD
 from sw_anchors.forecasts import AnchorForecast, AnchorRate
-from sw_anchors.fused_ops import anchor_values, mixture_bits, noisy_rows, sample_bits
+from sw_anchors.fused_ops import anchor_values, noisy_rows
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
 from sw_anchors.voxel_lattice import voxel_integers, voxel_positions
 from torch import Tensor, nn
 
 from sw_codecs.context.channel_mixture import ChannelMixture
+from sw_codecs.entropy.rates import gaussian_bits, mixture_bits
 from sw_codecs.quantizers.rounding import add_noise
 
 if TYPE_CHECKING:
@@ -142,38 +143,43 @@ class HACPlusAnchors(GridAnchors):
 
     def _rate_of(self, values: Tensor, masks: Tensor, counted: Tensor, forecast: PoolForecast) -> AnchorRate:
         """Estimate the bits of noisy values [S,C] of anchors; those that are not counted [S] are as if not there."""
-        there = self._there(masks) * counted
-        bits, by_group = self._bits(values, masks * there[:, None], there, forecast)
+        steps = self.widened(forecast.sample_steps)
+        bits = self._bits(values, steps, forecast) * (self._shares(masks) * counted[:, None])
+        by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
         numbers = counted.sum() * values.shape[1]
-        return AnchorRate(bits / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
+        return AnchorRate(bits.sum() / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
 
-    def _there(self, masks: Tensor) -> Tensor:
-        """[S] whether an anchor keeps any of its offsets, by their masks [S,k]; perhaps with gradient."""
+    def _shares(self, masks: Tensor) -> Tensor:
+        """[S,C] factors of the bits: whether the anchor is there, for an offset times its mask; with gradient."""
         mean = masks.mean(dim=1)
         there = (mean > 0).to(mean)
-        return mean + (there - mean).detach() if self.anchor_gradient else there
+        if self.anchor_gradient:
+            there = mean + (there - mean).detach()  # 1 or 0, with the gradient of the mean
+        widths = self.shape.widths
+        offsets = (there[:, None] * masks)[:, :, None].expand(-1, -1, 3).flatten(1)
+        return torch.cat([there[:, None].expand(-1, widths[0] + widths[1]), offsets], dim=1)
 
-    def _bits(self, values: Tensor, masks: Tensor, there: Tensor, forecast: PoolForecast) -> tuple[Tensor, Tensor]:
-        """Bits of noisy values [S,C] under the grid's Gaussians, of features under mixtures; and [3] the bits by group.
-
-        masks, there    [S,k] factors of the bits of an offset, [S] of those of all else
-        """
+    def _bits(self, values: Tensor, steps: Tensor, forecast: PoolForecast) -> Tensor:
+        """[S,C] bits of noisy values under the grid's Gaussians, of features under the mixture with the channels'."""
         assert forecast.hidden is not None
         _, last = linear_layers(self.mlp_grid)
         outputs = nn.functional.linear(forecast.hidden, last.weight, last.bias) * self.units
-        f, count, steps = self.shape.features, self._distributions, forecast.sample_steps
+        f, count = self.shape.features, self._distributions
         parts = torch.split(outputs[:, :count], self.shape.outputs[:-1], dim=1)
-        floors = {"p_min": self.smallest_probability, "smallest_scale": SMALLEST_SCALE}
+        mean = torch.cat(parts[0::2], dim=1)
+        scale = torch.cat(parts[1::2], dim=1).clamp(min=SMALLEST_SCALE)
         if self.channel is None:
-            mean, scale = torch.cat(parts[0::2], dim=1), torch.cat(parts[1::2], dim=1)
-            return sample_bits(values, mean, scale, steps, masks, there, **floors)
+            return gaussian_bits(values, mean, scale, steps, p_min=self.smallest_probability)
         base, logit = self.base_steps[0], outputs[:, count + 3 :]
         context = torch.cat([parts[0] / base, parts[1] / base, logit], dim=1)
-        own_mean, own_scale, own_logit = self.channel(values[:, :f] / base, context)
+        second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, context)
         features = mixture_bits(
-            values[:, :f], (parts[0], base * own_mean), (parts[1], base * own_scale), (logit, own_logit), steps[:, 0],
-            there, **floors,
-        )  # fmt: skip
-        mean, scale = torch.cat(parts[2::2], dim=1), torch.cat(parts[3::2], dim=1)
-        others, by_group = sample_bits(values[:, f:], mean, scale, steps, masks, there, **floors)
-        return features + others, torch.cat([features.detach()[None], by_group[1:]])
+            values[:, :f],
+            torch.stack([logit, second_logit], dim=-1),
+            torch.stack([mean[:, :f], base * second_mean], dim=-1),
+            torch.stack([scale[:, :f], (base * second_scale).clamp(min=SMALLEST_SCALE)], dim=-1),
+            steps[:, :f],
+            p_min=self.smallest_probability,
+        )
+        others = gaussian_bits(values[:, f:], mean[:, f:], scale[:, f:], steps[:, f:], p_min=self.smallest_probability)
+        return torch.cat([features, others], dim=1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import zipfile
-import zlib
 
 from splatwizard_core.api import BitstreamError
 from sw_interchange.source import Source
@@ -12,18 +11,21 @@ from sw_interchange.source import Source
 MAX_MEMBERS = 64
 
 
-def names_in(source: Source) -> list[str]:
-    """Names of all members. Raises BadZipFile."""
-    return [info.filename for info in _opened(source).infolist()]
-
-
 def entries_of(source: Source) -> list[zipfile.ZipInfo]:
-    """Entries of the central directory. Raises BadZipFile."""
+    """Entries of the central directory. Raises BitstreamError."""
     return _opened(source).infolist()
 
 
 def _opened(source: Source) -> zipfile.ZipFile:
-    return zipfile.ZipFile(_View(source.data))
+    try:
+        return zipfile.ZipFile(_View(source.data))
+    except Exception as error:  # zipfile raises many kinds for damaged archives, struct.error among them
+        raise _damaged(source, error) from error
+
+
+def _damaged(source: Source, error: Exception) -> BitstreamError:
+    reason = " ".join(str(error).split())[:200] or type(error).__name__
+    return BitstreamError(f"{source.name}: a damaged ZIP archive: {reason}")
 
 
 class _View(io.RawIOBase):
@@ -60,10 +62,9 @@ def read_archive(source: Source, limit: int) -> dict[str, bytes]:
 
     limit   bytes of all of them together
     """
-    name = source.name
+    name, archive = source.name, _opened(source)
     try:
-        archive = _opened(source)
-        members = [info for info in archive.infolist() if not info.is_dir()]
+        members = [info for info in archive.infolist() if not info.filename.endswith("/")]
         if len(members) > MAX_MEMBERS:
             raise BitstreamError(f"{name}: {len(members):,} files in the archive, {MAX_MEMBERS} at most are possible")
         if len({info.filename for info in members}) < len(members):
@@ -80,6 +81,8 @@ def read_archive(source: Source, limit: int) -> dict[str, bytes]:
                 raise BitstreamError(f"{name}: '{info.filename}' is not as long as the archive says")
             limit -= len(content)
             found[info.filename] = content
-    except (zipfile.BadZipFile, zlib.error, EOFError, ValueError, OverflowError, NotImplementedError, OSError) as error:
-        raise BitstreamError(f"{name}: a damaged ZIP archive: {error}") from error
+    except BitstreamError:
+        raise
+    except Exception as error:  # as above
+        raise _damaged(source, error) from error
     return found

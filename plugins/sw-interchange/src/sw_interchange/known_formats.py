@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -119,12 +118,9 @@ def detect(source: Source) -> Format:
 
 def _kind_of_archive(source: Source) -> str:
     """SOG bundle or torch checkpoint: both are ZIP archives."""
-    from sw_interchange.archive import names_in
+    from sw_interchange.archive import entries_of
 
-    try:
-        names = names_in(source)
-    except zipfile.BadZipFile as error:
-        raise BitstreamError(f"{source.name}: a damaged ZIP archive: {error}") from error
+    names = [entry.filename for entry in entries_of(source)]
     if any(name.endswith("/data.pkl") for name in names):
         return "checkpoint"
     if any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names):

@@ -20,7 +20,7 @@ REPORTED = ("steps", "train_s", "stages", "peak_bytes", "memory_kind", "breakdow
     shared.init_option, shared.config_option, shared.set_option, shared.out_option, shared.device_option,
     shared.seed_option, shared.resume_option, shared.changed_plan_option, shared.json_option, shared.debug_option,
     click.option("--view", is_flag=False, flag_value=8080, type=click.IntRange(1, 65535), metavar="[PORT]",
-                 help="Show the training in the browser (sw-viewer).  [default: not; without PORT: 8080]"),
+                 help="Show the training in the browser, where a viewer is installed.  [default: not; without PORT: 8080]"),
 )  # fmt: skip
 @takes_choices
 def train(out: Path, resume: bool, allow_changed_plan: bool, as_json: bool, view: int | None, chosen: Choices) -> None:

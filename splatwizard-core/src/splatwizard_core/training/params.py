@@ -54,7 +54,7 @@ class LogParams(Params):
     """Programs that a training is logged for besides log.jsonl: observers of `run_started` read it."""
 
     tensorboard: bool = Field(False, description="write the curves for TensorBoard too, into tensorboard/ of the run")
-    view: int = Field(0, ge=0, le=65535, description="port where sw-viewer shows the training; 0: nowhere")
+    view: int = Field(0, ge=0, le=65535, description="port where a viewer shows the training; 0: nowhere")
 
 
 class PipelineParams(Params):

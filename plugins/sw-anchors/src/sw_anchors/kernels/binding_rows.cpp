@@ -11,12 +11,9 @@ TORCH_LIBRARY_FRAGMENT(sw_anchors, m) {
         " Tensor? noise, Tensor? steps, float threshold) -> (Tensor, Tensor, Tensor)");
   m.def("row_values_backward(Tensor features, Tensor log_scales, Tensor offsets, Tensor logits, Tensor? weights,"
         " Tensor? valid, Tensor? noise, Tensor? steps, Tensor?[] slopes, bool steps_learn) -> Tensor[]");
-  // Bits [s,3], and derivatives of their sum by x, mean, scale, steps, masks and counted.
+  // Bits [s,3], and derivatives of their sum by x, mean, scale, steps and masks.
   m.def("sample_bits(Tensor x, Tensor mean, Tensor scale, Tensor steps, Tensor counted, Tensor masks, float p_min,"
         " float smallest_scale) -> Tensor[]");
-  // Bits [s], and derivatives of their sum by x, both means, both scales, both logits, steps and factors.
-  m.def("mixture_bits(Tensor x, Tensor[] means, Tensor[] scales, Tensor[] logits, Tensor steps, Tensor factors,"
-        " float p_min, float smallest_scale) -> Tensor[]");
 }
 
 #ifdef SW_WITH_CUDA
@@ -222,46 +219,15 @@ std::vector<Tensor> sample_bits(const Tensor& x, const Tensor& mean, const Tenso
   const auto real = x.options().requires_grad(false);
   std::vector<Tensor> found = {at::empty({s, kGroups}, real), at::empty({s, numbers}, real),
                                at::empty({s, numbers}, real), at::empty({s, numbers}, real),
-                               at::empty({s, kGroups}, real), at::empty({s, k}, real), at::empty({s}, real)};
+                               at::empty({s, kGroups}, real), at::empty({s, k}, real)};
   const Sample sample{s, int(numbers - 6 - 3 * k), int(k), x.const_data_ptr<float>(), mean.const_data_ptr<float>(),
                       scale.const_data_ptr<float>(), steps.const_data_ptr<float>(), counted.const_data_ptr<float>(),
                       masks.const_data_ptr<float>(), float(p_min), float(smallest_scale)};
   cuda::sample_bits(sample,
                     {found[0].mutable_data_ptr<float>(), found[1].mutable_data_ptr<float>(),
                      found[2].mutable_data_ptr<float>(), found[3].mutable_data_ptr<float>(),
-                     found[4].mutable_data_ptr<float>(), found[5].mutable_data_ptr<float>(),
-                     found[6].mutable_data_ptr<float>()},
+                     found[4].mutable_data_ptr<float>(), found[5].mutable_data_ptr<float>()},
                     c10::cuda::getCurrentCUDAStream());
-  C10_CUDA_KERNEL_LAUNCH_CHECK();
-  return found;
-}
-
-std::vector<Tensor> mixture_bits(const Tensor& x, const std::vector<Tensor>& means, const std::vector<Tensor>& scales,
-                                 const std::vector<Tensor>& logits, const Tensor& steps, const Tensor& factors,
-                                 double p_min, double smallest_scale) {
-  TORCH_CHECK(x.dim() == 2 && means.size() == 2 && scales.size() == 2 && logits.size() == 2,
-              "sw_anchors: x must be [s,f], with two means, scales and logits");
-  const int64_t s = x.size(0), f = x.size(1);
-  check(steps, "steps", x, {s});
-  check(factors, "factors", x, {s});
-  const c10::cuda::CUDAGuard guard(x.device());
-  const auto real = x.options().requires_grad(false);
-  std::vector<Tensor> found = {at::empty({s}, real)};
-  for (int i = 0; i < 7; ++i) found.push_back(at::empty({s, f}, real));
-  found.push_back(at::empty({s}, real)), found.push_back(at::empty({s}, real));
-  const auto to = [&](int i) { return found[i].mutable_data_ptr<float>(); };
-  const Mixture mixture{s,
-                        int(f),
-                        piece_of(x, s, f),
-                        {piece_of(means[0], s, f), piece_of(means[1], s, f)},
-                        {piece_of(scales[0], s, f), piece_of(scales[1], s, f)},
-                        {piece_of(logits[0], s, f), piece_of(logits[1], s, f)},
-                        steps.const_data_ptr<float>(),
-                        factors.const_data_ptr<float>(),
-                        float(p_min),
-                        float(smallest_scale)};
-  cuda::mixture_bits(mixture, {to(0), to(1), {to(2), to(3)}, {to(4), to(5)}, {to(6), to(7)}, to(8), to(9)},
-                     c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found;
 }
@@ -275,7 +241,6 @@ TORCH_LIBRARY_IMPL(sw_anchors, CUDA, m) {
   m.impl("row_values", row_values);
   m.impl("row_values_backward", row_values_backward);
   m.impl("sample_bits", sample_bits);
-  m.impl("mixture_bits", mixture_bits);
 }
 
 #endif  // SW_WITH_CUDA

@@ -60,22 +60,7 @@ struct Sample {
 
 // Bits [S,3] by group, and derivatives of their sum.
 struct SampleBits {
-  float *bits, *x, *mean, *scale, *steps, *masks, *counted;
-};
-
-// Numbers [S,F] under mixtures of two Gaussians: the first has weight sigmoid of its logit minus the other's. Steps and
-// factors of the bits are one a row.
-struct Mixture {
-  int64_t count;
-  int width;
-  Piece x, mean[2], scale[2], logit[2];
-  const float *steps, *factors;
-  float smallest, smallest_scale;
-};
-
-// Bits [S] times factors, and derivatives of their sum.
-struct MixtureBits {
-  float *bits, *x, *mean[2], *scale[2], *logit[2], *steps, *factors;
+  float *bits, *x, *mean, *scale, *steps, *masks;
 };
 
 }  // namespace sw_anchors

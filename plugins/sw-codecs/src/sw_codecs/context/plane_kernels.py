@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from sw_codecs.native import CODECS
 
@@ -60,21 +58,3 @@ def look_up_backward(cells: Tensor, weights: Tensor, slopes: Tensor, planes: Seq
         cells.contiguous(), weights.contiguous(), slopes.contiguous(), list(planes)
     )
     return found
-
-
-class SummedSites(torch.autograd.Function):
-    """Sums [n,W] over sizes, pairs of axes and corners: weights times the rows of tables [3 H W, W] of each size."""
-
-    @staticmethod
-    def forward(ctx: Any, cells: Tensor, weights: Tensor, *tables: Tensor) -> Tensor:
-        cells, weights = cells.contiguous(), weights.contiguous()
-        ctx.save_for_backward(cells, weights)
-        ctx.rows = [len(table) for table in tables]
-        found: Tensor = torch.ops.sw_codecs.sites_sum(cells, weights, [table.contiguous() for table in tables])
-        return found
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, slopes: Tensor) -> tuple[Tensor | None, ...]:
-        found = torch.ops.sw_codecs.sites_sum_backward(*ctx.saved_tensors, slopes.contiguous(), ctx.rows)
-        return None, None, *found

@@ -14,11 +14,10 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from sw_codecs.context.plane_kernels import SummedSites, fit_kernels, look_up, look_up_backward
+from sw_codecs.context.plane_kernels import fit_kernels, look_up, look_up_backward
 from sw_codecs.context.principal_frame import UNIT, PrincipalFrame
 from sw_codecs.exact_native import EXACT
 from sw_codecs.native import CODECS
-from sw_codecs.quantizers.straight_through import straight_through
 
 PAIRS = ((0, 1), (0, 2), (1, 2))
 """Axes (width, height) of the three planes."""
@@ -111,25 +110,6 @@ class Triplane(nn.Module):
         """`forward` of the places that `sites` was made from."""
         found: Tensor = _Sampled.apply(*sites, rounded, *self.planes)  # type: ignore[no-untyped-call]
         return found
-
-    def projected(self, sites: PlaneSites, weight: Tensor, bias: Tensor, *, rounded: bool = True) -> Tensor:
-        """`linear(at_sites(sites), weight, bias)` [n, outputs] for a weight [outputs, width].
-
-        On CUDA the planes are multiplied before they are looked up: they have fewer values than the features of all
-        places, which then need not be held either.
-        """
-        planes = list(self.planes)
-        if not fit_kernels(planes):
-            return nn.functional.linear(self.at_sites(sites, rounded=rounded), weight, bias)
-        parts = weight.unflatten(1, (len(planes), len(PAIRS), self.channels))
-        own = parts.flip(1).cumsum(1).flip(1)  # a plane is in the features of its own scale and of all finer ones
-        tables = []
-        for i, plane in enumerate(planes):
-            values = straight_through(plane, torch.round(plane.detach() * GAIN).div_(GAIN)) if rounded else plane
-            product = torch.bmm(values.flatten(2).transpose(1, 2), own[:, i].permute(1, 2, 0))  # [3, H W, outputs]
-            tables.append(product.flatten(0, 1))
-        summed: Tensor = SummedSites.apply(*sites, *tables)  # type: ignore[no-untyped-call]
-        return summed + bias
 
     def integers(self) -> list[Tensor]:
         """Planes of the file, int64 [3, C, m B, m B] per scale. Raises ValueError if a value is not finite."""

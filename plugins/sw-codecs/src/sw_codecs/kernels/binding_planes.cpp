@@ -8,9 +8,6 @@ TORCH_LIBRARY_FRAGMENT(sw_codecs, m) {
   // Features [n, scales 3 C] of planes [3,C,H,W], rounded to multiples of 1/gain where it is not 0.
   m.def("triplane_lookup(Tensor cells, Tensor weights, Tensor[] planes, float gain) -> Tensor");
   m.def("triplane_backward(Tensor cells, Tensor weights, Tensor slopes, Tensor[] planes) -> Tensor[]");
-  // Sums [n, width] of the rows of tables [rows, width] of each scale at all corners of the sites.
-  m.def("sites_sum(Tensor cells, Tensor weights, Tensor[] tables) -> Tensor");
-  m.def("sites_sum_backward(Tensor cells, Tensor weights, Tensor slopes, int[] rows) -> Tensor[]");
 }
 
 #ifdef SW_WITH_CUDA
@@ -76,23 +73,18 @@ std::tuple<Tensor, std::vector<Tensor>> plane_bits(const std::vector<Tensor>& pl
   return {partial.sum(1), std::move(to)};
 }
 
-sw_triplane::Sites sites_of(const Tensor& cells, const Tensor& weights, int64_t scales, int64_t channels) {
+sw_triplane::Sites sites_of(const Tensor& cells, const Tensor& weights, const std::vector<Tensor>& planes) {
   using namespace sw_triplane;
-  check(weights, "weights", weights);
-  TORCH_CHECK(scales > 0 && scales <= sw_triplane::kScales && channels > 0, "sw_codecs: planes of 1 to ",
-              sw_triplane::kScales, " scales are offered");
+  check_planes(planes, sw_triplane::kScales);
+  check(weights, "weights", planes[0]);
+  const int64_t scales = int64_t(planes.size());
+  TORCH_CHECK(planes[0].size(0) == kPairs && planes[0].size(1) > 0, "sw_codecs: planes must be [3,C,H,W]");
   TORCH_CHECK(cells.scalar_type() == at::kInt && cells.is_contiguous() && cells.device() == weights.device() &&
                   cells.dim() == 4 && cells.size(1) == scales && cells.size(2) == kPairs && cells.size(3) == kCorners &&
                   weights.sizes() == cells.sizes(),
               "sw_codecs: cells must be contiguous int32 [n,", scales, ",3,4], weights likewise");
-  return {cells.size(0), int(scales), int(channels), cells.const_data_ptr<int32_t>(), weights.const_data_ptr<float>()};
-}
-
-sw_triplane::Sites sites_of(const Tensor& cells, const Tensor& weights, const std::vector<Tensor>& planes) {
-  check_planes(planes, sw_triplane::kScales);
-  TORCH_CHECK(planes[0].size(0) == sw_triplane::kPairs && planes[0].device() == weights.device(),
-              "sw_codecs: planes must be [3,C,H,W] on the device of the sites");
-  return sites_of(cells, weights, int64_t(planes.size()), planes[0].size(1));
+  return {cells.size(0), int(scales), int(planes[0].size(1)), cells.const_data_ptr<int32_t>(),
+          weights.const_data_ptr<float>()};
 }
 
 bool in_fours(const sw_triplane::Sites& sites, const Tensor& features) {
@@ -135,48 +127,12 @@ std::vector<Tensor> triplane_backward(const Tensor& cells, const Tensor& weights
     held.push_back(at::zeros({sw_triplane::kPairs * planes[i].size(2) * planes[i].size(3), sites.channels}, real));
     tables.of[i] = held.back().mutable_data_ptr<float>();
   }
-  sw_triplane::cuda::backward(sites, in_fours(sites, slopes), false, slopes.const_data_ptr<float>(), tables, stream);
+  sw_triplane::cuda::backward(sites, in_fours(sites, slopes), slopes.const_data_ptr<float>(), tables, stream);
   for (size_t i = 0; i < planes.size(); ++i) {
     found.push_back(at::empty(planes[i].sizes(), real));
     sw_triplane::cuda::transpose(tables.of[i], found.back().mutable_data_ptr<float>(), sw_triplane::kPairs,
                                  planes[i].size(2) * planes[i].size(3), sites.channels, 0.f, stream);
   }
-  C10_CUDA_KERNEL_LAUNCH_CHECK();
-  return found;
-}
-
-Tensor sites_sum(const Tensor& cells, const Tensor& weights, const std::vector<Tensor>& tables) {
-  TORCH_CHECK(!tables.empty() && tables[0].dim() == 2, "sw_codecs: tables must be [rows,width]");
-  const sw_triplane::Sites sites = sites_of(cells, weights, int64_t(tables.size()), tables[0].size(1));
-  const c10::cuda::CUDAGuard guard(weights.device());
-  sw_triplane::cuda::Tables at{};
-  Tensor found = at::empty({sites.count, sites.channels}, weights.options().requires_grad(false));
-  bool four = in_fours(sites, found);
-  for (size_t i = 0; i < tables.size(); ++i) {
-    check(tables[i], "a table", weights);
-    TORCH_CHECK(tables[i].dim() == 2 && tables[i].size(1) == sites.channels, "sw_codecs: tables differ in width");
-    at.of[i] = const_cast<float*>(tables[i].const_data_ptr<float>());  // read only
-    four = four && in_fours(sites, tables[i]);
-  }
-  sw_triplane::cuda::sum(sites, four, at, found.mutable_data_ptr<float>(), c10::cuda::getCurrentCUDAStream());
-  C10_CUDA_KERNEL_LAUNCH_CHECK();
-  return found;
-}
-
-std::vector<Tensor> sites_sum_backward(const Tensor& cells, const Tensor& weights, const Tensor& slopes,
-                                       at::IntArrayRef rows) {
-  TORCH_CHECK(slopes.dim() == 2 && slopes.size(0) == cells.size(0), "sw_codecs: slopes do not fit the sites");
-  const sw_triplane::Sites sites = sites_of(cells, weights, int64_t(rows.size()), slopes.size(1));
-  check(slopes, "slopes", weights);
-  const c10::cuda::CUDAGuard guard(weights.device());
-  sw_triplane::cuda::Tables at{};
-  std::vector<Tensor> found;
-  for (size_t i = 0; i < rows.size(); ++i) {
-    found.push_back(at::zeros({rows[i], sites.channels}, weights.options().requires_grad(false)));
-    at.of[i] = found.back().mutable_data_ptr<float>();
-  }
-  sw_triplane::cuda::backward(sites, in_fours(sites, slopes), true, slopes.const_data_ptr<float>(), at,
-                              c10::cuda::getCurrentCUDAStream());
   C10_CUDA_KERNEL_LAUNCH_CHECK();
   return found;
 }
@@ -187,8 +143,6 @@ TORCH_LIBRARY_IMPL(sw_codecs, CUDA, m) {
   m.impl("plane_bits", plane_bits);
   m.impl("triplane_lookup", triplane_lookup);
   m.impl("triplane_backward", triplane_backward);
-  m.impl("sites_sum", sites_sum);
-  m.impl("sites_sum_backward", sites_sum_backward);
 }
 
 #endif  // SW_WITH_CUDA

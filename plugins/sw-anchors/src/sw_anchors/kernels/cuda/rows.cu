@@ -106,7 +106,7 @@ __global__ void __launch_bounds__(kWarp* kRows)
   const int64_t row = own_row();
   const int lane = int(threadIdx.x), f = from.features, k = from.offsets, numbers = f + 6 + 3 * k;
   const bool there = row < from.count;
-  float bits[kGroups] = {}, steps[kGroups] = {}, whole = 0.f;
+  float bits[kGroups] = {}, steps[kGroups] = {};
   if (there) {
     const float counted = from.counted[row];
     // An item is a number, or an offset with its three coordinates, which share a mask.
@@ -132,10 +132,7 @@ __global__ void __launch_bounds__(kWarp* kRows)
         to.scale[at] = raw >= from.smallest_scale ? (at_near * near - at_far * far) / deviation : 0.f;
         by_step += 0.5f * (at_near + at_far) * narrow;
       }
-      if (group == 2)
-        to.masks[row * k + item - f - 6] = own;
-      else
-        whole += own;
+      if (group == 2) to.masks[row * k + item - f - 6] = own;
 #pragma unroll
       for (int g = 0; g < kGroups; ++g)
         bits[g] += g == group ? factor * own : 0.f, steps[g] += g == group ? by_step : 0.f;
@@ -146,68 +143,6 @@ __global__ void __launch_bounds__(kWarp* kRows)
     const float sum = sum_of_warp(bits[group]), by_step = sum_of_warp(steps[group]);
     if (there && lane == group) to.bits[row * kGroups + group] = sum, to.steps[row * kGroups + group] = by_step;
   }
-  whole = sum_of_warp(whole);
-  if (there && lane == 0) to.counted[row] = whole;
-}
-
-// The mass of a bin under a Gaussian, and what its derivatives need.
-struct Mass {
-  float p, near, far, narrow, deviation, sign;
-};
-
-__device__ __forceinline__ Mass mass_of(float x, float mean, float scale, float half, float smallest_scale) {
-  Mass mass;
-  mass.deviation = fmaxf(scale, smallest_scale);
-  const float offset = x - mean, away = fabsf(offset);
-  mass.narrow = 0.70710678118f / mass.deviation;
-  mass.near = (away - half) * mass.narrow, mass.far = (away + half) * mass.narrow;
-  mass.sign = offset > 0.f ? 1.f : offset < 0.f ? -1.f : 0.f;
-  mass.p = 0.5f * (erfcf(mass.near) - erfcf(mass.far));
-  return mass;
-}
-
-__global__ void __launch_bounds__(kWarp* kRows)
-    mixture_kernel(const __grid_constant__ Mixture from, const __grid_constant__ MixtureBits to) {
-  const int64_t row = own_row();
-  const int lane = int(threadIdx.x);
-  const bool there = row < from.count;
-  float bits = 0.f, by_step = 0.f;
-  const float factor = there ? from.factors[row] : 0.f;
-  if (there) {
-    const float half = 0.5f * from.steps[row];
-    for (int column = lane; column < from.width; column += kWarp) {
-      const int64_t at = row * from.width + column;
-      const float x = at_of(from.x, row, column);
-      const float weight = sigmoid(at_of(from.logit[0], row, column) - at_of(from.logit[1], row, column));
-      Mass mass[2];
-#pragma unroll
-      for (int i = 0; i < 2; ++i)
-        mass[i] = mass_of(x, at_of(from.mean[i], row, column), at_of(from.scale[i], row, column), half,
-                          from.smallest_scale);
-      const float p = fmaxf(weight * mass[0].p + (1.f - weight) * mass[1].p, from.smallest);
-      bits -= log2f(p);
-      const float by_p = factor * -1.4426950409f / p;  // as of `sample_kernel`, below the floor too
-      const float by_logit = by_p * (mass[0].p - mass[1].p) * weight * (1.f - weight);
-      to.logit[0][at] = by_logit, to.logit[1][at] = -by_logit;
-      float by_x = 0.f;
-#pragma unroll
-      for (int i = 0; i < 2; ++i) {
-        const float slope = by_p * (i == 0 ? weight : 1.f - weight) * 0.56418958355f;  // 1 / sqrt(pi)
-        const float at_near = slope * expf(-mass[i].near * mass[i].near);
-        const float at_far = slope * expf(-mass[i].far * mass[i].far);
-        const float own = (at_far - at_near) * mass[i].narrow * mass[i].sign;
-        by_x += own;
-        to.mean[i][at] = -own;
-        to.scale[i][at] = at_of(from.scale[i], row, column) >= from.smallest_scale
-                              ? (at_near * mass[i].near - at_far * mass[i].far) / mass[i].deviation
-                              : 0.f;
-        by_step += 0.5f * (at_near + at_far) * mass[i].narrow;
-      }
-      to.x[at] = by_x;
-    }
-  }
-  bits = sum_of_warp(bits), by_step = sum_of_warp(by_step);
-  if (there && lane == 0) to.bits[row] = factor * bits, to.factors[row] = bits, to.steps[row] = by_step;
 }
 
 dim3 threads() { return {kWarp, kRows}; }
@@ -233,10 +168,6 @@ void values_backward(const Rows& from, const RowSlopes& by, const RowGradients& 
 
 void sample_bits(const Sample& sample, const SampleBits& to, cudaStream_t stream) {
   if (sample.count > 0) sample_kernel<<<blocks_of(sample.count), threads(), 0, stream>>>(sample, to);
-}
-
-void mixture_bits(const Mixture& mixture, const MixtureBits& to, cudaStream_t stream) {
-  if (mixture.count > 0) mixture_kernel<<<blocks_of(mixture.count), threads(), 0, stream>>>(mixture, to);
 }
 
 }  // namespace sw_anchors::cuda

@@ -20,7 +20,5 @@ void values_backward(const Rows& from, const RowSlopes& by, const RowGradients& 
 
 // Bits of bins a step wide under Gaussians, times whether an anchor counts, or for offsets their masks.
 void sample_bits(const Sample& sample, const SampleBits& to, cudaStream_t stream);
-// Likewise under mixtures.
-void mixture_bits(const Mixture& mixture, const MixtureBits& to, cudaStream_t stream);
 
 }  // namespace sw_anchors::cuda

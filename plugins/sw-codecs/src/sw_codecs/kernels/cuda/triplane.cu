@@ -45,11 +45,12 @@ __device__ __forceinline__ void add(float* to, const Some<kWidth>& some) {
 #if __CUDA_ARCH__ >= 900
   if constexpr (kWidth == 4) {
     atomicAdd(reinterpret_cast<float4*>(to), make_float4(some.at[0], some.at[1], some.at[2], some.at[3]));
-    return;
-  }
+  } else
 #endif
+  {
 #pragma unroll
-  for (int i = 0; i < kWidth; ++i) atomicAdd(to + i, some.at[i]);
+    for (int i = 0; i < kWidth; ++i) atomicAdd(to + i, some.at[i]);
+  }
 }
 
 // Thread number -> what it takes: a site or run of sites, a pair, the first of its channels.
@@ -59,10 +60,10 @@ struct Part {
 };
 
 template <int kWidth>
-__device__ __forceinline__ Part part_of(const Sites& sites, int pairs = kPairs) {
+__device__ __forceinline__ Part part_of(const Sites& sites) {
   const int each = sites.channels / kWidth;
-  const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x, row = thread / (pairs * each);
-  const int rest = int(thread - row * pairs * each);
+  const int64_t thread = int64_t(blockIdx.x) * kThreads + threadIdx.x, row = thread / (kPairs * each);
+  const int rest = int(thread - row * kPairs * each);
   return {row, rest / each, rest % each * kWidth};
 }
 
@@ -90,29 +91,6 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-// The sum of all samples of a site: a thread takes all pairs.
-template <int kWidth>
-__global__ void __launch_bounds__(kThreads)
-    sum_kernel(const __grid_constant__ Sites sites, const __grid_constant__ Tables tables, float* found) {
-  const Part part = part_of<kWidth>(sites, 1);
-  if (part.row >= sites.count) return;
-  Some<kWidth> sum{};
-  for (int scale = 0; scale < sites.scales; ++scale) {
-    const int64_t site = (part.row * sites.scales + scale) * kPairs * kCorners;
-#pragma unroll
-    for (int corner = 0; corner < kPairs * kCorners; ++corner) {
-      const int64_t cell = sites.cells[site + corner];
-      const float weight = sites.weights[site + corner];
-      const Some<kWidth> value = load<kWidth>(tables.of[scale] + cell * sites.channels + part.channel);
-#pragma unroll
-      for (int i = 0; i < kWidth; ++i) sum.at[i] += weight * value.at[i];
-    }
-  }
-  float* to = found + part.row * sites.channels + part.channel;
-#pragma unroll
-  for (int i = 0; i < kWidth; ++i) to[i] = sum.at[i];
-}
-
 template <int kWidth>
 __device__ __forceinline__ bool any(const Some<kWidth>& some) {
   bool found = false;
@@ -121,8 +99,7 @@ __device__ __forceinline__ bool any(const Some<kWidth>& some) {
   return found;
 }
 
-// kSummed: slopes are those of `sum_kernel`, else of `lookup_kernel`.
-template <int kWidth, bool kSummed>
+template <int kWidth>
 __global__ void __launch_bounds__(kThreads)
     backward_kernel(const __grid_constant__ Sites sites, const float* slopes, const __grid_constant__ Tables tables) {
   const Part part = part_of<kWidth>(sites);
@@ -138,10 +115,9 @@ __global__ void __launch_bounds__(kThreads)
           add<kWidth>(table + int64_t(cells[corner]) * sites.channels, sums[corner]);
     };
     for (int64_t row = first; row < last; ++row) {
-      Some<kWidth> slope{};
-      if (kSummed) slope = load<kWidth>(slopes + row * sites.channels + part.channel);
       // A plane is in the feature of its own scale and of all finer ones.
-      for (int other = scale; !kSummed && other < sites.scales; ++other) {
+      Some<kWidth> slope{};
+      for (int other = scale; other < sites.scales; ++other) {
         const Some<kWidth> one = load<kWidth>(
             slopes + ((row * sites.scales + other) * kPairs + part.pair) * sites.channels + part.channel);
 #pragma unroll
@@ -167,8 +143,8 @@ __global__ void __launch_bounds__(kThreads)
   }
 }
 
-unsigned blocks_of(int64_t rows, const Sites& sites, int width, int pairs = kPairs) {
-  return unsigned((rows * pairs * (sites.channels / width) + kThreads - 1) / kThreads);
+unsigned blocks_of(int64_t rows, const Sites& sites, int width) {
+  return unsigned((rows * kPairs * (sites.channels / width) + kThreads - 1) / kThreads);
 }
 
 }  // namespace
@@ -187,21 +163,13 @@ void lookup(const Sites& sites, bool four, const Tables& tables, float* features
     lookup_kernel<1><<<blocks_of(sites.count, sites, 1), kThreads, 0, stream>>>(sites, tables, features);
 }
 
-void sum(const Sites& sites, bool four, const Tables& tables, float* found, cudaStream_t stream) {
-  if (sites.count == 0) return;
-  if (four)
-    sum_kernel<4><<<blocks_of(sites.count, sites, 4, 1), kThreads, 0, stream>>>(sites, tables, found);
-  else
-    sum_kernel<1><<<blocks_of(sites.count, sites, 1, 1), kThreads, 0, stream>>>(sites, tables, found);
-}
-
-void backward(const Sites& sites, bool four, bool summed, const float* slopes, const Tables& tables,
-              cudaStream_t stream) {
+void backward(const Sites& sites, bool four, const float* slopes, const Tables& tables, cudaStream_t stream) {
   const int64_t runs = (sites.count + kRun - 1) / kRun;
   if (runs == 0) return;
-  const auto kernel = four ? (summed ? backward_kernel<4, true> : backward_kernel<4, false>)
-                           : (summed ? backward_kernel<1, true> : backward_kernel<1, false>);
-  kernel<<<blocks_of(runs, sites, four ? 4 : 1), kThreads, 0, stream>>>(sites, slopes, tables);
+  if (four)
+    backward_kernel<4><<<blocks_of(runs, sites, 4), kThreads, 0, stream>>>(sites, slopes, tables);
+  else
+    backward_kernel<1><<<blocks_of(runs, sites, 1), kThreads, 0, stream>>>(sites, slopes, tables);
 }
 
 }  // namespace sw_triplane::cuda

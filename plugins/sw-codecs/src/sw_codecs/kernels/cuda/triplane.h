@@ -19,12 +19,7 @@ void transpose(const float* from, float* to, int k, int64_t a, int64_t b, float 
 // channels are a multiple of four and all addresses of sixteen bytes.
 void lookup(const Sites& sites, bool four, const Tables& tables, float* features, cudaStream_t stream);
 
-// Sums [count][channels] of the samples of all scales and pairs.
-void sum(const Sites& sites, bool four, const Tables& tables, float* found, cudaStream_t stream);
-
-// Adds the gradients by the tables, from those of `lookup`, or of `sum` if `summed`; sums are atomic. Sites that follow
-// one another in the same cells share them.
-void backward(const Sites& sites, bool four, bool summed, const float* slopes, const Tables& tables,
-              cudaStream_t stream);
+// Adds the gradients by the tables; sums are atomic. Sites that follow one another in the same cells share them.
+void backward(const Sites& sites, bool four, const float* slopes, const Tables& tables, cudaStream_t stream);
 
 }  // namespace sw_triplane::cuda
