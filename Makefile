@@ -20,7 +20,7 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-geometry test-ray docs-site coverage lint format bench kernels docs clean
+.PHONY: demo test test-geometry test-ray test-browser docs-site coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
@@ -39,6 +39,12 @@ test-geometry: $(VENV)/.ready-dev
 test-ray: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt -e 'plugins/sw-ray[ray]' -e 'plugins/sw-bench[slurm]' --no-build-isolation
 	$(BIN)/python -m pytest -m 'not cuda' plugins/sw-ray plugins/sw-bench/tests/test_executors.py $(PYTEST_ARGS)
+
+# viser without its pins, which name an older rich than ours; Chromium is the system's.
+test-browser: $(VENV)/.ready-dev
+	$(PIP) install -q --no-deps viser==1.1.1
+	$(PIP) install -q 'websockets<17' msgspec trimesh imageio requests tqdm zstandard
+	$(BIN)/python -m pytest -m slow plugins/sw-viewer/tests/test_viewer_browser.py plugins/sw-report/tests/test_report_browser.py $(PYTEST_ARGS)
 
 docs-site: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt mkdocs-material
