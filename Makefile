@@ -20,7 +20,7 @@ TEST_JOBS ?= 2
 # Whole files, so that fixtures are made once, in the order of conftest.py: the long ones first.
 TEST_DIST := --dist loadfile --no-loadscope-reorder
 
-.PHONY: demo test test-geometry test-ray test-browser docs-site coverage lint format bench kernels docs clean
+.PHONY: demo test test-geometry test-ray test-browser test-interchange docs-site coverage lint format bench kernels docs clean
 
 demo: $(VENV)/.ready
 	@tools/check-system compiler
@@ -45,6 +45,14 @@ test-browser: $(VENV)/.ready-dev
 	$(PIP) install -q --no-deps viser==1.1.1
 	$(PIP) install -q 'websockets<17' msgspec trimesh imageio requests tqdm zstandard
 	$(BIN)/python -m pytest -m slow plugins/sw-viewer/tests/test_viewer_browser.py plugins/sw-report/tests/test_report_browser.py $(PYTEST_ARGS)
+
+# Needs node 18 or newer; what is installed stays below build/.
+test-interchange: $(VENV)/.ready-dev
+	npm install --silent --prefix build/oracle @playcanvas/splat-transform@2.7.1 'playcanvas@^2'
+	test -d build/oracle/venv || $(PYTHON) -m venv build/oracle/venv
+	build/oracle/venv/bin/pip install -q gsply==0.4.6
+	SPLAT_TRANSFORM=build/oracle/node_modules/.bin/splat-transform GSPLY_PYTHON=build/oracle/venv/bin/python \
+		$(BIN)/python -m pytest plugins/sw-interchange/tests/test_other_programs.py $(PYTEST_ARGS)
 
 docs-site: $(VENV)/.ready-dev
 	$(PIP) install -q -c constraints.txt mkdocs-material
