@@ -154,3 +154,13 @@ def test_a_run_encodes_a_trained_scene_and_decodes_it_in_a_fresh_process(tmp_pat
     assert reader.size == file.stat().st_size
     own, _ = encode(from_gaussians(read("spz", reader)), "spz", sh1_bits=8, sh_bits=8)
     assert decode(own, "spz").num_gaussians == 50
+
+
+def test_what_a_codec_clamps_is_told(caplog):
+    model = model_of()
+    with torch.no_grad():
+        model.log_scales[0] = 20
+        model.means[1] = 5000
+    written("spz", model)
+    assert "spz: 3 values of log_scales lie beyond its range" in caplog.text
+    assert "10 fractional bits instead of 12" in caplog.text

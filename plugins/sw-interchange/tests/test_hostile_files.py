@@ -3,6 +3,7 @@
 import gzip
 import io
 import json
+import os
 import pickle
 import struct
 import tracemalloc
@@ -13,7 +14,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from interchange_files import Sample, ksplat_file, mutants, random_scene, samples
-from sw_interchange import Limits, decode, encode, read
+from sw_interchange import Limits, decode, encode, gltf, read, write
 
 from splatwizard_core.api import SplatwizardError, UserInputError
 
@@ -115,7 +116,20 @@ def zstd_bomb() -> bytes:
     return spz4(1, table=[len(frame), 9, 0, 1, 0, 3, 0, 3, 0, 4], rest=frame)
 
 
+def shared_gltf(primitives: int, nodes: int) -> bytes:
+    """Nodes that all show one mesh, whose primitives all name the same accessors."""
+    data = encode(random_scene(5, 1), "gltf")[0]
+    size = struct.unpack_from("<I", data, 12)[0]
+    document = json.loads(data[20 : 20 + size])
+    document["meshes"][0]["primitives"] *= primitives
+    document["nodes"] = [{"mesh": 0}] * nodes
+    document["scenes"] = [{"nodes": list(range(nodes))}]
+    return glb(document, data[28 + size :])
+
+
 BAD = {
+    "gltf that reads its bytes again": (shared_gltf(40, 1), "gltf"),
+    "spz of many extensions": (gzip.compress(spz_head(count=1, degree=0, flags=2) + bytes(20 + 8 * 65)), "spz"),
     "nothing": (b"", None),
     "text": (b"hello", None),
     "ply without an end": (PLY, "ply"),
@@ -286,3 +300,83 @@ def test_a_view_that_is_larger_than_its_file_is_refused(tmp_path):
     assert (tmp_path / "wide.pt").stat().st_size < 1 << 20
     with pytest.raises(UserInputError, match="more than the limit"):
         read(tmp_path / "wide.pt", limits=LIMITS)
+    with pytest.raises(UserInputError, match="more than are stored"):
+        read(tmp_path / "wide.pt")
+
+
+def test_a_checkpoint_with_a_bytearray_is_not_opened(tmp_path, little_memory):
+    import torch
+
+    torch.save({"splats": {"means": torch.zeros(2, 3)}, "more": "M"}, tmp_path / "sound.pt")
+    # GLOBAL bytearray, BININT 400,000,000, TUPLE1, REDUCE in place of the text "M".
+    bomb = b"c__builtin__\nbytearray\nJ" + struct.pack("<i", 400_000_000) + b"\x85R"
+    with zipfile.ZipFile(tmp_path / "sound.pt") as old, zipfile.ZipFile(tmp_path / "bomb.pt", "w") as new:
+        for info in old.infolist():
+            content = old.read(info)
+            if info.filename.endswith("data.pkl"):
+                assert content.count(b"X\x01\0\0\0M") == 1
+                content = content.replace(b"X\x01\0\0\0M", bomb)
+            new.writestr(info.filename, content)
+    with pytest.raises(UserInputError, match="a bytearray"):
+        read(tmp_path / "bomb.pt")
+
+
+def test_primitives_of_a_mesh_are_looked_at_once(monkeypatch):
+    looked = []
+    has_splats = gltf._has_splats
+    monkeypatch.setattr(gltf, "_has_splats", lambda each: looked.append(1) or has_splats(each))
+    empty = {"attributes": {}}
+    document = {
+        "scenes": [{"nodes": list(range(50))}],
+        "nodes": [{"mesh": 0}] * 50,
+        "meshes": [{"primitives": [empty] * 50}],
+    }
+    with pytest.raises(UserInputError, match="no splats"):
+        decode(glb({"asset": {"version": "2.0"}, **document}), "gltf")
+    assert len(looked) == 50
+
+
+def test_an_instance_of_a_mesh_is_read():
+    assert decode(shared_gltf(1, 3), "gltf").num_gaussians == 15
+
+
+def test_images_beside_a_description_are_files_of_a_sound_size(tmp_path):
+    meta = tmp_path / "meta.json"
+    write(random_scene(5, 1), meta, format="sog-folder")
+    image = tmp_path / "quats.webp"
+    with image.open("r+b") as file:
+        file.truncate(1 << 30)  # sparse
+    with pytest.raises(UserInputError, match=r"1,073,741,824 bytes; 8,388,648 are the most"):
+        read(meta)
+    image.unlink()
+    os.mkfifo(image)
+    with pytest.raises(UserInputError, match="is no file"):
+        read(meta)
+
+
+def test_elements_and_properties_that_stand_twice_are_refused():
+    twice = PLY.replace(b"property", b"element vertex 1\nproperty") + b"end_header\n" + bytes(99)
+    with pytest.raises(UserInputError, match="bad header line 'element vertex 1'"):
+        decode(twice, "ply")
+
+
+def test_a_scale_of_many_digits_is_no_map(tmp_path, sound):
+    write(random_scene(3, 0), tmp_path / "a.ply")
+    told = {"transform": np.eye(4)[:3].tolist(), "scale": 10**400}
+    (tmp_path / "map.json").write_text(json.dumps(told))
+    with pytest.raises(UserInputError, match="no map of nerfstudio"):
+        read(tmp_path / "a.ply", undo_dataparser=tmp_path / "map.json")
+
+
+def test_sog_refuses_to_write_what_it_would_not_read():
+    scene = random_scene(5, 0)
+    scene.means[0, 0] = 1e36
+    with pytest.raises(UserInputError, match=r"coordinates up to 5\.5e"):
+        encode(scene, "sog")
+    scene.means[0, 0] = -5e34
+    assert decode(encode(scene, "sog")[0]).num_gaussians == 5
+
+
+def test_options_of_many_values_are_told_by_their_ends():
+    with pytest.raises(UserInputError, match=r"'palette' is 0; it may be None, or 1 to 65536$"):
+        encode(random_scene(5, 1), "sog", palette=0)

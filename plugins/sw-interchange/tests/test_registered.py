@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from interchange_files import ksplat_file, random_scene
 from sw_gaussians.ply import load_ply
-from sw_interchange import GaussianScene, read, write
+from sw_interchange import GaussianScene, decode, read, write
 
-from splatwizard_core.api import SceneError, SplatModel, UserInputError
+from splatwizard_core.api import ContainerReader, SceneError, SplatModel, UserInputError
 from splatwizard_core.cli.main import main
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.decode import export_model
@@ -55,6 +55,46 @@ def test_that_a_file_was_trained_with_antialiasing_is_asked_of_the_rasterizer(pl
     assert model.origin["raster"] == {"antialias": True}
     write(read(ply), tmp_path / "b.spz")
     assert load_plugins().importers.load("spz")(tmp_path / "b.spz").origin["raster"] == {}
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".compressed.ply", ".sog", ".json"])
+def test_antialiasing_goes_through_the_command_and_back(ply, tmp_path, suffix):
+    write(read(ply), tmp_path / "a.spz", antialiased=True)
+    there, back = tmp_path / f"there{suffix}", tmp_path / "back.spz"
+    assert main(["export", str(tmp_path / "a.spz"), str(there)]) == 0
+    assert read(there).antialiased
+    assert load_plugins().read_gaussians(there).origin["raster"] == {"antialias": True}
+    assert main(["export", str(there), str(back)]) == 0
+    assert read(back).antialiased
+
+
+def test_a_page_is_drawn_as_the_file_asks(ply, tmp_path):
+    for name, antialiased in (("a", True), ("b", False)):
+        write(read(ply), tmp_path / f"{name}.spz", antialiased=antialiased)
+        assert main(["export", str(tmp_path / f"{name}.spz"), str(tmp_path / f"{name}.html")]) == 0
+        assert f'"antialias":{int(antialiased)}' in (tmp_path / f"{name}.html").read_text()
+
+
+def test_an_encoded_file_asks_for_what_its_ply_asked(ply, tmp_path):
+    write(read(ply), tmp_path / "a.spz", antialiased=True)
+    assert main(["export", str(tmp_path / "a.spz"), str(tmp_path / "a.ply")]) == 0
+    assert main(["encode", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.swz"), "--method", "spz"]) == 0
+    file = ContainerReader.open(tmp_path / "a.swz")
+    assert file.raster["antialias"] is True
+    assert decode(file.section("file"), "spz").antialiased
+    assert main(["export", str(tmp_path / "a.swz"), str(tmp_path / "b.ply")]) == 0
+    assert read(tmp_path / "b.ply").antialiased
+    plain = ["--method", "spz", "--set", "raster.antialias=false"]
+    assert main(["encode", str(tmp_path / "a.ply"), "--out", str(tmp_path / "c.swz"), *plain]) == 0
+    assert "antialias" not in ContainerReader.open(tmp_path / "c.swz").raster
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".ply"])
+def test_a_low_pass_filter_of_its_own_is_told_as_lost(ply, tmp_path, caplog, suffix):
+    model = load_plugins().read_gaussians(ply)
+    model.origin = {"raster": {"eps2d": 0.1}}
+    export_model(model, tmp_path / f"a{suffix}", load_plugins())
+    assert "not kept: its low-pass filter of 0.1 px^2" in caplog.text
 
 
 @pytest.mark.pipeline
@@ -113,3 +153,16 @@ def test_a_damaged_file_is_one_line_of_the_command(tmp_path, capsys):
     with pytest.raises(UserInputError, match=r"compressed \.ply"):
         load_ply(tmp_path / "b.ply")
     assert read(tmp_path / "b.ply").report.format == "compressed-ply"
+
+
+def test_info_tells_what_a_meta_json_describes(ply, tmp_path, capsys):
+    write(read(ply), tmp_path / "meta.json", format="sog-folder")
+    assert main(["info", str(tmp_path / "meta.json"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert (facts["kind"], facts["num_gaussians"]) == ("sog-folder", 30)
+
+
+def test_the_cut_of_degree_4_is_told(tmp_path, caplog):
+    write(random_scene(5, 4), tmp_path / "a.spz", version=4)
+    assert load_plugins().read_gaussians(tmp_path / "a.spz").max_sh_degree == 3
+    assert "a.spz: its SH degree is 4" in caplog.text

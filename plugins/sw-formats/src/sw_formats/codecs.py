@@ -6,6 +6,7 @@ bytes: what was decoded is coded a second time.
 
 from __future__ import annotations
 
+import logging
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
@@ -16,6 +17,8 @@ from splatwizard_core.api import BitstreamError, GaussianModel, Params, UserInpu
 
 if TYPE_CHECKING:
     from splatwizard_core.api import ContainerReader, ContainerWriter, PluginManager
+
+log = logging.getLogger(__name__)
 
 SECTION = "file"
 RAW_BYTES = 4 * 59
@@ -48,9 +51,13 @@ class FormatCodec:
         count = 0
         if model.num_rows:
             try:
-                data, report = encode(from_gaussians(model), self.FORMAT, **self.settings.model_dump())
+                scene = from_gaussians(model)
+                scene.antialiased = writer.raster.get("antialias") is True
+                data, report = encode(scene, self.FORMAT, **self.settings.model_dump())
             except UserInputError as error:
                 raise ValueError(str(error)) from error
+            for line in report.notices():
+                log.warning("%s: %s", self.FORMAT, line)
             count = report.num_gaussians
             writer.add(SECTION, data)
         writer.static["num_gaussians"] = count

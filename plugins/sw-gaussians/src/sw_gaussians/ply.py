@@ -8,13 +8,14 @@ from __future__ import annotations
 import logging
 import mmap
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import torch
 
 from splatwizard_core.api import GaussianModel, SceneError, SplatModel, replacing
-from sw_gaussians.ply_gaussians import file_parts, parse_gaussians
+from sw_gaussians.drawn_as import antialias_of, lost_options
+from sw_gaussians.ply_gaussians import MIP_COMMENT, file_parts, parse_gaussians
 from sw_gaussians.surfels import as_ellipsoids, gaussians_of
 
 log = logging.getLogger(__name__)
@@ -23,7 +24,8 @@ log = logging.getLogger(__name__)
 def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     """Read a model with exactly the values of the file, active SH degree = the degree that is stored (0 .. 3).
 
-    A file with scale_0 and scale_1 and no scale_2 holds surfels: a SurfelModel.
+    A file with scale_0 and scale_1 and no scale_2 holds surfels: a SurfelModel. One whose comments say that it was
+    trained with antialiasing asks for that in the model's `origin`.
 
     Any order of properties, any type of number, binary or ASCII, is read; normals and unknown properties are ignored.
     Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
@@ -54,14 +56,18 @@ def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:
     for note in found.notes:
         log.warning("%s: %s", Path(path).name, note)
     columns = (found.means, found.sh_dc[:, None], found.sh_rest, found.opacity_logits, found.log_scales, found.quats)
-    return gaussians_of(*(torch.from_numpy(column) for column in columns))
+    model = gaussians_of(*(torch.from_numpy(column) for column in columns))
+    if found.antialiased:
+        model.origin = {"antialiased": True, "raster": {"antialias": True}}
+    return model
 
 
 def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """Write the raw parameters, binary little-endian, normals zero; `load_ply` gives every bit back.
 
-    The file is complete or absent: it is written beside `path` and then renamed. Raises SceneError for models that
-    are not explicit Gaussians.
+    A comment says that the model asks for antialiasing, if it does; the log tells what no .ply can say. The file is
+    complete or absent: it is written beside `path` and then renamed. Raises SceneError for models that are not explicit
+    Gaussians.
     """
     if not isinstance(model, GaussianModel):
         raise SceneError(
@@ -69,8 +75,11 @@ def export_ply(model: SplatModel, path: str | os.PathLike[str]) -> None:
             "`sw bake FILE OUT --scene SCENE` fits explicit ones",
             path=str(path),
         )
+    for what in lost_options(model):
+        log.warning("%s: not kept: %s", Path(path).name, what)
+    comments = [MIP_COMMENT] if antialias_of(model) else []
     with replacing(path) as temporary, open(temporary, "wb") as file:
-        file.writelines(_parts_of(model))
+        file.writelines(_parts_of(model, comments))
 
 
 def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
@@ -82,10 +91,10 @@ def export_ply_as_3dgs(model: SplatModel, path: str | os.PathLike[str]) -> None:
 
 
 def to_ply(model: GaussianModel) -> bytes:
-    """The bytes that `export_ply` writes of a model."""
+    """The bytes that `export_ply` writes of a model, with no comment."""
     return b"".join(_parts_of(model))
 
 
-def _parts_of(model: GaussianModel) -> Iterator[bytes | memoryview]:
+def _parts_of(model: GaussianModel, comments: Sequence[str] = ()) -> Iterator[bytes | memoryview]:
     columns = (model.means, model.sh_dc[:, 0], model.sh_rest, model.opacity_logits, model.log_scales, model.quats)
-    return file_parts(*(column.detach().cpu().float().numpy() for column in columns))
+    return file_parts(*(column.detach().cpu().float().numpy() for column in columns), comments=comments)

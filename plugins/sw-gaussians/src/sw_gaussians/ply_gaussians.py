@@ -22,6 +22,8 @@ from sw_gaussians.ply_tables import MAX_HEADER, PlyHeader, Table, read_header, r
 Array = npt.NDArray[np.float32]
 
 SH_C0 = 0.28209479177387814
+MIP_COMMENT = "SplatRenderMode: mip"
+"""Says that a file was trained with the filter of Mip-Splatting."""
 _ROWS_AT_ONCE = 1 << 13  # 2 MB of rows: they stay in the processor's cache
 
 

@@ -36,6 +36,7 @@ class _Element:
     count: int
     fields: list[tuple[str, str]] = field(default_factory=list)  # property, type code
     lists: int = 0
+    names: set[str] = field(default_factory=set)  # of the fields, to look one up
 
     def least_bytes(self, binary: bool) -> int:
         """Bytes that the rows take at least: a list its length, a value of text two letters, an empty row one."""
@@ -74,6 +75,7 @@ def read_header(head: bytes, size: int, name: str) -> PlyHeader:
     if not head.startswith(b"ply") or match is None:
         raise BitstreamError(f"{name}: not a .ply file: no header within {MAX_HEADER} bytes", section="header")
     elements: list[_Element] = []
+    named: set[str] = set()
     comments: list[str] = []
     order: str | None = None
     for line in re.split(r"\r\n|\r|\n", head[: match.start()].decode("ascii", "replace"))[1:]:
@@ -83,9 +85,10 @@ def read_header(head: bytes, size: int, name: str) -> PlyHeader:
             if order is None:
                 raise BitstreamError(f"{name}: not a readable .ply: '{line[:60]}'", section="header")
         elif words[:1] == ["element"]:
-            if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or words[1] in {e.name for e in elements}:
+            if len(words) != 3 or not re.fullmatch(r"\d{1,12}", words[2]) or words[1] in named:
                 raise BitstreamError(f"{name}: bad header line '{line[:60]}'", section="header")
             elements.append(_Element(words[1], int(words[2])))
+            named.add(words[1])
         elif words[:1] == ["property"] and elements:
             _add_property(elements[-1], words, f"{name}: property '{line[:60]}'")
         elif words[:1] in (["comment"], ["obj_info"]):
@@ -109,10 +112,11 @@ def _add_property(element: _Element, words: list[str], told: str) -> None:
         element.lists += 1
     elif len(words) != 3 or words[1] not in _TYPES:
         raise BitstreamError(f"{told} has no place in a 3DGS model", section="header")
-    elif words[2] in {name for name, _ in element.fields}:
+    elif words[2] in element.names:
         raise BitstreamError(f"{told} stands twice in the header", section="header")
     else:
         element.fields.append((words[2], _TYPES[words[1]]))
+        element.names.add(words[2])
 
 
 def read_tables(data: bytes | memoryview, header: PlyHeader, wanted: tuple[str, ...], name: str) -> Mapping[str, Table]:

@@ -93,7 +93,7 @@ def as_ellipsoids(model: GaussianModel) -> GaussianModel:
     if model.NUM_SCALES != SurfelModel.NUM_SCALES:
         return model
     thickness = torch.full_like(model.opacity_logits, math.log(THICKNESS))
-    return GaussianModel.from_tensors(
+    flat = GaussianModel.from_tensors(
         model.means,
         model.sh_dc,
         model.sh_rest,
@@ -102,6 +102,8 @@ def as_ellipsoids(model: GaussianModel) -> GaussianModel:
         model.quats,
         active_sh_degree=model.active_sh_degree,
     )
+    flat.origin = model.origin
+    return flat
 
 
 def state_surfels(model: GaussianModel, writer: ContainerWriter) -> None:

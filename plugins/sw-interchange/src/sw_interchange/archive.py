@@ -16,6 +16,17 @@ def entries_of(source: Source) -> list[zipfile.ZipInfo]:
     return _opened(source).infolist()
 
 
+def read_entry(source: Source, info: zipfile.ZipInfo) -> bytes:
+    """Return the content of one entry, no more bytes than it claims. Raises BitstreamError."""
+    try:
+        with _opened(source).open(info) as file:
+            return file.read(info.file_size)
+    except BitstreamError:
+        raise
+    except Exception as error:  # as below
+        raise _damaged(source, error) from error
+
+
 def _opened(source: Source) -> zipfile.ZipFile:
     try:
         return zipfile.ZipFile(_View(source.data))

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import io
 import pickle
+import pickletools
 from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
 from splatwizard_core.api import BitstreamError, SceneError
-from sw_interchange.archive import entries_of
+from sw_interchange.archive import entries_of, read_entry
 from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
 from sw_interchange.scene import GaussianScene, Limits, ReadReport
 from sw_interchange.source import Source
@@ -38,10 +39,14 @@ def _unpickled(source: Source, limits: Limits) -> Any:
     name = source.name
     if source.head(4) != b"PK\x03\x04":
         raise BitstreamError(f"{name}: not a checkpoint that torch 1.6 or later saved")
-    sizes = [info.file_size for info in entries_of(source)]
+    entries = entries_of(source)
+    sizes = [info.file_size for info in entries]
     # Storages are not compressed: none can be larger than the file.
     if sum(sizes) > len(source.data) or len(source.data) > limits.max_output_bytes:
         raise BitstreamError(f"{name}: its archive claims {sum(sizes):,} bytes, the file has {len(source.data):,}")
+    for info in entries:
+        if info.filename.endswith("data.pkl"):
+            _check_pickle(read_entry(source, info), name)
     import torch
 
     try:
@@ -53,6 +58,18 @@ def _unpickled(source: Source, limits: Limits) -> Any:
     except Exception as error:  # torch raises many kinds for damaged files
         reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise BitstreamError(f"{name}: a damaged checkpoint: {reason}") from error
+
+
+def _check_pickle(content: bytes, name: str) -> None:
+    """Refuse what makes much of few bytes: torch lets a pickle ask for a bytearray of any size."""
+    try:
+        asked = {str(value).rpartition(" ")[2] for opcode, value, _ in pickletools.genops(content)
+                 if opcode.name == "GLOBAL"}  # fmt: skip
+    except Exception as error:  # of many kinds, for damaged pickles
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
+        raise BitstreamError(f"{name}: a damaged checkpoint: {reason}") from error
+    if "bytearray" in asked:
+        raise BitstreamError(f"{name}: holds more than tensors and plain values: a bytearray")
 
 
 def _gsplat(found: Any, name: str) -> dict[str, Any] | None:
@@ -119,6 +136,8 @@ def _array(parts: dict[str, Any], key: str, name: str, limits: Limits) -> Array:
     found = parts.get(key)
     if not isinstance(found, torch.Tensor) or found.layout != torch.strided or not found.dtype.is_floating_point:
         raise BitstreamError(f"{name}: '{key}' is no tensor of numbers")
-    # A view may be larger than what it is a view of.
     limits.check(len(found) if found.ndim else 0, 4 * found.numel(), name)
+    # A view may be larger than what it is a view of, and a tensor of the device "meta" has no memory at all.
+    if found.device.type != "cpu" or found.numel() * found.itemsize > found.untyped_storage().nbytes():
+        raise BitstreamError(f"{name}: '{key}' claims {found.numel():,} numbers, more than are stored of it")
     return found.detach().float().contiguous().numpy()

@@ -33,7 +33,7 @@ def undone(scene: GaussianScene, path: str | os.PathLike[str]) -> GaussianScene:
         scale = float(told["scale"])
     except OSError as error:
         raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
         raise BitstreamError(f"{name}: no map of nerfstudio: {type(error).__name__}: {error}") from error
     if matrix.shape != (3, 4) or not np.isfinite(matrix).all() or not 1e-12 < scale < 1e12:
         raise BitstreamError(f"{name}: no map of nerfstudio: a 3x4 transform and a scale above 0")

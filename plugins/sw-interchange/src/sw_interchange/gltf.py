@@ -24,6 +24,8 @@ from sw_interchange.source import Source
 MAX_JSON = 1 << 24
 MAX_NODES = 1 << 16
 MAX_PRIMITIVES = 1 << 10
+MOST_READ = 16
+"""Times that the bytes of a file may be read: primitives and nodes may share accessors."""
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 
@@ -34,7 +36,7 @@ class _Document:
     """The two chunks of a file, every index into them checked."""
 
     def __init__(self, source: Source, limits: Limits) -> None:
-        self.name, self.limits, self.rows = source.name, limits, 0
+        self.name, self.limits, self.rows, self.read = source.name, limits, 0, 0
         data = source.data
         if bytes(data[:4]) != b"glTF":
             raise self.error("a .gltf of text, which is not read: make a .glb of it")
@@ -95,6 +97,9 @@ class _Document:
         inside = self.whole(view, "byteOffset", 0) + self.whole(view, "byteLength")
         if stride < row.itemsize or end > inside or inside > len(self.blob):
             raise self.error(f"accessor {index} reaches beyond its buffer: it is truncated")
+        self.read += count * row.itemsize
+        if self.read > MOST_READ * len(self.blob):
+            raise self.error(f"its splats name the same bytes more than {MOST_READ} times over")
         strides = (stride, row.base.itemsize)
         raw = np.ndarray((count, width), row.base, buffer=self.blob, offset=start, strides=strides)
         values = raw.astype(np.float32)
@@ -127,6 +132,7 @@ def _placed(document: _Document) -> list[tuple[dict[str, Any], Matrix]]:
     scene = document.item("scenes", root.get("scene", 0))
     waiting = [(index, np.eye(4)) for index in _list(scene.get("nodes"))]
     seen: set[int] = set()
+    of_meshes: dict[int, list[dict[str, Any]]] = {}
     found = []
     while waiting:
         index, above = waiting.pop()
@@ -138,13 +144,19 @@ def _placed(document: _Document) -> list[tuple[dict[str, Any], Matrix]]:
         waiting += [(child, place) for child in _list(node.get("children"))]
         if "mesh" not in node:
             continue
-        for primitive in _list(document.item("meshes", node["mesh"]).get("primitives")):
-            told = primitive.get("extensions") if isinstance(primitive, dict) else None
-            if isinstance(told, dict) and EXTENSION in told:
-                found.append((primitive, place))
-                if len(found) > MAX_PRIMITIVES:
-                    raise document.error(f"more than {MAX_PRIMITIVES:,} primitives with splats")
+        mesh = document.item("meshes", node["mesh"])
+        # Once a mesh: many nodes may name one of many primitives.
+        if node["mesh"] not in of_meshes:
+            of_meshes[node["mesh"]] = [each for each in _list(mesh.get("primitives")) if _has_splats(each)]
+        found += [(primitive, place) for primitive in of_meshes[node["mesh"]]]
+        if len(found) > MAX_PRIMITIVES:
+            raise document.error(f"more than {MAX_PRIMITIVES:,} primitives with splats")
     return found
+
+
+def _has_splats(primitive: Any) -> bool:
+    told = primitive.get("extensions") if isinstance(primitive, dict) else None
+    return isinstance(told, dict) and EXTENSION in told
 
 
 def _list(value: Any) -> list[Any]:

@@ -33,11 +33,6 @@ class Format:
     options: str = "options:Options"
 
     @property
-    def reads(self) -> bool:
-        """Whether such files are read."""
-        return self.reader is not None
-
-    @property
     def writes(self) -> bool:
         """Whether such files are written."""
         return self.writer is not None

@@ -25,6 +25,14 @@ class Options:
                 raise UserInputError(f"no option '{name}' of this format; {hint}")
             legal = self.choices.get(name)
             if legal is not None and value not in legal:
-                told = f"{legal[0]} to {legal[-1]}" if isinstance(legal, range) else ", ".join(map(str, legal))
-                raise UserInputError(f"option '{name}' is {value!r}; it may be {told}")
+                raise UserInputError(f"option '{name}' is {value!r}; it may be {_told(legal)}")
             setattr(self, name, value)
+
+
+def _told(legal: tuple[Any, ...] | range) -> str:
+    """The values in words: whole numbers in sequence by the first and the last."""
+    if isinstance(legal, range):
+        return f"{legal[0]} to {legal[-1]}"
+    if len(legal) > 8 and legal[0] is None:
+        return f"None, or {legal[1]} to {legal[-1]}"
+    return ", ".join(map(str, legal))

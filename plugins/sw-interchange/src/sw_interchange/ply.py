@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from sw_gaussians.ply_gaussians import file_parts, parse_gaussians
+from sw_gaussians.ply_gaussians import MIP_COMMENT, file_parts, parse_gaussians
 
 from sw_interchange.options import Options
 from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, WriteReport
@@ -35,6 +35,6 @@ def read_ply(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
 def write_ply(scene: GaussianScene, options: Options, report: WriteReport) -> list[bytes]:
     """Encode a scene: every bit, and the comment that says how it was trained."""
     scales = scene.log_scales[:, :2] if scene.kind == "2dgs" else scene.log_scales
-    comments = ["SplatRenderMode: mip"] if scene.antialiased else []
+    comments = [MIP_COMMENT] if scene.antialiased else []
     values = (scene.means, scene.sh_dc, scene.sh_rest, scene.opacity_logits, scales, scene.quats)
     return [bytes(part) for part in file_parts(*values, comments=comments)]

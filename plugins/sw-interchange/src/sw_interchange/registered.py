@@ -7,6 +7,8 @@ import os
 from collections.abc import Callable
 from typing import Any
 
+from sw_gaussians.drawn_as import lost_options
+
 from splatwizard_core.api import GaussianModel, SceneError, SplatModel
 from sw_interchange.bridge import from_gaussians, to_gaussians
 from sw_interchange.files import read, write
@@ -20,13 +22,14 @@ Path = str | os.PathLike[str]
 def _importer(name: str) -> Callable[[Path], GaussianModel]:
     def load(path: Path) -> GaussianModel:
         scene = read(path, format=name)
+        if scene.sh_degree > 3:
+            log.warning("%s: its SH degree is 4: the bands of degree 4 are left out", os.path.basename(path))
         model = to_gaussians(scene)
         assert scene.report is not None  # of whatever was read
         for line in notices(scene.report):
             log.warning("%s: %s", os.path.basename(path), line)
-        raster = {"antialias": True} if scene.antialiased else {}
         told = {key: value for key, value in scene.report.as_dict().items() if key not in ("bytes", "num_gaussians")}
-        model.origin = {**told, "antialiased": scene.antialiased, "raster": raster}
+        model.origin = {**told, "antialiased": scene.antialiased, **model.origin}
         return model
 
     return load
@@ -40,10 +43,9 @@ def _exporter(name: str, **options: Any) -> Callable[[SplatModel, Path], None]:
                 path=str(path),
             )
         report = write(from_gaussians(model), path, format=name, **options)
-        for line in [*report.warnings, *(f"not kept: {what}" for what in report.lost)]:
+        lost = [f"not kept: {what}" for what in [*report.lost, *lost_options(model)]]
+        for line in [*lost, *report.notices()]:
             log.warning("%s: %s", os.path.basename(path), line)
-        for field, count in report.clamped.items():
-            log.warning("%s: %s values of %s lie beyond its range", os.path.basename(path), f"{count:,}", field)
 
     return save
 

@@ -91,6 +91,11 @@ class WriteReport:
         """Plain values."""
         return asdict(self)
 
+    def notices(self) -> list[str]:
+        """Lines that a user should see: warnings, and what was clamped."""
+        clamped = [f"{count:,} values of {field} lie beyond its range" for field, count in self.clamped.items()]
+        return self.warnings + clamped
+
     def count(self, name: str, mask: npt.NDArray[np.bool_]) -> None:
         """Count the values of a field that are clamped, if there are any."""
         if found := int(np.count_nonzero(mask)):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import stat
 from collections.abc import Callable
 from pathlib import PurePosixPath
 from typing import Any
@@ -29,6 +30,8 @@ PALETTE_COLUMNS = 64
 """Entries of the SH palette side by side in its image."""
 BANDS = {1: 3, 2: 8, 3: 15}
 """SH degree -> coefficients a channel."""
+LARGEST_LOGARITHM = 80
+"""Of ln(1 + |x|) of a coordinate."""
 
 
 class _Bundle:
@@ -36,6 +39,7 @@ class _Bundle:
 
     def __init__(self, source: Source, limits: Limits) -> None:
         self.name = source.name
+        self.largest = limits.max_output_bytes
         self.file: Callable[[str], bytes]
         if source.head(2) == b"PK":
             files = read_archive(source, min(limits.max_output_bytes, 64 * len(source.data) + (1 << 24)))
@@ -60,8 +64,15 @@ class _Bundle:
             raise BitstreamError(f"{self.name}: its images lie in other files: read the folder")
         where = source.path.parent / name
         try:
+            told = where.stat()  # before it is opened: opening a pipe waits for a writer
+            if not stat.S_ISREG(told.st_mode):
+                raise BitstreamError(f"{self.name}: '{name}', which it names, is no file")
+            if told.st_size > self.largest:
+                raise BitstreamError(
+                    f"{self.name}: '{name}', which it names, has {told.st_size:,} bytes; {self.largest:,} are the most"
+                )
             with where.open("rb") as file:
-                return file.read()
+                return file.read(self.largest)
         except OSError as error:
             raise BitstreamError(f"{self.name}: '{name}', which it names, cannot be read: {error.strerror}") from error
 
@@ -138,6 +149,8 @@ def read_sog(source: Source, limits: Limits, report: ReadReport) -> GaussianScen
     report.version = str(version)
     count = _count(bundle, version)
     limits.check(count, 56 * count, bundle.name)
+    # An image has 4 bytes a texel and at most two texels a Gaussian; that of the SH palette has 2^22 bytes.
+    bundle.largest = min(limits.max_output_bytes, 8 * count + (1 << 23))
     images = _checked_images(bundle, count)
     shared = {name: _texels(data, name, count) for name, data in images}
     low, high, scales, quats, sh0 = shared.values()
@@ -186,7 +199,7 @@ def _texels(data: bytes, name: str, count: int) -> Pixels:
 def _means(bundle: _Bundle, low: Pixels, high: Pixels) -> Array:
     """Undo the logarithm of both signs: y = sign(x) ln(1 + |x|)."""
     least, most = bundle.numbers("means", "mins", 3), bundle.numbers("means", "maxs", 3)
-    if (most < least).any() or max(abs(least).max(), abs(most).max()) > 80:
+    if (most < least).any() or max(abs(least).max(), abs(most).max()) > LARGEST_LOGARITHM:
         raise BitstreamError(f"{bundle.name}: the bounds of 'means' make no sense")
     steps = (high[:, :3].astype(np.uint16) << 8 | low[:, :3]).astype(np.float64) / 65535
     y = least + (most - least) * steps

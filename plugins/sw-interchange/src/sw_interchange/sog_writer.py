@@ -17,7 +17,7 @@ from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, smallest_three
 from sw_interchange.scene import GaussianScene, WriteReport, sigmoid
-from sw_interchange.sog import BANDS, MAX_PALETTE, PALETTE_COLUMNS
+from sw_interchange.sog import BANDS, LARGEST_LOGARITHM, MAX_PALETTE, PALETTE_COLUMNS
 from sw_interchange.webp import LARGEST_SIDE, Pixels, encode_image, tiled
 
 
@@ -102,6 +102,11 @@ def _positions(means: Array) -> tuple[Any, dict[str, list[float]]]:
     """16-bit steps [N,3] of the logarithm of both signs, and its bounds."""
     y = np.sign(means) * np.log1p(np.abs(means.astype(np.float64)))
     low, high = y.min(0), y.max(0)
+    if max(-low.min(), high.max()) > LARGEST_LOGARITHM:
+        raise UserInputError(
+            f"the scene reaches to {np.abs(means).max():.3g}: .sog holds coordinates up to "
+            f"{math.expm1(LARGEST_LOGARITHM):.2g}"
+        )
     span = np.where(high > low, high - low, 1)
     return np.rint((y - low) / span * 65535).astype(np.uint16), {"mins": low.tolist(), "maxs": high.tolist()}
 

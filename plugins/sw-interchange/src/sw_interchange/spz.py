@@ -23,6 +23,7 @@ MAGIC = b"NGSP"
 ANTIALIASED, EXTENDED, LOD_TREE = 0x01, 0x02, 0x80
 EXTENSION_SLACK = 1 << 20
 """Bytes after the attributes that a file of versions 1 to 3 may hold."""
+MAX_EXTENSIONS = 64
 AXES_EXTENSION = 0xADBE0003
 _AXES = ["LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
 
@@ -152,15 +153,18 @@ def _extensions(header: _Header, source: Source, report: ReadReport) -> tuple[st
     """The axes of the numbers, and the other extensions as raw bytes."""
     frame = "RDF" if source.spz_frame == "raw" else source.spz_frame
     meta: dict[str, Any] = {}
-    rest = header.extensions if header.flags & EXTENDED else b""
-    while rest:
-        if len(rest) < 8:
+    records = header.extensions if header.flags & EXTENDED else b""
+    at = found = 0
+    while at < len(records):
+        if found == MAX_EXTENSIONS:
+            raise BitstreamError(f"{source.name}: more than {MAX_EXTENSIONS} extensions", section="extensions")
+        if len(records) < at + 8:
             raise BitstreamError(f"{source.name}: an extension is cut off", section="extensions")
-        kind, length = struct.unpack("<II", rest[:8])
-        payload = rest[8 : 8 + length]
+        kind, length = struct.unpack_from("<II", records, at)
+        payload = records[at + 8 : at + 8 + length]
         if len(payload) != length:
             raise BitstreamError(f"{source.name}: extension 0x{kind:08x} is cut off", section="extensions")
-        rest = rest[8 + length :]
+        at, found = at + 8 + length, found + 1
         if kind == AXES_EXTENSION and length == 4:
             code = int.from_bytes(payload, "little")
             if 1 <= code <= 16:

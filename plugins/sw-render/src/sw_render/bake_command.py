@@ -80,6 +80,8 @@ def bake(
     model = bake_model(drawing.model, fitted, drawing.rasterizer, drawing.options, sh_degree=sh_degree)
     generator = torch.Generator().manual_seed(resolved.ppl.seed)
     refine_model(model, drawing.model, fitted, drawing.rasterizer, drawing.options, steps=refine, generator=generator)
+    asked = drawing.rasterizer.decided(drawing.options)
+    model.origin = {"raster": {"antialias": asked.antialias, "eps2d": asked.eps2d}}
     baked = replace(drawing, model=model)
     name = export_model(model, out, plugins, exporter)
     psnr: dict[str, Any] = {"to_model_at_fitted": mean_psnr(baked, fitted, drawing)}

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from sw_gaussians.drawn_as import antialias_of, eps2d_of
 
 from splatwizard_core.api import Camera, SplatModel, replacing
 from sw_viewer.packing import pack
@@ -63,7 +64,8 @@ def write_page(model: SplatModel, path: str | os.PathLike[str], about: About, ar
 
 def export_page(model: SplatModel, path: str | os.PathLike[str]) -> None:
     """Write the page of a model of which nothing else is known (`sw export`): cameras are made up around it."""
-    write_page(model, path, About(Path(path).stem, note=MADE_UP), None)
+    about = About(Path(path).stem, eps2d=eps2d_of(model), antialias=antialias_of(model), note=MADE_UP)
+    write_page(model, path, about, None)
 
 
 def _page(gaussians: str, packed: dict[str, Any], about: About, around: Surroundings) -> str:

@@ -30,9 +30,9 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
     if (where / "scene.swz").is_file() and (where / "config.toml").is_file():
         where = where / "scene.swz"
     show: Callable[[dict[str, Any]], None] = _print_plain
-    if where.suffix == ".swz" or (where.is_file() and _starts_with(where, b"SPWZ")):
+    if where.suffix == ".swz" or (where.is_file() and _head(where, 4) == b"SPWZ"):
         kind, facts, show = "file", _file_facts(where), _print_file
-    elif where.suffix == ".json" and where.is_file():
+    elif where.suffix == ".json" and where.is_file() and not _holds_gaussians(_head(where)):
         kind, facts, show = "record", _record_facts(where), _print_record
     elif (importer := load_plugins().importers.of_suffix(where)) is not None:
         kind, facts = importer, _gaussian_facts(where)
@@ -41,10 +41,14 @@ def info(path: str, as_json: bool, chosen: Choices) -> None:
     shared.print_facts({"kind": kind, **facts}, as_json, show)
 
 
-def _starts_with(path: Path, magic: bytes) -> bool:
+def _holds_gaussians(text: bytes) -> bool:
+    return all(f'"{part}"'.encode() in text for part in ("means", "sh0")) and b'"protocol"' not in text
+
+
+def _head(path: Path, count: int = -1) -> bytes:
     try:
         with path.open("rb") as file:
-            return file.read(len(magic)) == magic
+            return file.read(count)
     except OSError as error:
         raise UserInputError(f"{path}: cannot be read: {error.strerror}") from error
 

@@ -15,6 +15,7 @@ import torch
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.errors import BitstreamError, PluginError, SplatwizardError, UserInputError
 from splatwizard_core.evaluation.speed import spread
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import PluginManager
@@ -32,7 +33,10 @@ def open_model(path: str | Path, plugins: PluginManager, device: torch.device) -
     Raises BitstreamError for a damaged file, PluginError if something that it needs is not installed.
     """
     reader = ContainerReader.open(path)
-    return decode_model(reader, plugins).to(device).eval().requires_grad_(False), reader
+    model = decode_model(reader, plugins).to(device).eval().requires_grad_(False)
+    if isinstance(model, GaussianModel):
+        model.origin = {**model.origin, "raster": reader.raster}
+    return model, reader
 
 
 def decode_model(reader: ContainerReader, plugins: PluginManager) -> SplatModel:

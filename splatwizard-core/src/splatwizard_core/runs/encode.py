@@ -15,7 +15,7 @@ import torch
 from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_core.evaluation.evaluate import raster_header
+from splatwizard_core.evaluation.evaluate import raster_header, render_options
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
@@ -108,7 +108,9 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     model = session.plugins.read_gaussians(path).to(session.device).eval().requires_grad_(False)
     method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
-    raster = raster_header(replace(last.raster_options(last.iterations, torch.zeros(3)), **resolved.ppl.raster.options))
+    # Those of a run win over what the file asks for, as when it is drawn.
+    asked = raster_header(render_options(model.origin.get("raster", {}), None)) | resolved.ppl.raster.options
+    raster = raster_header(replace(last.raster_options(last.iterations, torch.zeros(3)), **asked))
     try:
         return encode(method, model, raster, target)
     except (TypeError, AttributeError) as error:
