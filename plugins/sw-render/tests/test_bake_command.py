@@ -30,6 +30,12 @@ def test_a_file_whose_gaussians_depend_on_the_camera_is_made_explicit(tmp_path: 
     assert abs(psnr["model_at_test"] - psnr["baked_at_test"]) < 3
 
 
+def test_the_explicit_file_asks_for_what_was_drawn(tmp_path: Path):
+    arguments = ["--scene", "demo:tiny", "--sh-degree", "0", "--set", "raster.antialias=true"]
+    assert main(["bake", str(GOLDEN / "hac_exact_v2.swz"), str(tmp_path / "o.ply"), *arguments]) == 0
+    assert load_ply(tmp_path / "o.ply").origin["raster"] == {"antialias": True}
+
+
 def test_cameras_of_a_file_and_refining_are_told(tmp_path: Path, capsys):
     facing = [[[1, 0, 0], [0, 0, 1], [0, -1, 0]], [[-1, 0, 0], [0, 0, -1], [0, -1, 0]]]  # +y and -y
     entries = [
