@@ -89,6 +89,24 @@ def test_an_encoded_file_asks_for_what_its_ply_asked(ply, tmp_path):
     assert "antialias" not in ContainerReader.open(tmp_path / "c.swz").raster
 
 
+@pytest.mark.pipeline
+def test_a_ply_and_its_copies_are_drawn_alike(tmp_path, capsys):
+    scene = random_scene(200, 0)
+    scene.means *= 0.3  # in front of the cameras
+    scene.log_scales[:] = -6  # below a pixel, where antialiasing counts
+    scene.opacity_logits[:] = 3
+    scene.antialiased = True
+    write(scene, tmp_path / "a.ply")
+    assert main(["export", str(tmp_path / "a.ply"), str(tmp_path / "a.spz")]) == 0
+    capsys.readouterr()
+    found = []
+    for chosen in ([], ["--set", "raster.antialias=true"], ["--set", "raster.antialias=false"]):
+        files = [str(tmp_path / "a.ply"), str(tmp_path / "a.spz")]
+        assert main(["compare", *files, "--scene", "demo:tiny", "--json", *chosen]) == 0
+        found.append(json.loads(capsys.readouterr().out)["psnr"])
+    assert found[0] == found[1] != found[2]
+
+
 @pytest.mark.parametrize("suffix", [".spz", ".ply"])
 def test_a_low_pass_filter_of_its_own_is_told_as_lost(ply, tmp_path, caplog, suffix):
     model = load_plugins().read_gaussians(ply)
