@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -70,6 +72,19 @@ def find_entries(path: Path) -> list[Entry]:
     if found == [path / ENCODED]:
         return [Entry(str(path), found[0], path)]
     return [Entry(str(file.parent.relative_to(path)), file, file.parent) for file in found]
+
+
+def find_all_entries(paths: Iterable[Path]) -> dict[str, Entry]:
+    """Return what several paths offer, by label, each file once; of equal labels each becomes the whole path.
+
+    Raises UserInputError if one of them offers nothing.
+    """
+    found = {entry.file.resolve(): entry for path in paths for entry in find_entries(path)}.values()
+    times = Counter(entry.label for entry in found)
+    whole = (
+        entry if times[entry.label] == 1 else replace(entry, label=str(entry.run or entry.file)) for entry in found
+    )
+    return {entry.label: entry for entry in whole}
 
 
 def open_entry(entry: Entry, chosen: Choices, plugins: PluginManager) -> Opened:
