@@ -130,8 +130,8 @@ def bytes_with_named(path: Path) -> int:
     if path.suffix.lower() not in (".json", ".gltf") or size > LARGEST_DESCRIPTION:
         return size
     names = set(re.findall(r'"([^"\\/]{1,128})"', path.read_text("utf-8", errors="replace"))) - {path.name, ".", ".."}
-    beside = {path.parent / name for name in names if "\0" not in name}
-    others: int = sum(file.stat().st_size for file in beside if file.is_file())
+    beside = [path.parent / name for name in names]
+    others: int = sum(file.stat().st_size for file in beside if os.path.isfile(file))  # no error for a name too long
     return size + others
 
 
