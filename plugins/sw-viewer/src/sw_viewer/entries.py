@@ -19,7 +19,7 @@ from splatwizard_core.api import (
     SplatModel,
     UserInputError,
 )
-from splatwizard_core.tooling import Choices, NegotiatedRasterizer, open_session, open_subject
+from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_named, open_session, open_subject
 from sw_viewer.packing import solid_means
 from sw_viewer.page_file import MADE_UP, About
 from sw_viewer.shown_cameras import Surroundings, surroundings_about, surroundings_of
@@ -53,7 +53,7 @@ class Opened:
         counts = ", ".join(
             f"{n:,} {name.removeprefix('num_')}" for name, n in self.drawing.model.counts().items()
         )  # fmt: skip
-        return f"{counts}, {self.entry.file.stat().st_size:,} bytes"
+        return f"{counts}, {bytes_with_named(self.entry.file):,} bytes"
 
 
 def find_entries(path: Path) -> list[Entry]:
@@ -131,7 +131,7 @@ def about_page(opened: Opened) -> About:
     options = drawing.rasterizer.decided(drawing.options)
     red, green, blue = drawing.scene.background.tolist()
     return About(
-        drawing.scene.name, ContainerReader.open(file).method if encoded else None, file.stat().st_size,
+        drawing.scene.name, ContainerReader.open(file).method if encoded else None, bytes_with_named(file),
         (red, green, blue), options.eps2d, options.antialias,
     )  # fmt: skip
 
