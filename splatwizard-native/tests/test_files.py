@@ -14,6 +14,7 @@ import pytest
 
 from splatwizard_native import DiskFullError, files
 from splatwizard_native.files import (
+    bytes_with_named,
     file_sha256,
     remove_folder,
     replacing,
@@ -197,3 +198,28 @@ def test_temporaries_of_another_container_stay_for_a_day(tmp_path):
     os.utime(theirs[1], (long_ago, long_ago))
     files.sweep(tmp_path, "a")
     assert sorted(tmp_path.iterdir()) == [theirs[0]]
+
+
+def test_a_description_counts_with_the_files_that_it_names(tmp_path: Path):
+    (tmp_path / "sub").mkdir()
+    for name, size in (("a.webp", 100), ("b.webp", 20), ("other.webp", 3000), ("sub/c.webp", 4000)):
+        (tmp_path / name).write_bytes(bytes(size))
+    names = [
+        "a.webp",
+        "b.webp",
+        "a.webp",
+        "sub",
+        "sub/c.webp",
+        "../x",
+        "..",
+        "gone.webp",
+        "meta.json",
+        "\x00",
+        "\u4e2d" * 120,
+    ]
+    meta = tmp_path / "meta.json"
+    meta.write_text(json.dumps({"means": {"files": names}}, ensure_ascii=False), "utf-8")
+    assert bytes_with_named(meta) == meta.stat().st_size + 120
+    assert bytes_with_named(tmp_path / "a.webp") == 100
+    plain = meta.rename(tmp_path / "meta.swz")
+    assert bytes_with_named(plain) == plain.stat().st_size

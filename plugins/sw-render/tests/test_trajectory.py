@@ -185,6 +185,7 @@ def test_an_interrupt_leaves_no_video(tmp_path: Path, monkeypatch, ply: Path, li
         (["--video", "{}/o.mp4"], "--video, --frames and --size are for --trajectory: orbit, spiral, cameras or"),
         (["--frames", "3"], "are for --trajectory"),
         (["--trajectory", "orbit", "--fps", "3"], "--fps is for --video"),
+        (["--trajectory", "orbit", "--video", "{}/o.mp4", "--fps", "1e-4"], "0.001<=x<=1000"),
         (["--trajectory", "orbti"], "'orbti' is none of orbit, spiral, cameras, and no file"),
         (["--trajectory", "orbit", "--size", "640"], "WIDTHxHEIGHT in pixels"),
         (["--trajectory", "orbit", "--size", "8x8"], "WIDTHxHEIGHT in pixels"),

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from sw_gaussians.picture_psnr import capped_psnr
 from sw_gaussians.ply import export_ply, load_ply
 from sw_report.attribute_errors import attribute_errors
 
-from splatwizard_core.api import GaussianModel, rgb_to_dc
+from splatwizard_core.api import GaussianModel, UserInputError, rgb_to_dc
 from splatwizard_core.cli.main import main
 
 GOLDEN = Path(__file__).parents[3] / "tests" / "golden"
@@ -144,6 +145,39 @@ def test_a_run_directory_brings_its_scene(tmp_path: Path, capsys, folder: Path):
     assert facts["psnr"]["mean"] == 100
     assert facts["a"]["kind"] == "3dgs"
     assert load_ply(folder / "a.ply").num_rows == facts["attributes"]["rows"]
+
+
+def test_runs_of_different_scenes_are_refused_unless_a_scene_or_cameras_are_named(tmp_path: Path, capsys, folder: Path):
+    arguments = ["encode", str(folder / "a.ply"), "--method", "3dgs", "--rate", "r6", "--out"]
+    runs = []
+    for scene in ("demo:tiny", "demo"):
+        runs.append(tmp_path / scene.replace(":", "-"))
+        runs[-1].mkdir()
+        (runs[-1] / "config.toml").write_text(f'method = "3dgs"\nscene = "{scene}"\niterations = 3\n')
+        assert main([*arguments, str(runs[-1] / "scene.swz")]) == 0
+    capsys.readouterr()
+    assert main(["compare", *map(str, runs)]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "different scenes, demo and demo:tiny" in said
+    assert run(capsys, *runs, "--scene", "demo:tiny")["cameras"] == "test views of demo-tiny"
+
+
+def test_the_images_of_a_folder_count_among_its_bytes(tmp_path: Path, capsys, monkeypatch, folder: Path):
+    pytest.importorskip("sw_interchange")
+    monkeypatch.setattr("sw_report.compare.SIZE", (24, 16))
+    meta = tmp_path / "meta.json"
+    assert main(["export", str(folder / "a.ply"), str(meta), "--json"]) == 0
+    size = sum(file.stat().st_size for file in tmp_path.iterdir())
+    assert json.loads(capsys.readouterr().out)["bytes"] == size > meta.stat().st_size
+    assert run(capsys, folder / "a.ply", meta)["b"]["bytes"] == size
+
+
+def test_pictures_that_are_no_numbers_have_no_psnr():
+    picture = torch.full((3, 2, 2), 0.5)
+    assert capped_psnr(picture, picture) == 100
+    assert capped_psnr(picture, picture + 0.1) == pytest.approx(20, abs=1e-4)
+    with pytest.raises(UserInputError, match="no numbers"):
+        capped_psnr(picture * torch.nan, picture)
 
 
 @pytest.mark.parametrize(("arguments", "told"), [

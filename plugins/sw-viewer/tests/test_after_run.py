@@ -74,3 +74,12 @@ def test_a_page_that_cannot_be_made_is_told_in_a_line(tmp_path):
     assert not page.exists()
     (line,) = said
     assert line.startswith(f"warning: {page} was not written: the pictures are gone")
+
+
+def test_a_defect_of_the_page_fails_no_finished_run(tmp_path, scene, monkeypatch):
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("division by zero")
+
+    monkeypatch.setattr("sw_viewer.after_run.write_page", broken)
+    page, (line,) = finish(tmp_path, lambda: scene)
+    assert line.startswith(f"warning: {page} was not written: ZeroDivisionError: division by zero")

@@ -130,6 +130,28 @@ def test_nothing_to_show_is_an_error():
         pack(gaussians(0))
 
 
+def test_a_few_wild_gaussians_coarsen_no_others():
+    model = gaussians(600, 1)
+    with torch.no_grad():
+        model.log_scales[5] = 30.0
+        model.means[6] = 3e38
+        model.sh_dc[7] = 1e6
+        model.sh_rest[8] = -1e6
+    packed = pack(model)
+    assert packed.facts["count"] == 599
+    found = unpacked(packed.text, packed.facts)
+    rows = np.delete(np.arange(600), 6)
+    rows = rows[morton_order(model.means.numpy()[rows])]
+    tame = ~np.isin(rows, [5, 7, 8])
+    truth = {
+        "log_scales": (model.log_scales, 0.01), "rest": (model.sh_rest, 0.04), "means": (model.means, 0.02),
+        "colors": (0.5 + SH_0 * model.sh_dc[:, 0], 0.01),
+    }  # fmt: skip
+    for name, (values, bound) in truth.items():
+        np.testing.assert_allclose(found[name][tame], values.numpy()[rows][tame], atol=bound, rtol=0, err_msg=name)
+    assert found["log_scales"][rows == 5].min() > 4  # the huge one is as large as the others' range allows
+
+
 def test_neighbours_in_morton_order_are_close():
     grid = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3).astype(np.float32)
     steps = np.abs(np.diff(grid[morton_order(grid)], axis=0)).sum(axis=1)

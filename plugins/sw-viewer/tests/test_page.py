@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from sw_gaussians.ply import export_ply
+from sw_viewer.page_file import About, write_page
 
 from splatwizard_core.api import GaussianModel
 from splatwizard_core.cli.main import main
@@ -103,3 +104,13 @@ def test_what_cannot_be_a_page_is_refused_and_nothing_is_left(tmp_path, capsys):
     assert main(["view", *two, "--html", str(tmp_path / "new.html")]) == 2
     assert "writes one model, here are 2" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
+
+
+def test_a_mean_at_the_end_of_float32_leaves_a_page_that_browsers_can_read(model, tmp_path):
+    with torch.no_grad():
+        far = GaussianModel.from_tensors(*(getattr(model, name).clone() for name in model.RAW))
+        far.means[:3] = torch.tensor([3e38, -3e38, 0.0])[:, None]
+    write_page(far, tmp_path / "far.html", About("far"), None)
+    text = (tmp_path / "far.html").read_text("utf-8")
+    assert "NaN" not in re.findall(r'id="facts">(.*?)</script>', text)[0]
+    assert facts_of(tmp_path / "far.html")["count"] == 38

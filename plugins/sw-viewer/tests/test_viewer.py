@@ -14,6 +14,7 @@ import torch
 from fake_viser import Client, Server
 from sw_viewer import frames
 from sw_viewer.command import view
+from sw_viewer.entries import find_all_entries
 from sw_viewer.exhibits import Exhibit
 from sw_viewer.live import LiveView
 from sw_viewer.shown_cameras import surroundings_about, surroundings_of
@@ -144,6 +145,52 @@ def test_what_cannot_be_drawn_is_told_and_another_mode_works(clock):
     assert one.drawn[-1][1] == "depth"
 
 
+def test_a_full_gpu_or_a_lost_file_is_told_and_ends_nothing(clock):
+    for error in (RuntimeError("out of memory"), FileNotFoundError(2, "No such file", "scene.swz")):
+
+        def lost(_label: str, error: Exception = error) -> Exhibit:
+            raise error
+
+        server = Server()
+        viewer = Viewer(server, surroundings_about(POINTS), ("10",), lost)  # type: ignore[arg-type]
+        visitor = viewer._visitors[server.connect().client_id]
+        viewer.pump(0)
+        assert str(error) in visitor.told.content
+
+
+def test_who_comes_while_a_picture_is_drawn_disturbs_nobody(clock):
+    one = Shown(("10",))
+    one.client.camera.say()
+
+    class Enters(tuple):
+        """A visitor's last picture; to look at it lets another browser in, as viser's thread may."""
+
+        def __getitem__(self, index: Any) -> Any:
+            if len(one.viewer._visitors) == 1:
+                one.server.connect()
+            return super().__getitem__(index)
+
+    one.visitor.drawn = Enters((9, 0, 0.5))
+    one.visitor.due = lambda *_: None  # type: ignore[method-assign]
+    one.viewer.pump(0)
+    assert len(one.viewer._visitors) == 2
+
+
+def test_equal_names_in_two_folders_are_told_apart(tmp_path):
+    for place in ("a/r1", "b/r1", "b/r2"):
+        (tmp_path / place).mkdir(parents=True)
+        (tmp_path / place / "scene.swz").touch()
+        (tmp_path / place / "config.toml").touch()
+    a, b = tmp_path / "a", tmp_path / "b"
+    (a / "r3").mkdir()
+    for name in ("scene.swz", "config.toml"):
+        (a / "r3" / name).touch()
+    found = find_all_entries([a, b, b])
+    assert list(found) == [str(a / "r1"), "r3", str(b / "r1"), "r2"]
+    assert [entry.run for entry in found.values()] == [a / "r1", a / "r3", b / "r1", b / "r2"]
+    assert all(label == entry.label for label, entry in found.items())
+
+
 def test_ellipsoids_and_splats_are_sent_once_and_taken_away(clock):
     one = Shown(("10",))
     one.visitor.mode.say(value=ELLIPSOIDS)
@@ -234,6 +281,25 @@ def test_a_training_draws_for_who_looks_and_leaves_no_trace(live, training):
     assert torch.equal(torch.get_rng_state(), random)
     observer.finished()
     assert server.stopped
+
+
+def test_who_moves_takes_a_fifth_of_the_time_of_a_training_at_most(live, training, monkeypatch):
+    observer, server = live
+    server.connect()
+    clock, drawn = Clock(), []
+    monkeypatch.setattr("sw_viewer.live.time", clock)
+
+    def pump(_wait: float) -> None:
+        drawn.append(clock.now)
+        clock.now += 0.1  # somebody moves all the time
+
+    monkeypatch.setattr(observer._viewer, "pump", pump)
+    model = made(training)
+    for n in range(100):
+        observer.after_step(model, step(n))
+        clock.now += 0.02
+    assert len(drawn) > 2
+    assert 0.1 * len(drawn) <= 0.2 * (clock.now - 100.0) + 0.1
 
 
 def test_a_paused_training_waits_until_the_box_is_cleared(live, training, monkeypatch):

@@ -164,6 +164,16 @@ def test_controls_move_the_eye_and_cameras_bring_it_back(browser, scene, model, 
     assert not [line for line in browser.complaints() if "ReadPixels" not in line]
 
 
+def test_an_eye_that_sees_nothing_is_shown_the_background(browser, scene, model, tmp_path):
+    around = surroundings_of(scene)
+    near = around.cameras[0].camera
+    away = replace(near, R=torch.diag(torch.tensor([-1.0, 1.0, -1.0])) @ near.R, tau=torch.tensor([0.0, 0.0, -1e4]))
+    page = tmp_path / "scene.html"
+    cameras = [around.cameras[0], replace(around.cameras[0], camera=away)]
+    write_page(model, page, About("toy", background=(1.0, 0.0, 0.0)), replace(around, cameras=cameras))
+    np.testing.assert_array_equal(still(browser, page, 1, (64, 48)), np.broadcast_to([1.0, 0.0, 0.0], (48, 64, 3)))
+
+
 def test_it_fits_a_phone_in_light_and_dark(browser, scene, model, tmp_path):
     page = tmp_path / "scene.html"
     write_page(model, page, About("a-title-" * 12, "3dgs", 123456), surroundings_of(scene))

@@ -39,7 +39,7 @@ MODULES = {
     "coding.contracts": (
         "Quantizer EntropyModel ContextModel EntropyCoder PositionCodec ArrayCoder VectorCoder GaussianCodec"
     ),
-    "evaluation.image": "ssim_map",
+    "evaluation.image": "psnr ssim_map",
     "evaluation.evaluate": "MetricResult Subject",
     "evaluation.metrics": "MetricSetup PreparedMetric",
 }

@@ -19,6 +19,7 @@ from splatwizard_core.errors import SplatwizardError as SplatwizardError
 from splatwizard_core.errors import UserInputError as UserInputError
 from splatwizard_core.evaluation.evaluate import MetricResult as MetricResult
 from splatwizard_core.evaluation.evaluate import Subject as Subject
+from splatwizard_core.evaluation.image import psnr as psnr
 from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric

@@ -21,7 +21,7 @@ MODULES = {
     "runs.pretrained": "base_config first_scene make_method named_scenes useful_starts",
     "runs.training": "cached_directory",
     "runs.run": "run train_in",
-    "runs.decode": "export_model open_model",
+    "runs.decode": "export_model exporter_of open_model",
     "runs.session": "Session",
     "runs.device": "choose_device",
     "runs.measure": "open_subject",
@@ -45,7 +45,7 @@ MODULES = {
     "cli.setup": "Choices open_session takes_choices",
 }
 """Module of the core -> the names that it lends. `tooling.pyi` repeats them for type checkers."""
-BASE = {"files": "file_sha256 new_folder write_atomic write_json", "progress": "Bar"}
+BASE = {"files": "bytes_with_named file_sha256 new_folder write_atomic write_json", "progress": "Bar"}
 """The same of splatwizard-native."""
 
 __all__, __getattr__ = lend(__name__, MODULES, BASE)

@@ -47,6 +47,7 @@ from splatwizard_core.rendering.negotiation import NegotiatedRasterizer as Negot
 from splatwizard_core.runs.config import ResolvedConfig as ResolvedConfig
 from splatwizard_core.runs.config import resolve as resolve
 from splatwizard_core.runs.decode import export_model as export_model
+from splatwizard_core.runs.decode import exporter_of as exporter_of
 from splatwizard_core.runs.decode import open_model as open_model
 from splatwizard_core.runs.device import choose_device as choose_device
 from splatwizard_core.runs.directory import OWN_FILES as OWN_FILES
@@ -77,6 +78,7 @@ from splatwizard_core.training.params import SceneParams as SceneParams
 from splatwizard_core.training.pipeline import TrainingRun as TrainingRun
 from splatwizard_core.training.pipeline import TrainingStopped as TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers as build_schedulers
+from splatwizard_native.files import bytes_with_named as bytes_with_named
 from splatwizard_native.files import file_sha256 as file_sha256
 from splatwizard_native.files import new_folder as new_folder
 from splatwizard_native.files import write_atomic as write_atomic

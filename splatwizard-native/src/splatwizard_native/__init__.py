@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from splatwizard_native.cuda_toolkit import find_nvcc as find_nvcc
     from splatwizard_native.cuda_toolkit import nvcc_version as nvcc_version
     from splatwizard_native.files import TEMPORARY as TEMPORARY
+    from splatwizard_native.files import bytes_with_named as bytes_with_named
     from splatwizard_native.files import file_sha256 as file_sha256
     from splatwizard_native.files import naming_full_disk as naming_full_disk
     from splatwizard_native.files import new_folder as new_folder
@@ -72,8 +73,8 @@ MODULES = {
     "cuda_toolkit": "find_nvcc nvcc_version",
     "errors": "FULL CompilerMissingError DeviceMemoryError DiskFullError ForeseenError NativeBuildError out_of_memory",
     "files": (
-        "TEMPORARY file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder sweep write_atomic "
-        "write_json"
+        "TEMPORARY bytes_with_named file_sha256 naming_full_disk new_folder remove_folder replacing scratch_folder "
+        "sweep write_atomic write_json"
     ),
     "lending": "lend",
     "fused.adam": "AdamUpdate adam_steps",

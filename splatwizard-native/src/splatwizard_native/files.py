@@ -30,6 +30,9 @@ FOREIGN_SECONDS = 86_400.0
 YOUNGER_SECONDS = 2.0
 """By how much a process must be younger than a file to be another one of the same number: clocks count in seconds."""
 
+LARGEST_DESCRIPTION = 1 << 20
+"""Bytes of a file that is looked into for the names of others; a larger one is all of its scene."""
+
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str], *, wanted: int | None = None, durable: bool = False) -> Iterator[Path]:
@@ -116,6 +119,20 @@ def file_sha256(path: Path) -> str:
         for block in iter(lambda: file.read(1 << 20), b""):
             sha.update(block)
     return sha.hexdigest()
+
+
+def bytes_with_named(path: Path) -> int:
+    """Bytes of a file; of a .json or .gltf, which may describe images or buffers beside it, those that it names too.
+
+    Only plain names of files in its own folder count, each once. Raises OSError.
+    """
+    size: int = path.stat().st_size
+    if path.suffix.lower() not in (".json", ".gltf") or size > LARGEST_DESCRIPTION:
+        return size
+    names = set(re.findall(r'"([^"\\/]{1,128})"', path.read_text("utf-8", errors="replace"))) - {path.name, ".", ".."}
+    beside = [path.parent / name for name in names]
+    others: int = sum(file.stat().st_size for file in beside if os.path.isfile(file))  # no error for a name too long
+    return size + others
 
 
 @contextlib.contextmanager

@@ -127,11 +127,19 @@ def focus_of(cameras: Sequence[Camera], depth: float) -> Array:
     """The point [3] nearest to all viewing axes; where these are parallel, the one `depth` before the mean camera."""
     centers, rotations = _poses(cameras)
     forward = rotations[:, 2]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # [n,3,3] onto the plane across each axis
+    point = nearest_to_axes(centers, forward)
+    return centers.mean(axis=0) + depth * _unit(forward.mean(axis=0)) if point is None else point
+
+
+def nearest_to_axes(centers: Array, forwards: Array) -> Array | None:
+    """Return the point [3] nearest to the viewing axes from `centers` [n,3] along unit `forwards` [n,3].
+
+    None where they are nearly parallel.
+    """
+    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [n,3,3] onto the plane across each axis
     mean = across.mean(axis=0)
     if np.linalg.eigvalsh(mean)[0] < NEARLY_PARALLEL:
-        ahead: Array = centers.mean(axis=0) + depth * _unit(forward.mean(axis=0))
-        return ahead
+        return None
     point: Array = np.linalg.solve(mean, np.einsum("nij,nj->i", across, centers) / len(centers))
     return point
 

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
+from sw_gaussians.picture_psnr import capped_psnr
 from torch import Tensor
 
 from splatwizard_core.api import track
@@ -13,9 +13,6 @@ from splatwizard_core.api import track
 if TYPE_CHECKING:
     from splatwizard_core.api import Camera, View
     from sw_render.drawing import Drawing
-
-SAME = 100.0
-"""PSNR that is told of identical pictures, dB: that of an error of 1e-5."""
 
 
 def mean_psnr(drawing: Drawing, cameras: Sequence[Camera], other: Drawing | Callable[[int], Tensor]) -> float:
@@ -28,8 +25,7 @@ def mean_psnr(drawing: Drawing, cameras: Sequence[Camera], other: Drawing | Call
         for i, camera in enumerate(cameras):
             shown = drawing.render(camera).image.clamp(0, 1)
             truth = other(i) if callable(other) else other.render(camera).image.clamp(0, 1)
-            error = float(((shown - truth) ** 2).mean())
-            total += min(SAME, -10 * math.log10(error)) if error > 0 else SAME
+            total += capped_psnr(shown, truth)
             bar.advance()
     return total / len(cameras)
 

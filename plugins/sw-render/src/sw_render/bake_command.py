@@ -12,10 +12,12 @@ from splatwizard_core.tooling import (
     EXISTING,
     OUTPUT_FILE,
     Choices,
+    bytes_with_named,
     config_option,
     debug_option,
     device_option,
     export_model,
+    exporter_of,
     images_option,
     json_option,
     load_plugins,
@@ -74,6 +76,7 @@ def bake(
         file = encoded_file(file)
     resolved = chosen.resolve_without_method()
     plugins = load_plugins()
+    name = exporter_of(out, plugins, exporter)  # before the work, not after it
     drawing = open_drawing(file, open_session(resolved, plugins), resolved)
     train = [view.camera for view in drawing.views("train")]
     fitted = train if cameras is None else read_cameras(cameras).cameras
@@ -83,7 +86,7 @@ def bake(
     asked = drawing.rasterizer.decided(drawing.options)
     model.origin = {"raster": {"antialias": asked.antialias, "eps2d": asked.eps2d}}
     baked = replace(drawing, model=model)
-    name = export_model(model, out, plugins, exporter)
+    export_model(model, out, plugins, name)
     psnr: dict[str, Any] = {"to_model_at_fitted": mean_psnr(baked, fitted, drawing)}
     told = f"PSNR {psnr['to_model_at_fitted']:.2f} dB against the model at the cameras it was fitted to"
     if cameras is None and (test := drawing.views("test")):
@@ -96,7 +99,7 @@ def bake(
         told += f", {psnr['to_model_at_test']:.2f} dB at the test cameras, where the PSNR of the model was "
         told += f"{psnr['model_at_test']:.2f} dB and is now {psnr['baked_at_test']:.2f} dB"
     facts = {
-        "file": str(out), "format": name, "bytes": out.stat().st_size, "counts": model.counts(),
+        "file": str(out), "format": name, "bytes": bytes_with_named(out), "counts": model.counts(),
         "sh_degree": sh_degree, "refined": refine, "cameras": len(fitted), "psnr": psnr,
     }  # fmt: skip
     print_facts(facts, as_json, f"{model.num_rows:,} Gaussians, {facts['bytes']:,} bytes ({name}): {out}\n{told}")

@@ -76,7 +76,7 @@ def _offered(names: Iterable[str]) -> Callable[[click.Context, click.Parameter, 
     ),
     click.option("--frames", type=click.IntRange(1, 100_000), metavar="N", help="Cameras on the path.  [default: 120]"),
     click.option(
-        "--fps", type=click.FloatRange(0, 1000, min_open=True), metavar="F", help="Frames a second.  [default: 30]"
+        "--fps", type=click.FloatRange(1e-3, 1000), metavar="F", help="Frames a second.  [default: 30]"
     ),
     click.option(
         "--size", callback=_size, metavar="WxH", shell_complete=_offered(("960x540", "1280x720", "1920x1080")),

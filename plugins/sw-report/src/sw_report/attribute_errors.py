@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from sw_gaussians.covariances import covariances_of
 
 from splatwizard_core.api import GaussianModel, rgb_to_dc
 
@@ -117,15 +118,7 @@ class _Columns:
 
     def covariances(self) -> Array:
         """[n,3,3]."""
-        w, x, y, z = self.quats.T
-        rotations = np.stack([
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ], axis=1).reshape(-1, 3, 3)  # fmt: skip
-        axes = rotations * np.exp(self.log_scales)[:, None, :]
-        covariances: Array = axes @ axes.transpose(0, 2, 1)
-        return covariances
+        return covariances_of(self.quats, np.exp(self.log_scales))
 
 
 def _partners(a: _Columns, b: _Columns) -> tuple[str, NDArray[np.intp]]:

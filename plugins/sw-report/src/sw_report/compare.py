@@ -92,12 +92,17 @@ def _compared(a: Path, b: Path, camera_file: Path | None, chosen: Choices) -> di
     for path in (a, b):
         if not path.exists():
             raise UserInputError(f"{path}: there is no such file or folder")
-    config = next((path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()), None)
-    if config is not None:
-        chosen = replace(chosen, config_file=str(config))
-    resolved = chosen.resolve_without_method()
+    configs = [path / "config.toml" for path in (a, b) if (path / "config.toml").is_file()]
+    of_runs = [replace(chosen, config_file=str(config)).resolve_without_method() for config in configs]
+    scenes = sorted({each.absolute_scene for each in of_runs})
+    if len(scenes) > 1 and camera_file is None:
+        raise UserInputError(
+            f"the runs are of different scenes, {' and '.join(scenes)}, so they have no views in common: give --scene "
+            "SCENE if they are one scene by two names, else --cameras FILE"
+        )
+    resolved = of_runs[0] if of_runs else chosen.resolve_without_method()
     session = open_session(resolved, load_plugins())
-    scene = session.scene(resolved) if chosen.scene is not None or config is not None else None
+    scene = session.scene(resolved) if chosen.scene is not None or configs else None
     background = torch.zeros(3) if scene is None else scene.background
     left, right = (open_file(path, session, resolved, background) for path in (a, b))
     test = [] if scene is None or camera_file is not None else scene.test

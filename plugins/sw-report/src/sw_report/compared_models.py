@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sw_gaussians.picture_psnr import capped_psnr
 from torch import Tensor
 
 from splatwizard_core.api import Camera, GaussianModel, RasterOptions, SplatModel, UserInputError, track
@@ -14,6 +14,7 @@ from splatwizard_core.tooling import (
     NegotiatedRasterizer,
     ResolvedConfig,
     Session,
+    bytes_with_named,
     open_model,
     render_options,
     render_view,
@@ -22,9 +23,6 @@ from splatwizard_core.tooling import (
 
 if TYPE_CHECKING:
     from splatwizard_core.api import View
-
-MOST_PSNR = 100.0
-"""Told of pictures that are equal, dB: that of an error of 1e-5."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ class OpenedFile:
         """Name, format or method, bytes and counts."""
         degree = self.model.active_sh_degree if isinstance(self.model, GaussianModel) else None
         return {
-            "file": str(self.path), "kind": self.kind, "bytes": self.path.stat().st_size,
+            "file": str(self.path), "kind": self.kind, "bytes": bytes_with_named(self.path),
             "counts": self.model.counts(), "sh_degree": degree,
         }  # fmt: skip
 
@@ -81,22 +79,16 @@ def compare_pictures(a: OpenedFile, b: OpenedFile, cameras: list[Camera], views:
     with track("compare", total=len(cameras), unit="views") as bar:
         for i, camera in enumerate(cameras):
             pictures = a.picture(camera), b.picture(camera)
-            between.append(psnr(*pictures))
+            between.append(capped_psnr(*pictures))
             if views is not None:
                 truth = views[i].image(a.options.background, a.model.device)
                 for values, picture in zip(to_truth, pictures, strict=True):
-                    values.append(psnr(picture, truth))
+                    values.append(capped_psnr(picture, truth))
             bar.advance()
     found: dict[str, Any] = {"views": len(cameras), "mean": _mean(between), "least": min(between)}
     if views is not None:
         found |= {"a_to_pictures": _mean(to_truth[0]), "b_to_pictures": _mean(to_truth[1])}
     return found
-
-
-def psnr(a: Tensor, b: Tensor) -> float:
-    """PSNR of two pictures in 0 .. 1, dB, at most MOST_PSNR."""
-    error = float(((a - b) ** 2).mean())
-    return min(MOST_PSNR, -10 * math.log10(error)) if error > 0 else MOST_PSNR
 
 
 def _mean(values: list[float]) -> float:

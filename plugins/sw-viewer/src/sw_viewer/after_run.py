@@ -31,8 +31,9 @@ def show_finished(run: FinishedRun, tell: Callable[[str], None]) -> None:
         return
     try:
         _write(run, file, page)
-    except (ForeseenError, OSError, ValueError) as error:
-        tell(f"warning: {page} was not written: {error} (the results are whole; `sw view RUN --html` makes it, too)")
+    except Exception as error:
+        why = str(error) if isinstance(error, (ForeseenError, OSError)) else f"{type(error).__name__}: {error}"
+        tell(f"warning: {page} was not written: {why} (the results are whole; `sw view RUN --html` makes it, too)")
 
 
 def _write(run: FinishedRun, file: Path, page: Path) -> None:

@@ -55,10 +55,10 @@ def view(
     --scene, else of the run's scene; without either they are made up around the Gaussians. Needs viser:
     pip install 'sw-viewer[viser]'; --html does not.
     """
-    from sw_viewer.entries import about_page, find_entries, fixed_gaussians, open_entry
+    from sw_viewer.entries import about_page, find_all_entries, fixed_gaussians, open_entry
 
     plugins = load_plugins()
-    entries = {entry.label: entry for path in paths for entry in find_entries(path)}
+    entries = find_all_entries(paths)
     if page is not None:
         from sw_viewer.page_file import write_page
 

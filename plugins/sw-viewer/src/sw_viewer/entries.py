@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -17,7 +19,7 @@ from splatwizard_core.api import (
     SplatModel,
     UserInputError,
 )
-from splatwizard_core.tooling import Choices, NegotiatedRasterizer, open_session, open_subject
+from splatwizard_core.tooling import Choices, NegotiatedRasterizer, bytes_with_named, open_session, open_subject
 from sw_viewer.packing import solid_means
 from sw_viewer.page_file import MADE_UP, About
 from sw_viewer.shown_cameras import Surroundings, surroundings_about, surroundings_of
@@ -51,7 +53,7 @@ class Opened:
         counts = ", ".join(
             f"{n:,} {name.removeprefix('num_')}" for name, n in self.drawing.model.counts().items()
         )  # fmt: skip
-        return f"{counts}, {self.entry.file.stat().st_size:,} bytes"
+        return f"{counts}, {bytes_with_named(self.entry.file):,} bytes"
 
 
 def find_entries(path: Path) -> list[Entry]:
@@ -70,6 +72,19 @@ def find_entries(path: Path) -> list[Entry]:
     if found == [path / ENCODED]:
         return [Entry(str(path), found[0], path)]
     return [Entry(str(file.parent.relative_to(path)), file, file.parent) for file in found]
+
+
+def find_all_entries(paths: Iterable[Path]) -> dict[str, Entry]:
+    """Return what several paths offer, by label, each file once; of equal labels each becomes the whole path.
+
+    Raises UserInputError if one of them offers nothing.
+    """
+    found = {entry.file.resolve(): entry for path in paths for entry in find_entries(path)}.values()
+    times = Counter(entry.label for entry in found)
+    whole = (
+        entry if times[entry.label] == 1 else replace(entry, label=str(entry.run or entry.file)) for entry in found
+    )
+    return {entry.label: entry for entry in whole}
 
 
 def open_entry(entry: Entry, chosen: Choices, plugins: PluginManager) -> Opened:
@@ -116,7 +131,7 @@ def about_page(opened: Opened) -> About:
     options = drawing.rasterizer.decided(drawing.options)
     red, green, blue = drawing.scene.background.tolist()
     return About(
-        drawing.scene.name, ContainerReader.open(file).method if encoded else None, file.stat().st_size,
+        drawing.scene.name, ContainerReader.open(file).method if encoded else None, bytes_with_named(file),
         (red, green, blue), options.eps2d, options.antialias,
     )  # fmt: skip
 

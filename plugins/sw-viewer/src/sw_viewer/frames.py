@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
+from sw_gaussians.path_spline import quat_of, rotation_of
 
 from splatwizard_core.api import Camera
 
@@ -65,13 +66,7 @@ def camera_at(wxyz: ArrayLike, position: ArrayLike, fov_y: float, size: tuple[in
     fov_y       vertical field of view, radians
     size        width, height in pixels
     """
-    quat = np.asarray(wxyz, np.float64)
-    w, x, y, z = quat / np.linalg.norm(quat)
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],
-        [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)],
-        [2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    rotation = rotation_of(np.asarray(wxyz, np.float64)).T
     width, height = size
     focal = height / (2 * math.tan(fov_y / 2))
     tau = -rotation @ np.asarray(position, np.float64)
@@ -81,22 +76,7 @@ def camera_at(wxyz: ArrayLike, position: ArrayLike, fov_y: float, size: tuple[in
 
 def orientation_of(camera: Camera) -> NDArray[np.float64]:
     """Return (w,x,y,z) [4] camera -> world of a camera, unit length."""
-    m = camera.R.double().cpu().numpy().T
-    q = np.array([1 + m[0, 0] + m[1, 1] + m[2, 2], 1 + m[0, 0] - m[1, 1] - m[2, 2],
-                  1 - m[0, 0] + m[1, 1] - m[2, 2], 1 - m[0, 0] - m[1, 1] + m[2, 2]])  # fmt: skip
-    q = np.sqrt(np.maximum(q, 0)) / 2
-    pairs = {0: (m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1])}
-    largest = int(q.argmax())
-    if largest == 0:
-        x, y, z = (value / (4 * q[0]) for value in pairs[0])
-        return np.array([q[0], x, y, z])
-    i, j, k = [(0, 1, 2), (1, 2, 0), (2, 0, 1)][largest - 1]
-    found = np.empty(4)
-    found[0] = (m[k, j] - m[j, k]) / (4 * q[largest])
-    found[1 + i] = q[largest]
-    found[1 + j] = (m[j, i] + m[i, j]) / (4 * q[largest])
-    found[1 + k] = (m[k, i] + m[i, k]) / (4 * q[largest])
-    return found
+    return quat_of(camera.R.double().cpu().numpy().T)
 
 
 def side_by_side(left: Pixels, right: Pixels, split: float) -> Pixels:

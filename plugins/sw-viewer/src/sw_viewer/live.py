@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 EVERY = 1.0
-"""Least seconds between pictures of a model that trains on while nobody moves, and a fifth of all time at most."""
+"""Least seconds between pictures of a model that trains on while nobody moves."""
+REST = 4.0
+"""Least time between two drawings, in times of the one before: a fifth of all time is drawn, also for who moves."""
 
 
 class LiveView:
@@ -35,7 +37,7 @@ class LiveView:
     def __init__(self, training: StartedTraining, port: int) -> None:
         self._training = training
         self._model: SplatModel | None = None
-        self._shown_at = self._spent = 0.0
+        self._shown_at = self._rests_until = 0.0
         self._viewer = Viewer(
             start_server(HOST, port), surroundings_of(training.scene), [training.method], lambda _label: self.exhibit
         )
@@ -44,12 +46,12 @@ class LiveView:
         say(f"look at the training at {self._viewer.address}")
 
     def after_step(self, model: SplatModel, record: Any) -> None:
-        """Draw for browsers that moved, and now and then for the others; stay here while one of them pauses."""
-        if not self._viewer.watched:
+        """Draw now and then, soonest for browsers that moved; stay here while one of them pauses."""
+        now = time.monotonic()
+        if not self._viewer.watched or (now < self._rests_until and not self._paused.value):
             return
         self._model = model
-        now = time.monotonic()
-        if now - self._shown_at >= max(EVERY, 4 * self._spent) or self._paused.value:
+        if now - self._shown_at >= EVERY or self._paused.value:
             self._shown_at = now
             self._viewer.generation += 1
             loss = float(record.total)
@@ -58,7 +60,8 @@ class LiveView:
                 f"{record.num_rows:,} {model.ROW_LABEL}"
             )
         self._viewer.pump(0)
-        self._spent = time.monotonic() - now
+        ended = time.monotonic()
+        self._rests_until = ended + REST * (ended - now)
         while self._paused.value and self._viewer.watched:
             self._viewer.pump(0.2)
 

@@ -13,6 +13,7 @@ A Gaussian takes 19 bytes and 3 a coefficient of the bands above 0, before defla
 from __future__ import annotations
 
 import base64
+import math
 import zlib
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,10 @@ LEAST_STEP = 0.008
 """Of a coefficient: a finer one changes no 8-bit colour."""
 FAINTEST = 1 / 255
 """Gaussians with less opacity are drawn by no rasterizer."""
+FARTHEST = 1e4
+"""Distance from the median that is kept along an axis, in widths of the middle half: farther ones coarsen others."""
+BRIGHTEST = 8.0
+"""Least and largest 0.5 + SH_0 dc are -8 and 8, of a coefficient, too: a wilder one would coarsen all others."""
 
 
 @dataclass(frozen=True)
@@ -54,7 +59,7 @@ def explicit(model: SplatModel) -> GaussianModel:
 
 
 def solid_means(model: GaussianModel) -> NDArray[np.float32]:
-    """Return the means [n,3] of the Gaussians that can be drawn: finite, and not too faint."""
+    """Return the means [n,3] of the Gaussians that can be drawn: finite, not too faint, not too far."""
     means: NDArray[np.float32] = model.means[_drawable(model)].detach().float().cpu().numpy()
     return means
 
@@ -64,11 +69,23 @@ def _drawable(model: GaussianModel) -> torch.Tensor:
     keep = torch.sigmoid(model.opacity_logits) >= FAINTEST
     for value in (getattr(model, name) for name in model.RAW):
         keep &= torch.isfinite(value).flatten(1).all(dim=1) if value.dim() > 1 else torch.isfinite(value)
+    kept = torch.nonzero(keep)[:, 0]
+    keep[kept[~_near(model.means[kept])]] = False
     return keep
 
 
+def _near(means: torch.Tensor) -> torch.Tensor:
+    """Return whether each of the means [N,3] is at most `FARTHEST` from the median; where half are one, all are."""
+    if not len(means):
+        return torch.ones(0, dtype=torch.bool, device=means.device)
+    places = means.detach().double().cpu().numpy()
+    low, middle, high = np.percentile(places, (25, 50, 75), axis=0)
+    width = float((high - low).max()) or math.inf
+    return torch.from_numpy((np.abs(places - middle) <= FARTHEST * width).all(axis=1)).to(means.device)
+
+
 def pack(model: SplatModel) -> Packed:
-    """Quantize, order and deflate the Gaussians of a model, those that are finite and not too faint to be drawn.
+    """Quantize, order and deflate the Gaussians of a model, those that are finite, not too faint and not too far.
 
     Raises SceneError if they depend on the camera, or if none is left.
     """
@@ -102,7 +119,9 @@ def pack(model: SplatModel) -> Packed:
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     """Return rows so that neighbours [N,3] follow each other: by the interleaved bits of 21-bit coordinates."""
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
-    cells = ((means - low) / np.maximum(high - low, 1e-30) * (2**21 - 1)).astype(np.uint64)
+    least, most = np.percentile(means.astype(np.float64), (1, 99), axis=0, method="nearest")
+    low, high = np.maximum(low, 2 * least - most), np.minimum(high, 2 * most - least)  # a far one is at the border
+    cells = ((means.clip(low, high) - low) / np.maximum(high - low, 1e-30) * (2**21 - 1)).astype(np.uint64)
     spread = cells & np.uint64(0x1FFFFF)
     for shift, mask in (
         (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
@@ -117,22 +136,35 @@ def _places(means: NDArray[np.float32]) -> tuple[list[NDArray[np.uint16]], NDArr
     """Return x, y, z as [N] each, and the bounds [chunks,6]: least and largest x, y, z."""
     starts = np.arange(0, len(means), CHUNK)
     low, high = (np.repeat(f.reduceat(means, starts), CHUNK, axis=0)[: len(means)] for f in (np.minimum, np.maximum))
-    share = (means - low).astype(np.float64) / np.maximum(high - low, 1e-30)
+    low, high = low.astype(np.float64), high.astype(np.float64)  # their difference may be no float32
+    share = (means - low) / np.maximum(high - low, 1e-30)
     cells = np.round(share * 65535).astype(np.uint16)
-    bounds = np.concatenate([low[::CHUNK], high[::CHUNK]], axis=1)
+    bounds = np.concatenate([low[::CHUNK], high[::CHUNK]], axis=1).astype(np.float32)
     return [cells[:, k] for k in range(3)], bounds
 
 
 def _scales(log_scales: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
-    high = float(log_scales.max())
-    low = max(float(log_scales.min()), high - LOG_RANGE)
+    low, high = _scale_range(log_scales)
     step = max(high - low, 1e-6) / 1023
     cells = np.round((log_scales.clip(low, high) - low) / step).clip(0, 1023).astype(np.uint32)
     return _packed_bits(cells, (0, 10, 20)), [low, step]
 
 
+def _scale_range(log_scales: NDArray[np.float32]) -> tuple[float, float]:
+    """Return the least and largest log scale that are told apart, at most `LOG_RANGE` apart.
+
+    Where they are farther apart, as many Gaussians as possible keep their largest axis: a few huge ones become smaller.
+    """
+    tops = np.sort(log_scales.max(axis=1).astype(np.float64))
+    held = np.arange(1, len(tops) + 1) - np.searchsorted(tops, tops - LOG_RANGE)
+    top = tops[held.argmax()]
+    least = float(log_scales[log_scales >= top - LOG_RANGE].min())
+    high = min(float(tops[-1]), least + LOG_RANGE)
+    return max(float(log_scales.min()), high - LOG_RANGE), high
+
+
 def _colors(dc: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
-    base = 0.5 + SH_0 * dc.astype(np.float64)
+    base = (0.5 + SH_0 * dc.astype(np.float64)).clip(-BRIGHTEST, BRIGHTEST)
     low, high = float(base.min()), float(base.max())
     share = (base - low) / max(high - low, 1e-6)
     cells = np.round(share * np.array([2047, 2047, 1023])).astype(np.uint32)
@@ -141,6 +173,7 @@ def _colors(dc: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
 
 def _coefficients(rest: NDArray[np.float32], degree: int) -> tuple[NDArray[np.uint8], list[float]]:
     """Return the bytes [N,3K] (a coefficient's three colours together), and the step of each band."""
+    rest = rest.clip(-BRIGHTEST, BRIGHTEST)
     cells = np.full(rest.shape, 128, np.uint8)
     steps = []
     for band in range(1, degree + 1):

@@ -83,7 +83,7 @@ def _page(gaussians: str, packed: dict[str, Any], about: About, around: Surround
         "STYLE": _text("style.css"),
         "FACTS_SHOWN": "".join(f"<span>{html.escape(each)}</span>" for each in told),
         "NOTE": html.escape(f"{about.note} Written by Splatwizard; the file needs no network.".strip()),
-        "FACTS": json.dumps(facts, separators=(",", ":")).replace("<", "\\u003c"),
+        "FACTS": json.dumps(facts, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         "VERTEX": _text("splat.vert"),
         "FRAGMENT": _text("splat.frag"),
         "WORKER": _text("sort.js"),

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.camera_paths import nearest_to_axes
 
 from splatwizard_core.api import Camera, Scene, View
 
@@ -67,12 +68,9 @@ def surroundings_of(scene: Scene) -> Surroundings:
 
 def looked_at(centers: NDArray[np.float64], forwards: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
     """Return the point [3] that is nearest to the optical axes [V,3]; `extent` ahead where they are parallel."""
-    across = np.eye(3) - forwards[:, :, None] * forwards[:, None, :]  # [V,3,3] onto the plane across the axis
-    total = across.sum(axis=0)
-    if np.linalg.cond(total) < 1e4:
-        point: NDArray[np.float64] = np.linalg.solve(total, np.einsum("vij,vj->i", across, centers))
-        if ((point - centers) * forwards).sum(axis=1).mean() > 0:
-            return point
+    point = nearest_to_axes(centers, forwards)
+    if point is not None and ((point - centers) * forwards).sum(axis=1).mean() > 0:
+        return point
     ahead: NDArray[np.float64] = (centers + extent * forwards).mean(axis=0)
     return ahead
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.covariances import covariances_of
 from sw_gaussians.surfels import as_ellipsoids
 
 from splatwizard_core.api import Camera, GaussianModel, Rasterizer, SplatModel
@@ -37,15 +38,7 @@ class ShownGaussians:
     @property
     def covariances(self) -> NDArray[np.float32]:
         """[N,3,3]."""
-        w, x, y, z = self.quats.T
-        rotation = np.stack([
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ], axis=-1).reshape(-1, 3, 3)  # fmt: skip
-        half = rotation * self.scales[:, None, :]
-        covariances: NDArray[np.float32] = half @ half.transpose(0, 2, 1)
-        return covariances
+        return covariances_of(self.quats, self.scales)
 
     def largest(self, most: int = MOST_ELLIPSOIDS) -> ShownGaussians:
         """Return at most so many of those that are not faint: the ones with the most light, opacity times area."""

@@ -106,7 +106,7 @@ class Viewer:
                 if key is not None:
                     self._serve(visitor, key)
             now = time.monotonic()
-            resting = [v.moved_at + REST for v in self._visitors.values() if v.drawn[2] < 1]
+            resting = [v.moved_at + REST for v in list(self._visitors.values()) if v.drawn[2] < 1]
             upto = min([until, *resting])
             with self._awake:
                 if not self._woken and upto > now:
@@ -143,7 +143,7 @@ class Viewer:
         began = time.monotonic()
         try:
             self._show(visitor, key)
-        except ForeseenError as error:
+        except (ForeseenError, OSError, RuntimeError) as error:  # also a full GPU, or a file that was taken away
             visitor.told.content = f"**{error}**"
             key = (*key[:2], 1.0)  # it would fail in full, too
         visitor.drawn = key

@@ -28,10 +28,11 @@ def export(file: Path, out: Path, exporter: str | None, as_json: bool, chosen: C
     """Decode FILE (.swz, .ply or another format) and write it to OUT in the format of its suffix, such as .ply."""
     from splatwizard_core.runs.decode import export_model
     from splatwizard_core.runs.measure import opener
+    from splatwizard_native import bytes_with_named
 
     plugins = load_plugins()
     session = open_session(chosen.resolve_without_method(), plugins)
     model = opener(file, session)().model
     name = export_model(model, out, plugins, exporter)
-    facts = {"file": str(out), "format": name, "bytes": out.stat().st_size, "counts": model.counts()}
+    facts = {"file": str(out), "format": name, "bytes": bytes_with_named(out), "counts": model.counts()}
     shared.print_facts(facts, as_json, f"{facts['bytes']:,} bytes ({name}): {out}")

@@ -160,18 +160,21 @@ def save_decoded(model: SplatModel, facts: Mapping[str, Any], path: Path, plugin
         save_file(tensors, temporary, metadata=told)
 
 
-def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: str | None = None) -> str:
-    """Write an interchange format; returns the name of the exporter.
+def exporter_of(path: Path, plugins: PluginManager, name: str | None = None) -> str:
+    """Return the exporter `name`; None: the one whose declared suffix `path` has. Raises UserInputError without it."""
+    name = plugins.exporters.of_suffix(path) if name is None else plugins.exporters.entry(name).name
+    if name is None:
+        known = ", ".join(f"{s} ({e.name})" for e in plugins.exporters if (s := e.declared.get("suffix")))
+        raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
+    return name
 
-    name    of the exporter; None: the one whose declared suffix `path` has
+
+def export_model(model: SplatModel, path: Path, plugins: PluginManager, name: str | None = None) -> str:
+    """Write an interchange format; returns the name of the exporter, that of `exporter_of`.
 
     Raises UserInputError if there is none, or if the model has no such form, PluginError if the exporter breaks.
     """
-    if name is None:
-        name = plugins.exporters.of_suffix(path)
-        if name is None:
-            known = ", ".join(f"{s} ({e.name})" for e in plugins.exporters if (s := e.declared.get("suffix")))
-            raise UserInputError(f"no installed exporter writes '{path.suffix}' files ({path}); there are: {known}")
+    name = exporter_of(path, plugins, name)
     with plugins.guarding(plugins.exporters, name):
         plugins.exporters.load(name)(model, path)
         if not path.exists():

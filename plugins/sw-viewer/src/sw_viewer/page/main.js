@@ -20,7 +20,7 @@ async function begin() {
   const worker = new Worker(URL.createObjectURL(new Blob([find('worker').textContent], { type: 'text/javascript' })));
   worker.postMessage({ means: gaussians.means }, [gaussians.means.buffer]);
 
-  let sorting = 0, number = 0, wanted = false, drawing = 0, share = 1, last = 0, rest = 0;
+  let sorting = 0, number = 0, wanted = false, drawing = 0, share = 1, last = 0, rest = 0, ordered = false;
   const eye = new Eye(facts, () => { wanted = true; again(); });
 
   function sort() {  // one order at a time; the newest place is asked for when it is there
@@ -41,7 +41,7 @@ async function begin() {
     const [width, height] = fixed ? [+fixed[1], +fixed[2]] : [canvas.clientWidth, canvas.clientHeight];
     if (fixed) canvas.style.cssText = `width:${width}px;height:${height}px`;
     const pixels = [width, height].map(length => Math.max(1, Math.round(length * ratio)));
-    if (renderer.count) {
+    if (ordered) {  // also where nothing is in front of the eye
       renderer.draw(eye.pose, eye.lens(...pixels), ...pixels);
       said();
     }
@@ -64,6 +64,7 @@ async function begin() {
   worker.onmessage = ({ data }) => {
     if (data.number === sorting) sorting = 0;
     renderer.take(data.sorted);
+    ordered = true;
     again();
   };
   worker.onerror = fail;
