@@ -113,7 +113,16 @@ def test_trainings_without_any_part_keep_their_identity():
     assert resolve(ThreeDGS, "paper", sets={"fast.morton": True}).config.identity()["fast"]["morton"]
 
 
-@pytest.mark.parametrize("sets", [{"mcmc__enabled": True}, {"densify__absgrad": True}])
+@pytest.mark.parametrize(
+    "sets",
+    [
+        {"mcmc__enabled": True},
+        {"densify__absgrad": True},
+        {"sparse_adam": "none"},
+        {"mcmc__enabled": True, "fast__densify": "threshold"},
+        {"mcmc__enabled": True, "fast__densify": "threshold", "fast__opacity": "reset"},
+    ],
+)
 def test_what_does_not_go_together_is_said_before_anything_runs(sets):
     with pytest.raises(ConfigError, match="fast"):
         stage_of(**sets)

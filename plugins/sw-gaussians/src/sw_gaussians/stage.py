@@ -64,6 +64,17 @@ class ThreeDGSStage(Stage):
         budget = opt.fast.densify == "budget"
         if budget and opt.mcmc.enabled:
             raise ConfigError("mcmc.enabled and fast.densify=budget are two density controls: set one of them")
+        halves = opt.fast.opacity == "halve"
+        if opt.mcmc.enabled and (halves or opt.fast.morton):
+            raise ConfigError(
+                "mcmc.enabled neither resets opacities nor sorts Gaussians: fast.opacity=halve and fast.morton would "
+                "have no effect, leave them off"
+            )
+        if halves and opt.sparse_adam == "none":
+            raise ConfigError(
+                "fast.opacity=halve clears Adam's moments, after which sparse_adam=none makes steps of 3.2 times the "
+                "learning rate: set sparse_adam=per_row or off"
+            )
         self._fragments = budget and opt.fast.score == "opacity_variance"
         if self._fragments and opt.densify.absgrad:
             raise ConfigError("densify.absgrad does not go with fast.score=opacity_variance: set fast.score=gradient")
@@ -95,6 +106,7 @@ class ThreeDGSStage(Stage):
             scene,
             full_at=self.steps(self.config.densify.stop),
             every=self.steps(self.config.densify.interval),
+            first=self.steps(self.config.densify.start),
             most=fast.resolution_start,
             rounding=fast.resolution_rounding,
         )
@@ -183,13 +195,17 @@ class ThreeDGSStage(Stage):
             self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
         )
 
+    def min_opacity(self) -> float:
+        """Return the opacity below which density control prunes; a stage with a rule of its own overrides it."""
+        return self.config.densify.min_opacity
+
     def densification(self) -> Callable[..., None]:
         """Return the task that clones, splits and prunes; a stage with rules of its own wraps it."""
         densify = self.config.densify
         return tasks.PruneAndDensify(
             grad_threshold=densify.grad_threshold,
             percent_dense=densify.percent_dense,
-            min_opacity=densify.min_opacity,
+            min_opacity=self.min_opacity(),
             world_prune=densify.world_prune,
             size_rules_after=self.steps(densify.reset_interval),
             prune_screen_px=densify.prune_screen_px,
@@ -210,7 +226,7 @@ class ThreeDGSStage(Stage):
             score=fast.score,
             grad_threshold=densify.grad_threshold,
             percent_dense=densify.percent_dense,
-            min_opacity=densify.min_opacity,
+            min_opacity=self.min_opacity(),
             morton=fast.morton,
         )
 
