@@ -113,6 +113,13 @@ def test_trainings_without_any_part_keep_their_identity():
     assert resolve(ThreeDGS, "paper", sets={"fast.morton": True}).config.identity()["fast"]["morton"]
 
 
+def test_updates_in_the_backward_pass_have_a_key_that_changes_no_identity_while_off():
+    on = resolve(ThreeDGS, "paper", sets={"fused_updates": True}).config
+    assert ThreeDGS(load_plugins(), on).stages()[0].fuses_updates
+    assert on.identity()["fused_updates"]
+    assert "fused_updates" not in resolve(ThreeDGS, "paper").config.identity()
+
+
 @pytest.mark.parametrize(
     "sets",
     [

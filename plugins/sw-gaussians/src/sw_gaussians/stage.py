@@ -48,14 +48,21 @@ READERS = (collect_statistics, fragments.collect_opacity_gradients)
 
 
 class ThreeDGSStage(Stage):
-    """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
+    """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time.
+
+    fuses_updates   on CUDA spherical harmonics are updated in the backward pass, at steps at which nothing else asks
+                    for their gradients; with dense Adam alone
+    """
 
     name = "3dgs"
-    fuses_updates: bool = False
-    """Whether spherical harmonics are updated in the backward pass where nothing else asks for their gradients."""
 
-    def __init__(self, opt: GaussianTraining) -> None:
+    def __init__(self, opt: GaussianTraining, *, fuses_updates: bool = False) -> None:
         super().__init__(opt)
+        self.fuses_updates = fuses_updates
+        if fuses_updates and (opt.sparse_adam != "off" or opt.fast.sh_every > 1):
+            raise ConfigError(
+                "fused_updates updates all Gaussians at every step: leave sparse_adam off and fast.sh_every at 1"
+            )
         if opt.sparse_adam != "off" and opt.mcmc.enabled:
             raise ConfigError(
                 "sparse_adam leaves hidden Gaussians as they are, which the regularisers of mcmc.enabled must reach: "
@@ -91,6 +98,8 @@ class ThreeDGSStage(Stage):
     def begin(self, context: StageContext) -> SplatModel:
         self.white = context.scene.protocol.background == "white"
         model = context.model
+        if self.fuses_updates and not next(model.parameters()).is_cuda:
+            raise ConfigError("fused_updates is for rasterizers on CUDA, and the model is on the CPU: leave it off")
         if hasattr(model, "split_seed"):
             model.split_seed = context.generator("split").initial_seed()
         if self._fragments:
