@@ -9,7 +9,7 @@ which slows the host: busy time of phases, launches and the host's waits are of 
 nothing to do. The first size has next to nothing for the device: its wall clock is what the host takes for a step.
 
 dense           preset `paper`
-fused           spherical harmonics updated in the backward pass (`ThreeDGSStage.fuses_updates`)
+fused           spherical harmonics updated in the backward pass (`fused_updates`)
 sparse          sparse_adam=per_row
 deterministic   deterministic=true: sums in one order
 """

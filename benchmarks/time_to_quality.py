@@ -156,8 +156,10 @@ def _no_other(name: str) -> Any:
     raise AssertionError(f"3dgs starts from no {name}")
 
 
-def variants_of(args: argparse.Namespace) -> list[Variant]:
-    """The variants that the command line asks for, `paper` first where it is among them."""
+def variants_of(args: argparse.Namespace, parser: argparse.ArgumentParser) -> list[Variant]:
+    """The variants that the command line asks for, `paper` first where it is among them; exits for wrong input."""
+    if args.gsplat and args.jobs > 1:
+        parser.error("--gsplat is measured alone: leave out --jobs")
     found = [Variant(preset, preset) for preset in args.presets.split(",") if preset]
     if args.parts:
         base = resolve(load_plugins().methods.load("3dgs"), "fast").config.model_dump()
@@ -167,6 +169,10 @@ def variants_of(args: argparse.Namespace) -> list[Variant]:
     for text in args.also:
         name, _, rest = text.partition("=")
         preset, *pairs = rest.split(",")
+        if not name or not preset:
+            parser.error(f"--also '{text}': it must be NAME=PRESET,KEY=VALUE,...")
+        if wrong := [pair for pair in pairs if "=" not in pair]:
+            parser.error(f"--also '{text}': '{wrong[0]}' must be KEY=VALUE")
         found.append(Variant(name, preset, dict(pair.split("=", 1) for pair in pairs)))
     if args.gsplat:
         found.append(Variant("gsplat", ""))
@@ -287,7 +293,7 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=1, help="trainings at once, for quality alone (default: 1)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="lines of JSON, which a second call goes on from")
     args = parser.parse_args()
-    variants = variants_of(args)
+    variants = variants_of(args, parser)
     jobs = [
         Job(scene, variant, int(seed), args.device, args.threads, args.iterations, args.curve)
         for scene in args.scenes

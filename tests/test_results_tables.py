@@ -97,6 +97,11 @@ def test_a_claim_is_held_where_ratio_and_loss_are(tools, record, tmp_path):
     assert "**" not in tools.table("claims", "all", tmp_path)
     tools.write([small], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
+    tools.write([exact, replace(small, repetition=2)], tmp_path / "lego.jsonl")  # no 3DGS of that matrix
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
+    other = [replace(r, repetition=2) for r in (replace(exact, psnr=29.0), small)]
+    tools.write([exact, *other], tmp_path / "lego.jsonl")
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, +0.70 dB** |")
 
 
 def test_a_trainer_stands_beside_ours_with_means_and_without_speeds_of_shared_gpus(tools, tmp_path):
@@ -134,6 +139,27 @@ def test_what_was_not_measured_alone_is_no_time(tools, record):
     alone = replace(shared, alone=True, fps_alone=True, fps=200.0, default_fps=100.0, rasterizer="flash")
     _, row = tools.cost_table([alone])
     assert [row[head.index(name)] for name in ("FPS, its own", "FPS, one rasterizer for all")] == ["200", "100"]
+
+
+def test_fresh_records_take_the_place_of_all_once_they_are_read(tools, record, tmp_path, monkeypatch):
+    finished = ROOT / "tests" / "golden" / "runs_0_1" / "finished"
+    path = tmp_path / "x.jsonl"
+    tools.write([record], path)
+    with pytest.raises(SystemExit, match="no metrics"):
+        tools.collect([tmp_path], tmp_path, name="x", fresh=True)
+    assert tools.read(path) == [record]
+    tools.collect([finished], tmp_path, name="x", fresh=True)
+    (found,) = tools.read(path)
+    assert found.method == "speedy-splat"
+
+    def full_disk(self, text, **_):
+        self.open("w").write(text[:9])
+        raise OSError("no space left")
+
+    monkeypatch.setattr(Path, "write_text", full_disk)
+    with pytest.raises(OSError, match="space"):
+        tools.write([record], path)
+    assert tools.read(path) == [found]
 
 
 def test_runs_are_collected_and_replace_what_they_repeat(tools, tmp_path):

@@ -1,7 +1,7 @@
 """Claims of papers whose data sets are not at hand, beside what small scenes of the same kind give: `table claims all`.
 
-Ratio and difference are to the exact 3DGS of the same seed: its float32 .ply (248 bytes a Gaussian) over the file, and
-PSNR less its PSNR.
+Ratio and difference are to the exact 3DGS of the same seed and matrix of runs ("-" if it has no record): its float32
+.ply (248 bytes a Gaussian) over the file, and PSNR less its PSNR.
 """
 
 from __future__ import annotations
@@ -63,10 +63,10 @@ def _cell(group: Rows | None, records: Rows, scene: str, claims: Iterable[Claim]
     """Write ratio, difference and number of runs; bold where a claim on data of this kind is reached by both."""
     if group is None:
         return NONE
-    ratios = smaller(group, records)
+    ratios = smaller(group, records, same_matrix=True)
     losses = [
         None if base is None or base.psnr is None or r.psnr is None else r.psnr - base.psnr
-        for r, base in zip(group, bases(group, records), strict=True)
+        for r, base in zip(group, bases(group, records, same_matrix=True), strict=True)
     ]
     known = [(x, loss) for x, loss in zip(ratios, losses, strict=True) if x is not None and loss is not None]
     if len(known) < len(group):

@@ -46,21 +46,25 @@ def points(records: Rows) -> list[list[SmallRecord]]:
     return sorted((sorted(group, key=lambda r: r.seed) for group in groups.values()), key=place)
 
 
-def bases(group: Rows, records: Rows) -> list[SmallRecord | None]:
-    """Return the exact 3DGS of each run's seed, that of the same repetition if there is one."""
+def bases(group: Rows, records: Rows, *, same_matrix: bool = False) -> list[SmallRecord | None]:
+    """Return the exact 3DGS of each run's seed, that of the same repetition if there is one.
+
+    same_matrix     that of the same repetition or none
+    """
     plain = [r for r in records if r.method == BASE and not r.variant]
     exact = max((r.rate for r in plain), default="")
     found: dict[tuple[int, int | None], SmallRecord] = {}
     for r in plain:
         if r.rate == exact and r.gaussians:
             found[r.seed, r.repetition] = r
-            found.setdefault((r.seed, None), r)
+            if not same_matrix:
+                found.setdefault((r.seed, None), r)
     return [found.get((r.seed, r.repetition), found.get((r.seed, None))) for r in group]
 
 
-def smaller(group: Rows, records: Rows) -> list[float | None]:
-    """Divide the float32 .ply of the same seed's 3DGS by each file."""
-    found = zip(group, bases(group, records), strict=True)
+def smaller(group: Rows, records: Rows, *, same_matrix: bool = False) -> list[float | None]:
+    """Divide the float32 .ply of the same seed's 3DGS, as `bases` finds it, by each file."""
+    found = zip(group, bases(group, records, same_matrix=same_matrix), strict=True)
     return [None if base is None else PLY_BYTES * (base.gaussians or 0) / r.bytes for r, base in found]
 
 

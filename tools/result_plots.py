@@ -34,7 +34,7 @@ def shown(scene: str, records_at: Path = RECORDS) -> str:
     return (
         f"![PSNR and SSIM over the bytes of the file on {scene}, on a logarithmic axis: {names}]"
         f"(images/{path_of(scene).name})\n\n"
-        "Means over the seeds, bars: one deviation; dashed: anchor methods.\n"
+        "Means over the runs, bars: one deviation; dashed: anchor methods.\n"
     )
 
 

@@ -165,10 +165,12 @@ def _drawn(drawn_by: Mapping[str, str]) -> str:
 
 
 def write(records: Iterable[SmallRecord], path: Path) -> None:
-    """Write the records of one scene, one a line, in the order of their keys."""
+    """Write the records of one scene, one a line, in the order of their keys: the file is whole at any time."""
     path.parent.mkdir(parents=True, exist_ok=True)
     lines = [json.dumps(asdict(record)) for record in sorted(records, key=lambda r: r.key)]
-    path.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    beside = path.with_name(f"{path.name}.new")
+    beside.write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+    beside.replace(path)
 
 
 def read(path: Path) -> list[SmallRecord]:

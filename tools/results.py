@@ -6,7 +6,7 @@
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
 file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at every
-scene. Between `<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the seeds
+scene. Between `<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs
 ± the deviation of the sample (n - 1).
 """
 
@@ -116,11 +116,14 @@ def filled(text: str, records_at: Path = RECORDS) -> str:
     return MARKED.sub(lambda m: f"{m[1]}{table(m[2], m[3], records_at)}{m[4]}", text)
 
 
-def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "", repetition: int = 0) -> list[Path]:
+def collect(
+    roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = "", repetition: int = 0, fresh: bool = False
+) -> list[Path]:
     """Keep the small records of all runs under `roots`, by scene; one with the key of an older one takes its place.
 
     name        of the file in place of the scene's, if all runs are of one scene
     repetition  of all of them: those of another number stay beside them
+    fresh       drop the records that are there, once the new ones have been read
 
     Raises SystemExit where there is no run, or the runs of several protocols would come together.
     """
@@ -137,7 +140,7 @@ def collect(roots: Sequence[Path], records_at: Path = RECORDS, *, name: str = ""
     written = []
     for file, new in by_file.items():
         path = records_at / f"{file}.jsonl"
-        found = merged(read(path) if path.exists() else [], new)
+        found = merged(read(path) if path.exists() and not fresh else [], new)
         if len({r.protocol for r in found}) > 1:
             told = ", ".join(sorted({r.protocol for r in found}))
             raise SystemExit(f"{path} would hold several protocols ({told}): keep them apart by --name")
@@ -154,16 +157,14 @@ def main() -> int:
     gather.add_argument("out", nargs="+", type=Path, metavar="OUT", help="where runs lie, at any depth")
     gather.add_argument("--name", default="", help="of the file in docs/records (default: the scene)")
     gather.add_argument("--repetition", type=int, default=0, help="number of this matrix of runs (default: 0)")
-    gather.add_argument("--fresh", action="store_true", help="drop the records that are there first")
+    gather.add_argument("--fresh", action="store_true", help="drop the records that are there")
     write_tables = commands.add_parser("tables", help="the tables from the records")
     write_tables.add_argument("--check", action="store_true", help="write nothing, status 1 where they disagree")
     args = parser.parse_args()
     if args.command == "collect":
-        if args.fresh and args.name:
-            (RECORDS / f"{args.name}.jsonl").unlink(missing_ok=True)
-        elif args.fresh:
+        if args.fresh and not args.name:
             parser.error("--fresh needs --name")
-        for path in collect(args.out, name=args.name, repetition=args.repetition):
+        for path in collect(args.out, name=args.name, repetition=args.repetition, fresh=args.fresh):
             print(path)
     stale = []
     for page in PAGES:

@@ -4,10 +4,13 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_gaussians.budget import densify_to_budget
+from sw_gaussians.fast_tasks import DensifyToBudget
 from sw_gaussians.ply import export_ply
 from sw_gaussians.start import gaussians_from_points, surfels_from_points
 from sw_gaussians.surfels import Surface, SurfelModel
 
+from splatwizard_core.api import ParamGroup, SplatOptimizer
 from splatwizard_core.errors import ConfigError, SceneError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
@@ -172,6 +175,29 @@ def test_the_loss_is_the_photometric_one_plus_the_weighted_parts():
 def test_relocation_is_refused():
     with pytest.raises(ConfigError, match=r"mcmc\.enabled"):
         TwoDGSStage(configured(mcmc__enabled=True))
+
+
+def test_a_score_that_no_rasterizer_of_surfels_has_is_refused_at_once():
+    with pytest.raises(ConfigError, match=r"set fast\.score=gradient"):
+        TwoDGSStage(configured(fast__densify="budget"))
+
+
+def test_a_budget_prunes_below_a_reset_as_plain_density_control_does():
+    for values in ({}, {"iterations": 9_000, "scale_schedule": True}):
+        stage = TwoDGSStage(configured(fast__densify="budget", fast__score="gradient", **values))
+        _, post = build_schedulers(stage, PipelineParams())
+        (task,) = (entry.task for entry in post.registrations if isinstance(entry.task, DensifyToBudget))
+        assert task.min_opacity == stage.min_opacity() == (0.005 if values else 0.05)
+
+
+def test_a_budget_grows_surfels():
+    model = surfels_from_points(points(), generator=torch.Generator().manual_seed(0))
+    model.grad_accum.fill_(1.0)
+    model.denom.fill_(1.0)
+    optimizer = SplatOptimizer(model, [ParamGroup(name, lr=0.01) for name, _ in model.named_parameters()])
+    n = model.num_rows
+    densify_to_budget(model, optimizer, step=1, extent=1e-3, target=n + 7, score="gradient", min_opacity=0.0)
+    assert (model.num_rows, model.log_scales.shape[1]) == (n + 7, 2)
 
 
 def test_the_stage_refuses_other_gaussians():

@@ -94,9 +94,20 @@ def waits_for_nothing(trainer: Trainer) -> None:
 
 DENSE = {"densify": {"start": 60, "interval": 40, "grad_threshold": 5e-5, "reset_interval": 150}, "iterations": 7000}
 CHAIN = {"mcmc": {"enabled": True, "start": 60, "interval": 40, "cap": 700}, "iterations": 7000}
+FAST_PLAN = {**DENSE, "fast": {"densify": "budget", "opacity": "halve", "morton": True, "growth": 2.0}}
 
 
-@pytest.mark.parametrize("values", [DENSE, {**DENSE, "sparse_adam": "per_row"}, CHAIN], ids=["dense", "sparse", "mcmc"])
+@pytest.mark.parametrize(
+    "values",
+    [
+        DENSE,
+        {**DENSE, "sparse_adam": "per_row"},
+        CHAIN,
+        FAST_PLAN,
+        {**FAST_PLAN, "fast": {**FAST_PLAN["fast"], "resolution": "dash"}},
+    ],
+    ids=["dense", "sparse", "mcmc", "fast", "fast-dash"],
+)
 def test_two_deterministic_trainings_give_the_same_bits(values):
     config = ThreeDGSConfig.model_validate(values)
     outcomes = []

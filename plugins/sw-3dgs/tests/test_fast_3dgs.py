@@ -113,7 +113,23 @@ def test_trainings_without_any_part_keep_their_identity():
     assert resolve(ThreeDGS, "paper", sets={"fast.morton": True}).config.identity()["fast"]["morton"]
 
 
-@pytest.mark.parametrize("sets", [{"mcmc__enabled": True}, {"densify__absgrad": True}])
+def test_updates_in_the_backward_pass_have_a_key_that_changes_no_identity_while_off():
+    on = resolve(ThreeDGS, "paper", sets={"fused_updates": True}).config
+    assert ThreeDGS(load_plugins(), on).stages()[0].fuses_updates
+    assert on.identity()["fused_updates"]
+    assert "fused_updates" not in resolve(ThreeDGS, "paper").config.identity()
+
+
+@pytest.mark.parametrize(
+    "sets",
+    [
+        {"mcmc__enabled": True},
+        {"densify__absgrad": True},
+        {"sparse_adam": "none"},
+        {"mcmc__enabled": True, "fast__densify": "threshold"},
+        {"mcmc__enabled": True, "fast__densify": "threshold", "fast__opacity": "reset"},
+    ],
+)
 def test_what_does_not_go_together_is_said_before_anything_runs(sets):
     with pytest.raises(ConfigError, match="fast"):
         stage_of(**sets)

@@ -6,6 +6,7 @@ import pytest
 import torch
 from sw_gaussians import fragments
 from sw_gaussians.budget import densify_to_budget, draw_distinct, halve_opacity, linear_target
+from sw_gaussians.fast_tasks import DensifyToBudget
 from sw_gaussians.morton import morton_order
 from sw_gaussians.start import logit
 
@@ -76,6 +77,7 @@ def test_the_target_rises_linearly_and_is_the_cap_at_the_last_round():
     plan = {"first": 100, "last": 500, "start": 1000, "cap": 3000}
     assert [linear_target(step, **plan) for step in (50, 100, 300, 500, 900)] == [1000, 1000, 2000, 3000, 3000]
     assert linear_target(500, first=500, last=500, start=10, cap=20) == 20
+    assert linear_target(5, first=10, last=10, start=10, cap=20) == 10
     assert linear_target(500, first=0, last=400, start=10, cap=5) == 10  # a cap takes nothing away
 
 
@@ -135,6 +137,30 @@ def test_faint_ones_and_those_without_a_fragment_go():
     assert model.means[:, 0].tolist() == [0, 3, 4]
     densify_to_budget(kept, optimizer_of(kept), step=1, extent=EXTENT, target=0, prune_unused=False)
     assert kept.means[:, 0].tolist() == [0, 2, 3, 4]
+
+
+def test_a_model_without_the_buffer_is_told_what_it_lacks():
+    model = model_of(4)
+    optimizer = optimizer_of(model)
+    seen(model)
+    fragments.drop_buffer(model)
+    with pytest.raises(ValueError, match=r"add_buffer.*score=\"gradient\""):
+        densify_to_budget(model, optimizer, step=1, extent=EXTENT, target=10)
+    assert densify_to_budget(model, optimizer, step=1, extent=EXTENT, target=6, score="gradient").total == 6
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"score": "nonsense"}, "nonsense"),
+        ({"cap": -1}, "cap is -1"),
+        ({"growth": -0.5}, "growth"),
+        ({"interval": 0}, "interval"),
+    ],
+)
+def test_settings_of_the_task_are_checked_when_it_is_made(settings, said):
+    with pytest.raises(ValueError, match=said):
+        DensifyToBudget(**settings)
 
 
 def test_nothing_left_is_an_error():

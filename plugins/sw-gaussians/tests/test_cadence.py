@@ -88,6 +88,26 @@ def test_it_goes_with_sparse_adam():
     assert moved.tolist() == rows.tolist()
 
 
+def test_what_a_hidden_gaussian_has_gathered_waits_until_it_is_shown():
+    model = model_of(3)
+    optimizer = SparseCadencedOptimizer(model, groups(), every=2, bias_correction="per_row")
+    views = [[True, True, False], [True, False, False], [True, False, False], [True, True, False]]
+    shown, given = [], torch.zeros_like(model.sh_rest)
+    for step, view in enumerate(views):
+        rows = torch.tensor(view)
+        gradients(model, step)
+        for p in model.parameters():
+            p.grad[~rows] = 0
+        given += model.sh_rest.grad
+        before = model.sh_rest.detach().clone()
+        optimizer.step_rows(rows)
+        shown.append((model.sh_rest != before).flatten(1).any(dim=1).tolist())
+    assert shown == [[False] * 3, [True, False, False], [False] * 3, [True, True, False]]
+    moments, _, _ = optimizer.moments("sh_rest")
+    assert torch.allclose(moments[1], 0.1 * given[1])  # all that it was given, the view of step 1 included
+    assert not optimizer.states["sh_rest"].tensors["pending"].any()
+
+
 @pytest.mark.parametrize("mask", [torch.tensor([True, False]), torch.tensor([0.0] * 4)])
 def test_rows_to_keep_are_a_mask_or_an_order(mask):
     model = model_of()

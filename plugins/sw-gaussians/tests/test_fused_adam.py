@@ -1,5 +1,7 @@
 """Updates that are offered to the backward pass: when, to whom, and what is left to the optimizer."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from sw_gaussians.config import GaussianTraining
@@ -8,6 +10,7 @@ from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
 from sw_gaussians.statistics import collect_statistics
 
+from splatwizard_core.api import ConfigError
 from splatwizard_core.scene.scene import PointCloud
 from splatwizard_core.training.optimizer import ParamGroup, SplatOptimizer
 from splatwizard_core.training.params import PipelineParams
@@ -103,10 +106,23 @@ def test_it_is_offered_where_no_task_but_the_statistics_follows(monkeypatch):
 
 def test_a_stage_made_of_this_one_offers_nothing(monkeypatch):
     class Other(ThreeDGSStage):
-        fuses_updates = True
+        pass
 
-    stage = Other(GaussianTraining())
+    stage = Other(GaussianTraining(), fuses_updates=True)
     build_schedulers(stage, PipelineParams())
     _, stage._optimizer = made(FusingOptimizer)
     monkeypatch.setattr(FusingOptimizer, "offer", lambda self: pytest.fail("offered"))
     stage.raster_options(3, torch.zeros(3))
+
+
+@pytest.mark.parametrize("values", [{"sparse_adam": "per_row"}, {"fast": {"sh_every": 2}}])
+def test_it_is_refused_beside_other_optimizers(values):
+    with pytest.raises(ConfigError, match="fused_updates"):
+        ThreeDGSStage(GaussianTraining.model_validate(values), fuses_updates=True)
+
+
+def test_it_is_refused_on_a_cpu():
+    model, _ = made(FusingOptimizer)
+    scene = SimpleNamespace(protocol=SimpleNamespace(background="black"))
+    with pytest.raises(ConfigError, match="CUDA"):
+        ThreeDGSStage(GaussianTraining(), fuses_updates=True).begin(SimpleNamespace(model=model, scene=scene))

@@ -1,19 +1,27 @@
 """The resolution schedule: what spectra say, how scales fall, and how views are handed out."""
 
+import itertools
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 import torch
+from sw_gaussians.config import GaussianTraining
+from sw_gaussians.fast_tasks import DensifyToBudget
 from sw_gaussians.resolution import (
     ResolutionPlan,
     ResolutionSampler,
     Spectrum,
     amplitudes,
+    first_scale,
     plan_of_views,
     resolution_plan,
     shrunk,
 )
+from sw_gaussians.stage import ThreeDGSStage
 
-from splatwizard_core.api import Camera, CameraSampler, View, stream
+from splatwizard_core.api import Camera, CameraSampler, PipelineParams, View, stream
+from splatwizard_core.training.scheduler import build_schedulers
 
 SIDE = 256
 
@@ -49,15 +57,16 @@ def test_windows_are_sums_of_the_middle():
 
 def test_scales_fall_to_one_and_pixels_grow_linearly_between():
     image = spectrum(picture(1.0))
-    plan = resolution_plan([image], image, full_at=8000)
-    assert plan.scales[0] == pytest.approx(4.0, rel=0.05)
+    assert first_scale(image) == pytest.approx(4.0, rel=0.05)
+    plan = resolution_plan(first_scale(image), image, full_at=8000)
+    assert plan.scales[0] == first_scale(image)
     assert list(plan.times) == sorted(set(plan.times))
     assert list(plan.scales) == sorted(plan.scales, reverse=True)
     assert (plan.scale(0), plan.scale(8000), plan.scale(20_000)) == (plan.scales[0], 1.0, 1.0)
     between = ResolutionPlan((0, 100), (2.0, 1.0))
     assert between.scale(50) == pytest.approx((1 / 0.625) ** 0.5)
-    assert resolution_plan([image], image, full_at=8000, most=2.0).scales[0] == 2.0
-    assert resolution_plan([image], image, full_at=8000, most=1.0) == ResolutionPlan((0,), (1.0,))
+    assert resolution_plan(2.0, image, full_at=8000).scales[0] == 2.0
+    assert resolution_plan(1.0, image, full_at=8000) == ResolutionPlan((0,), (1.0,))
 
 
 def views(sizes=((24, 16), (24, 16))) -> list[View]:
@@ -95,6 +104,32 @@ def test_the_scale_changes_only_where_statistics_start_again():
     scales = [drawn.scale(step) for step in range(1, 51)]
     assert [len(set(scales[i : i + 10])) for i in range(0, 50, 10)] == [1] * 5
     assert scales[::10] == sorted(set(scales), reverse=True)
+
+
+def test_pictures_without_detail_are_whole_from_the_start():
+    flat = spectrum(torch.full((1, 8, 8), 0.5))
+    for image in (flat, spectrum(torch.zeros(1, 8, 8))):
+        assert resolution_plan(4.0, image, full_at=100) == ResolutionPlan((0,), (1.0,))
+
+
+def test_statistics_of_every_round_of_the_preset_fast_are_of_one_resolution():
+    config = GaussianTraining.model_validate({
+        "iterations": 10_000, "scale_schedule": True, "densify": {"start": 900, "stop": 24_000, "interval": 750},
+        "fast": {"densify": "budget", "resolution": "dash"},
+    })  # fmt: skip
+    stage = ThreeDGSStage(config)
+    _, post = build_schedulers(stage, PipelineParams())
+    (entry,) = (entry for entry in post.registrations if isinstance(entry.task, DensifyToBudget))
+    rounds = [step for step in range(1, 8001) if entry.due(step)]
+    pictures = views()
+    scene = SimpleNamespace(train=pictures, background=None)
+    drawn = stage.create_sampler(scene, stream(0, "sampler"))
+    drawn._plan = ResolutionPlan((0, 8000), (4.0, 1.0))
+    assert rounds[:2] == [300, 550]
+    for past, now in itertools.pairwise([0, *rounds]):
+        assert len({drawn.scale(step) for step in range(past + 1, now + 1)}) == 1, now
+    assert len({drawn.scale(step) for step in rounds}) == len(rounds)
+    assert (drawn.scale(8000) > 1, drawn.scale(8001)) == (True, 1.0)
 
 
 def test_whole_scales_are_an_option():

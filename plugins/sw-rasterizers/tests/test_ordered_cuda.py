@@ -38,6 +38,7 @@ CASES = {
     "absgrad": (RasterOptions(absgrad=True, alpha=True), {}),
     "depths": (RasterOptions(alpha=True, depth=ALL_DEPTHS, grad2d=True, absgrad=True), {}),
     "large": (RasterOptions(grad2d=True), {"width": 900, "height": 900}),  # whole lists: 3,249 tiles
+    "fragments": (RasterOptions(grad2d=True, fragment_grad=True), {}),
     "features": (RasterOptions(), {"features": 11}),
     "dgr-exact": (RasterOptions(profile="dgr-exact", grad2d=True), {}),
 }
@@ -56,7 +57,7 @@ def drawn(name: str):
         g = replace(g, sh=SH(dc=sh[:, :1].clone(), rest=sh[:, 1:].clone(), active_degree=g.sh.active_degree))
     result, gradients = run(StandardRasterizer(), g, cam, options)
     found = {"image": result.image.detach(), **gradients}
-    for which in ("grad2d", "absgrad2d"):
+    for which in ("grad2d", "absgrad2d", "fragment_grad"):
         if getattr(result, which) is not None:
             found[which] = getattr(result, which).value
     return found

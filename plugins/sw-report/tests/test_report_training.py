@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from sw_report.looks import looks_of
+from sw_report.numbers import SHARED_NOTE
 from sw_report.plots import training_charts
 from sw_report.runs import collect
 from sw_report.training_log import log_path, read_training, thin
@@ -126,3 +127,16 @@ def test_the_page_draws_quality_over_seconds(make_run):
     assert captions[1] == "PSNR of the test views over seconds of training, evaluation not counted"
     assert captions[2].startswith("SSIM")
     assert "seconds of training" in str(charts.figures[1].svg)
+
+
+def test_seconds_of_a_shared_machine_are_marked_below_the_curve(make_run):
+    directory = make_run("r1", keep=("log",), change=lambda c: c.update(contended={"train": 0.5}))
+    with (directory / "log.jsonl").open("a") as file:
+        for step in (301, 302):
+            line = {"stage": 0, "step": step, "metrics": {"psnr": step / 10}, "train_s": step / 100}
+            file.write(json.dumps(line) + "\n")
+    runs = collect([directory]).runs
+    charts, _ = training_charts(runs, looks_of(runs))
+    marked = [figure.caption for figure in charts.figures if SHARED_NOTE in figure.caption]
+    assert len(marked) == 1
+    assert marked[0].startswith("PSNR of the test views over seconds")

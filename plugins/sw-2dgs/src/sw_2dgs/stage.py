@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,7 +10,6 @@ from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import logit
 from sw_gaussians.surface_losses import add_surface_losses, maps_for
 from sw_gaussians.surfels import Surface, SurfelModel
-from sw_gaussians.tasks import PruneAndDensify
 
 from splatwizard_core.api import ConfigError, RasterOptions
 from sw_2dgs.datasets import OTHER, surface_of
@@ -40,6 +38,12 @@ class TwoDGSStage(ThreeDGSStage):
                 "mcmc.enabled relocates Gaussians with three scales, which surfels do not have: leave it off",
                 key="mcmc.enabled",
             )
+        if opt.fast.densify == "budget" and opt.fast.score == "opacity_variance":
+            raise ConfigError(
+                "fast.score=opacity_variance sums opacity gradients over fragments, which no rasterizer of surfels "
+                "does: set fast.score=gradient",
+                key="fast.score",
+            )
         self.settings = opt.surface
         self.surface = self._configured(OTHER)
         self._drawn: dict[tuple[bool, bool], RasterOptions] = {}  # by the losses that are on
@@ -61,19 +65,18 @@ class TwoDGSStage(ThreeDGSStage):
         log.info("surface of %s (%s): %s", scene.name, scene.protocol.dataset, self.surface)
         return model
 
-    def densification(self) -> Callable[..., None]:
-        """Return the task of 3DGS, with a threshold that surfels can reach again after an opacity reset.
+    def min_opacity(self) -> float:
+        """Return the threshold of pruning, one that surfels can reach again after an opacity reset.
 
         Adam needs 33 steps from an opacity of 0.01 to 0.05, and the published plan leaves 100. In one that is scaled
         down to fewer the threshold is below the reset: else nothing would survive it.
         """
-        task, plan = super().densification(), self.config.densify
-        assert isinstance(task, PruneAndDensify)
+        plan, least = self.config.densify, super().min_opacity()
         has_resets = plan.reset_interval < plan.stop or (self.white and 0 < plan.white_reset < plan.stop)
         way = logit(plan.min_opacity) - logit(plan.reset_opacity) if plan.min_opacity > 0 else 0.0
         if has_resets and self.steps(plan.interval) * self.config.lr.opacity < way:
-            task.settings["min_opacity"] = min(plan.min_opacity, plan.reset_opacity / 2)
-        return task
+            return min(least, plan.reset_opacity / 2)
+        return least
 
     def weights(self, step: int) -> tuple[float, float]:
         """Return the weights of distortion and normals at a step; 0 until their steps have come."""

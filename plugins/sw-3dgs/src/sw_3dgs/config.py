@@ -26,6 +26,9 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
     init: InputFile = Field(
         "", description="a .ply to start from, with all its SH bands active; empty: the scene's points"
     )
+    fused_updates: bool = Field(
+        False, description="on CUDA, update spherical harmonics in the backward pass: equal but for rounding"
+    )
     codec: CodecChoice = Field(CodecChoice(name="gaussians-exact"), description="what writes the file")
 
     def translated(self, values: dict[str, Any]) -> dict[str, Any]:
@@ -36,6 +39,8 @@ class ThreeDGSConfig(Choosing, GaussianTraining):
 
     def identity(self) -> dict[str, Any]:
         content = super().identity()
+        if not self.fused_updates:
+            del content["fused_updates"]  # trainings of before it existed are still found
         mode = next((mode for mode, name in MODES.items() if name == self.codec.name), None)
         if mode is not None:
             content["codec"]["mode"] = mode

@@ -46,7 +46,8 @@ class ThreeDGS(GaussianMethod):
         return gaussians_from_points(points, max_sh_degree=config.sh_degree, **config.mcmc.first_values())
 
     def stages(self) -> Sequence[Stage]:
-        return [ThreeDGSStage(self.config)]
+        config: ThreeDGSConfig = self.config
+        return [ThreeDGSStage(config, fuses_updates=config.fused_updates)]
 
     def encode(self, model: SplatModel, writer: ContainerWriter) -> None:
         """Write the model with the chosen codec, which the header calls `mode`, or `codec` if it is not one of two."""

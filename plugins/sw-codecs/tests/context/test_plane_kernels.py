@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
-from sw_codecs.context import spatial_ar, triplane
+from sw_codecs.context import plane_kernels, spatial_ar, triplane
 from sw_codecs.context.plane_kernels import fit_kernels
 from sw_codecs.context.spatial_ar import SpatialAr
 from sw_codecs.context.triplane import PlaneSites, Triplane
@@ -28,6 +30,17 @@ def close(found, expected, tolerance=1e-4):
 def test_there_are_no_kernels_on_a_cpu():
     assert not fit_kernels([torch.zeros(3, 2, 4, 4)])
     assert not fit_kernels([])
+
+
+def test_there_are_none_for_planes_of_more_cells_than_a_grid_has_rows_for(monkeypatch):
+    monkeypatch.setattr(plane_kernels, "CODECS", SimpleNamespace(has_cuda=lambda: True))
+
+    def on_cuda(height, width):
+        shape = (3, 1, height, width)
+        return SimpleNamespace(is_cuda=True, dtype=torch.float32, shape=shape, numel=lambda: 3 * height * width)
+
+    assert fit_kernels([on_cuda(65_535, 32)])
+    assert not fit_kernels([on_cuda(1, 1), on_cuda(65_535, 33)])
 
 
 @pytest.mark.cuda

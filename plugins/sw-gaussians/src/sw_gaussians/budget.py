@@ -19,6 +19,8 @@ CHILD_SHRINK = 1.6
 """Scales of a child of a large Gaussian are divided by this, as those of two children are in 3DGS."""
 OPACITY_FLOOR = 1 / 128
 """Opacity that halving leaves at least."""
+SCORES = ("opacity_variance", "gradient")
+"""By what the draw is weighted."""
 
 
 def draw_distinct(weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
@@ -38,7 +40,7 @@ def draw_distinct(weights: Tensor, count: int, generator: torch.Generator) -> Te
 
 def linear_target(step: int, *, first: int, last: int, start: int, cap: int) -> int:
     """Return how many Gaussians there should be at a step: from `start` at `first` to `cap` at `last`, linearly."""
-    share = 1.0 if step >= last else max(0.0, (step - first) / (last - first))
+    share = 1.0 if step >= last else 0.0 if step <= first else (step - first) / (last - first)
     return int(start + (max(cap, start) - start) * share)
 
 
@@ -72,8 +74,15 @@ def densify_to_budget(
     morton          put the rows in Morton order of the means
 
     Order of rows otherwise: survivors, copies, children. Statistics start again at zero.
-    Raises EmptyModel if nothing is left.
+    Raises EmptyModel if nothing is left, ValueError for a score that is none, or whose buffer the model lacks.
     """
+    if score not in SCORES:
+        raise ValueError(f"score '{score}' is none of {', '.join(SCORES)}")
+    if score == "opacity_variance" and fragments.BUFFER not in model.ROWS:
+        raise ValueError(
+            'score="opacity_variance" needs a model with the buffer of sw_gaussians.fragments.add_buffer, which the '
+            'task collect_opacity_gradients fills: give it one, or set score="gradient"'
+        )
     n = model.num_rows
     mean_gradient = (model.grad_accum / model.denom).nan_to_num_(nan=0.0)  # never seen: 0 / 0
     doomed = model.opacities < min_opacity

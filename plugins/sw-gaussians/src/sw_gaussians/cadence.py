@@ -6,6 +6,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import torch
+from torch import Tensor
 
 from splatwizard_core.api import SplatOptimizer
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
@@ -66,4 +67,18 @@ class CadencedOptimizer(SplatOptimizer):
 
 
 class SparseCadencedOptimizer(CadencedOptimizer, SparseSplatOptimizer):
-    """Both: of the slow parameters, too, only the rows are updated that the view of that step shows."""
+    """Both: of the slow parameters, too, only the rows are updated that the view of that step shows.
+
+    What the others have gathered waits for the first such view that shows them.
+    """
+
+    @torch.no_grad()
+    def step_rows(self, rows: Tensor | None) -> None:
+        super().step_rows(rows)
+        if rows is None:
+            return
+        for name in self.slow:
+            gradient = self.model.get_parameter(name).grad
+            if gradient is not None:  # updated just now
+                shown = rows.view(-1, *[1] * (gradient.dim() - 1))
+                self.states[name].tensors[PENDING] = gradient.masked_fill(shown, 0.0)

@@ -17,7 +17,9 @@ class DensifyToBudget:
     first, last     steps between which the budget rises linearly, from the start points of the scene to `cap`
     interval        steps between two calls; a Gaussian without a fragment is pruned only if that is a whole round of
                     the training views, or nearly
-    The other settings are those of `densify_to_budget`. Curves: "cloned", "split", "pruned", numbers of Gaussians.
+    The other settings are those of `densify_to_budget`. With the default score the model needs the buffer of
+    `fragments.add_buffer`. Raises ValueError for settings outside their range.
+    Curves: "cloned", "split", "pruned", numbers of Gaussians.
     """
 
     def __init__(
@@ -34,6 +36,11 @@ class DensifyToBudget:
         min_opacity: float = 0.005,
         morton: bool = False,
     ) -> None:
+        if score not in budget.SCORES:
+            raise ValueError(f"score '{score}' is none of {', '.join(budget.SCORES)}")
+        for name, value, least in (("cap", cap, 1), ("growth", growth, 0), ("interval", interval, 1)):
+            if value < least:
+                raise ValueError(f"{name} is {value}: it must be at least {least}")
         self.first, self.last, self.interval, self.cap = first, last, interval, cap
         self.growth, self.score, self.grad_threshold = growth, score, grad_threshold
         self.percent_dense, self.min_opacity, self.morton = percent_dense, min_opacity, morton

@@ -39,9 +39,10 @@ class Spectrum:
 
     def __init__(self, amplitude: Tensor) -> None:
         self.height, self.width = amplitude.shape
-        table = amplitude.new_zeros(self.height + 1, self.width + 1, dtype=torch.float64)
-        table[1:, 1:] = amplitude.double().cumsum(0).cumsum(1)
-        self._table = table.cpu()
+        # On the CPU: cumsum on CUDA is not deterministic.
+        table = torch.zeros(self.height + 1, self.width + 1, dtype=torch.float64)
+        table[1:, 1:] = amplitude.double().cpu().cumsum(0).cumsum(1)
+        self._table = table
 
     def within(self, scale: float) -> float:
         """Sum of the window of floor(H / scale) x floor(W / scale) bins."""
@@ -83,18 +84,21 @@ class ResolutionPlan:
         return float((p0 + (step - t0) / (t1 - t0) * (p1 - p0)) ** -0.5)
 
 
-def resolution_plan(spectra: Sequence[Spectrum], mean: Spectrum, *, full_at: int, most: float = 4.0) -> ResolutionPlan:
+def first_scale(spectrum: Spectrum) -> float:
+    """Return the scale at which one picture holds its first share of the amplitudes."""
+    return spectrum.scale_of(spectrum.within(1) / ENERGY)
+
+
+def resolution_plan(first: float, mean: Spectrum, *, full_at: int) -> ResolutionPlan:
     """Return when pictures have which scale, by what their spectra hold.
 
-    spectra     of each picture, for the first scale
-    mean        of the mean of their amplitudes
+    first       scale of the first pictures; without detail beyond it, or at 1, pictures are whole from the start
+    mean        spectrum of the mean of their amplitudes
     full_at     step from which pictures are whole
-    most        largest scale
     """
-    first = min([most, *(s.scale_of(s.within(1) / ENERGY) for s in spectra)])
-    if first <= 1 or full_at <= 0:
-        return ResolutionPlan((0,), (1.0,))
     least, total = mean.within(first), mean.within(1)
+    if first <= 1 or full_at <= 0 or not 0 < least < total:
+        return ResolutionPlan((0,), (1.0,))
     times, scales = [0], [first]
     for k in range(1, LEVELS):
         energy = least + (total - least) * k / (LEVELS - 1)
@@ -116,14 +120,14 @@ def plan_of_views(
     """Return the plan of these training views; pictures of other sizes count at the size of the median."""
     sizes = sorted((view.camera.height * view.camera.width, view.camera.height, view.camera.width) for view in views)
     _, height, width = sizes[len(sizes) // 2]
-    spectra, total = [], torch.zeros(height, width)
+    first, total = most, torch.zeros(height, width)
     for view in views:
         device = view.kept_on
         picture = shrunk(view.image(background, device), height, width)
         amplitude = amplitudes(picture)
-        spectra.append(Spectrum(amplitude))
+        first = min(first, first_scale(Spectrum(amplitude)))
         total = total.to(device) + amplitude
-    return resolution_plan(spectra, Spectrum(total / len(views)), full_at=full_at, most=most)
+    return resolution_plan(first, Spectrum(total / len(views)), full_at=full_at)
 
 
 def shrunk(image: Tensor, height: int, width: int) -> Tensor:
@@ -157,9 +161,15 @@ class ResolutionSampler(CameraSampler):
     """
 
     def __init__(
-        self, inner: CameraSampler, make_plan: Callable[[], ResolutionPlan], *, every: int, rounding: Rounding = "real"
+        self,
+        inner: CameraSampler,
+        make_plan: Callable[[], ResolutionPlan],
+        *,
+        every: int,
+        first: int = 0,
+        rounding: Rounding = "real",
     ) -> None:
-        self.inner, self.every, self.rounding = inner, every, rounding
+        self.inner, self.every, self.first, self.rounding = inner, every, first, rounding
         self.views, self.generator = inner.views, inner.generator
         self._make_plan = make_plan
         self._plan: ResolutionPlan | None = None
@@ -175,7 +185,9 @@ class ResolutionSampler(CameraSampler):
 
     def scale(self, step: int) -> float:
         """Return how many times smaller the pictures of a step are."""
-        scale = self.plan.scale((step - 1) // self.every * self.every)
+        since = step - 1 - self.first  # a round at step k is past from step k + 1 on
+        at = self.first + since // self.every * self.every if since >= 0 else 0
+        scale = 1.0 if step > self.plan.times[-1] else self.plan.scale(at)
         return float(math.floor(scale)) if self.rounding == "floor" else scale
 
     def next(self, step: int) -> View:
@@ -201,17 +213,26 @@ class ResolutionSampler(CameraSampler):
 
 
 def by_resolution(
-    inner: CameraSampler, scene: Scene, *, full_at: int, every: int, most: float = 4.0, rounding: Rounding = "real"
+    inner: CameraSampler,
+    scene: Scene,
+    *,
+    full_at: int,
+    every: int,
+    first: int = 0,
+    most: float = 4.0,
+    rounding: Rounding = "real",
 ) -> ResolutionSampler:
     """Return a sampler that hands out what `inner` draws by the resolution schedule of a scene.
 
     full_at     step from which pictures are whole
     every       steps between two looks at the schedule: the interval of densification
+    first       step of the first look after that at the start: the first densification
     most        times that the first pictures are smaller, at most
     """
     return ResolutionSampler(
         inner,
         lambda: plan_of_views(scene.train, full_at=full_at, most=most, background=scene.background),
         every=every,
+        first=first,
         rounding=rounding,
     )

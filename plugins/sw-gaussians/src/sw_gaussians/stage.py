@@ -48,14 +48,21 @@ READERS = (collect_statistics, fragments.collect_opacity_gradients)
 
 
 class ThreeDGSStage(Stage):
-    """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time."""
+    """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time.
+
+    fuses_updates   on CUDA spherical harmonics are updated in the backward pass, at steps at which nothing else asks
+                    for their gradients; with dense Adam alone
+    """
 
     name = "3dgs"
-    fuses_updates: bool = False
-    """Whether spherical harmonics are updated in the backward pass where nothing else asks for their gradients."""
 
-    def __init__(self, opt: GaussianTraining) -> None:
+    def __init__(self, opt: GaussianTraining, *, fuses_updates: bool = False) -> None:
         super().__init__(opt)
+        self.fuses_updates = fuses_updates
+        if fuses_updates and (opt.sparse_adam != "off" or opt.fast.sh_every > 1):
+            raise ConfigError(
+                "fused_updates updates all Gaussians at every step: leave sparse_adam off and fast.sh_every at 1"
+            )
         if opt.sparse_adam != "off" and opt.mcmc.enabled:
             raise ConfigError(
                 "sparse_adam leaves hidden Gaussians as they are, which the regularisers of mcmc.enabled must reach: "
@@ -64,6 +71,17 @@ class ThreeDGSStage(Stage):
         budget = opt.fast.densify == "budget"
         if budget and opt.mcmc.enabled:
             raise ConfigError("mcmc.enabled and fast.densify=budget are two density controls: set one of them")
+        halves = opt.fast.opacity == "halve"
+        if opt.mcmc.enabled and (halves or opt.fast.morton):
+            raise ConfigError(
+                "mcmc.enabled neither resets opacities nor sorts Gaussians: fast.opacity=halve and fast.morton would "
+                "have no effect, leave them off"
+            )
+        if halves and opt.sparse_adam == "none":
+            raise ConfigError(
+                "fast.opacity=halve clears Adam's moments, after which sparse_adam=none makes steps of 3.2 times the "
+                "learning rate: set sparse_adam=per_row or off"
+            )
         self._fragments = budget and opt.fast.score == "opacity_variance"
         if self._fragments and opt.densify.absgrad:
             raise ConfigError("densify.absgrad does not go with fast.score=opacity_variance: set fast.score=gradient")
@@ -80,6 +98,8 @@ class ThreeDGSStage(Stage):
     def begin(self, context: StageContext) -> SplatModel:
         self.white = context.scene.protocol.background == "white"
         model = context.model
+        if self.fuses_updates and not next(model.parameters()).is_cuda:
+            raise ConfigError("fused_updates is for rasterizers on CUDA, and the model is on the CPU: leave it off")
         if hasattr(model, "split_seed"):
             model.split_seed = context.generator("split").initial_seed()
         if self._fragments:
@@ -95,6 +115,7 @@ class ThreeDGSStage(Stage):
             scene,
             full_at=self.steps(self.config.densify.stop),
             every=self.steps(self.config.densify.interval),
+            first=self.steps(self.config.densify.start),
             most=fast.resolution_start,
             rounding=fast.resolution_rounding,
         )
@@ -183,13 +204,17 @@ class ThreeDGSStage(Stage):
             self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
         )
 
+    def min_opacity(self) -> float:
+        """Return the opacity below which density control prunes; a stage with a rule of its own overrides it."""
+        return self.config.densify.min_opacity
+
     def densification(self) -> Callable[..., None]:
         """Return the task that clones, splits and prunes; a stage with rules of its own wraps it."""
         densify = self.config.densify
         return tasks.PruneAndDensify(
             grad_threshold=densify.grad_threshold,
             percent_dense=densify.percent_dense,
-            min_opacity=densify.min_opacity,
+            min_opacity=self.min_opacity(),
             world_prune=densify.world_prune,
             size_rules_after=self.steps(densify.reset_interval),
             prune_screen_px=densify.prune_screen_px,
@@ -210,7 +235,7 @@ class ThreeDGSStage(Stage):
             score=fast.score,
             grad_threshold=densify.grad_threshold,
             percent_dense=densify.percent_dense,
-            min_opacity=densify.min_opacity,
+            min_opacity=self.min_opacity(),
             morton=fast.morton,
         )
 

@@ -55,7 +55,7 @@ class ScoreRasterizer(StandardRasterizer):
 
     Sums are formed per tile in the dtype of the Gaussians and across tiles and views in float64; on the CPU they are
     bit-equal for any number of threads, on CUDA each (Gaussian, pixel) counts once but the order of additions varies,
-    unless torch is asked for deterministic algorithms.
+    unless torch is asked for deterministic algorithms: then a Gaussian's sum over the tiles of a view is float32, too.
     No score is differentiable, and none touches a gradient.
     """
 

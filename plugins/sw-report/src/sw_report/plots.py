@@ -174,12 +174,16 @@ def single_sections_table(run: Run) -> Table | None:
 
 @dataclass(frozen=True)
 class Drawn:
-    """One training as the charts draw it; `style` and `dash` as of `charts.Series`."""
+    """One training as the charts draw it; `style` and `dash` as of `charts.Series`.
+
+    contended   other processes wanted the cores meanwhile
+    """
 
     name: str
     curves: TrainingCurves
     style: int
     dash: int
+    contended: bool = False
 
 
 def training_charts(runs: Sequence[Run], style_of: dict[str, int]) -> tuple[Charts | None, list[str]]:
@@ -200,7 +204,8 @@ def training_charts(runs: Sequence[Run], style_of: dict[str, int]) -> tuple[Char
         rates = [run.facts.rate for run in group if run.facts.rate]
         name = group[0].variant + (f" ({', '.join(rates)})" if rates and len(runs) > 1 else "")
         variant = group[0].variant
-        curves.append(Drawn(name, found, style_of[variant], sum(style_of[variant] == c.style for c in curves)))
+        dash, contended = sum(style_of[variant] == c.style for c in curves), any(r.contended("train") for r in group)
+        curves.append(Drawn(name, found, style_of[variant], dash, contended))
     notes = [f"{', '.join(names)}: {why}" for why, names in missing.items()]
     if len(curves) > MOST_LINES:
         notes.append(f"{MOST_LINES} of {len(curves)} trainings are drawn")
@@ -233,9 +238,10 @@ def _training_figures(drawn: Sequence[Drawn]) -> list[Figure]:
 
     add("Training loss (logarithmic, means of neighbouring steps)", "Training loss over steps", lambda c: c.loss,
         log=True)  # fmt: skip
+    shared = f". {numbers.SHARED_NOTE}" if any(d.contended and d.curves.quality for d in drawn) else ""
     for name in sorted({name for d in drawn for name in d.curves.quality}, key=lambda name: (name != "psnr", name)):
         style = metric_style(name)
-        add(f"{style.label} of the test views over seconds of training, evaluation not counted",
+        add(f"{style.label} of the test views over seconds of training, evaluation not counted{shared}",
             f"{style.heading} over seconds of training", lambda c, name=name: c.quality.get(name, []),  # type: ignore[misc]
             over="seconds of training")  # fmt: skip
     counted = {key for d in drawn for key in d.curves.counts}

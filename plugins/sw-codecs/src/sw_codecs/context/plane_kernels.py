@@ -13,6 +13,11 @@ MOST_SIZES = 4
 """Planes of so many sizes are taken: `kScales` of kernels/plane_bits.h and kernels/triplane.h."""
 
 
+MOST_CELLS = 65_535 * 32
+"""Of a plane, H x W: it is transposed in tiles of 32 cells, one in each row of a CUDA grid, which has 65,535 at most.
+"""
+
+
 def fit_kernels(planes: Sequence[Tensor]) -> bool:
     """Whether there are kernels for these planes [K,C,H,W], one for each size: float32 on CUDA; loads them.
 
@@ -20,7 +25,9 @@ def fit_kernels(planes: Sequence[Tensor]) -> bool:
     """
     if not 0 < len(planes) <= MOST_SIZES or not all(p.is_cuda and p.dtype == torch.float32 for p in planes):
         return False
-    if any(p.numel() >= 1 << 31 for p in planes) or torch.are_deterministic_algorithms_enabled():
+    if any(p.numel() >= 1 << 31 or p.shape[-2] * p.shape[-1] > MOST_CELLS for p in planes):
+        return False
+    if torch.are_deterministic_algorithms_enabled():
         return False
     return CODECS.has_cuda()
 
