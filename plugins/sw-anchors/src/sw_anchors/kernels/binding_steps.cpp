@@ -7,19 +7,13 @@
 
 #include <vector>
 
+#include "checked.h"
 #include "kernels.h"
 
 namespace {
 
 using namespace sw_anchors;
 using at::Tensor;
-
-const float* floats(const Tensor& t, const char* name, at::IntArrayRef shape) {
-  TORCH_CHECK(t.scalar_type() == at::kFloat && t.is_cpu() && t.is_contiguous() && t.sizes() == shape,
-              "sw_anchors: ", name, " must be contiguous float32 ", shape, " on the CPU, got ", t.toString(), " ",
-              t.sizes());
-  return t.const_data_ptr<float>();
-}
 
 // `parameters`: weight and bias of the first layer, then of the last one.
 StepNetwork network_of(const Tensor& features, const std::vector<Tensor>& parameters, const Tensor& base, double offset,

@@ -9,19 +9,13 @@
 #include <optional>
 #include <vector>
 
+#include "checked.h"
 #include "kernels.h"
 
 namespace {
 
 using namespace sw_anchors;
 using at::Tensor;
-
-const float* floats(const Tensor& t, const char* name, at::IntArrayRef shape) {
-  TORCH_CHECK(t.scalar_type() == at::kFloat && t.is_cpu() && t.is_contiguous() && t.sizes() == shape,
-              "sw_anchors: ", name, " must be contiguous float32 ", shape, " on the CPU, got ", t.toString(), " ",
-              t.sizes());
-  return t.const_data_ptr<float>();
-}
 
 // Ascending, if so asked; each within 0 .. limit - 1.
 const int64_t* places(const Tensor& t, const char* name, int64_t limit, bool ascending) {
