@@ -33,12 +33,15 @@ PLANS = {
 }
 
 
-def run(scene: str, methods: str, out: Path, device: str, steps: int | None, rates: str) -> None:
-    """Run rate points of some methods on a scene; a method that fails is told and left out."""
+def run(scene: str, methods: str, steps: int | None, rates: str, shared: list[str]) -> None:
+    """Run rate points of some methods on a scene; a method that fails is told and left out.
+
+    shared  words of the command line that are those of all methods
+    """
     starts, full = PLANS[methods]
     path, _, images = scene.partition(":")
     own_rates = rates if methods in ("lightgaussian", "chimerags") else "all"
-    words = ["run", "--method", methods, "--rate", own_rates, "--scene", path, "--out", str(out), "--device", device]
+    words = ["run", "--method", methods, "--rate", own_rates, "--scene", path, *shared]
     words += ["--images", images] if images else []
     if steps is not None:
         own = ["scale_schedule=true", f"iterations={max(1, round(full * steps / FULL_STEPS))}"] if full else []
@@ -83,7 +86,11 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=["demo"], help="PATH or PATH:IMAGES (default: demo)")
     parser.add_argument("--out", type=Path, default=Path("out/formats"), help="root of the run directories")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
-    parser.add_argument("--steps", type=int, help="of 3DGS, its plan scaled to that (default: the preset's)")
+    parser.add_argument("--preset", help="of all methods (default: quick on demo, else paper)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="of the whole run, such as resolution=2"
+    )
+    parser.add_argument("--steps", type=int, help="of 3DGS, all plans of preset paper scaled alike (default: in full)")
     parser.add_argument(
         "--methods", default="3dgs,formats,lightgaussian,chimerags", help="which of these (default: all four)"
     )
@@ -93,9 +100,12 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the rows into this file")
     args = parser.parse_args()
     names = {"formats": ",".join(FORMATS)}
+    shared = ["--out", str(args.out), "--device", args.device]
+    shared += ["--preset", args.preset] if args.preset else []
+    shared += [word for value in args.set for word in ("--set", value)]
     for scene in args.scenes:
         for method in args.methods.split(","):
-            run(scene, names.get(method, method), args.out, args.device, args.steps, args.rates)
+            run(scene, names.get(method, method), args.steps, args.rates, shared)
     found = rows(args.out)
     print_table(found)
     if args.json is not None:
