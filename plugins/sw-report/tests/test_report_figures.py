@@ -62,7 +62,7 @@ def test_sizes_are_read_at_1_2_and_5(tmp_path):
     line = Line("3dgs", [(0.25, 30.0, None), (6.0, 31.0, None)], 0)
     text = write_panels([Panel("x", [line])], tmp_path / "x.svg").read_text("utf-8")
     written = [label for label in ElementTree.fromstring(text).itertext() if label.strip()]
-    assert written[: written.index("file size, MB")] == ["0.5", "1", "2", "5"]
+    assert written[: written.index("file size, MB")][-4:] == ["0.5", "1", "2", "5"]
 
 
 def test_without_matplotlib_one_line_says_what_to_install(make_run, tmp_path, monkeypatch):
