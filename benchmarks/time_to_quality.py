@@ -4,9 +4,9 @@
     python benchmarks/time_to_quality.py DATA/fox:images_2 --parts --iterations 3000 --device cpu --out out/parts.jsonl
 
 A scene is FOLDER[:PICTURES]. Seconds are those of the training loop: statistics, sorting, resizing and spectra count,
-reading pictures, evaluation and checkpoints do not. `CPU s` are those of all threads, loading included: on a CPU that is
-shared they tell more. PSNR and SSIM are means over the held-out views, peak MiB that of torch's allocator on a GPU,
-else of the process. Several seeds are given as mean and half the spread.
+reading pictures, evaluation and checkpoints do not. `CPU s` are those of all threads, with reading pictures and without
+evaluation: on a CPU that is shared they tell more. PSNR and SSIM are means over the held-out views, peak MiB that of
+torch's allocator on a GPU, else of the process. Several seeds are given as mean and half the spread.
 
 --parts     also the last of the presets with each of its parts left out
 --also      a further variant, NAME=PRESET,KEY=VALUE,KEY=VALUE
