@@ -1,4 +1,4 @@
-"""The preset `fast` of methods that train Gaussians from points: a third of the steps, by one plan for all scenes."""
+"""The presets `fast` and `fast-cpu` of methods that train Gaussians from points: one plan for all scenes."""
 
 from __future__ import annotations
 
@@ -26,4 +26,25 @@ FAST: Mapping[str, Any] = {
 Source: LiteGS (arXiv 2503.01199), with new Gaussians bounded by twice what plain density control would copy: on a room
 (400x266, seed 0) a bound of once gives 31.54 dB with 526,000 Gaussians, twice 31.94 dB with 823,000, none 31.66 dB with
 1,000,000 (benchmarks/time_to_quality.py).
+"""
+
+FAST_CPU: Mapping[str, Any] = {
+    **FAST,
+    "iterations": 2_400,
+    "lr.position_init": 8e-4,
+    "lr.sh_dc": 1e-2,
+    "lr.sh_rest": 1e-3,
+    "lr.opacity": 0.05,
+    "lr.scales": 1e-2,
+    "lr.quats": 2e-3,
+    "densify.stop": 18_000,
+    "densify.reset_interval": 30_000,  # never: a short run does not recover from what a long one gains by
+    "fast.cap": 80_000,
+    "fast.opacity": "reset",
+    "fast.resolution": "dash",
+}
+"""`fast` for two cores: few steps, as large as those of `quick`, and no more Gaussians than such a run can fit.
+
+Two thirds of a step on a CPU are blending, which grows with pixels and Gaussians; hence small pictures at first
+(DashGaussian, arXiv 2503.18402). What each part brings: docs/methods/3dgs.md.
 """

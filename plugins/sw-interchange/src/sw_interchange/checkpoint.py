@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from splatwizard_core.api import BitstreamError, SceneError
+from splatwizard_core.api import SH_C0, BitstreamError, SceneError
 from sw_interchange.archive import entries_of, read_entry
-from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
+from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.scene import GaussianScene, Limits, ReadReport
 from sw_interchange.source import Source
 

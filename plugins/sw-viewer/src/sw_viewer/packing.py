@@ -5,7 +5,7 @@ A Gaussian takes 19 bytes and 3 a coefficient of the bands above 0, before defla
     place       3 x 16 bit, between the bounds of its chunk of 256 neighbours (Morton order)
     rotation    32 bit, smallest three of (w,x,y,z): index of the largest, 3 x 10 bit
     scales      3 x 10 bit, logarithmic; at most `LOG_RANGE` below the largest
-    colour      11 + 11 + 10 bit, of 0.5 + SH_0 dc
+    colour      11 + 11 + 10 bit, of 0.5 + SH_C0 dc
     opacity     8 bit
     bands 1-3   8 bit a coefficient, one step a band
 """
@@ -23,12 +23,11 @@ import torch
 from numpy.typing import NDArray
 from sw_gaussians.surfels import as_ellipsoids
 
-from splatwizard_core.api import GaussianModel, SceneError, SplatModel
+from splatwizard_core.api import SH_C0, GaussianModel, SceneError, SplatModel
 
 CHUNK = 256
 LOG_RANGE = 14.0
 """Largest minus least log scale that is told apart: e^-14 of the largest Gaussian is below any pixel."""
-SH_0 = 0.28209479177387814
 LEAST_STEP = 0.008
 """Of a coefficient: a finer one changes no 8-bit colour."""
 FAINTEST = 1 / 255
@@ -36,7 +35,7 @@ FAINTEST = 1 / 255
 FARTHEST = 1e4
 """Distance from the median that is kept along an axis, in widths of the middle half: farther ones coarsen others."""
 BRIGHTEST = 8.0
-"""Least and largest 0.5 + SH_0 dc are -8 and 8, of a coefficient, too: a wilder one would coarsen all others."""
+"""Least and largest 0.5 + SH_C0 dc are -8 and 8, of a coefficient, too: a wilder one would coarsen all others."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +163,7 @@ def _scale_range(log_scales: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _colors(dc: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
-    base = (0.5 + SH_0 * dc.astype(np.float64)).clip(-BRIGHTEST, BRIGHTEST)
+    base = (0.5 + SH_C0 * dc.astype(np.float64)).clip(-BRIGHTEST, BRIGHTEST)
     low, high = float(base.min()), float(base.max())
     share = (base - low) / max(high - low, 1e-6)
     cells = np.round(share * np.array([2047, 2047, 1023])).astype(np.uint32)
