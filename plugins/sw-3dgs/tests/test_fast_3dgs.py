@@ -126,6 +126,17 @@ def test_each_task_can_be_left_out(sets, gone, come):
     assert come in plan
 
 
+def test_on_a_cpu_pictures_begin_small_and_opacities_are_left_alone(scene):
+    stage = ThreeDGSStage(resolve(ThreeDGS, "fast-cpu").config)
+    _, post = build_schedulers(stage, PipelineParams())
+    names = {entry.name for step in range(1, stage.iterations + 1) for entry in post.registrations if entry.due(step)}
+    assert "densify to budget" in names
+    assert not any("opacity" in name and name != "collect opacity gradients" for name in names)
+    sampler = stage.create_sampler(scene, stream(0, "sampler"))
+    assert isinstance(sampler, ResolutionSampler)
+    assert sampler.plan.times[-1] <= 0.6 * stage.iterations  # from then on whole pictures, and no new Gaussians
+
+
 def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_last_step():
     stage, black = stage_of(), torch.zeros(3)
     asked = [stage.raster_options(step, black).fragment_grad for step in (1, 7_999, 8_000, 9_999, 10_000)]
