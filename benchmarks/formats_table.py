@@ -4,9 +4,12 @@
     python benchmarks/formats_table.py DATA/fox:images_2 DATA/room --device cuda --steps 7000 --out out/formats
 
 Every row is a `sw run`: encoded, decoded in a fresh process, evaluated on the test views. 3DGS r1 to r6 and the formats
-encode the same Gaussians; LightGaussian prunes and distils them; ChimeraGS trains its own. Finished runs are not done
-again. Bytes are those of the .swz; those of a format's own file, a few hundred fewer, stand beside them. Needs
-sw-formats, sw-3dgs, sw-lightgaussian and sw-chimerags, with zstandard and Pillow (WebP), and no network.
+encode the same Gaussians; LightGaussian prunes and distils them; ChimeraGS trains its own, taught by them. --steps
+scales all plans by the same factor. Finished runs are not done again. Bytes are those of the .swz; those of a format's
+own file, a few hundred fewer, stand beside them. Needs sw-formats, sw-3dgs, sw-lightgaussian and sw-chimerags, with
+zstandard and Pillow (WebP), and no network.
+
+    python tools/results.py collect OUT/SCENE --name formats-SCENE       # keeps the rows, for docs/formats.md
 """
 
 from __future__ import annotations
@@ -20,23 +23,28 @@ from typing import Any
 
 SW = [sys.executable, "-m", "splatwizard_core"]
 FORMATS = ("spz", "sog", "compressed-ply", "splat")
+FULL_STEPS = 30_000  # of 3DGS, preset paper
 PLANS = {
-    # method -> rate points, whether it starts from the scene of 3dgs, share of the steps of 3DGS that it trains
-    "3dgs": ("all", False, 1.0),
-    ",".join(FORMATS): ("all", True, 0.0),
-    "lightgaussian": ("all", True, 1 / 3),
-    "chimerags": ("all", False, 1.0),
+    # method -> whether it needs the scene of 3dgs, its `iterations` in preset paper; 0: it trains nothing
+    "3dgs": (False, FULL_STEPS),
+    ",".join(FORMATS): (True, 0),
+    "lightgaussian": (True, 5_000),
+    "chimerags": (True, 30_000),
 }
 
 
-def run(scene: str, methods: str, out: Path, device: str, steps: int | None) -> None:
-    """Run the rate points of some methods on a scene; a method that fails is told and left out."""
-    rates, starts, share = PLANS[methods]
+def run(scene: str, methods: str, steps: int | None, rates: str, shared: list[str]) -> None:
+    """Run rate points of some methods on a scene; a method that fails is told and left out.
+
+    shared  words of the command line that are those of all methods
+    """
+    starts, full = PLANS[methods]
     path, _, images = scene.partition(":")
-    words = ["run", "--method", methods, "--rate", rates, "--scene", path, "--out", str(out), "--device", device]
+    own_rates = rates if methods in ("lightgaussian", "chimerags") else "all"
+    words = ["run", "--method", methods, "--rate", own_rates, "--scene", path, *shared]
     words += ["--images", images] if images else []
     if steps is not None:
-        own = ["scale_schedule=true", f"iterations={max(1, round(steps * share))}"] if share else []
+        own = ["scale_schedule=true", f"iterations={max(1, round(full * steps / FULL_STEPS))}"] if full else []
         before = ["pretrained.scale_schedule=true", f"pretrained.iterations={steps}"] if starts else []
         words += [word for value in own + before for word in ("--set", value)]
     done = subprocess.run([*SW, *words], stdout=sys.stderr, check=False)
@@ -78,16 +86,26 @@ def main() -> None:
     parser.add_argument("scenes", nargs="*", default=["demo"], help="PATH or PATH:IMAGES (default: demo)")
     parser.add_argument("--out", type=Path, default=Path("out/formats"), help="root of the run directories")
     parser.add_argument("--device", default="auto", help="auto, cpu or cuda (default: auto)")
-    parser.add_argument("--steps", type=int, help="of 3DGS, its plan scaled to that (default: the preset's)")
+    parser.add_argument("--preset", help="of all methods (default: quick on demo, else paper)")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="of the whole run, such as resolution=2"
+    )
+    parser.add_argument("--steps", type=int, help="of 3DGS, all plans of preset paper scaled alike (default: in full)")
     parser.add_argument(
         "--methods", default="3dgs,formats,lightgaussian,chimerags", help="which of these (default: all four)"
+    )
+    parser.add_argument(
+        "--rates", default="all", help="of LightGaussian and ChimeraGS, which train anew for each (default: all)"
     )
     parser.add_argument("--json", type=Path, help="also write the rows into this file")
     args = parser.parse_args()
     names = {"formats": ",".join(FORMATS)}
+    shared = ["--out", str(args.out), "--device", args.device]
+    shared += ["--preset", args.preset] if args.preset else []
+    shared += [word for value in args.set for word in ("--set", value)]
     for scene in args.scenes:
         for method in args.methods.split(","):
-            run(scene, names.get(method, method), args.out, args.device, args.steps)
+            run(scene, names.get(method, method), args.steps, args.rates, shared)
     found = rows(args.out)
     print_table(found)
     if args.json is not None:

@@ -18,7 +18,7 @@ import math
 import numpy as np
 import torch
 
-from splatwizard_core.api import SH, Camera, GaussianInputs
+from splatwizard_core.api import SH, SH_C0, Camera, GaussianInputs
 
 SEED = 7
 PATCHES = 300  # surface patches of the object
@@ -70,7 +70,7 @@ def make_arrays(n: int, seed: int = SEED, sh_degree: int = 3) -> dict[str, np.nd
     opacities = np.where(r.random(n) < OPAQUE, r.beta(6.0, 0.7, n), r.beta(0.7, 4.0, n))
     opacities = np.clip(opacities, OPACITY_MIN, 0.999)
     sh = r.normal(size=(n, (sh_degree + 1) ** 2, 3), scale=0.04)
-    sh[:, 0] = (r.beta(1.6, 2.2, (n, 3)) - 0.5) / 0.28209479177387814
+    sh[:, 0] = (r.beta(1.6, 2.2, (n, 3)) - 0.5) / SH_C0
 
     order = r.permutation(n)
     arrays = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}

@@ -1,4 +1,4 @@
-"""tools/results.py: every table of README.md and docs/results.md is what its records say."""
+"""tools/results.py: every table of README.md, docs/results.md and docs/formats.md is what its records say."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_every_record_file_is_shown_and_every_record_is_read(tools):
 def test_every_figure_shows_what_its_records_say(tools):
     shown = [found[3] for page in tools.PAGES for found in tools.MARKED.finditer(page.read_text("utf-8"))
              if found[2] == "plot"]  # fmt: skip
-    assert sorted(shown) == ["fox", "lego", "room"]
+    assert sorted(shown) == ["formats-demo", "formats-fox", "fox", "lego", "room"]
     for scene in shown:
         assert not tools.result_plots.is_stale(scene), "python tools/results.py tables"
 
@@ -130,6 +130,20 @@ def test_mean_deviation_and_number_of_seeds(tools, record):
     cell = {row[1]: dict(zip(head, row, strict=True)) for row in rows}
     assert cell["r1"]["PSNR dB"] == "31.00 ± 1.00"
     assert (cell["r1"]["n"], cell["r1"]["x"], cell["r6 *"]["x"]) == ("3", "24.8 ± 0.0", "1.0 ± 0.0")
+
+
+def test_files_stand_in_the_order_of_their_bytes_with_what_they_come_from(tools, record):
+    exact = replace(record, rate="r6", bytes=24_800, gaussians=100, default_rate=True, encode_s=0.125)
+    spz = replace(exact, method="spz", rate="r2", bytes=1000, starts_from="3dgs", steps=0)
+    chimera = replace(exact, method="chimerags", rate="r1", bytes=2000, taught_by=["3dgs"], default_rate=False)
+    head, *rows = tools.formats_table([exact, chimera, spz])
+    cells = [dict(zip(head, row, strict=True)) for row in rows]
+    assert [(c["method"], c["bytes"], c["x"]) for c in cells] == [
+        ("spz", "1,000", "24.8"), ("ChimeraGS", "2,000", "12.4"), ("3DGS", "24,800", "1.0"),
+    ]  # fmt: skip
+    assert [(c["rate"], c["starts from"], c["taught by"], c["steps"]) for c in cells] == [
+        ("r2 *", "3dgs", "-", "-"), ("r1", "points", "3dgs", "2,000"), ("r6 *", "points", "-", "2,000"),
+    ]  # fmt: skip
 
 
 def test_what_was_not_measured_alone_is_no_time(tools, record):

@@ -32,7 +32,7 @@ def shown(scene: str, records_at: Path = RECORDS) -> str:
         return f"*No records of {scene} yet.*\n"
     names = ", ".join(line.name for line in panels(records)[0].lines)
     return (
-        f"![PSNR and SSIM over the bytes of the file on {scene}, on a logarithmic axis: {names}]"
+        f"![PSNR and SSIM over the bytes of the file on {records[0].scene}, on a logarithmic axis: {names}]"
         f"(images/{path_of(scene).name})\n\n"
         "Means over the runs, bars: one deviation; dashed: anchor methods.\n"
     )

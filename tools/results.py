@@ -1,4 +1,4 @@
-"""Make every table and plot of measured runs in docs/results.md and README.md from the small records in docs/records.
+"""Make every table and plot of measured runs in README.md, docs/results.md and docs/formats.md from docs/records.
 
     python tools/results.py collect OUT...       # records of all runs under OUT into docs/records, then what follows
     python tools/results.py tables               # the tables and plots alone
@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import statistics
 import sys
 from collections import defaultdict
 from collections.abc import Callable, Sequence
@@ -27,7 +28,7 @@ from result_records import MIB, RECORDS, ROOT, extract, merged, read, write
 
 from splatwizard_core.tooling import load_plugins
 
-PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md")
+PAGES = (ROOT / "docs" / "results.md", ROOT / "README.md", ROOT / "docs" / "formats.md")
 MARKED = re.compile(r"(<!-- (?:table|(?=plot)) ?(\w[\w-]*) (\w[\w.-]*) -->\n).*?(<!-- end -->)", re.S)
 
 
@@ -79,8 +80,24 @@ def brief_table(records: Rows) -> list[list[str]]:
     return rows
 
 
+def formats_table(records: Rows) -> list[list[str]]:
+    """Files of one scene, the smallest first: what each holds, from which training, and its seconds."""
+    rows = [["method", "rate", "bytes", "x", "PSNR dB", "SSIM", "Gaussians", "starts from", "taught by", "steps",
+             "encode s", "decode s", "n"]]  # fmt: skip
+    for group in sorted(points(records), key=lambda group: statistics.fmean(r.bytes for r in group)):
+        first = group[0]
+        rows.append([
+            title(group), rate(group), spread([r.bytes for r in group], 0), spread(smaller(group, records), 1),
+            spread([r.psnr for r in group], 2), spread([r.ssim for r in group], 4),
+            spread([r.gaussians for r in group], 0),
+            first.starts_from, ", ".join(first.taught_by) or NONE, f"{first.steps:,}" if first.steps else NONE,
+            spread([r.encode_s for r in group], 2), spread([r.decode_s for r in group], 2), str(len(group)),
+        ])  # fmt: skip
+    return rows
+
+
 TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
-    "quality": quality_table, "cost": cost_table, "brief": brief_table,
+    "quality": quality_table, "cost": cost_table, "brief": brief_table, "formats": formats_table,
 }  # fmt: skip
 
 

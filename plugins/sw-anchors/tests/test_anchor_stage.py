@@ -1,5 +1,6 @@
 """The stages of methods on anchors: their plans, rates, statistics and loss."""
 
+import itertools
 from types import SimpleNamespace
 
 import pytest
@@ -8,7 +9,7 @@ from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.params import AnchorGrowth, AnchorParams, CodedAnchorLearningRates, CodedAnchorParams
 from sw_anchors.stage import AnchorStage, CodedAnchorStage
-from sw_gaussians.resolution import ResolutionSampler
+from sw_gaussians.resolution import ResolutionPlan, ResolutionSampler
 from sw_reference.rasterizer import ReferenceRasterizer
 
 from splatwizard_core.rendering.rasterizer import RasterOptions
@@ -182,6 +183,22 @@ def test_pictures_may_begin_small():
     assert not isinstance(AnchorStage(plain).create_sampler(scene, stream(0, "sampler")), ResolutionSampler)
     sampler = AnchorStage(small).create_sampler(scene, stream(0, "sampler"))
     assert isinstance(sampler, ResolutionSampler)
-    assert sampler.every == small.growth.interval
     assert "pictures" not in plain.identity()
     assert small.identity()["pictures"]["schedule"] == "dash"
+
+
+@pytest.mark.parametrize("iterations", [500, 4_500, 30_000])
+def test_statistics_between_two_adjustments_are_of_one_resolution(iterations):
+    """The pause, too, ends where adjustments begin again, whatever length the plan is scaled to."""
+    stage = AnchorStage(
+        AnchorParams(iterations=iterations, scale_schedule=True, pictures={"schedule": "dash", "start": 4.0})
+    )
+    _, post = build_schedulers(stage, PipelineParams())
+    adjusts = [entry for entry in post.registrations if entry.task == stage.adjust_anchor]
+    rounds = [step for step in range(1, iterations + 1) if any(entry.due(step) for entry in adjusts)]
+    sampler = stage.create_sampler(scene_of(), stream(0, "sampler"))
+    assert isinstance(sampler, ResolutionSampler)
+    sampler._plan = ResolutionPlan((0, iterations // 2), (4.0, 1.0))
+    for past, now in itertools.pairwise([0, *rounds]):
+        assert len({sampler.scale(step) for step in range(past + 1, now + 1)}) == 1, now
+    assert len({sampler.scale(step) for step in rounds}) == len(rounds)

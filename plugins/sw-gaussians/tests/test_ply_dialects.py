@@ -5,8 +5,9 @@ import math
 import numpy as np
 import pytest
 from sw_gaussians.ply import from_ply
-from sw_gaussians.ply_gaussians import SH_C0, parse_gaussians
+from sw_gaussians.ply_gaussians import parse_gaussians
 
+from splatwizard_core.api import SH_C0
 from splatwizard_core.errors import BitstreamError, SceneError
 
 REQUIRED = {"x": 1.0, "y": 2.0, "z": 3.0, "f_dc_0": 0.1, "f_dc_1": 0.2, "f_dc_2": 0.3, "opacity": -1.0,

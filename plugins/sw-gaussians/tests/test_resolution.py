@@ -81,7 +81,7 @@ def views(sizes=((24, 16), (24, 16))) -> list[View]:
 
 def sampler(plan: ResolutionPlan, **settings) -> ResolutionSampler:
     inner = CameraSampler(views(), stream(0, "sampler"))
-    return ResolutionSampler(inner, lambda: plan, every=10, **settings)
+    return ResolutionSampler(inner, lambda: plan, rounds=range(10, 120, 10), **settings)
 
 
 def test_views_are_drawn_as_always_and_keep_their_field_of_view():
@@ -112,24 +112,26 @@ def test_pictures_without_detail_are_whole_from_the_start():
         assert resolution_plan(4.0, image, full_at=100) == ResolutionPlan((0,), (1.0,))
 
 
-def test_statistics_of_every_round_of_the_preset_fast_are_of_one_resolution():
+@pytest.mark.parametrize("iterations", [500, 900, 4_500, 6_100, 10_000])
+def test_statistics_of_every_round_of_the_preset_fast_are_of_one_resolution(iterations):
     config = GaussianTraining.model_validate({
-        "iterations": 10_000, "scale_schedule": True, "densify": {"start": 900, "stop": 24_000, "interval": 750},
+        "iterations": iterations, "scale_schedule": True, "densify": {"start": 900, "stop": 24_000, "interval": 750},
         "fast": {"densify": "budget", "resolution": "dash"},
     })  # fmt: skip
     stage = ThreeDGSStage(config)
     _, post = build_schedulers(stage, PipelineParams())
     (entry,) = (entry for entry in post.registrations if isinstance(entry.task, DensifyToBudget))
-    rounds = [step for step in range(1, 8001) if entry.due(step)]
+    last = round(0.8 * iterations)
+    rounds = [step for step in range(1, last + 1) if entry.due(step)]
+    assert (entry.task.first, entry.task.last) == (rounds[0], rounds[-1])
     pictures = views()
     scene = SimpleNamespace(train=pictures, background=None)
     drawn = stage.create_sampler(scene, stream(0, "sampler"))
-    drawn._plan = ResolutionPlan((0, 8000), (4.0, 1.0))
-    assert rounds[:2] == [300, 550]
+    drawn._plan = ResolutionPlan((0, last), (4.0, 1.0))
     for past, now in itertools.pairwise([0, *rounds]):
         assert len({drawn.scale(step) for step in range(past + 1, now + 1)}) == 1, now
     assert len({drawn.scale(step) for step in rounds}) == len(rounds)
-    assert (drawn.scale(8000) > 1, drawn.scale(8001)) == (True, 1.0)
+    assert (drawn.scale(last) > 1, drawn.scale(last + 1)) == (True, 1.0)
 
 
 def test_whole_scales_are_an_option():

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from interchange_files import random_scene
 from sw_interchange import GaussianScene
-from sw_interchange.bands import COEFFICIENTS, SH_C0
+from sw_interchange.bands import COEFFICIENTS
 from sw_interchange.frames import axes_of, band_rotation, flipped, sh_band, sh_signs, transformed
 
-from splatwizard_core.api import UserInputError
+from splatwizard_core.api import SH_C0, UserInputError
 
 DIRECTIONS = np.array([d for d in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(d)])  # 26
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)

@@ -116,6 +116,15 @@ def zstd_bomb() -> bytes:
     return spz4(1, table=[len(frame), 9, 0, 1, 0, 3, 0, 3, 0, 4], rest=frame)
 
 
+def rle_bomb(blocks: int) -> bytes:
+    """A frame of blocks of four bytes that stand for 128 KiB each, and no size of the whole."""
+    block = 1 << 17
+    frame = struct.pack("<IBB", 0xFD2FB528, 0, 7 << 3)  # a window of 2^17
+    frame += (struct.pack("<I", block << 3 | 1 << 1)[:3] + b"\7") * blocks
+    frame += struct.pack("<I", 1)[:3]  # the last one, of no bytes
+    return spz4(1, table=[len(frame), 9, 0, 1, 0, 3, 0, 3, 0, 4], rest=frame)
+
+
 def shared_gltf(primitives: int, nodes: int) -> bytes:
     """Nodes that all show one mesh, whose primitives all name the same accessors."""
     data = encode(random_scene(5, 1), "gltf")[0]
@@ -163,6 +172,7 @@ BAD = {
     "spz4 with too many": (spz4(2**31 - 1, rest=bytes(199)), "spz"),
     "spz4 of other sizes": (spz4(5, table=[1, 2**60] * 5, rest=bytes(5)), "spz"),
     "spz4 bomb": (zstd_bomb(), "spz"),
+    "spz4 bomb of 16 kB": (rle_bomb(4000), "spz"),
     "compressed ply without chunks": (encode(random_scene(5, 1), "compressed-ply")[0].replace(
         b"element chunk 1", b"element chunk 0"), "compressed-ply"),
     "compressed ply with other SH": (encode(random_scene(5, 1), "compressed-ply")[0].replace(

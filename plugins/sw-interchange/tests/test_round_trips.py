@@ -174,6 +174,33 @@ def test_sog_as_a_folder(tmp_path):
         read(tmp_path)
 
 
+def test_two_scenes_in_one_folder_keep_their_images(tmp_path):
+    scenes = {"a": random_scene(30, 1), "b": random_scene(30, 1, seed=1)}
+    for name, scene in scenes.items():
+        write(scene, tmp_path / f"{name}.json")
+    for name, scene in scenes.items():
+        found, wanted = read(tmp_path / f"{name}.json"), decode(encode(scene, "sog")[0])
+        assert np.array_equal(found.means, wanted.means)
+        assert np.array_equal(found.sh_rest, wanted.sh_rest)
+    assert (tmp_path / "a_means_l.webp").exists()
+    with pytest.raises(UserInputError, match=r"write a meta\.json"):
+        write(scenes["a"], tmp_path / "a:b.json")
+
+
+@pytest.mark.parametrize("bits", [0x3F80007B, 0x3F807B20, 0x3F808B1F])
+def test_a_splat_may_begin_like_text_or_gzip(bits, tmp_path):
+    scene = random_scene(2, 0)
+    scene.means[0, 0] = np.uint32(bits).view(np.float32)
+    data, _ = encode(scene, "splat", order="given")
+    (tmp_path / "a.splat").write_bytes(data)
+    assert np.array_equal(read(tmp_path / "a.splat").means, scene.means)
+    write(scene, tmp_path / "meta.json")
+    others = {"spz": encode(scene, "spz")[0], "sog": (tmp_path / "meta.json").read_bytes()}
+    for name, other in others.items():  # another format is not .splat because it is called so
+        (tmp_path / "b.splat").write_bytes(other.ljust(-(-len(other) // 32) * 32))
+        assert read(tmp_path / "b.splat").report.format == name
+
+
 def test_an_archive_may_hold_the_files_in_a_folder():
     data = encode(random_scene(5, 0), "sog")[0]
     buffer = io.BytesIO()

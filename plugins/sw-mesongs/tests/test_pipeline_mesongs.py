@@ -8,7 +8,8 @@ from sw_kit import short_training
 from sw_kit.short_training import file_of as encoded
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
-from splatwizard_core.errors import BitstreamError, ConfigError, EmptyModel, SceneError
+from splatwizard_core.errors import BitstreamError, ConfigError, SceneError, TaskError
+from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.pipeline import TrainingStopped
@@ -195,9 +196,24 @@ def test_gaussians_that_are_not_finite_are_left_out(plugins, toy, rasterizer):
     assert decoded(plugins, encoded(method, model)).num_rows == model.num_rows
 
 
-def test_nothing_left_is_an_error(train, monkeypatch):
+def test_of_one_gaussian_the_file_holds_it(plugins, toy, rasterizer):
+    """The published rule takes the lowest at any share: of one there would be nothing left."""
+    opaque = int(toy.truth.opacity_logits.argmax())
+    alone = GaussianModel(*[getattr(toy.truth, name).detach()[[opaque]] for name in GaussianModel.RAW])
+    alone = alone.requires_grad_(False)
+    method = configured(plugins, iterations=2, prune__tau=0.5)
+    model, _ = tuned(method, alone, toy.scene, rasterizer)
+    assert model.num_rows == decoded(plugins, encoded(method, model)).num_rows == 1
+
+
+def test_of_equal_scores_all_stay(train, toy, monkeypatch):
     monkeypatch.setattr(Importance, "score", lambda self, model, *_: torch.ones(model.num_rows))
-    with pytest.raises(EmptyModel):
+    assert train(iterations=1, codec__settings__depth=21)[1].num_rows == toy.truth.num_rows
+
+
+def test_a_scene_that_no_view_shows_is_an_error(train, monkeypatch):
+    monkeypatch.setattr(Importance, "score", lambda self, model, *_: torch.zeros(model.num_rows))
+    with pytest.raises(TaskError, match="no training view of 'toy' shows a Gaussian"):
         train(iterations=1)
 
 

@@ -5,7 +5,7 @@ from xml.etree import ElementTree
 
 import pytest
 from sw_report.charts import STYLES
-from sw_report.figures import write_figures
+from sw_report.figures import Line, Panel, write_figures, write_panels
 from sw_report.looks import look_of
 from sw_report.rd_file import themes
 from sw_report.runs import collect
@@ -55,6 +55,14 @@ def test_the_command_writes_them_where_asked_and_none_over_another(make_run, tmp
     printed = capsys.readouterr()
     assert (printed.out, printed.err.count("wrote ")) == ("", 4)
     assert {file.name for file in (tmp_path / "plots").glob("*.svg")} == {"rd-garden.svg", "rd-garden@2.svg"}
+
+
+def test_sizes_are_read_at_1_2_and_5(tmp_path):
+    pytest.importorskip("matplotlib")
+    line = Line("3dgs", [(0.25, 30.0, None), (6.0, 31.0, None)], 0)
+    text = write_panels([Panel("x", [line])], tmp_path / "x.svg").read_text("utf-8")
+    written = [label for label in ElementTree.fromstring(text).itertext() if label.strip()]
+    assert written[: written.index("file size, MB")][-4:] == ["0.5", "1", "2", "5"]
 
 
 def test_without_matplotlib_one_line_says_what_to_install(make_run, tmp_path, monkeypatch):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians.surfels import SurfelModel
-from sw_viewer.packing import CHUNK, LEAST_STEP, SH_0, morton_order, pack
+from sw_viewer.packing import CHUNK, LEAST_STEP, morton_order, pack
 
-from splatwizard_core.api import GaussianModel, SceneError, SplatModel
+from splatwizard_core.api import SH_C0, GaussianModel, SceneError, SplatModel
 
 
 def gaussians(n: int, degree: int = 3, seed: int = 0) -> GaussianModel:
@@ -78,7 +78,7 @@ def test_what_is_unpacked_is_what_was_packed(n, degree):
     half_steps = {
         "opacities": (torch.sigmoid(model.opacity_logits), 0.5 / 255),
         "log_scales": (model.log_scales, packed.facts["scales"][1] / 2),
-        "colors": (0.5 + SH_0 * model.sh_dc[:, 0], packed.facts["colors"][1] * 2047 / 1023 / 2),
+        "colors": (0.5 + SH_C0 * model.sh_dc[:, 0], packed.facts["colors"][1] * 2047 / 1023 / 2),
         "rest": (model.sh_rest, max(packed.facts["bands"], default=0) / 2),
     }
     for name, (values, bound) in half_steps.items():
@@ -145,7 +145,7 @@ def test_a_few_wild_gaussians_coarsen_no_others():
     tame = ~np.isin(rows, [5, 7, 8])
     truth = {
         "log_scales": (model.log_scales, 0.01), "rest": (model.sh_rest, 0.04), "means": (model.means, 0.02),
-        "colors": (0.5 + SH_0 * model.sh_dc[:, 0], 0.01),
+        "colors": (0.5 + SH_C0 * model.sh_dc[:, 0], 0.01),
     }  # fmt: skip
     for name, (values, bound) in truth.items():
         np.testing.assert_allclose(found[name][tame], values.numpy()[rows][tame], atol=bound, rtol=0, err_msg=name)

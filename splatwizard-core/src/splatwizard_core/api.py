@@ -21,7 +21,7 @@ MODULES = {
     "scene.dataset": "SceneOptions Dataset",
     "gaussians.splat_model": "SplatModel",
     "gaussians.model": "GaussianModel",
-    "gaussians.inputs": "GaussianInputs SH rgb_to_dc",
+    "gaussians.inputs": "GaussianInputs SH SH_C0 rgb_to_dc",
     "rendering.rasterizer": "Rasterizer RasterOptions RenderResult RasterStats AccumOutput GradBuffer ScoreSpec",
     "rendering.features": "Feature",
     "rendering.info": "RasterizerInfo",

@@ -24,6 +24,7 @@ from splatwizard_core.evaluation.image import ssim_map as ssim_map
 from splatwizard_core.evaluation.metrics import MetricSetup as MetricSetup
 from splatwizard_core.evaluation.metrics import PreparedMetric as PreparedMetric
 from splatwizard_core.gaussians.inputs import SH as SH
+from splatwizard_core.gaussians.inputs import SH_C0 as SH_C0
 from splatwizard_core.gaussians.inputs import GaussianInputs as GaussianInputs
 from splatwizard_core.gaussians.inputs import rgb_to_dc as rgb_to_dc
 from splatwizard_core.gaussians.model import GaussianModel as GaussianModel

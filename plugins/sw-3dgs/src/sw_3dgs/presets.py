@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from sw_gaussians.fast import FAST
+from sw_gaussians.fast import FAST, FAST_CPU
 from sw_gaussians.quick import QUICK
 
 from sw_codecs.models.rate_points import QUANTIZED_RATES
@@ -21,6 +21,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
     "mcmc": {"mcmc.enabled": True},
     # A third of the steps: density control by budget and score, opacities halved instead of reset.
     "fast": FAST,
+    # The same with few, larger steps and a low cap: photographs on a CPU, in minutes.
+    "fast-cpu": FAST_CPU,
     "quick": QUICK,
 }
 

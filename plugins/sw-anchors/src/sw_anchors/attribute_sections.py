@@ -7,7 +7,7 @@ walk hands them to an `AttributeEncoder`, which rounds the values of a model and
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -20,6 +20,9 @@ from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.entropy.conditional import ConditionalGaussian, RowContext
 from sw_codecs.entropy.conditional_mixture import ConditionalMixture, RowMixture
+from sw_codecs.entropy.exact_tables import exact_tables
+from sw_codecs.entropy.lattice import RowLattice
+from sw_codecs.exact_native import EXACT
 from sw_codecs.quantizers.rounding import SteRound
 
 if TYPE_CHECKING:
@@ -50,7 +53,7 @@ class AttributeCoder:
         self.rows = self.coder.blocks(count, max(shape.widths))
 
     def code(
-        self, block: Block, context: RowContext | RowMixture, step: Tensor, present: Tensor | None = None
+        self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
     ) -> Tensor:
         """Code one block; its integers [n,C] int64, 0 where they are not in the file.
 
@@ -72,7 +75,7 @@ class AttributeEncoder(AttributeCoder):
         self._round = SteRound()
 
     def code(
-        self, block: Block, context: RowContext | RowMixture, step: Tensor, present: Tensor | None = None
+        self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
     ) -> Tensor:
         values = self._values[block.group][block.rows, block.columns].double()
         symbols, _ = self._round.encode(values, step, mean=self._centres[block.group])
@@ -106,7 +109,7 @@ class AttributeDecoder(AttributeCoder):
         }
 
     def code(
-        self, block: Block, context: RowContext | RowMixture, step: Tensor, present: Tensor | None = None
+        self, block: Block, context: RowContext | RowLattice | RowMixture, step: Tensor, present: Tensor | None = None
     ) -> Tensor:
         """Raises BitstreamError for damage."""
         with self._reader.decoding(block.section):
@@ -160,6 +163,28 @@ class ExactNetwork:
         )
         self._shape, self._base_steps, self._step_offset = shape, tuple(base_steps), step_offset
 
+    def on_lattice(
+        self, places: Tensor, features: Callable[[Tensor], Tensor], width: int
+    ) -> Mapping[str, RowContext | RowLattice]:
+        """Distributions as of a call, put on the lattice of the coder at once where there is a kernel."""
+        if not EXACT.try_load():
+            return self(places, features, width)
+        n, columns = len(places), self._shape.widths
+        centre = [torch.empty(n, c, dtype=torch.int32) for c in columns]
+        number = [torch.empty(n, c, dtype=torch.int16) for c in columns]
+        steps = torch.empty(n, len(columns), dtype=torch.int64)
+        multipliers = torch.from_numpy(exact_tables().multipliers + self._step_offset)
+        thresholds, start, fine = torch.from_numpy(exact_tables().thresholds), 0, True
+        for part in parts_of(places, width, EXACT_NUMBERS) if n else ():
+            at = slice(start, start + len(part))
+            fine = fine and self._network.forecast(
+                features(part), multipliers, thresholds, [c[at] for c in centre], [c[at] for c in number], steps[at]
+            )
+            start += len(part)
+        if not fine:  # out of range: whoever codes the numbers says so
+            return self(places, features, width)
+        return {group: RowLattice(centre[i], number[i], steps[:, i : i + 1]) for i, group in enumerate(GROUPS)}
+
     def __call__(self, places: Tensor, features: Callable[[Tensor], Tensor], width: int) -> dict[str, RowContext]:
         """Distributions by group for anchors at `places` [n, ...].
 
@@ -186,7 +211,7 @@ class ExactNetwork:
             for i, group in enumerate(GROUPS)
         }
 
-    def steps(self, group: str, context: RowContext) -> Tensor:
+    def steps(self, group: str, context: RowContext | RowLattice) -> Tensor:
         """[n,1] float64: quantiser steps of a group, in units of the values."""
-        multipliers: Tensor = context.step
+        multipliers = torch.as_tensor(context.step)
         return multipliers.to(torch.float64) * (self._base_steps[GROUPS.index(group)] / (1 << FRACTION))

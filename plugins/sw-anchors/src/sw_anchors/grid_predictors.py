@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -13,8 +15,9 @@ from sw_anchors.row_parts import FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
 from sw_codecs.context.hash_grid import MixedHashGrid
 from sw_codecs.entropy.conditional import RowContext
+from sw_codecs.entropy.lattice import RowLattice
 
-BlockPrediction = dict[str, tuple[RowContext, Tensor]]
+BlockPrediction = dict[str, tuple[RowContext | RowLattice, Tensor]]
 """Group -> its distributions for a block of n anchors, and quantiser steps [n,1] float64 in units of the values."""
 
 
@@ -29,7 +32,7 @@ class ExactPredictor:
 
     def __call__(self, codes: Tensor) -> BlockPrediction:
         """Predict for anchors at `codes` [n,3] on the lattice."""
-        found = self._network(codes, self._grid.integer_features, row_width(self._grid))
+        found = self._network.on_lattice(codes, short_features(self._grid), row_width(self._grid))
         return {group: (context, self._network.steps(group, context)) for group, context in found.items()}
 
 
@@ -53,6 +56,11 @@ class FloatPredictor:
             group: (RowContext(mean.clamp(-1e6, 1e6), scale.clamp(1e-9, 1e6), step.double()), step.double())
             for group, mean, scale, step in zip(GROUPS, found.means, found.scales, found.steps, strict=True)
         }
+
+
+def short_features(grid: MixedHashGrid) -> Callable[[Tensor], Tensor]:
+    """Features of codes [n,3] as the integer network takes them fastest."""
+    return lambda codes: grid.integer_features(codes, torch.int16)
 
 
 def row_width(grid: MixedHashGrid) -> int:

@@ -58,12 +58,8 @@ class AnchorStage(Stage):
         super().__init__(opt)
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
-    def steps(self, steps: int) -> int:
-        """Scale a number of steps of the full run, for a task that counts by itself."""
-        return max(1, round(steps * self.opt.schedule_scale)) if steps > 0 else 0
-
     def at(self, step: int) -> int:
-        """Scale one step of the full run, as `when` does."""
+        """Scale one step of the full run, or a number of steps that a task counts by itself, as `when` does."""
         found = self.when(step)
         assert isinstance(found, int)
         return found
@@ -85,8 +81,8 @@ class AnchorStage(Stage):
         return by_resolution(
             sampler,
             scene,
-            full_at=self.steps(growth.stop),
-            every=self.steps(growth.interval),
+            full_at=self.at(growth.stop),
+            rounds=[step for steps in self.adjustments for step in steps],
             most=pictures.start,
             rounding=pictures.rounding,
         )
@@ -94,7 +90,7 @@ class AnchorStage(Stage):
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:
         """Decay exponentially from `init` at step 0 to `final` at `max_steps` of the full run (None: lr.max_steps)."""
         last = self.opt.lr.max_steps if max_steps is None else max_steps
-        return exponential_lr(step, init=init, final=final, max_steps=self.steps(last))
+        return exponential_lr(step, init=init, final=final, max_steps=self.at(last))
 
     def learning_rates(self, step: int) -> Mapping[str, float]:
         """Learning rate of each parameter or submodule, by name: the optimizer's groups, the same at every step."""
@@ -114,16 +110,26 @@ class AnchorStage(Stage):
 
     # Plan
 
+    @property
+    def adjustments(self) -> list[range]:
+        """Steps of this run that grow and prune anchors, before the pause and after it."""
+        growth = self.opt.growth
+        pause_end = max(growth.start, growth.pause_start, growth.pause_end)
+        found = []
+        for start, stop in ((growth.start, min(growth.pause_start, growth.stop)), (pause_end, growth.stop)):
+            if start < stop:
+                steps = self.when(range(start, stop, growth.interval))
+                assert isinstance(steps, range)
+                found.append(steps)
+        return found
+
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_lr)
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
-        growth = self.opt.growth
-        scheduler.register_task(self.when(range(growth.stop)), self.collect_gradient_statistics)
-        pause_end = max(growth.start, growth.pause_start, growth.pause_end)
-        for start, stop in ((growth.start, min(growth.pause_start, growth.stop)), (pause_end, growth.stop)):
-            if start < stop:
-                scheduler.register_task(self.when(range(start, stop, growth.interval)), self.adjust_anchor)
+        scheduler.register_task(self.when(range(self.opt.growth.stop)), self.collect_gradient_statistics)
+        for steps in self.adjustments:
+            scheduler.register_task(steps, self.adjust_anchor)
 
     def update_lr(self, optimizer: SplatOptimizer, step: int) -> None:
         """Set the learning rates of this step."""
@@ -132,7 +138,7 @@ class AnchorStage(Stage):
 
     def collect_gradient_statistics(self, model: AnchorModel, result: RenderResult, step: int) -> None:
         """Add this view to the statistics that growing and pruning go by."""
-        if step > self.steps(self.opt.growth.start_stat):
+        if step > self.at(self.opt.growth.start_stat):
             assert result.grad2d is not None
             accumulate_anchor_statistics(model, result.extras["anchors"], result.grad2d.value, result.radii)
 
@@ -142,7 +148,7 @@ class AnchorStage(Stage):
         """Grow and prune anchors; curves "grown" and "pruned"."""
         growth = self.opt.growth
         report = adjust_anchors(
-            model, optimizer, step=step, generator=self.growth_draws, interval=self.steps(growth.interval),
+            model, optimizer, step=step, generator=self.growth_draws, interval=self.at(growth.interval),
             success=growth.success, grad_threshold=growth.grad_threshold, min_opacity=growth.min_opacity,
             levels=growth.levels, init_factor=growth.init_factor, hierarchy=growth.hierarchy, subvoxel=growth.subvoxel,
         )  # fmt: skip

@@ -13,7 +13,7 @@ from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
 
 from splatwizard_core.api import CameraIterator, LossPack, Rasterizer, SplatOptimizer, TaskLog
-from sw_cat_3dgs.config import CatConfig
+from sw_cat_3dgs.config import FULL_RUN, CatConfig
 from sw_cat_3dgs.model import CatAnchors, Trained
 from sw_cat_3dgs.plane_bits import FixedPlaneBits
 
@@ -74,9 +74,11 @@ class CatStage(CodedAnchorStage):
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         phases = self.opt.phases
-        scheduler.register_task(self.when(range(self.opt.lr.max_steps)), self.update_lr)
-        counting = max(self.opt.lr.max_steps, self.opt.growth.stop)  # as long as anchors come and go
-        scheduler.register_task(self.when(range(counting)), self.update_cam_mask)
+        # All steps, also where lr.max_steps is less (BungeeNeRF): the context's rates start to decay late, and anchors
+        # come and go until growth.stop.
+        whole = range(max(FULL_RUN, self.opt.lr.max_steps, self.opt.growth.stop))
+        scheduler.register_task(self.when(whole), self.update_lr)
+        scheduler.register_task(self.when(whole), self.update_cam_mask)
         scheduler.register_task(1, self.update_anchor_bound)
         PhaseSwitch(self.at(phases.quantize), QUANTIZED).register(scheduler)
         scheduler.register_task(self.at(phases.triplane), self.update_anchor_bound)

@@ -7,13 +7,15 @@ from splatwizard_native import NativeModule
 EXACT = NativeModule(
     name="sw_codecs_exact",
     package="sw_codecs",
-    sources=("exact_kernels/binding.cpp",),
+    sources=("exact_kernels/binding.cpp", "exact_kernels/binding_networks.cpp"),
     kernels=(
+        "exact_kernels/lattice.cpp",
         "exact_kernels/network.cpp",
         "exact_kernels/planes.cpp",
         "exact_kernels/streams.cpp",
         "exact_kernels/lookups.cpp",
         "exact_kernels/mixtures.cpp",
+        "exact_kernels/octree.cpp",
     ),
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code

@@ -46,6 +46,27 @@ def test_a_network(sizes, rows, kernels):
     assert not out[-1].any()
 
 
+@pytest.mark.parametrize("largest", [4096, 30_000, 1 << 20])
+@pytest.mark.parametrize("weight", [0.05, 5.0, 300.0, 4000.0])
+def test_a_network_of_small_and_of_large_numbers(weight, largest, kernels):
+    torch.manual_seed(0)
+    network = nn.Sequential(nn.Linear(41, 30), nn.ReLU(), nn.Linear(30, 29))
+    with torch.no_grad():
+        network[2].weight[7] *= 40  # one tile of two parts, one of one
+        for each in (network[0], network[2]):
+            each.weight *= weight / each.weight.abs().max()
+    made = IntegerMlp.from_module(network)
+    inputs = torch.randint(-largest, largest + 1, (61, 41), generator=generator())
+    inputs[:50] //= 1000  # blocks of rows differ in the products that hold them
+    inputs[60] = largest
+    ours, expected = both(kernels, lambda: made(inputs))
+    assert torch.equal(ours, expected)
+    assert ours.any()
+    if largest < 1 << 15:
+        ours, expected = both(kernels, lambda: made(inputs.to(torch.int16)))
+        assert torch.equal(ours, expected)
+
+
 @pytest.mark.parametrize("features", [1, 4, 6, 16])
 def test_a_mixed_hash_grid(features, kernels):
     grid = MixedHashGrid(
@@ -55,6 +76,9 @@ def test_a_mixed_hash_grid(features, kernels):
     codes[:4] = torch.tensor([[0, 0, 0], [65_535] * 3, [0, 65_535, 1], [65_536, 5, 5]])
     ours, expected = both(kernels, lambda: grid.integer_features(codes))
     assert torch.equal(ours, expected)
+    for short in both(kernels, lambda: grid.integer_features(codes, torch.int16)):
+        assert short.dtype == torch.int16
+        assert torch.equal(short.to(torch.int64), expected)
 
 
 def test_a_table_that_changed_is_looked_up_anew(kernels):

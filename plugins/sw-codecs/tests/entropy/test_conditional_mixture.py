@@ -207,3 +207,19 @@ def test_wrong_input_is_named():
         C("float").encode(symbols, dataclasses.replace(floats, mean=floats.mean * np.inf))
     with pytest.raises(ValueError, match="mode is 'fast'"):
         C("fast")
+
+
+@pytest.mark.parametrize("kernel", [True, False])
+def test_words_that_do_not_decode_are_noticed_while_encoding(kernel, monkeypatch):
+    symbols, context = block()
+    rows = conditional_mixture._Rows
+    write = rows.encode
+
+    def damaged(self, entries):
+        words = bytearray(write(self, entries))
+        words[len(words) // 2] ^= 1
+        return bytes(words)
+
+    monkeypatch.setattr(rows, "encode", damaged)
+    with contextlib.nullcontext() if kernel else without_kernel(), pytest.raises(RuntimeError, match="encoded"):
+        C().encode(symbols, context)

@@ -44,6 +44,19 @@ def test_kernel_and_library_write_the_same_bytes_and_read_them(family, long, ker
     assert bits / 8 < len(coded[True]) < 1.002 * bits / 8 + 100
 
 
+def test_words_that_do_not_decode_are_noticed_while_encoding(kernels, monkeypatch):
+    kernels(False)
+    write = exact_streams._encoded_in_turn
+
+    def damaged(*given):
+        content, rows = write(*given)
+        return bytes([content[0] ^ 1]) + content[1:], rows
+
+    monkeypatch.setattr(exact_streams, "_encoded_in_turn", damaged)
+    with pytest.raises(RuntimeError, match="encoded"):
+        exact_streams.encode("gaussian", *drawn(500))
+
+
 def test_symbols_and_bytes_do_not_depend_on_the_number_of_threads(long, kernels):
     kernels(True)
     kept, found = torch.get_num_threads(), set()

@@ -16,12 +16,11 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.api import SceneError
+from splatwizard_core.api import SH_C0, SceneError
 from sw_gaussians.ply_tables import MAX_HEADER, PlyHeader, Table, read_header, read_tables
 
 Array = npt.NDArray[np.float32]
 
-SH_C0 = 0.28209479177387814
 MIP_COMMENT = "SplatRenderMode: mip"
 """Says that a file was trained with the filter of Mip-Splatting."""
 _ROWS_AT_ONCE = 1 << 13  # 2 MB of rows: they stay in the processor's cache

@@ -156,7 +156,8 @@ class ResolutionSampler(CameraSampler):
 
     inner       draws
     make_plan   () -> ResolutionPlan, asked at the first step: it reads all pictures, which is training time
-    every       the scale is read anew only every so many steps, so that statistics in between are of one resolution
+    rounds      steps, ascending, after each of which the scale is read anew: those at which statistics start again, so
+                that all in between are of one resolution
     rounding    "real": any scale; "floor": whole ones, as published
     """
 
@@ -165,11 +166,10 @@ class ResolutionSampler(CameraSampler):
         inner: CameraSampler,
         make_plan: Callable[[], ResolutionPlan],
         *,
-        every: int,
-        first: int = 0,
+        rounds: Sequence[int],
         rounding: Rounding = "real",
     ) -> None:
-        self.inner, self.every, self.first, self.rounding = inner, every, first, rounding
+        self.inner, self.rounds, self.rounding = inner, rounds, rounding
         self.views, self.generator = inner.views, inner.generator
         self._make_plan = make_plan
         self._plan: ResolutionPlan | None = None
@@ -185,9 +185,8 @@ class ResolutionSampler(CameraSampler):
 
     def scale(self, step: int) -> float:
         """Return how many times smaller the pictures of a step are."""
-        since = step - 1 - self.first  # a round at step k is past from step k + 1 on
-        at = self.first + since // self.every * self.every if since >= 0 else 0
-        scale = 1.0 if step > self.plan.times[-1] else self.plan.scale(at)
+        past = bisect.bisect_left(self.rounds, step)  # a round at step k is past from step k + 1 on
+        scale = 1.0 if step > self.plan.times[-1] else self.plan.scale(self.rounds[past - 1] if past else 0)
         return float(math.floor(scale)) if self.rounding == "floor" else scale
 
     def next(self, step: int) -> View:
@@ -217,22 +216,19 @@ def by_resolution(
     scene: Scene,
     *,
     full_at: int,
-    every: int,
-    first: int = 0,
+    rounds: Sequence[int],
     most: float = 4.0,
     rounding: Rounding = "real",
 ) -> ResolutionSampler:
     """Return a sampler that hands out what `inner` draws by the resolution schedule of a scene.
 
     full_at     step from which pictures are whole
-    every       steps between two looks at the schedule: the interval of densification
-    first       step of the first look after that at the start: the first densification
+    rounds      steps, ascending, after which the schedule is looked at again: those that densify
     most        times that the first pictures are smaller, at most
     """
     return ResolutionSampler(
         inner,
         lambda: plan_of_views(scene.train, full_at=full_at, most=most, background=scene.background),
-        every=every,
-        first=first,
+        rounds=rounds,
         rounding=rounding,
     )

@@ -93,7 +93,17 @@ class ThreeDGSStage(Stage):
 
     def steps(self, steps: int) -> int:
         """Return a number of steps of the full run in steps of this one, for what a task counts itself."""
-        return max(1, round(steps * self.config.schedule_scale)) if steps > 0 else 0
+        found = self.when(steps)
+        assert isinstance(found, int)
+        return found
+
+    @property
+    def densifications(self) -> range:
+        """Steps of this run that densify."""
+        densify = self.config.densify
+        found = self.when(range(densify.start, densify.stop, densify.interval))
+        assert isinstance(found, range)
+        return found
 
     def begin(self, context: StageContext) -> SplatModel:
         self.white = context.scene.protocol.background == "white"
@@ -114,8 +124,7 @@ class ThreeDGSStage(Stage):
             sampler,
             scene,
             full_at=self.steps(self.config.densify.stop),
-            every=self.steps(self.config.densify.interval),
-            first=self.steps(self.config.densify.start),
+            rounds=self.densifications,
             most=fast.resolution_start,
             rounding=fast.resolution_rounding,
         )
@@ -155,7 +164,9 @@ class ThreeDGSStage(Stage):
         if chain.enabled and chain.noise > 0:
             noise = mcmc.AddNoise(strength=chain.noise, min_opacity=chain.min_opacity)
             # First of all: it belongs to the update of the step before, and to that step's learning rate.
-            scheduler.register_task(self.when(range(lr.max_steps)), noise, name="add noise")
+            # In a run shorter than lr.max_steps it is written as "update lr" is, so that checkpoints keep their plan.
+            steps = range(max(self.iterations, self.steps(lr.max_steps)))
+            scheduler.register_task(steps, noise, name="add noise")
         update_lr = tasks.UpdateLearningRate(
             init=lr.position_init,
             final=lr.position_final,
@@ -185,11 +196,10 @@ class ThreeDGSStage(Stage):
             scheduler.register_task(
                 self.when(range(densify.stop)), fragments.collect_opacity_gradients, name="collect opacity gradients"
             )
-        when = self.when(range(densify.start, densify.stop, densify.interval))
         if self.config.fast.densify == "budget":
-            scheduler.register_task(when, self._densify_to_budget(), name="densify to budget")
+            scheduler.register_task(self.densifications, self._densify_to_budget(), name="densify to budget")
         else:
-            scheduler.register_task(when, self.densification(), name="prune and densify")
+            scheduler.register_task(self.densifications, self.densification(), name="prune and densify")
         if self.config.fast.opacity == "halve":
             halve = self.when(range(0, densify.stop, densify.reset_interval))
             scheduler.register_task(halve, fast_tasks.HalveOpacity(), name="halve opacity")
@@ -225,7 +235,7 @@ class ThreeDGSStage(Stage):
 
     def _densify_to_budget(self) -> fast_tasks.DensifyToBudget:
         densify, fast = self.config.densify, self.config.fast
-        rounds = range(self.steps(densify.start), self.steps(densify.stop), self.steps(densify.interval))
+        rounds = self.densifications
         return fast_tasks.DensifyToBudget(
             first=rounds.start,
             last=rounds[-1] if rounds else rounds.start,

@@ -12,7 +12,7 @@ import torch
 from sw_anchors.attribute_sections import ExactNetwork
 from sw_anchors.float_mode import Mode, one_thread
 from sw_anchors.grid_anchors import context_of
-from sw_anchors.grid_predictors import BlockPrediction, row_width
+from sw_anchors.grid_predictors import BlockPrediction, row_width, short_features
 from sw_anchors.lattice import TOP
 from sw_anchors.row_parts import EXACT_NUMBERS, FLOAT_NUMBERS, by_parts
 from sw_anchors.shape import GROUPS, AnchorShape
@@ -56,7 +56,7 @@ class ExactPredictor:
 
     def first(self, codes: Tensor) -> FirstPrediction:
         """Predict for anchors at `codes` [n,3] of the hash grid."""
-        outputs = self._network.outputs(codes, self._grid.integer_features, row_width(self._grid))
+        outputs = self._network.outputs(codes, short_features(self._grid), row_width(self._grid))
         count = sum(self._shape.outputs)
         found, logit = self._network.read(outputs[:, :count]), outputs[:, count:]
         features = found["features"]

@@ -1,4 +1,4 @@
-"""Spherical harmonics as all formats count them: bands, and the constant of the first."""
+"""Spherical harmonics as all formats count them: bands and their coefficients."""
 
 from __future__ import annotations
 
@@ -7,6 +7,5 @@ import numpy.typing as npt
 
 Array = npt.NDArray[np.float32]
 
-SH_C0 = 0.28209479177387814
 COEFFICIENTS = {0: 0, 1: 3, 2: 8, 3: 15, 4: 24}
 """SH degree -> coefficients a channel above band 0."""

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from sw_gaussians.ply_tables import MAX_HEADER, Table, read_header, read_tables
 
-from splatwizard_core.api import BitstreamError
-from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
+from splatwizard_core.api import SH_C0, BitstreamError
+from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.options import Options
 from sw_interchange.order import morton_order
 from sw_interchange.quats import ROOT_2, from_smallest_three, smallest_three

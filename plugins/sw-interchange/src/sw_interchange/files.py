@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import zipfile
 from dataclasses import replace
@@ -19,6 +20,7 @@ from sw_interchange.source import Source
 
 NO_LIMITS = Limits()
 FOLDER = "sog-folder"
+META = "meta.json"
 
 
 def read(
@@ -43,7 +45,7 @@ def read(
     """
     where = Path(path)
     if where.is_dir():
-        where = where / "meta.json"
+        where = where / META
     source = _checked(Source.open(where, spz_frame=spz_frame))
     scene = _decoded(source, format, limits, frame, strict)
     if undo_dataparser is None:
@@ -97,11 +99,26 @@ def encode(scene: GaussianScene, format: str, **options: Any) -> tuple[bytes, Wr
 
 
 def _unpack(bundle: bytes, meta: Path) -> None:
-    """Write the images of a bundle beside its meta.json, which comes last: it names files that are there."""
+    """Write the images of a bundle beside its description, which comes last: it names files that are there.
+
+    The images of a `garden.json` are called `garden_*.webp`: several scenes may lie in one folder.
+    """
+    from sw_interchange.sog import is_plain
+
+    prefix = "" if meta.name == META else f"{meta.name.removesuffix('.json')}_"
     with zipfile.ZipFile(io.BytesIO(bundle)) as archive:
-        for name in archive.namelist():
-            with replacing(meta if name == "meta.json" else meta.parent / name) as temporary:
-                temporary.write_bytes(archive.read(name))
+        files = {prefix + name: archive.read(name) for name in archive.namelist() if name != META}
+        if not all(is_plain(name) for name in files):
+            raise UserInputError(f"{meta}: its images would have names that no .sog may have; write a {META}")
+        text = json.loads(archive.read(META))
+    for part in text.values():
+        if isinstance(part, dict) and "files" in part:
+            part["files"] = [prefix + name for name in part["files"]]
+    for name, content in files.items():
+        with replacing(meta.parent / name) as temporary:
+            temporary.write_bytes(content)
+    with replacing(meta) as temporary:
+        temporary.write_text(json.dumps(text, separators=(",", ":")))
 
 
 def _checked(source: Source) -> Source:

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from splatwizard_core.api import UserInputError
-from sw_interchange.bands import SH_C0, Array
+from splatwizard_core.api import SH_C0, UserInputError
+from sw_interchange.bands import Array
 from sw_interchange.options import Options
 from sw_interchange.scene import GaussianScene, WriteReport, sigmoid
 

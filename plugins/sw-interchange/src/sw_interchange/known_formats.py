@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,6 +11,10 @@ from typing import Any
 
 from splatwizard_core.api import BitstreamError, UserInputError
 from sw_interchange.source import Source
+from sw_interchange.spz_packing import inflate
+
+MAX_META = 1 << 20
+"""Bytes of a meta.json."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +96,9 @@ def format_of_suffix(path: str | Path, what: str = "writer") -> Format:
 
 def detect(source: Source) -> Format:
     """The format of a file, by its content; where that says nothing, by its suffix. Raises BitstreamError."""
-    head = source.head(1 << 12)
+    head, name = source.head(1 << 12), source.name.lower()
+    if name.endswith(".splat") and not len(source.data) % 32 and not _is_something_else(source):
+        return format_named("splat")
     if head[:4] in (b"ply\n", b"ply\r"):
         return format_named("compressed-ply" if b"packed_position" in head else "ply")
     if head[:4] == b"NGSP" or head[:2] == b"\x1f\x8b":
@@ -102,13 +109,29 @@ def detect(source: Source) -> Format:
         return format_named("gltf")
     if head.lstrip()[:1] == b"{":
         return format_named("gltf" if b'"asset"' in head and b'"means"' not in head else "sog")
-    name = source.name.lower()
     for suffix, found in ((".splat", "splat"), (".ksplat", "ksplat")):
         if name.endswith(suffix):
             return format_named(found)
     if head[:7] == b"#usda 1" or head[:8] == b"PXR-USDC":
         raise BitstreamError(f"{source.name}: USD is not read: export the scene as .ply where it was made")
     raise BitstreamError(f"{source.name}: neither its first bytes nor its suffix is that of a format with Gaussians")
+
+
+def _is_something_else(source: Source) -> bool:
+    """Whether a file called .splat is another one. The coordinate it begins with may look like a brace or like gzip."""
+    head = source.head(1 << 12)
+    if head[:2] == b"\x1f\x8b":
+        try:
+            return inflate(head, 4, source.name) == b"NGSP"
+        except BitstreamError:
+            return False
+    if head.lstrip()[:1] != b"{":
+        return head[:4] in (b"ply\n", b"ply\r", b"NGSP", b"PK\x03\x04", b"glTF")
+    try:
+        json.loads(source.head(MAX_META + 1))
+    except (ValueError, RecursionError):
+        return False
+    return True
 
 
 def _kind_of_archive(source: Source) -> str:

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from splatwizard_core.api import BitstreamError
-from sw_interchange.bands import COEFFICIENTS, SH_C0, Array
+from splatwizard_core.api import SH_C0, BitstreamError
+from sw_interchange.bands import COEFFICIENTS, Array
 from sw_interchange.scene import FLAT, GaussianScene, Limits, ReadReport, logit_of_byte
 from sw_interchange.source import Source
 

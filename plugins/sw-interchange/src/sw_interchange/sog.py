@@ -19,12 +19,12 @@ import numpy.typing as npt
 from splatwizard_core.api import BitstreamError
 from sw_interchange.archive import read_archive
 from sw_interchange.bands import Array
+from sw_interchange.known_formats import MAX_META
 from sw_interchange.quats import ROOT_2, from_smallest_three
 from sw_interchange.scene import LARGEST_LOGIT, GaussianScene, Limits, ReadReport, logit_of_byte
 from sw_interchange.source import Source
 from sw_interchange.webp import LARGEST_SIDE, Pixels, decode_image, image_size
 
-MAX_META = 1 << 20
 MAX_PALETTE = 1 << 16
 PALETTE_COLUMNS = 64
 """Entries of the SH palette side by side in its image."""
@@ -126,7 +126,7 @@ class _Bundle:
     def images(self, part: str, count: int) -> list[tuple[str, bytes]]:
         names = self.part(part).get("files")
         good = isinstance(names, list) and len(names) == count
-        if not good or not all(isinstance(n, str) and _is_plain(n) for n in names or []):
+        if not good or not all(isinstance(n, str) and is_plain(n) for n in names or []):
             raise BitstreamError(f"{self.name}: 'files' of '{part}' is no list of {count} plain file names")
         assert isinstance(names, list)  # for mypy
         return [(f"{self.name}/{each}", self.file(each)) for each in names]
@@ -136,7 +136,8 @@ def _is_number(*values: Any) -> bool:
     return all(type(x) in (int, float) and abs(x) < 1e30 for x in values)
 
 
-def _is_plain(name: str) -> bool:
+def is_plain(name: str) -> bool:
+    """Whether a name is that of a file beside its meta.json, on any system."""
     return 0 < len(name) <= 128 and not set(name) & set('/\\:*?"<>|\0') and name.strip(".") != ""
 
 

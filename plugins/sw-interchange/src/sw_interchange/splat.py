@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from splatwizard_core.api import BitstreamError
-from sw_interchange.bands import SH_C0
+from splatwizard_core.api import SH_C0, BitstreamError
 from sw_interchange.options import Options
 from sw_interchange.scene import (
     FLAT,

@@ -56,23 +56,17 @@ def unzstd(frames: Sequence[bytes | memoryview], sizes: Sequence[int], name: str
 
     def plain(part: tuple[bytes | memoryview, int]) -> bytes:
         frame, size = part
-        decoder = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompressobj()
-        pieces, got = [], 0
         try:
             told = zstandard.frame_content_size(frame)
             if told not in (size, -1):
                 raise BitstreamError(f"{name}: a stream decodes to {told:,} bytes, expected are {size:,}")
-            # Little by little: a frame of any length decodes to no more than one step beyond its size.
-            for at in range(0, len(frame), 1 << 16):
-                pieces.append(decoder.decompress(frame[at : at + (1 << 16)]))
-                got += len(pieces[-1])
-                if got > size or decoder.eof:
-                    break
+            # Into memory of that size: a few bytes of a frame may stand for 128 KiB, however it is cut.
+            content = zstandard.ZstdDecompressor(max_window_size=1 << 27).decompress(frame, max_output_size=size)
         except zstandard.ZstdError as error:
-            raise BitstreamError(f"{name}: damaged zstd stream: {error}") from error
-        if got != size or not decoder.eof:
-            raise BitstreamError(f"{name}: a stream decodes to {got:,} bytes, expected are {size:,}")
-        return b"".join(pieces)
+            raise BitstreamError(f"{name}: no zstd stream of {size:,} bytes: {error}") from error
+        if len(content) != size:
+            raise BitstreamError(f"{name}: a stream decodes to {len(content):,} bytes, expected are {size:,}")
+        return content
 
     return each_of(plain, list(zip(frames, sizes, strict=True)))
 

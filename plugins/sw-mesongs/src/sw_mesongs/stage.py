@@ -10,13 +10,13 @@ from sw_finetuning.pruning import scores_of, up_to
 
 from splatwizard_core.api import (
     CameraIterator,
-    EmptyModel,
     GaussianModel,
     LossPack,
     ParamGroup,
     Pruner,
     Rasterizer,
     Scene,
+    SceneError,
     SplatOptimizer,
     Stage,
     photometric_loss,
@@ -96,7 +96,8 @@ class MesonGSStage(Stage):
     ) -> None:
         """Remove all Gaussians up to the score at the share tau; the others keep their importance.
 
-        The importance weighs the colours in the codebook, whoever decides what goes. Raises EmptyModel.
+        The importance weighs the colours in the codebook, whoever decides what goes. Those of the highest score stay
+        where all would go. Raises SceneError if no training view shows any.
         """
         own = self.pruner if isinstance(self.pruner, Importance) and self.pruner.beta is not None else None
         importance = own or Importance(beta=self.values.beta)
@@ -106,9 +107,15 @@ class MesonGSStage(Stage):
             scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
         tau = self.config.prune.tau
         doomed = up_to(scores, self.values.tau if tau is None else tau)
+        if bool(doomed.all()):  # of one Gaussian, or of equal scores, all are up to the lowest at any share
+            if not bool(model.importance.any()):
+                raise SceneError(
+                    f"no training view of '{scene.name}' shows a Gaussian of the trained scene: compare its poses with "
+                    "those of the scene that it was trained on",
+                    path=scene.path,
+                )
+            doomed = scores < scores.max()
         before, gone = model.num_rows, int(doomed.sum())
-        if gone == before:
-            raise EmptyModel(step)
         optimizer.keep_rows(model, ~doomed)
         log.info("step %d: pruned %d of %d Gaussians, %d left", step, gone, before, before - gone)
 

@@ -7,9 +7,8 @@ import math
 import torch
 from torch import Tensor
 
-from splatwizard_core.api import SH, ShapeError
+from splatwizard_core.api import SH, SH_C0, ShapeError
 
-C0 = 0.28209479177387814
 C1 = 0.4886025119029199
 C2 = (1.0925484305920792, -1.0925484305920792, 0.31539156525252005, -1.0925484305920792, 0.5462742152960396)
 C3 = (
@@ -21,7 +20,7 @@ C3 = (
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Values of the basis functions B_k, [N,3] unit vectors -> [N,(degree+1)^2]. Source: 3DGS (arXiv 2308.04079)."""
     x, y, z = directions.unbind(-1)
-    basis = [torch.full_like(x, C0)]
+    basis = [torch.full_like(x, SH_C0)]
     if degree >= 1:
         basis += [-C1 * y, C1 * z, -C1 * x]
     if degree >= 2:

@@ -138,6 +138,8 @@ def _of_means(table: DatasetTable, runs: Sequence[Run], looks: dict[str, int]) -
 
 
 def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter
+
     colours = [themes()[0][f"--s{i}"] for i in range(STYLES)]
     handles: dict[str, Any] = {}
     for panel, axes in zip(panels, figure.subplots(1, len(panels), squeeze=False)[0], strict=True):
@@ -152,6 +154,10 @@ def _draw(figure: Figure, panels: Sequence[Panel]) -> None:
             if any(deviation is not None for deviation in deviations):
                 axes.errorbar(x, y, [d or 0.0 for d in deviations], fmt="none", ecolor=style["color"], capsize=2)
         axes.set_xscale("log")
+        # At 1, 2 and 5: what stands between powers of ten by default overlaps where there is one such power.
+        axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
         axes.set_xlabel("file size, MB")
         axes.set_ylabel(_plain(panel.label))
         axes.grid(alpha=0.3, linewidth=0.5)

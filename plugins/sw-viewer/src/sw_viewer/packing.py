@@ -5,7 +5,7 @@ A Gaussian takes 19 bytes and 3 a coefficient of the bands above 0, before defla
     place       3 x 16 bit, between the bounds of its chunk of 256 neighbours (Morton order)
     rotation    32 bit, smallest three of (w,x,y,z): index of the largest, 3 x 10 bit
     scales      3 x 10 bit, logarithmic; at most `LOG_RANGE` below the largest
-    colour      11 + 11 + 10 bit, of 0.5 + SH_0 dc
+    colour      11 + 11 + 10 bit, of 0.5 + SH_C0 dc
     opacity     8 bit
     bands 1-3   8 bit a coefficient, one step a band
 """
@@ -21,14 +21,14 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.morton import BITS, interleave
 from sw_gaussians.surfels import as_ellipsoids
 
-from splatwizard_core.api import GaussianModel, SceneError, SplatModel
+from splatwizard_core.api import SH_C0, GaussianModel, SceneError, SplatModel
 
 CHUNK = 256
 LOG_RANGE = 14.0
 """Largest minus least log scale that is told apart: e^-14 of the largest Gaussian is below any pixel."""
-SH_0 = 0.28209479177387814
 LEAST_STEP = 0.008
 """Of a coefficient: a finer one changes no 8-bit colour."""
 FAINTEST = 1 / 255
@@ -36,7 +36,7 @@ FAINTEST = 1 / 255
 FARTHEST = 1e4
 """Distance from the median that is kept along an axis, in widths of the middle half: farther ones coarsen others."""
 BRIGHTEST = 8.0
-"""Least and largest 0.5 + SH_0 dc are -8 and 8, of a coefficient, too: a wilder one would coarsen all others."""
+"""Least and largest 0.5 + SH_C0 dc are -8 and 8, of a coefficient, too: a wilder one would coarsen all others."""
 
 
 @dataclass(frozen=True)
@@ -121,15 +121,8 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     least, most = np.percentile(means.astype(np.float64), (1, 99), axis=0, method="nearest")
     low, high = np.maximum(low, 2 * least - most), np.minimum(high, 2 * most - least)  # a far one is at the border
-    cells = ((means.clip(low, high) - low) / np.maximum(high - low, 1e-30) * (2**21 - 1)).astype(np.uint64)
-    spread = cells & np.uint64(0x1FFFFF)
-    for shift, mask in (
-        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):  # fmt: skip
-        spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
-    code = spread[:, 0] | (spread[:, 1] << np.uint64(1)) | (spread[:, 2] << np.uint64(2))
-    return np.argsort(code, kind="stable")
+    cells = ((means.clip(low, high) - low) / np.maximum(high - low, 1e-30) * (2**BITS - 1)).astype(np.int64)
+    return np.argsort(interleave(cells), kind="stable")
 
 
 def _places(means: NDArray[np.float32]) -> tuple[list[NDArray[np.uint16]], NDArray[np.float32]]:
@@ -164,7 +157,7 @@ def _scale_range(log_scales: NDArray[np.float32]) -> tuple[float, float]:
 
 
 def _colors(dc: NDArray[np.float32]) -> tuple[NDArray[np.uint32], list[float]]:
-    base = (0.5 + SH_0 * dc.astype(np.float64)).clip(-BRIGHTEST, BRIGHTEST)
+    base = (0.5 + SH_C0 * dc.astype(np.float64)).clip(-BRIGHTEST, BRIGHTEST)
     low, high = float(base.min()), float(base.max())
     share = (base - low) / max(high - low, 1e-6)
     cells = np.round(share * np.array([2047, 2047, 1023])).astype(np.uint32)

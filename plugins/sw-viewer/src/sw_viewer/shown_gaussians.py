@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from sw_gaussians.covariances import covariances_of
 from sw_gaussians.surfels import as_ellipsoids
 
-from splatwizard_core.api import Camera, GaussianModel, Rasterizer, SplatModel
-from sw_viewer.packing import SH_0
+from splatwizard_core.api import SH_C0, Camera, GaussianModel, Rasterizer, SplatModel
 
 MOST_ELLIPSOIDS = 30_000
 SOLID = 0.1
@@ -60,7 +59,7 @@ def shown_gaussians(model: SplatModel, camera: Camera, rasterizer: Rasterizer) -
         means, quats, scales, opacities = (
             value.detach() for value in (found.means, found.quats, found.scales, found.opacities)
         )
-        colors = 0.5 + SH_0 * found.sh_dc[:, 0]
+        colors = 0.5 + SH_C0 * found.sh_dc[:, 0]
     else:
         inputs = model.gaussians(camera.to(model.device), rasterizer).gathered(colors=False)
         assert inputs.scales is not None

@@ -43,6 +43,12 @@ def guarded(error: type[Exception], doing: str) -> Iterator[None]:
         raise error(f"{doing} failed: {type(cause).__name__}: {cause}") from cause
 
 
+def check_again(again: np.ndarray | None, symbols: np.ndarray) -> None:
+    """Raise RuntimeError unless what was just encoded decodes to the same symbols; None: it does not decode at all."""
+    if again is None or not np.array_equal(again, symbols):
+        raise RuntimeError("a block does not decode to what was encoded; please report this")
+
+
 def _only_symbol(counts: np.ndarray) -> int | None:
     """The one symbol with a positive count, or None if there are several."""
     positive = np.flatnonzero(counts)

@@ -405,12 +405,12 @@ class MixedHashGrid(nn.Module):
         features, bits = BinaryLookup.apply(*places, *(grid.table for grid in self._all()))
         return features, bits
 
-    def integer_features(self, codes: Tensor) -> Tensor:
-        """[n,3] 16-bit codes -> [n, width] int64 with 12 fractional bits."""
+    def integer_features(self, codes: Tensor, dtype: torch.dtype = torch.int64) -> Tensor:
+        """[n,3] 16-bit codes -> [n, width] with 12 fractional bits, at most 1 in magnitude: int64, or int16."""
         first = self._all()[0]
         if codes.device.type == "cpu" and first.features <= 16 and EXACT.try_load():
             codes, column = codes.to(torch.int64).contiguous(), 0
-            found = codes.new_empty(len(codes), self.width)
+            found = codes.new_empty(len(codes), self.width, dtype=dtype)
             for grid, axes in zip(self._all(), self.AXES, strict=True):
                 grid._kernel_features(codes, axes, found, column)
                 column += grid.width
@@ -418,7 +418,7 @@ class MixedHashGrid(nn.Module):
         return torch.cat(
             [grid.integer_features(codes[:, list(axes)]) for grid, axes in zip(self._all(), self.AXES, strict=True)],
             dim=1,
-        )
+        ).to(dtype)
 
     def signs(self) -> Tensor:
         """[entries] int64 of 0 and 1, grid by grid, level by level, entry by entry: what the file holds."""

@@ -104,26 +104,51 @@ class IntegerMlp:
         if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
             raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
         if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
-            flat = [each for layer in self._layers for each in layer]
             found = torch.empty(len(inputs), self.outputs, dtype=torch.int64) if out is None else out
-            torch.ops.sw_codecs_exact.network(inputs.to(torch.int64).contiguous(), flat, found)
+            torch.ops.sw_codecs_exact.network(_for_kernel(inputs), self.tensors(), found)
             return found
         rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
         found = torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
         return found if out is None else out.copy_(found)
 
+    def tensors(self) -> list[Tensor]:
+        """Integers of weights [out, in] and biases [out] in turn, float64, layer by layer."""
+        return [each for layer in self._layers for each in layer]
+
     def flat(self) -> Tensor:
         """Integers of all weights and biases, layer by layer, float64 [P]."""
-        return torch.cat([each.reshape(-1) for layer in self._layers for each in layer])
+        return torch.cat([each.reshape(-1) for each in self.tensors()])
+
+    def forecast(
+        self, inputs: Tensor, multipliers: Tensor, thresholds: Tensor, centre: list[Tensor], number: list[Tensor],
+        steps: Tensor,
+    ) -> bool:  # fmt: skip
+        """Evaluate, and put outputs on the lattice at once; whether all of it is within range. Needs the kernels.
+
+        Outputs are means and scales [C, C] of each group, and at the end a step output of each.
+
+        inputs      as of a call
+        multipliers, thresholds     int64 [128] by step output, and [63]: `entropy.exact_tables`
+        centre, number      of each group int32 and int16 [n,C], written: see `entropy.lattice.RowLattice`
+        steps       int64 [n, groups], written
+        """
+        status: int = torch.ops.sw_codecs_exact.forecast(
+            _for_kernel(inputs), self.tensors(), multipliers, thresholds, centre, number, steps
+        )
+        return status == 0
 
     def _evaluate(self, inputs: Tensor) -> Tensor:
         device = self._layers[0][0].device
-        a = inputs.to(device).clamp(-ACTIVATION_LIMIT, ACTIVATION_LIMIT).to(torch.float64)
+        a = inputs.to(device, torch.float64).clamp(-ACTIVATION_LIMIT, ACTIVATION_LIMIT)
         for i, (w, b) in enumerate(self._layers):
             a = ((a @ w.T + b) / 2.0**FRACTION).floor()
             if i < len(self._layers) - 1:
                 a = a.clamp(0, ACTIVATION_LIMIT)
         return a.to(torch.int64).to(inputs.device)
+
+
+def _for_kernel(inputs: Tensor) -> Tensor:
+    return (inputs if inputs.dtype == torch.int16 else inputs.to(torch.int64)).contiguous()
 
 
 def to_fixed(values: np.ndarray) -> np.ndarray:

@@ -20,8 +20,8 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.bits.packing import ByteReader, write_varint
 from sw_codecs.coders.arithmetic import RangeCoder
 from sw_codecs.coders.model_spec import K_LIMIT, Gaussian
-from sw_codecs.entropy.gaussian_exact import GaussianExact, IntegerContext
-from sw_codecs.entropy.lattice import lattice
+from sw_codecs.entropy.gaussian_exact import GaussianExact
+from sw_codecs.entropy.lattice import RowLattice, lattice
 from sw_codecs.entropy.rates import gaussian_bits
 from sw_codecs.exact_native import EXACT
 
@@ -56,7 +56,7 @@ class ConditionalGaussian:
         self.mode = mode
         self._exact, self._range = GaussianExact(), RangeCoder()
 
-    def encode(self, symbols: Numbers, context: RowContext, present: Numbers | None = None) -> bytes:
+    def encode(self, symbols: Numbers, context: RowContext | RowLattice, present: Numbers | None = None) -> bytes:
         """Bytes of one block.
 
         symbols     [n,C] integers
@@ -66,8 +66,8 @@ class ConditionalGaussian:
         """
         values, where = _array(symbols), _where(present)
         if self.mode == "exact":
-            there = None if present is None else where
-            return self._exact.encode_rows(values, context.mean, context.scale, context.step, there)
+            coded = values.reshape(-1) if present is None else values[where]
+            return self._exact.encode_at(coded, *_on_lattice(context, present))
         coded = values[where].reshape(-1)
         if not len(coded):
             return b""
@@ -75,14 +75,14 @@ class ConditionalGaussian:
         head = write_varint(low + K_LIMIT) + write_varint(high - low)
         return head + self._range.encode(coded, _floats(context, where, values.shape, low, high))
 
-    def decode(self, data: bytes, context: RowContext, present: Numbers | None = None) -> np.ndarray:
+    def decode(self, data: bytes, context: RowContext | RowLattice, present: Numbers | None = None) -> np.ndarray:
         """int64 [n,C], 0 where `present` is False. Raises BitstreamError."""
-        shape, where = np.shape(_array(context.mean)), _where(present)
+        where = _where(present)
+        shape = tuple(np.shape(context.centre if isinstance(context, RowLattice) else context.mean))
         found = np.zeros(shape, np.int64)
         try:
             if self.mode == "exact":
-                there = None if present is None else where
-                coded = self._exact.decode_at(data, *lattice(context.mean, context.scale, context.step, there))
+                coded = self._exact.decode_at(data, *_on_lattice(context, present))
             else:
                 coded = self._decode_floats(data, context, where, shape)
         except ValueError as error:
@@ -91,7 +91,7 @@ class ConditionalGaussian:
         return found
 
     def decode_into(
-        self, values: Tensor, data: bytes, context: RowContext, step: Tensor, present: Tensor | None = None
+        self, values: Tensor, data: bytes, context: RowContext | RowLattice, step: Tensor, present: Tensor | None = None
     ) -> Tensor:
         """As `decode`, a tensor; and write integer * step into `values`.
 
@@ -100,9 +100,8 @@ class ConditionalGaussian:
         """
         if self.mode == "exact" and values.stride(-1) == 1 and EXACT.try_load():
             there = None if present is None else present.to(torch.bool).contiguous()
-            shown = None if there is None else there.numpy()
             try:
-                where = lattice(context.mean, context.scale, context.step, shown)
+                where = _on_lattice(context, there)
             except ValueError as error:
                 raise BitstreamError(str(error)) from error
             symbols = torch.from_numpy(self._exact.decode_at(data, *where))
@@ -112,7 +111,7 @@ class ConditionalGaussian:
         values.copy_(found * step)
         return found
 
-    def bits(self, symbols: Numbers, context: RowContext, present: Numbers | None = None) -> Tensor:
+    def bits(self, symbols: Numbers, context: RowContext | RowLattice, present: Numbers | None = None) -> Tensor:
         """Bits that `encode` spends on each symbol, float64 [n,C] on the CPU, 0 where `present` is False; no gradient.
 
         In mode `exact` from the very tables that it uses. Framing is not counted.
@@ -121,7 +120,7 @@ class ConditionalGaussian:
         found = np.zeros(values.shape)
         coded = values[where].reshape(-1)
         if self.mode == "exact":
-            bits = self._exact.table_bits(coded, _integers(context, where, values.shape))
+            bits = self._exact.table_bits_at(coded, *_on_lattice(context, present))
         else:
             low, high = int(coded.min(initial=0)), int(coded.max(initial=0))
             spec = _floats(context, where, values.shape, low, high)
@@ -187,8 +186,12 @@ def _spread(context: RowContext, where: Any, shape: tuple[int, ...]) -> list[np.
     ]
 
 
-def _integers(context: RowContext, where: Any, shape: tuple[int, ...]) -> IntegerContext:
-    return IntegerContext(*_spread(context, where, shape))
+def _on_lattice(context: RowContext | RowLattice, present: Numbers | None) -> tuple[np.ndarray, np.ndarray]:
+    """Integer part of each mean and table number of each number that is coded, flat. Raises ValueError."""
+    where = None if present is None else _where(present)
+    if isinstance(context, RowLattice):
+        return context.present(where)
+    return lattice(context.mean, context.scale, context.step, where)
 
 
 def _floats(context: RowContext, where: Any, shape: tuple[int, ...], low: int, high: int) -> Gaussian:

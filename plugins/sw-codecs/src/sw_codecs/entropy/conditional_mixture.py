@@ -23,7 +23,7 @@ import torch
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader, write_varint
-from sw_codecs.coders.symbol_stream import guarded
+from sw_codecs.coders.symbol_stream import check_again, guarded
 from sw_codecs.entropy.conditional import Numbers, _array, _where
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _flat_lattice
@@ -146,7 +146,7 @@ class ConditionalMixture:
         symbols     [n,C] integers
         present     [n,C] bool: others are not coded; None: all are
 
-        Raises ValueError for parameters that are not finite or out of range.
+        The words are decoded again and compared. Raises ValueError for parameters that are not finite or out of range.
         """
         values, where = _array(symbols), _where(present)
         coded = values[where].reshape(-1).astype(np.int64)
@@ -157,7 +157,10 @@ class ConditionalMixture:
         mixtures = self._rows(context, where, values.shape)
         offsets, width = coded - mixtures.centre, mixtures.width
         outside = np.abs(offsets) > width
-        words = mixtures.encode(np.where(outside, 2 * width + 1, offsets + width))
+        entries = np.where(outside, 2 * width + 1, offsets + width)
+        words = mixtures.encode(entries)
+        with guarded(RuntimeError, "decoding what was encoded"):
+            check_again(mixtures.decode(memoryview(words)), entries)
         escaped = mixtures.order[outside[mixtures.order]]
         tables = exact_tables()
         return b"".join([

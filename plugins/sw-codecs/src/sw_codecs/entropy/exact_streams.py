@@ -24,7 +24,7 @@ from torch import Tensor
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import checksum, exp_golomb
 from sw_codecs.bits.packing import ByteReader, write_varint
-from sw_codecs.coders.symbol_stream import guarded
+from sw_codecs.coders.symbol_stream import check_again, guarded
 from sw_codecs.entropy.exact_tables import FRACTIONS, Family, exact_tables
 from sw_codecs.exact_native import EXACT
 
@@ -83,20 +83,22 @@ def prefix() -> bytes:
 def encode(family: str, symbols: np.ndarray, centre: np.ndarray, number: np.ndarray) -> bytes:
     """Bytes of symbols int [n], |s| < 2^30, for integer parts of means [n] and table numbers [n].
 
-    What a kernel wrote is decoded again and compared.
+    What was written is decoded again and compared.
     """
     symbols = np.ascontiguousarray(symbols, np.int32)
     if not len(symbols):
         return prefix()
     if not EXACT.try_load():
-        return _framed(*_encoded_in_turn(family, symbols, centre, number), symbols)
+        content, rows = _encoded_in_turn(family, symbols, centre, number)
+        with guarded(RuntimeError, "decoding what was encoded"):
+            check_again(_decoded_in_turn(family, memoryview(content), rows, centre, number), symbols)
+        return _framed(content, rows, symbols)
     at = _tensors(centre, number)
     data, sizes = torch.ops.sw_codecs_exact.encode_streams(
         share_tables(family), torch.from_numpy(symbols), at[0], at[1]
     )
     again, status = torch.ops.sw_codecs_exact.decode_streams(share_tables(family), data, sizes, *at)
-    if status or not np.array_equal(again.numpy(), symbols):
-        raise RuntimeError("a block does not decode to what was encoded; please report this")
+    check_again(None if status else again.numpy(), symbols)
     return _framed(data.numpy().tobytes(), sizes.numpy(), symbols)
 
 

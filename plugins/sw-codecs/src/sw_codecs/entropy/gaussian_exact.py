@@ -112,10 +112,14 @@ class GaussianExact:
         return self.decode_at(data, centre, number)
 
     @staticmethod
-    def encode_rows(symbols: np.ndarray, mean: Numbers, scale: Numbers, multiplier: Numbers, present: Any) -> bytes:
-        """As `encode`, of what is present of symbols [n,C] under parameters as of `lattice.lattice`."""
-        coded = _check_symbols(symbols.reshape(-1) if present is None else symbols[present])
-        return exact_streams.encode("gaussian", coded, *lattice(mean, scale, multiplier, present))
+    def encode_at(symbols: np.ndarray, centre: np.ndarray, number: np.ndarray) -> bytes:
+        """As `encode`, for what `lattice.lattice` gave."""
+        return exact_streams.encode("gaussian", _check_symbols(symbols), centre, number)
+
+    @staticmethod
+    def table_bits_at(symbols: np.ndarray, centre: np.ndarray, number: np.ndarray) -> np.ndarray:
+        """As `table_bits`, for what `lattice.lattice` gave."""
+        return exact_streams.table_bits("gaussian", _check_symbols(symbols), centre, number)
 
     @staticmethod
     def decode_at(data: bytes, centre: np.ndarray, number: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-// Registers the kernels of the exact mode as torch ops; checks what they are handed.
+// Registers the coding of the exact mode as torch ops; checks what it is handed.
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
 #include <ATen/ops/zeros.h>
@@ -12,19 +12,14 @@
 
 #include <splatwizard/torch_parallel.h>
 
-#include "kernels.h"
+#include "binding.h"
 #include "mixtures.h"
+#include "octree.h"
 
 namespace {
 
 using at::Tensor;
 using namespace splatwizard;
-
-void check(const Tensor& tensor, at::ScalarType type, int64_t dims, const char* op, const char* name) {
-  TORCH_CHECK(tensor.is_cpu() && tensor.scalar_type() == type && tensor.dim() == dims && tensor.is_contiguous(), op,
-              ": ", name, " must be a contiguous ", type, " tensor of ", dims, " axes on the CPU, got ",
-              tensor.toString(), tensor.sizes());
-}
 
 Tables tables_of(at::TensorList t, const char* op) {
   TORCH_CHECK(t.size() == 4, op, ": tables must be shares, first, radius and bucket");
@@ -127,6 +122,27 @@ std::tuple<Tensor, Tensor, int64_t> lattice(const Tensor& mean, const Tensor& sc
   return {centre, number, status};
 }
 
+// (centre [m], number [m]) of the present ones of [n, columns].
+std::tuple<Tensor, Tensor> present_rows(const Tensor& centre, const Tensor& number, const Tensor& present) {
+  const char* op = "present_rows";
+  check(centre, at::kInt, 2, op, "centre");
+  check(number, at::kShort, 2, op, "number");
+  TORCH_CHECK(number.sizes() == centre.sizes(), op, ": centre and number differ in shape");
+  std::vector<int64_t> start;
+  const int64_t count = starts_of(present, centre.size(0), centre.size(1), start, op);
+  Tensor to_centre = at::empty({count}, centre.options()), to_number = at::empty({count}, number.options());
+  const PresentArgs args{centre.const_data_ptr<int32_t>(),
+                        number.const_data_ptr<int16_t>(),
+                        reinterpret_cast<const uint8_t*>(present.const_data_ptr<bool>()),
+                        start.data(),
+                        centre.size(0),
+                        centre.size(1),
+                        to_centre.mutable_data_ptr<int32_t>(),
+                        to_number.mutable_data_ptr<int16_t>()};
+  SW_SELECT(present_rows)(args, torch_parallel());
+  return {to_centre, to_number};
+}
+
 void check_lattice(const Tensor& centre, const Tensor& number, const char* op) {
   check(centre, at::kInt, 1, op, "centre");
   check(number, at::kShort, 1, op, "number");
@@ -224,6 +240,24 @@ Tensor encode_mixtures(at::TensorList tables, at::TensorList rows, const Tensor&
   return found;
 }
 
+// (nodes [m] i64, occupancies u8 of all levels, nodes of each level and at the end [levels + 1] i64, status) of
+// range-coded words under counts [levels, 4, 255] i64, none empty; no level has more than `points` nodes.
+std::tuple<Tensor, Tensor, Tensor, int64_t> decode_octree(const Tensor& words, const Tensor& counts, int64_t points) {
+  const char* op = "decode_octree";
+  check(words, at::kByte, 1, op, "words");
+  check(counts, at::kLong, 3, op, "counts");
+  const int64_t depth = counts.size(0);
+  TORCH_CHECK(counts.size(1) == 4 && counts.size(2) == 255 && depth <= 21 && points >= 1 && points < int64_t{1} << 40,
+              op, ": counts must be [levels, 4, 255]");
+  Tensor nodes = at::empty({points}, counts.options());
+  Tensor occupancies = at::empty({depth * points}, words.options());
+  Tensor sizes = at::zeros({depth + 1}, counts.options());
+  const int32_t status = SW_SELECT(decode_octree)(
+      {words.const_data_ptr<uint8_t>(), words.numel(), depth, points, counts.const_data_ptr<int64_t>()},
+      nodes.mutable_data_ptr<int64_t>(), occupancies.mutable_data_ptr<uint8_t>(), sizes.mutable_data_ptr<int64_t>());
+  return {nodes, occupancies, sizes, status};
+}
+
 // Symbols [m] i32 as integers [n, C] i64, 0 where they are not present; values [n, C] f32 become integer * step.
 Tensor put_values(const Tensor& symbols, const std::optional<Tensor>& present, const Tensor& step,
                   const Tensor& values) {
@@ -248,114 +282,6 @@ Tensor put_values(const Tensor& symbols, const std::optional<Tensor>& present, c
                      integers.mutable_data_ptr<int64_t>()};
   SW_SELECT(put_values)(args, torch_parallel());
   return integers;
-}
-
-// Writes outputs [n, out] i64 of a network for inputs [n, in] i64; layers: W [out, in] and b [out] f64 in turn.
-void network(const Tensor& inputs, at::TensorList layers, const Tensor& outputs) {
-  const char* op = "network";
-  check(inputs, at::kLong, 2, op, "inputs");
-  TORCH_CHECK(layers.size() >= 2 && layers.size() % 2 == 0, op, ": weights and biases must come in pairs");
-  const int64_t tile = SW_SELECT(tile)();
-  int64_t width = inputs.size(1);
-  std::vector<std::vector<double>> packed;
-  std::vector<Layer> found;
-  for (size_t i = 0; i < layers.size(); i += 2) {
-    check(layers[i], at::kDouble, 2, op, "weights");
-    check(layers[i + 1], at::kDouble, 1, op, "biases");
-    const int64_t out = layers[i].size(0);
-    TORCH_CHECK(layers[i].size(1) == width && layers[i + 1].size(0) == out, op, ": layers do not fit");
-    const int64_t tiles = (out + tile - 1) / tile;
-    std::vector<double> weights(static_cast<size_t>(tiles * tile * width)), bias(static_cast<size_t>(tiles * tile));
-    const double *w = layers[i].const_data_ptr<double>(), *b = layers[i + 1].const_data_ptr<double>();
-    for (int64_t o = 0; o < out; ++o) {
-      for (int64_t k = 0; k < width; ++k)
-        weights[static_cast<size_t>((o / tile * width + k) * tile + o % tile)] = w[o * width + k];
-      bias[static_cast<size_t>(o)] = b[o];
-    }
-    packed.push_back(std::move(weights));
-    packed.push_back(std::move(bias));
-    found.push_back({packed[i].data(), packed[i + 1].data(), width, out});
-    width = out;
-  }
-  for (size_t i = 0; i < found.size(); ++i) {
-    found[i].weights = packed[2 * i].data();
-    found[i].bias = packed[2 * i + 1].data();
-  }
-  check(outputs, at::kLong, 2, op, "outputs");
-  TORCH_CHECK(outputs.size(0) == inputs.size(0) && outputs.size(1) == width, op, ": outputs do not fit");
-  SW_SELECT(network)(found.data(), static_cast<int64_t>(found.size()), inputs.const_data_ptr<int64_t>(),
-                     inputs.size(0), outputs.mutable_data_ptr<int64_t>(), torch_parallel());
-}
-
-// Writes the columns of a grid into out [n, width] i64. signs [entries] i16: bit f is sign f; levels [3, L]: R - 1,
-// first entry and first column, dense levels first.
-void grid_features(const Tensor& codes, at::IntArrayRef axes, const Tensor& signs, int64_t features,
-                   const Tensor& levels, int64_t dense, int64_t log2_size, const Tensor& out) {
-  const char* op = "grid_features";
-  check(codes, at::kLong, 2, op, "codes");
-  check(signs, at::kShort, 1, op, "signs");
-  check(levels, at::kLong, 2, op, "levels");
-  check(out, at::kLong, 2, op, "out");
-  const auto dimensions = static_cast<int>(axes.size());
-  TORCH_CHECK(codes.size(1) == 3 && (dimensions == 2 || dimensions == 3) && levels.size(0) == 3 && features >= 1 &&
-                  features <= 16 && log2_size >= 3 && log2_size <= 30 && out.size(0) == codes.size(0) && dense >= 0 &&
-                  dense <= levels.size(1),
-              op, ": shapes do not fit");
-  GridArgs args{};
-  args.codes = codes.const_data_ptr<int64_t>();
-  for (int d = 0; d < dimensions; ++d) {
-    TORCH_CHECK(axes[static_cast<size_t>(d)] >= 0 && axes[static_cast<size_t>(d)] < 3, op, ": axes must be below 3");
-    args.axes[d] = static_cast<int>(axes[static_cast<size_t>(d)]);
-  }
-  args.dimensions = dimensions;
-  args.signs = reinterpret_cast<const uint16_t*>(signs.const_data_ptr<int16_t>());
-  args.features = static_cast<int>(features);
-  args.levels = levels.size(1);
-  args.last = levels.const_data_ptr<int64_t>();
-  args.start = args.last + args.levels;
-  args.column = args.start + args.levels;
-  args.dense = dense;
-  args.log2_size = log2_size;
-  args.rows = codes.size(0);
-  args.out = out.mutable_data_ptr<int64_t>();
-  args.stride = out.size(1);
-  for (int64_t i = 0; i < args.levels; ++i) {
-    int64_t entries = int64_t{1} << log2_size;
-    if (i < dense) {
-      entries = 1;
-      for (int d = 0; d < dimensions; ++d) entries *= args.last[i] + 1;
-    }
-    TORCH_CHECK(args.last[i] >= 1 && args.last[i] < 1 << 16 && args.start[i] >= 0 &&
-                    args.start[i] + entries <= signs.numel() && args.column[i] >= 0 &&
-                    args.column[i] + features <= args.stride,
-                op, ": level ", i, " does not fit its table");
-  }
-  SW_SELECT(grid_features)(args, torch_parallel());
-}
-
-// [n, scales * 3 * C] i64 of places [n, 3] i64 and planes [3, R * R, C] i32 for each scale.
-Tensor triplane_features(const Tensor& places, at::TensorList planes, at::IntArrayRef sizes) {
-  const char* op = "triplane_features";
-  check(places, at::kLong, 2, op, "places");
-  TORCH_CHECK(places.size(1) == 3 && !planes.empty() && planes.size() <= 4 && planes.size() == sizes.size(), op,
-              ": one to four scales of planes");
-  TriplaneArgs args{};
-  args.places = places.const_data_ptr<int64_t>();
-  args.scales = static_cast<int64_t>(planes.size());
-  args.channels = planes[0].size(2);
-  for (size_t i = 0; i < planes.size(); ++i) {
-    check(planes[i], at::kInt, 3, op, "planes");
-    TORCH_CHECK(sizes[i] >= 1 && planes[i].size(0) == 3 && planes[i].size(1) == sizes[i] * sizes[i] &&
-                    planes[i].size(2) == args.channels,
-                op, ": planes must be [3, R * R, C]");
-    args.planes[i] = planes[i].const_data_ptr<int32_t>();
-    args.size[i] = sizes[i];
-  }
-  args.rows = places.size(0);
-  Tensor out = at::empty({args.rows, args.scales * 3 * args.channels}, places.options());
-  args.out = out.mutable_data_ptr<int64_t>();
-  SW_SELECT(triplane_features)(args, torch_parallel());
-  return out;
 }
 
 // The streams of planes: rows (scale, orientation, first channel, channels), as the file has them.
@@ -442,11 +368,9 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
   m.def("decode_mixtures(Tensor[] tables, Tensor[] rows, Tensor words) -> (Tensor, int)");
   m.def("encode_mixtures(Tensor[] tables, Tensor[] rows, Tensor entries) -> Tensor");
+  m.def("decode_octree(Tensor words, Tensor counts, int points) -> (Tensor, Tensor, Tensor, int)");
   m.def("put_values(Tensor symbols, Tensor? present, Tensor step, Tensor(a!) values) -> Tensor");
-  m.def("network(Tensor inputs, Tensor[] layers, Tensor(a!) outputs) -> ()");
-  m.def("grid_features(Tensor codes, int[] axes, Tensor signs, int features, Tensor levels, int dense, int log2_size,"
-        " Tensor(a!) out) -> ()");
-  m.def("triplane_features(Tensor places, Tensor[] planes, int[] sizes) -> Tensor");
+  m.def("present_rows(Tensor centre, Tensor number, Tensor present) -> (Tensor, Tensor)");
   m.def("decode_planes(Tensor[] tables, Tensor data, Tensor sizes, Tensor(a!)[] planes, Tensor parts, Tensor weights)"
         " -> int");
   m.def("encode_planes(Tensor[] tables, Tensor[] planes, Tensor parts, Tensor weights) -> (Tensor, Tensor)");
@@ -455,10 +379,9 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.impl("encode_streams", c10::DispatchKey::CPU, TORCH_FN(encode_streams));
   m.impl("decode_mixtures", c10::DispatchKey::CPU, TORCH_FN(decode_mixtures));
   m.impl("encode_mixtures", c10::DispatchKey::CPU, TORCH_FN(encode_mixtures));
+  m.impl("decode_octree", c10::DispatchKey::CPU, TORCH_FN(decode_octree));
   m.impl("put_values", c10::DispatchKey::CPU, TORCH_FN(put_values));
-  m.impl("network", c10::DispatchKey::CPU, TORCH_FN(network));
-  m.impl("grid_features", c10::DispatchKey::CPU, TORCH_FN(grid_features));
-  m.impl("triplane_features", c10::DispatchKey::CPU, TORCH_FN(triplane_features));
+  m.impl("present_rows", c10::DispatchKey::CPU, TORCH_FN(present_rows));
   m.impl("decode_planes", c10::DispatchKey::CPU, TORCH_FN(decode_planes));
   m.impl("encode_planes", c10::DispatchKey::CPU, TORCH_FN(encode_planes));
 }

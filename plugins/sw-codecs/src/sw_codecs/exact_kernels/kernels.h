@@ -58,6 +58,17 @@ struct LatticeArgs {
   int16_t* number;
 };
 
+// The present ones of [rows, columns] numbers.
+struct PresentArgs {
+  const int32_t* centre;
+  const int16_t* number;
+  const uint8_t* present;
+  const int64_t* start;  // as in LatticeArgs
+  int64_t rows, columns;
+  int32_t* to_centre;
+  int16_t* to_number;
+};
+
 // Where decoded symbols go: integers [rows, columns], and their products with a step of each row.
 struct PutArgs {
   const int32_t* symbols;
@@ -71,9 +82,28 @@ struct PutArgs {
 };
 
 struct Layer {
-  const double* weights;  // [tiles, inputs, TILE]: outputs in tiles, zeros behind the last one
-  const double* bias;     // [tiles * TILE]
+  const double* weights;  // [outputs, inputs] integers
+  const double* bias;     // [outputs]
   int64_t inputs, outputs;
+};
+
+struct NetworkArgs {
+  const Layer* layers;
+  int64_t depth;
+  const int64_t* inputs;        // [rows, inputs of the first layer]
+  const int16_t* short_inputs;  // the same, or null
+  int64_t rows;
+};
+
+// Outputs of a network in groups: means, then scales of each; at the end a step of each.
+struct ForecastArgs {
+  int64_t groups;
+  int64_t columns[4];         // of each group
+  const int64_t* multipliers;  // [128] 64 .. 16384, by output of the step
+  const int64_t* thresholds;   // [63]
+  int32_t* centre[4];          // of each group [rows, columns]
+  int16_t* number[4];
+  int64_t* steps;  // [rows, groups] multipliers
 };
 
 struct GridArgs {
@@ -84,7 +114,8 @@ struct GridArgs {
   int features;
   const int64_t *last, *start, *column;  // [levels] R - 1, first entry, first column of the output
   int64_t levels, dense, log2_size, rows;
-  int64_t* out;
+  int64_t* out;        // [rows, stride]
+  int16_t* short_out;  // instead, or null
   int64_t stride;
 };
 
@@ -115,15 +146,16 @@ struct PlanesArgs {
 
 #define SW_DECLARE_EXACT(arch)                                                                                      \
   namespace arch {                                                                                                  \
-  int64_t tile();                                                                                                   \
   int32_t lattice(const splatwizard::LatticeArgs&, const splatwizard::Parallel&);                                   \
+  void present_rows(const splatwizard::PresentArgs&, const splatwizard::Parallel&);                                 \
   int32_t decode_streams(const splatwizard::Tables&, const splatwizard::Streams&, const int32_t* centre,            \
                          const int16_t* number, int64_t count, int32_t* symbols, const splatwizard::Parallel&);     \
   int32_t encode_streams(const splatwizard::Tables&, const splatwizard::Sinks&, const int32_t* centre,              \
                          const int16_t* number, int64_t count, const int32_t* symbols, const splatwizard::Parallel&); \
   void put_values(const splatwizard::PutArgs&, const splatwizard::Parallel&);                                       \
-  void network(const splatwizard::Layer* layers, int64_t depth, const int64_t* inputs, int64_t rows, int64_t* out,  \
-               const splatwizard::Parallel&);                                                                       \
+  void network(const splatwizard::NetworkArgs&, int64_t* out, const splatwizard::Parallel&);                        \
+  int32_t forecast(const splatwizard::NetworkArgs&, const splatwizard::ForecastArgs&,                               \
+                   const splatwizard::Parallel&);                                                                   \
   void grid_features(const splatwizard::GridArgs&, const splatwizard::Parallel&);                                   \
   void triplane_features(const splatwizard::TriplaneArgs&, const splatwizard::Parallel&);                           \
   int32_t decode_planes(const splatwizard::Tables&, const splatwizard::Streams&, const splatwizard::PlanesArgs&,    \

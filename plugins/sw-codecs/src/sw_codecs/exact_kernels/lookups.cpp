@@ -25,9 +25,9 @@ struct Bits {
 };
 
 // Features of one level at one place: cell, and part of it in 1/4096, of each axis.
-template <int D>
+template <int D, class Out>
 void level_features(const GridArgs& a, const Bits& bits, int64_t level, const int64_t* cell, const int64_t* part,
-                    int64_t* out) {
+                    Out* out) {
   const bool dense = level < a.dense;
   const int64_t mask = (int64_t{1} << a.log2_size) - 1, last = a.last[level];
   uint32_t place[D][2];
@@ -66,15 +66,15 @@ void level_features(const GridArgs& a, const Bits& bits, int64_t level, const in
     const Four quotient = dividend / Four{divisor, divisor, divisor, divisor};
     for (int i = 0; i < 4 && f + i < a.features; ++i) {
       const auto whole = static_cast<int32_t>(quotient[i]);
-      out[f + i] = whole - (static_cast<double>(whole) > quotient[i]);
+      out[f + i] = static_cast<Out>(whole - (static_cast<double>(whole) > quotient[i]));
     }
   }
 }
 
-template <int D>
-void grid_rows(const GridArgs& a, const Bits& bits, int64_t begin, int64_t end) {
+template <int D, class Out>
+void grid_rows(const GridArgs& a, const Bits& bits, int64_t begin, int64_t end, Out* first) {
   for (int64_t row = begin; row < end; ++row) {
-    int64_t* out = a.out + row * a.stride;
+    Out* out = first + row * a.stride;
     int64_t code[D], cell[D], part[D];
     bool inside = true;
     for (int d = 0; d < D; ++d) {
@@ -92,7 +92,7 @@ void grid_rows(const GridArgs& a, const Bits& bits, int64_t begin, int64_t end) 
         cell[d] = place >> 12;
         part[d] = place & 4095;
       }
-      level_features<D>(a, bits, level, cell, part, out + a.column[level]);
+      level_features<D, Out>(a, bits, level, cell, part, out + a.column[level]);
     }
   }
 }
@@ -102,10 +102,11 @@ void grid_rows(const GridArgs& a, const Bits& bits, int64_t begin, int64_t end) 
 void grid_features(const GridArgs& a, const Parallel& parallel) {
   static const Bits bits;
   parallel(a.rows, 256, [&](int64_t begin, int64_t end) {
-    if (a.dimensions == 3)
-      grid_rows<3>(a, bits, begin, end);
+    if (a.short_out != nullptr)
+      a.dimensions == 3 ? grid_rows<3>(a, bits, begin, end, a.short_out)
+                        : grid_rows<2>(a, bits, begin, end, a.short_out);
     else
-      grid_rows<2>(a, bits, begin, end);
+      a.dimensions == 3 ? grid_rows<3>(a, bits, begin, end, a.out) : grid_rows<2>(a, bits, begin, end, a.out);
   });
 }
 

@@ -1,7 +1,9 @@
-// A ReLU network on rows of integers with 12 fractional bits (sw_codecs.context.integer_mlp), in float64.
-#include "kernels.h"
-#include "rans.h"
-#include "vectors.h"
+// A ReLU network on rows of integers with 12 fractional bits (sw_codecs.context.integer_mlp), and what its outputs mean
+// to the coder.
+#include <atomic>
+
+#include "lattice.h"
+#include "layers.h"
 
 namespace SW_ARCH {
 
@@ -9,93 +11,134 @@ using namespace splatwizard;
 
 namespace {
 
-// Sums of ROWS rows and WIDE vectors of outputs are kept in registers.
-#ifdef __AVX512F__
-constexpr int ROWS = 8;
-#else
-constexpr int ROWS = 4;
-#endif
-constexpr int WIDE = 3, TILE = WIDE * LANES, BLOCK = 12 * ROWS;
-
-constexpr int64_t DEEP = 128;  // inputs at once: their weights of a tile stay in the first cache
-
-// Adds to sums of ROWS rows, [ROWS, TILE]; `in` has `stride` numbers a row.
-inline void add_products(const double* in, int64_t stride, const double* weights, int64_t inputs, double* sums) {
-  Vec sum[ROWS][WIDE];
-#pragma GCC unroll 8
-  for (int r = 0; r < ROWS; ++r)
-#pragma GCC unroll 8
-    for (int v = 0; v < WIDE; ++v) sum[r][v] = load(sums + r * TILE + v * LANES);
-  for (int64_t k = 0; k < inputs; ++k) {
-    Vec w[WIDE];
-#pragma GCC unroll 8
-    for (int v = 0; v < WIDE; ++v) w[v] = load(weights + k * TILE + v * LANES);
-#pragma GCC unroll 8
-    for (int r = 0; r < ROWS; ++r) {
-      const Vec a = all(in[r * stride + k]);
-#pragma GCC unroll 8
-      for (int v = 0; v < WIDE; ++v) sum[r][v] += w[v] * a;
+// Inputs of a block as rows, within +-2^20; `width` of each.
+template <class T>
+void take_inputs(const T* inputs, int64_t width, int64_t n, Rows& rows) {
+  constexpr int64_t LIMIT = int64_t{1} << 20;
+  rows.begin(width + width % 2);
+  int32_t* to = rows.value.data;
+  int32_t most = 0;
+  for (int64_t r = 0; r < n; ++r, to += rows.stride) {
+    for (int64_t i = 0; i < width; ++i) {
+      const int64_t x = inputs[r * width + i];
+      to[i] = static_cast<int32_t>(x < -LIMIT ? -LIMIT : x > LIMIT ? LIMIT : x);
     }
+    for (int64_t i = 0; i < width; ++i) {
+      const int32_t size = to[i] < 0 ? -to[i] : to[i];
+      most = size > most ? size : most;
+    }
+    if (width % 2) to[width] = 0;
   }
-#pragma GCC unroll 8
-  for (int r = 0; r < ROWS; ++r)
-#pragma GCC unroll 8
-    for (int v = 0; v < WIDE; ++v) store(sums + r * TILE + v * LANES, sum[r][v]);
+  std::memset(to, 0, sizeof(int32_t) * static_cast<size_t>((BLOCK - n) * rows.stride));
+  rows.most = most;
 }
 
-int64_t padded(int64_t outputs) { return (outputs + TILE - 1) / TILE * TILE; }
+// The outputs of a layer between others as rows.
+void take_outputs(const Tiles& l, int64_t t, const double* sums, Rows& rows) {
+  Narrow most{};
+  for (int64_t r = 0; r < BLOCK; ++r)
+    for (int v = 0; v < TILE; v += LANES) {
+      const Vec x = clamped(shifted(load(sums + r * TILE + v)), 0, ACTIVATION_LIMIT);
+      const Narrow whole = __builtin_convertvector(x, Narrow);
+      most = whole > most ? whole : most;
+      store_narrow(rows.value.data + r * l.padded() + t * TILE + v, whole);
+    }
+  for (int i = 0; i < LANES; ++i) rows.most = most[i] > rows.most ? most[i] : rows.most;
+}
+
+// All layers in tiles.
+struct Packed {
+  Scratch<Tiles*> layer;
+  int64_t depth, widest;
+
+  Packed(const Layer* layers, int64_t count) : layer(count), depth(0), widest(layers[0].inputs + 1) {
+    for (; depth < count; ++depth) {
+      layer[depth] = new Tiles(layers[depth]);
+      widest = layer[depth]->padded() > widest ? layer[depth]->padded() : widest;
+    }
+  }
+  ~Packed() {
+    for (int64_t i = 0; i < depth; ++i) delete layer[i];
+  }
+};
+
+// Calls sink(first row, rows, outputs [rows, stride], stride) for every block; outputs are integers, and a vector may be
+// read behind the last one.
+template <class Sink>
+void over_blocks(const NetworkArgs& a, const Parallel& parallel, const Sink& sink) {
+  const Packed packed(a.layers, a.depth);
+  const int64_t width = a.layers[0].inputs, stride = packed.layer[a.depth - 1]->padded();
+  parallel((a.rows + BLOCK - 1) / BLOCK, 4, [&](int64_t begin, int64_t end) {
+    Rows even(packed.widest), odd(packed.widest);
+    Scratch<double> sums(BLOCK * TILE), outputs(BLOCK * stride + LANES);
+    for (int64_t i = 0; i < LANES; ++i) outputs[BLOCK * stride + i] = 0;
+    for (int64_t block = begin; block < end; ++block) {
+      const int64_t start = block * BLOCK, n = a.rows - start < BLOCK ? a.rows - start : BLOCK;
+      if (a.short_inputs != nullptr)
+        take_inputs(a.short_inputs + start * width, width, n, even);
+      else
+        take_inputs(a.inputs + start * width, width, n, even);
+      for (int64_t layer = 0; layer < a.depth; ++layer) {
+        const Tiles& l = *packed.layer[layer];
+        Rows &from = layer % 2 ? odd : even, &to = layer % 2 ? even : odd;
+        if (layer < a.depth - 1) to.begin(l.padded());
+        for (int64_t t = 0; t < l.tiles; ++t) {
+          tile_sums(l, t, from, n, sums.data);
+          if (layer < a.depth - 1)
+            take_outputs(l, t, sums.data, to);
+          else
+            for (int64_t r = 0; r < BLOCK; ++r)
+              for (int v = 0; v < TILE; v += LANES)
+                store(outputs.data + r * stride + t * TILE + v, shifted(load(sums.data + r * TILE + v)));
+        }
+      }
+      sink(start, n, outputs.data, stride);
+    }
+  });
+}
 
 }  // namespace
 
-int64_t tile() { return TILE; }
-
-void network(const Layer* layers, int64_t depth, const int64_t* inputs, int64_t rows, int64_t* out,
-             const Parallel& parallel) {
-  int64_t widest = layers[0].inputs;
-  for (int64_t i = 0; i < depth; ++i) widest = padded(layers[i].outputs) > widest ? padded(layers[i].outputs) : widest;
-  const int64_t width = layers[0].inputs, outputs = layers[depth - 1].outputs;
-  parallel((rows + BLOCK - 1) / BLOCK, 4, [&](int64_t begin, int64_t end) {
-    Scratch<double> first(BLOCK * widest), second(BLOCK * widest), sums(BLOCK * TILE);
-    for (int64_t block = begin; block < end; ++block) {
-      const int64_t start = block * BLOCK, n = rows - start < BLOCK ? rows - start : BLOCK;
-      double *a = first.data, *b = second.data;
-      for (int64_t i = 0; i < n * width; ++i) {
-        const int64_t limit = int64_t{1} << 20, x = inputs[start * width + i];
-        a[i] = static_cast<double>(static_cast<int32_t>(x < -limit ? -limit : x > limit ? limit : x));
-      }
-      for (int64_t i = n * width; i < BLOCK * width; ++i) a[i] = 0;
-      for (int64_t layer = 0; layer < depth; ++layer) {
-        const Layer& l = layers[layer];
-        const int64_t stride = layer == 0 ? width : padded(layers[layer - 1].outputs), to = padded(l.outputs);
-        for (int64_t t = 0; t * TILE < l.outputs; ++t) {
-          for (int64_t r = 0; r < BLOCK; ++r)
-            std::memcpy(sums.data + r * TILE, l.bias + t * TILE, sizeof(double) * TILE);
-          for (int64_t k = 0; k < l.inputs; k += DEEP) {
-            const double* weights = l.weights + (t * l.inputs + k) * TILE;
-            const int64_t deep = l.inputs - k < DEEP ? l.inputs - k : DEEP;
-            for (int64_t r = 0; r < n; r += ROWS)
-              add_products(a + r * stride + k, stride, weights, deep, sums.data + r * TILE);
-          }
-          const int64_t count = l.outputs - t * TILE < TILE ? l.outputs - t * TILE : TILE;
-          for (int64_t r = 0; r < n; ++r) {
-            int64_t whole[TILE];
-            for (int v = 0; v < WIDE; ++v) {
-              const Vec x = shifted(load(sums.data + r * TILE + v * LANES));
-              if (layer < depth - 1)
-                store(b + r * to + t * TILE + v * LANES, clamped(x, 0, ACTIVATION_LIMIT));
-              else
-                store_integers(whole + v * LANES, x);
-            }
-            if (layer == depth - 1)
-              std::memcpy(out + (start + r) * outputs + t * TILE, whole, sizeof(int64_t) * static_cast<size_t>(count));
-          }
-        }
-        double* swap = a;
-        a = b;
-        b = swap;
-      }
+void network(const NetworkArgs& a, int64_t* out, const Parallel& parallel) {
+  const int64_t count = a.layers[a.depth - 1].outputs;
+  over_blocks(a, parallel, [&](int64_t start, int64_t n, const double* outputs, int64_t stride) {
+    for (int64_t r = 0; r < n; ++r) {
+      int64_t* to = out + (start + r) * count;
+      int64_t c = 0;
+      for (; c + LANES <= count; c += LANES) store_integers(to + c, load(outputs + r * stride + c));
+      for (; c < count; ++c) to[c] = static_cast<int64_t>(outputs[r * stride + c]);
     }
   });
+}
+
+int32_t forecast(const NetworkArgs& a, const ForecastArgs& to, const Parallel& parallel) {
+  const Levels levels(to.thresholds);
+  std::atomic<int32_t> status{FINE};
+  int64_t steps = 0;
+  for (int64_t g = 0; g < to.groups; ++g) steps += 2 * to.columns[g];
+  over_blocks(a, parallel, [&](int64_t start, int64_t n, const double* outputs, int64_t stride) {
+    int32_t centre[COLUMNS], fine = FINE;
+    int16_t number[COLUMNS];
+    bool beyond = false;
+    for (int64_t r = 0; r < n; ++r, outputs += stride) {
+      const double* mean = outputs;
+      for (int64_t g = 0; g < to.groups; ++g) {
+        const int64_t columns = to.columns[g], row = start + r;
+        const int64_t j = (static_cast<int64_t>(outputs[steps + g]) + (1 << 15)) >> 9;
+        const int64_t m = to.multipliers[j < 0 ? 0 : j > 127 ? 127 : j];
+        to.steps[row * to.groups + g] = m;
+        for (int64_t c = 0; c < columns; c += COLUMNS) {
+          const int64_t count = columns - c < COLUMNS ? columns - c : COLUMNS;
+          beyond |= columns_of(levels, mean + c, mean + columns + c, m, count, centre, number);
+          std::memcpy(to.centre[g] + row * columns + c, centre, sizeof(int32_t) * static_cast<size_t>(count));
+          std::memcpy(to.number[g] + row * columns + c, number, sizeof(int16_t) * static_cast<size_t>(count));
+        }
+        mean += 2 * columns;
+      }
+    }
+    if (beyond) status.compare_exchange_strong(fine, BEYOND_LIMIT);
+  });
+  return status;
 }
 
 }  // namespace SW_ARCH

@@ -14,6 +14,8 @@ constexpr int LANES = 4;
 typedef double Vec __attribute__((vector_size(8 * LANES)));
 typedef int64_t IntVec __attribute__((vector_size(8 * LANES)));
 typedef double VecLoad __attribute__((vector_size(8 * LANES), aligned(8)));
+typedef int32_t Narrow __attribute__((vector_size(4 * LANES)));
+typedef int32_t NarrowLoad __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef float FloatLoad __attribute__((vector_size(4 * LANES), aligned(4)));
 typedef int64_t IntLoad __attribute__((vector_size(8 * LANES), aligned(8)));
 
@@ -25,6 +27,7 @@ inline Vec all(double x) { return Vec{x, x, x, x}; }
 #endif
 inline Vec load(const double* p) { return *reinterpret_cast<const VecLoad*>(p); }
 inline void store(double* p, Vec v) { *reinterpret_cast<VecLoad*>(p) = v; }
+inline void store_narrow(int32_t* p, Narrow v) { *reinterpret_cast<NarrowLoad*>(p) = v; }
 
 constexpr double ROUND = 6755399441055744.0;  // 1.5 * 2^52: a sum with it has no fraction
 

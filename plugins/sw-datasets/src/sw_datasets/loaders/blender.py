@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from splatwizard_core.api import Camera, PointCloud, Scene, SceneError, SceneOptions, View, stream
+from splatwizard_core.api import SH_C0, Camera, PointCloud, Scene, SceneError, SceneOptions, View, stream
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import BLENDER
 from sw_datasets.pictures import (
@@ -29,7 +29,6 @@ from sw_datasets.pictures import (
 from sw_datasets.rules import Rules, rules_for, unused_option_warnings
 
 HALF_CUBE = 1.3  # start points fill [-1.3, 1.3]^3 (3DGS)
-SH_C0 = 0.28209479177387814
 
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
 
