@@ -4,6 +4,7 @@ import pytest
 import torch
 from hac_plus_models import decoded, encoded, generator, make, published
 from sw_anchors.growth import adjust_anchors
+from sw_anchors.noisy_values import draws
 from sw_anchors.voxel_lattice import voxel_integers, within_reach
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
@@ -100,7 +101,7 @@ def bits_by_hand(model):
     n, f, k = model.num_rows, model.shape.features, model.num_offsets
     g = generator(3)
     torch.rand(n, generator=g)  # the sample
-    torch.rand(10, f + 6 + 3 * k, generator=g)  # noise of what is rendered
+    draws((10, f + 6 + 3 * k), g, torch.device("cpu"))  # noise of what is rendered
     noise = torch.rand(n, f + 6 + 3 * k, generator=g) - 0.5
     out = model.mlp_grid(model.grid(model.codes() / 65535))
     mu_f, s_f, mu_l, s_l, mu_o, s_o, t, logit = out.split([f, f, 6, 6, 3 * k, 3 * k, 3, f], dim=1)

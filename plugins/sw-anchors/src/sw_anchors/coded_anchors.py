@@ -247,7 +247,7 @@ class CodedAnchors(AnchorModel):
             if self.phase == ENTROPY:
                 forecast = self.forecast(rows)
                 steps = forecast.steps
-            uniform = draws((len(rows), sum(self.shape.widths)), self._own_generator(), self.device)
+            uniform = self.draw_noise(len(rows), sum(self.shape.widths))
             noise = Noise(steps, uniform, self._columns(steps))
             drawn = self.sampled(len(rows)) if forecast is not None else drawn
         found = noisy_values(rows, self._tables, self.mask_weights(), MASK_THRESHOLD, noise, drawn)
@@ -300,6 +300,10 @@ class CodedAnchors(AnchorModel):
     def uniform(self, *shape: int) -> Tensor:
         """Draws of U(0,1) on the model's device."""
         return torch.rand(shape, generator=self._own_generator(), device=self.device)
+
+    def draw_noise(self, rows: int, numbers: int) -> Tensor:
+        """[rows, numbers] draws of U(0,1) for noise, see `noisy_values.draws`."""
+        return draws((rows, numbers), self._own_generator(), self.device)
 
     def _own_generator(self) -> torch.Generator | None:
         """The generator of noise, if it draws on the model's device."""

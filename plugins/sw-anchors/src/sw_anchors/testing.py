@@ -87,6 +87,7 @@ def _one_step(
         mock.patch.object(PoolRows, "draw", fill),
         mock.patch.object(model, "pool_sample", pool),
         mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
+        mock.patch.object(model, "draw_noise", lambda *shape: noise[: shape[0]].clone()),
         mock.patch.object(model, "draw_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
     ):
         inputs = model.decode(camera, rows)
