@@ -7,7 +7,11 @@ from splatwizard_native import NativeModule
 EXACT = NativeModule(
     name="sw_codecs_exact",
     package="sw_codecs",
-    sources=("exact_kernels/binding.cpp", "exact_kernels/binding_networks.cpp"),
+    sources=(
+        "exact_kernels/binding.cpp",
+        "exact_kernels/binding_networks.cpp",
+        "exact_kernels/binding_mixtures.cpp",
+    ),
     kernels=(
         "exact_kernels/lattice.cpp",
         "exact_kernels/network.cpp",
@@ -15,6 +19,7 @@ EXACT = NativeModule(
         "exact_kernels/streams.cpp",
         "exact_kernels/lookups.cpp",
         "exact_kernels/mixtures.cpp",
+        "exact_kernels/mixture_rows.cpp",
         "exact_kernels/octree.cpp",
     ),
     headers=("exact_kernels/*.h",),

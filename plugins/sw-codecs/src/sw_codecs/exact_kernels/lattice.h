@@ -74,6 +74,26 @@ inline bool columns_of(const Levels& levels, const double* mean, const double* s
   return any != 0;
 }
 
+// Integers of a row as float64; false if one is beyond 2^48.
+inline bool take_integers(const int64_t* from, int64_t n, double* to) {
+  constexpr int64_t LIMIT = int64_t{1} << 48;
+  IntVec wrong{};
+  int64_t c = 0;
+  for (; c + LANES <= n; c += LANES) {
+    const IntVec x = *reinterpret_cast<const IntLoad*>(from + c);
+    wrong |= (x <= -LIMIT) | (x >= LIMIT);
+    store(to + c, of_integers(x));
+  }
+  int64_t any = 0;
+  for (int l = 0; l < LANES; ++l) any |= wrong[l];
+  for (; c < n; ++c) {
+    any |= from[c] <= -LIMIT || from[c] >= LIMIT;
+    to[c] = static_cast<double>(from[c]);
+  }
+  for (; c % LANES; ++c) to[c] = 0;
+  return any == 0;
+}
+
 // Moves the present ones of n numbers to the front; how many there are.
 inline int64_t keep_present(const uint8_t* present, int64_t n, int32_t* centre, int16_t* number) {
   int64_t kept = 0;
