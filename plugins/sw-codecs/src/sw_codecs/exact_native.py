@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from splatwizard_native import NativeModule
+from splatwizard_native import NativeBuildError, NativeModule
 
 EXACT = NativeModule(
     name="sw_codecs_exact",
@@ -21,9 +21,18 @@ EXACT = NativeModule(
         "exact_kernels/mixtures.cpp",
         "exact_kernels/mixture_rows.cpp",
         "exact_kernels/octree.cpp",
+        "exact_kernels/bits.cpp",
     ),
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code
     seconds=15,
     without="files of anchors decode by torch and the library constriction: the same bits, five to ten times slower",
 )
+
+
+def has_exact() -> bool:
+    """Whether the kernels are built; loads them. For what any file has: compiling takes longer than it does without."""
+    try:
+        return EXACT.load_built()
+    except NativeBuildError:
+        return False

@@ -13,7 +13,7 @@
 #include <splatwizard/torch_parallel.h>
 
 #include "binding.h"
-#include "octree.h"
+#include "range_coded.h"
 
 namespace {
 
@@ -207,6 +207,18 @@ std::tuple<Tensor, Tensor, Tensor, int64_t> decode_octree(const Tensor& words, c
   return {nodes, occupancies, sizes, status};
 }
 
+// (bits [count] i32, status) of range-coded words; `zeros` of 2^24 is the share of 0.
+std::tuple<Tensor, int64_t> decode_bits(const Tensor& words, int64_t zeros, int64_t count) {
+  const char* op = "decode_bits";
+  check(words, at::kByte, 1, op, "words");
+  TORCH_CHECK(zeros >= 1 && zeros < 1 << 24 && count >= 0, op, ": zeros must be 1..2^24 - 1");
+  Tensor bits = at::empty({count}, words.options().dtype(at::kInt));
+  const int32_t status =
+      SW_SELECT(decode_bits)(words.const_data_ptr<uint8_t>(), words.numel(), static_cast<uint32_t>(zeros), count,
+                             bits.mutable_data_ptr<int32_t>());
+  return {bits, status};
+}
+
 // Symbols [m] i32 as integers [n, C] i64, 0 where they are not present; values [n, C] f32 become integer * step.
 Tensor put_values(const Tensor& symbols, const std::optional<Tensor>& present, const Tensor& step,
                   const Tensor& values) {
@@ -315,6 +327,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
         " -> (Tensor, Tensor, int)");
   m.def("decode_streams(Tensor[] tables, Tensor data, Tensor sizes, Tensor centre, Tensor number) -> (Tensor, int)");
   m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
+  m.def("decode_bits(Tensor words, int zeros, int count) -> (Tensor, int)");
   m.def("decode_octree(Tensor words, Tensor counts, int points) -> (Tensor, Tensor, Tensor, int)");
   m.def("put_values(Tensor symbols, Tensor? present, Tensor step, Tensor(a!) values) -> Tensor");
   m.def("present_rows(Tensor centre, Tensor number, Tensor present) -> (Tensor, Tensor)");
@@ -324,6 +337,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.impl("lattice", c10::DispatchKey::CPU, TORCH_FN(lattice));
   m.impl("decode_streams", c10::DispatchKey::CPU, TORCH_FN(decode_streams));
   m.impl("encode_streams", c10::DispatchKey::CPU, TORCH_FN(encode_streams));
+  m.impl("decode_bits", c10::DispatchKey::CPU, TORCH_FN(decode_bits));
   m.impl("decode_octree", c10::DispatchKey::CPU, TORCH_FN(decode_octree));
   m.impl("put_values", c10::DispatchKey::CPU, TORCH_FN(put_values));
   m.impl("present_rows", c10::DispatchKey::CPU, TORCH_FN(present_rows));
