@@ -152,7 +152,6 @@ def test_the_smallest_and_largest_parameters_still_code(coder, spec):
                 assert np.array_equal(coder().decode(coder().encode(symbols, model), 7, model), symbols)
 
 
-@pytest.mark.parametrize("coder", STREAMS)
 def test_bits_decode_with_and_without_the_kernel(kernels):
     shares = np.concatenate([rng(3).random(40), [1e-9, 2.0**-24, 3e-5, 0.5, 1 / 3, 1 - 1e-6, 1 - 1e-9]])
     coded = []
@@ -167,6 +166,7 @@ def test_bits_decode_with_and_without_the_kernel(kernels):
         RangeCoder().decode(data[:20] + b"\xff" * (len(data) - 20), len(symbols), model)
 
 
+@pytest.mark.parametrize("coder", STREAMS)
 @pytest.mark.parametrize("name", ["table", "gaussian", "bernoulli"])
 def test_many_chunks(coder, name, monkeypatch):
     monkeypatch.setattr(coders, "CHUNK", 1000)
