@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from hac_plus_models import PLUGINS, decoded, method
+from hac_plus_models import PLUGINS, decoded, method, recorded
 from sw_anchors.coded_anchors import ENTROPY
 from sw_kit import short_training
 from sw_kit.short_training import demo, file_of, psnr
@@ -10,6 +10,7 @@ from sw_kit.short_training import demo, file_of, psnr
 from splatwizard_core.coding.container import ContainerReader
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.training.pipeline import TrainingStopped
+from sw_codecs.entropy.rates import mixture_bits
 
 pytestmark = pytest.mark.pipeline
 
@@ -90,6 +91,28 @@ def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
         model.eval()
     numbers = model.num_rows * (8 + 6 + 15)
     assert sum(float(rate.bits) for rate in sampled) / 40 * numbers == pytest.approx(size, rel=0.06)
+
+
+def test_the_file_is_as_small_as_the_mixtures_of_a_trained_model_ask_for(trained):
+    model, _, made = trained[WEIGHTS[0]]
+    estimate = tables = 0.0
+    recorder, _ = recorded(model)
+    for symbols, context in recorder.mixed:
+        wide = {name: torch.as_tensor(value).double() / 4096 for name, value in vars(context).items()}
+        bits = mixture_bits(
+            symbols * wide["step"],
+            torch.stack([wide["logit"], torch.zeros_like(wide["logit"])], dim=-1),
+            torch.stack([wide["mean"], wide["second_mean"]], dim=-1),
+            torch.stack([wide["scale"], wide["second_scale"]], dim=-1).clamp(min=1e-9),
+            wide["step"],
+            p_min=1e-12,
+        )
+        estimate += float(bits.sum())
+        tables += float(recorder.mixtures.bits(symbols, context).sum())
+    assert estimate < tables < 1.002 * estimate
+    sections = ContainerReader(file_of(made, model)).sections
+    size = 8 * sum(sections[name] for name in ("features.1", "features.2"))
+    assert size - tables < 2 * 8 * 20  # framing and checksums: of so small a section they are most of the difference
 
 
 def test_an_interrupted_training_ends_as_a_whole_one(scene, rasterizer, tmp_path):
