@@ -14,9 +14,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from interchange_files import Sample, ksplat_file, mutants, random_scene, samples
+from sw_gaussians.ply import load_ply
 from sw_interchange import Limits, decode, encode, gltf, read, write
 
-from splatwizard_core.api import SplatwizardError, UserInputError
+from splatwizard_core.api import SceneError, SplatwizardError, UserInputError
 
 LIMITS = Limits(max_gaussians=1 << 20, max_output_bytes=1 << 28)
 MEMORY = 256 << 20
@@ -362,6 +363,17 @@ def test_images_beside_a_description_are_files_of_a_sound_size(tmp_path):
     os.mkfifo(image)
     with pytest.raises(UserInputError, match="is no file"):
         read(meta)
+
+
+def test_a_pipe_is_no_file(tmp_path):
+    """Also one without a writer, which another `open` would wait for."""
+    pipe = tmp_path / "a.ply"
+    os.mkfifo(pipe)
+    for reader in (read, load_ply):
+        with pytest.raises(SceneError, match=r"a\.ply: cannot be read: it is no file"):
+            reader(pipe)
+    with pytest.raises(SceneError, match="cannot be read: it is a folder"):
+        load_ply(tmp_path)
 
 
 def test_elements_and_properties_that_stand_twice_are_refused():
