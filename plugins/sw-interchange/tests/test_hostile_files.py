@@ -221,6 +221,8 @@ BAD = {
     "gltf with another file": (gltf_with("buffers.0.uri", "/etc/passwd"), "gltf"),
     "gltf with sparse rows": (gltf_with("accessors.0.sparse", {}), "gltf"),
     "gltf that shears": (gltf_with("nodes.0.scale", [1, 2, 1]), "gltf"),
+    "gltf that mirrors": (gltf_with("nodes.0.scale", [-1, 1, 1]), "gltf"),
+    "gltf that turns everything inside out": (gltf_with("nodes.0.scale", [-2, -2, -2]), "gltf"),
     "gltf that flattens": (gltf_with("nodes.0.scale", [0, 0, 0]), "gltf"),
     "gltf with a node of its own": (gltf_with("nodes.0.children", [0]), "gltf"),
     "gltf with a ring of nodes": (nested_gltf(2000), "gltf"),

@@ -100,6 +100,13 @@ def test_spz_of_a_large_scene_has_fewer_fractional_bits_and_of_a_huge_one_is_ref
         encode(scene, "spz")
 
 
+def test_spz_4_of_many_equal_gaussians_is_one_that_readers_believe():
+    scene = random_scene(1, 0).select(np.zeros(300_000, int))
+    data, _ = encode(scene, "spz", version=4)
+    assert len(data) * 1024 // 9 >= 300_000
+    assert decode(data).num_gaussians == 300_000
+
+
 def test_spz_options():
     scene = random_scene(300, 3)
     fine = decode(encode(scene, "spz", sh1_bits=8, sh_bits=8, fractional_bits=16, antialiased=True)[0])
@@ -246,6 +253,29 @@ def test_surfels_stay_surfels(name):
     found = decode(encode(scene, name)[0])
     assert found.kind == "2dgs"
     assert np.allclose(found.log_scales[:, 2], -20, atol=0.1)
+
+
+@pytest.mark.parametrize("name", ["splat", "spz", "compressed-ply", "gltf"])
+def test_that_surfels_become_ellipsoids_is_told(name):
+    scene = random_scene(4, 0)
+    assert encode(scene, name)[1].lost == []
+    scene.kind = "2dgs"
+    scene.log_scales[:, 2] = -20
+    data, report = encode(scene, name)
+    assert report.lost == ["that these are surfels: they are flat ellipsoids"]
+    assert decode(data, name).kind == "default"
+
+
+@pytest.mark.parametrize("name", ["splat", "gltf"])
+def test_scales_beyond_float32_are_clamped_and_counted(name):
+    scene = random_scene(4, 0)
+    scene.log_scales[1] = (95, -110, 88)
+    data, report = encode(scene, name)
+    assert report.clamped == {"log_scales": 2}
+    found = decode(data, name)
+    assert (found.num_gaussians, found.report.dropped) == (4, 0)
+    row = found.log_scales[np.abs(found.log_scales).max(1).argmax()]
+    assert np.allclose(row, [88.72, -87.33, 88], atol=1e-4)
 
 
 @pytest.mark.parametrize("name", [f.name for f in formats() if f.writes and f.name != "ply"])

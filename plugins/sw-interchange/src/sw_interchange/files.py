@@ -21,6 +21,7 @@ from sw_interchange.source import Source
 NO_LIMITS = Limits()
 FOLDER = "sog-folder"
 META = "meta.json"
+KEEPS_SURFELS = ("ply", "sog", FOLDER)
 
 
 def read(
@@ -157,6 +158,8 @@ def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tu
         scene = scene.with_degree(chosen.max_sh_degree)
     if scene.antialiased and chosen.name in ("splat", "gltf"):
         report.lost.append("that it was trained with antialiasing")
+    if scene.kind == "2dgs" and chosen.name not in KEEPS_SURFELS:
+        report.lost.append("that these are surfels: they are flat ellipsoids")
     parts = writer(replace(in_frame(scene, chosen.frame), report=None), options, report)
     report.bytes = sum(len(part) for part in parts)
     return parts, report
