@@ -9,6 +9,7 @@ from splatwizard_core.errors import BitstreamError
 from sw_codecs.context import hash_grid, integer_mlp, plane_streams, triplane
 from sw_codecs.entropy import conditional, exact_streams, lattice
 from sw_codecs.exact_native import EXACT
+from sw_codecs.positions import octree
 
 
 def _assert_survives_damage(data, decode, expected, *, masks=(0x01, 0x80, 0xFF), truncations=None):
@@ -37,12 +38,13 @@ def assert_survives_damage():
 @pytest.fixture
 def kernels(monkeypatch):
     """Let the exact mode run with its compiled kernels or without: `kernels(False)`."""
-    users = (hash_grid, integer_mlp, plane_streams, triplane, conditional, exact_streams, lattice)
+    users = (hash_grid, integer_mlp, plane_streams, triplane, conditional, exact_streams, lattice, octree)
 
     def use(compiled):
         if compiled:
             EXACT.load()
+        without = SimpleNamespace(try_load=lambda: False, load_built=lambda: False)
         for module in users:
-            monkeypatch.setattr(module, "EXACT", EXACT if compiled else SimpleNamespace(try_load=lambda: False))
+            monkeypatch.setattr(module, "EXACT", EXACT if compiled else without)
 
     return use

@@ -15,6 +15,7 @@ EXACT = NativeModule(
         "exact_kernels/streams.cpp",
         "exact_kernels/lookups.cpp",
         "exact_kernels/mixtures.cpp",
+        "exact_kernels/octree.cpp",
     ),
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code

@@ -62,12 +62,15 @@ def test_morton_inverts(points):
 
 
 @pytest.mark.parametrize("name", list(clouds()))
-def test_clouds_come_back_in_order(name):
+def test_clouds_come_back_in_order(name, kernels):
     points, bits = clouds()[name]
     points = in_order(points)
-    found = Octree().decode(Octree().encode(points, bits))
-    assert found.dtype == np.int64
-    assert np.array_equal(found, points)
+    data = Octree().encode(points, bits)
+    for compiled in (True, False):
+        kernels(compiled)
+        found = Octree().decode(data)
+        assert found.dtype == np.int64
+        assert np.array_equal(found, points)
 
 
 @settings(max_examples=100, deadline=None)
@@ -104,12 +107,24 @@ def test_a_surface_costs_less_than_its_steps_along_the_curve():
     assert size < len(zstd_frame.compress(points.T.astype("<u2").tobytes()))
 
 
+@pytest.mark.parametrize("compiled", [True, False])
 @pytest.mark.parametrize("name", ["duplicates", "clustered"])
-def test_damage_is_found(assert_survives_damage, name):
+def test_damage_is_found(assert_survives_damage, name, compiled, kernels):
+    kernels(compiled)
     points, bits = clouds()[name]
     points = in_order(points[:60])
     data = Octree().encode(points, bits)
     assert_survives_damage(data, Octree().decode, points)
+
+
+@pytest.mark.parametrize("compiled", [True, False])
+def test_levels_with_too_many_nodes_are_named(compiled, kernels):
+    points = in_order(clouds()["random"][0][:300])
+    data, head = Octree().encode(points, 16), len(write_varint(300))
+    kernels(compiled)
+    fewer = data[:2] + write_varint(200) * 2 + data[2 + 2 * head :]
+    with pytest.raises(BitstreamError, match="level 2 has more nodes than the 200 points"):
+        Octree().decode(fewer)
 
 
 def test_claims_of_huge_counts_are_refused():

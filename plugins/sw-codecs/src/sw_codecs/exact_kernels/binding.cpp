@@ -14,6 +14,7 @@
 
 #include "binding.h"
 #include "mixtures.h"
+#include "octree.h"
 
 namespace {
 
@@ -239,6 +240,24 @@ Tensor encode_mixtures(at::TensorList tables, at::TensorList rows, const Tensor&
   return found;
 }
 
+// (nodes [m] i64, occupancies u8 of all levels, nodes of each level and at the end [levels + 1] i64, status) of
+// range-coded words under counts [levels, 4, 255] i64, none empty; no level has more than `points` nodes.
+std::tuple<Tensor, Tensor, Tensor, int64_t> decode_octree(const Tensor& words, const Tensor& counts, int64_t points) {
+  const char* op = "decode_octree";
+  check(words, at::kByte, 1, op, "words");
+  check(counts, at::kLong, 3, op, "counts");
+  const int64_t depth = counts.size(0);
+  TORCH_CHECK(counts.size(1) == 4 && counts.size(2) == 255 && depth <= 21 && points >= 1 && points < int64_t{1} << 40,
+              op, ": counts must be [levels, 4, 255]");
+  Tensor nodes = at::empty({points}, counts.options());
+  Tensor occupancies = at::empty({depth * points}, words.options());
+  Tensor sizes = at::zeros({depth + 1}, counts.options());
+  const int32_t status = SW_SELECT(decode_octree)(
+      {words.const_data_ptr<uint8_t>(), words.numel(), depth, points, counts.const_data_ptr<int64_t>()},
+      nodes.mutable_data_ptr<int64_t>(), occupancies.mutable_data_ptr<uint8_t>(), sizes.mutable_data_ptr<int64_t>());
+  return {nodes, occupancies, sizes, status};
+}
+
 // Symbols [m] i32 as integers [n, C] i64, 0 where they are not present; values [n, C] f32 become integer * step.
 Tensor put_values(const Tensor& symbols, const std::optional<Tensor>& present, const Tensor& step,
                   const Tensor& values) {
@@ -349,6 +368,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
   m.def("decode_mixtures(Tensor[] tables, Tensor[] rows, Tensor words) -> (Tensor, int)");
   m.def("encode_mixtures(Tensor[] tables, Tensor[] rows, Tensor entries) -> Tensor");
+  m.def("decode_octree(Tensor words, Tensor counts, int points) -> (Tensor, Tensor, Tensor, int)");
   m.def("put_values(Tensor symbols, Tensor? present, Tensor step, Tensor(a!) values) -> Tensor");
   m.def("present_rows(Tensor centre, Tensor number, Tensor present) -> (Tensor, Tensor)");
   m.def("decode_planes(Tensor[] tables, Tensor data, Tensor sizes, Tensor(a!)[] planes, Tensor parts, Tensor weights)"
@@ -359,6 +379,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.impl("encode_streams", c10::DispatchKey::CPU, TORCH_FN(encode_streams));
   m.impl("decode_mixtures", c10::DispatchKey::CPU, TORCH_FN(decode_mixtures));
   m.impl("encode_mixtures", c10::DispatchKey::CPU, TORCH_FN(encode_mixtures));
+  m.impl("decode_octree", c10::DispatchKey::CPU, TORCH_FN(decode_octree));
   m.impl("put_values", c10::DispatchKey::CPU, TORCH_FN(put_values));
   m.impl("present_rows", c10::DispatchKey::CPU, TORCH_FN(present_rows));
   m.impl("decode_planes", c10::DispatchKey::CPU, TORCH_FN(decode_planes));

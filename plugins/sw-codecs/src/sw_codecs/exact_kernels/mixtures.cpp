@@ -2,15 +2,13 @@
 //
 // A row of counts is never made: the sum of those before an entry follows from the sums of both tables.
 #include "mixtures.h"
-#include "rans.h"
+#include "ranges.h"
 
 namespace SW_ARCH {
 
 using namespace splatwizard;
 
 namespace {
-
-constexpr uint64_t TOP = uint64_t{1} << BITS;
 
 // The model of one number: shares of 2^24 before each of its entries. All sums are integers, exact in float64.
 struct Window {
@@ -51,29 +49,18 @@ struct Window {
 }  // namespace
 
 int32_t decode_mixtures(const MixtureArgs& a, const uint8_t* words, int64_t bytes, int32_t* entries) {
-  int64_t at = 0;
-  const int64_t count = bytes / 4;
-  const auto next = [&] { return uint64_t{at < count ? word_at(words + 4 * at++) : 0u}; };
-  uint64_t low = 0, range = ~uint64_t{0}, point = next() << 32;
-  point |= next();
+  RangeReader coded(words, bytes);
   for (int64_t i = 0; i < a.n; ++i) {
     const Window window(a, a.order[i]);
-    const uint64_t scale = range >> BITS, q = (point - low) / scale;
+    const uint64_t q = coded.quantile();
     if (q >= TOP) return WORDS_LEFT;
     int64_t entry = 0, end = window.entries;
     while (end - entry > 1) {
       const int64_t middle = (entry + end) / 2;
       (window.share(middle) <= q ? entry : end) = middle;
     }
-    const uint64_t share = window.share(entry);
     entries[a.order[i]] = static_cast<int32_t>(entry);
-    low += scale * share;
-    range = scale * (window.share(entry + 1) - share);
-    if (range < uint64_t{1} << 32) {
-      low <<= 32;
-      range <<= 32;
-      point = point << 32 | next();
-    }
+    coded.take(window.share(entry), window.share(entry + 1));
   }
   return FINE;
 }

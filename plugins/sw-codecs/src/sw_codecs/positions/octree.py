@@ -12,15 +12,20 @@ duplicates (`columns`), u32 CRC-32 of the points.
 
 from __future__ import annotations
 
+from typing import NoReturn
+
 import numpy as np
 import numpy.typing as npt
+import torch
 
 from splatwizard_core.api import BitstreamError
+from splatwizard_native import NativeBuildError
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.coders.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
 from sw_codecs.coders.model_spec import Tables
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter
+from sw_codecs.exact_native import EXACT
 from sw_codecs.positions import morton
 from sw_codecs.positions.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.positions.ordering import spatial_order
@@ -30,6 +35,8 @@ VERSION = 1
 CONTEXTS = 4  # by the number of the parent's children; 4 stands for 4..8
 OCCUPANCIES = 255
 UNIFORM, OWN, LATEST = 0, 1, 2  # which count table a level and context takes
+BEYOND_LIMIT = 3  # status of the kernel
+CRC_DIFFERS = "the decoded symbols do not match their CRC-32: damaged data or a wrong model"
 
 _POPCOUNT = np.array([bin(i).count("1") for i in range(256)], np.int64)
 _CHILDREN = np.unpackbits(np.arange(256, dtype=np.uint8)[:, None], axis=1, bitorder="little").astype(bool)  # [256, 8]
@@ -116,32 +123,67 @@ def _decode_tree(reader: ByteReader, bits: int, distinct: int) -> np.ndarray:
     actions = bytes(reader.take(depth))
     wanted = [(level, c) for level in range(depth) for c in range(CONTEXTS) if _action(actions[level], c) == OWN]
     stored = dict(zip(wanted, unpack_tables(reader, [OCCUPANCIES] * len(wanted)), strict=True))
-    coded = SymbolReader(reader.take(reader.varint(reader.left)))
-    tables = np.ones((CONTEXTS, OCCUPANCIES), np.int64)
-    nodes, contexts = np.zeros(1, np.int64), np.zeros(1, np.int64)
+    words = reader.take(reader.varint(reader.left))
+    levels = np.ones((depth, CONTEXTS, OCCUPANCIES), np.int64)
     for level in range(depth):
         for c in range(CONTEXTS):
             action = _action(actions[level], c)
             if action == OWN:
-                tables[c] = stored[level, c]
-            elif action == UNIFORM:
-                tables[c] = 1
-        if not tables.any(axis=1).all():
-            raise BitstreamError("a count table is empty")
-        occupancy = coded.get(len(nodes), Tables(tables, contexts)) + 1
-        children = _POPCOUNT[occupancy]
-        if children.sum() > distinct:
-            raise BitstreamError(f"level {level} has more nodes than the {distinct:,} points that were announced")
-        place = np.flatnonzero(_CHILDREN[occupancy])  # in [nodes, 8]: several times as fast as two indices
-        row = place >> 3
-        nodes = (nodes[row] << 3) | (place & 7)
-        contexts = (np.minimum(children, CONTEXTS) - 1)[row]
-    coded.check(reader.integer(4))
+                levels[level, c] = stored[level, c]
+            elif action == LATEST and level:
+                levels[level, c] = levels[level - 1, c]
+    if not levels.any(axis=2).all():
+        raise BitstreamError("a count table is empty")
+    nodes = _decode_levels(words, levels, reader.integer(4), distinct)
     if len(nodes) != distinct:
         raise BitstreamError(f"{len(nodes):,} points were found, {distinct:,} were announced")
     suffix = 3 * (bits - depth)
     raw = unpack_fixed(reader.take(packed_size(distinct, suffix)), distinct, suffix)
     return (nodes << suffix) | raw.view(np.int64)
+
+
+def _decode_levels(words: memoryview, tables: np.ndarray, crc: int, limit: int) -> np.ndarray:
+    """Nodes int64 below the last level; `tables` [levels, 4, 255] counts, `limit` the most nodes of a level."""
+    if len(words) % 4 == 0 and _has_kernel():
+        coded = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
+        nodes, occupancies, sizes, status = torch.ops.sw_codecs_exact.decode_octree(
+            coded, torch.from_numpy(tables), limit
+        )
+        if status == BEYOND_LIMIT:
+            _refuse_nodes(int((sizes > 0).sum()) - 1, limit)
+        counts = sizes.tolist()
+        found, seen = occupancies[: sum(counts[:-1])].numpy(), 0
+        for level in np.split(found, np.cumsum(counts[:-2])):
+            seen = checksum.crc32(level.astype("<i4") - 1, seen)
+        if status or seen != crc:
+            raise BitstreamError(CRC_DIFFERS)
+        points: np.ndarray = nodes[: counts[-1]].numpy()
+        return points
+    reader = SymbolReader(words)
+    at, contexts = np.zeros(1, np.int64), np.zeros(1, np.int64)
+    for level, counts in enumerate(tables):
+        occupancy = reader.get(len(at), Tables(counts, contexts)) + 1
+        children = _POPCOUNT[occupancy]
+        if children.sum() > limit:
+            _refuse_nodes(level, limit)
+        place = np.flatnonzero(_CHILDREN[occupancy])  # in [nodes, 8]: several times as fast as two indices
+        row = place >> 3
+        at = (at[row] << 3) | (place & 7)
+        contexts = (np.minimum(children, CONTEXTS) - 1)[row]
+    reader.check(crc)
+    return at
+
+
+def _has_kernel() -> bool:
+    """Whether there is a compiled decoder. Compiling one takes longer than a file does without."""
+    try:
+        return EXACT.load_built()
+    except NativeBuildError:
+        return False
+
+
+def _refuse_nodes(level: int, limit: int) -> NoReturn:
+    raise BitstreamError(f"level {level} has more nodes than the {limit:,} points that were announced")
 
 
 class _TableChooser:

@@ -1,0 +1,21 @@
+// Points as the occupancies of an octree (sw_codecs.positions.octree).
+#pragma once
+#include "kernels.h"
+
+namespace splatwizard {
+
+struct OctreeArgs {
+  const uint8_t* words;
+  int64_t bytes, depth, points;  // points: no level has more nodes
+  const int64_t* counts;         // [depth, 4, 255] by level and by children of the parent; none empty
+};
+
+}  // namespace splatwizard
+
+// Nodes go to nodes [points]; occupancies of all levels, one after another, to occupancy [depth * points]; numbers of
+// nodes of each level, and of the nodes at the end, to sizes [depth + 1].
+#define SW_DECLARE_OCTREE(arch)                                                                                    \
+  namespace arch {                                                                                                 \
+  int32_t decode_octree(const splatwizard::OctreeArgs&, int64_t* nodes, uint8_t* occupancy, int64_t* sizes);       \
+  }
+SW_FOR_EACH_ARCH(SW_DECLARE_OCTREE)
