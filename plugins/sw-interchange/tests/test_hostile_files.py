@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import struct
+import time
 import tracemalloc
 import zipfile
 import zlib
@@ -253,6 +254,17 @@ def test_a_bad_file_is_refused_in_two_lines(name, little_memory):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_refused_within_a_second_of_work(name):
+    """Of the processor, all threads together: other programs do not count."""
+    data, format = BAD[name]
+    before = time.process_time()
+    with pytest.raises(SplatwizardError):
+        decode(data, format, limits=LIMITS)
+    assert time.process_time() - before < 1
+
+
 def test_what_stands_after_the_attributes_of_a_gzip_bomb_is_not_inflated(little_memory):
     assert decode(GZIP_BOMB, "spz", limits=LIMITS).num_gaussians == 1
 
@@ -267,11 +279,14 @@ def test_a_file_cut_off_anywhere_is_refused(name, sound):
                 decode(data[:at], sample.format, limits=LIMITS)
 
 
-@pytest.mark.parametrize("name", samples())
-def test_a_mutated_file_is_a_scene_or_a_clear_error(name, sound):
+@pytest.mark.parametrize(("name", "count"), [
+    *((name, SLOW_TO_OPEN.get(name, FLIPS)) for name in samples()),
+    *(pytest.param(name, 2000, marks=pytest.mark.slow) for name in samples()),
+])  # fmt: skip
+def test_a_mutated_file_is_a_scene_or_a_clear_error(name, count, sound):
     """100,000 of each: benchmarks/interchange_fuzz.py."""
     refused = told = 0
-    for data in mutants(sound[name], SLOW_TO_OPEN.get(name, FLIPS), seed=7):
+    for data in mutants(sound[name], count, seed=7):
         try:
             scene = decode(data, sound[name].format, limits=LIMITS)
         except SplatwizardError as error:
