@@ -18,6 +18,7 @@ from sw_interchange.spz_fields import field_sizes
 from sw_interchange.spz_packing import inflate
 
 from splatwizard_core.api import SceneError, UserInputError
+from splatwizard_core.tooling import bytes_with_named
 
 SCALE_ULPS = 5  # of e^x: a float32 near -8 is known to 2^-22, which are 4, and exp rounds once more
 SIZES = [1, 255, 256, 257, 1500]
@@ -226,16 +227,18 @@ def test_sog_as_a_folder(tmp_path):
 
 
 def test_two_scenes_in_one_folder_keep_their_images(tmp_path):
-    scenes = {"a": random_scene(30, 1), "b": random_scene(30, 1, seed=1)}
+    scenes = {"a": random_scene(30, 1), "größer b": random_scene(30, 1, seed=1)}
     for name, scene in scenes.items():
         write(scene, tmp_path / f"{name}.json")
     for name, scene in scenes.items():
         found, wanted = read(tmp_path / f"{name}.json"), decode(encode(scene, "sog")[0])
         assert np.array_equal(found.means, wanted.means)
         assert np.array_equal(found.sh_rest, wanted.sh_rest)
-    assert (tmp_path / "a_means_l.webp").exists()
+        images = sum(file.stat().st_size for file in tmp_path.glob(f"{name}_*.webp"))
+        assert bytes_with_named(tmp_path / f"{name}.json") == images + (tmp_path / f"{name}.json").stat().st_size
     with pytest.raises(UserInputError, match=r"write a meta\.json"):
         write(scenes["a"], tmp_path / "a:b.json")
+    assert len([*tmp_path.iterdir()]) == 16
 
 
 @pytest.mark.parametrize("bits", [0x3F80007B, 0x3F807B20, 0x3F808B1F])

@@ -109,7 +109,7 @@ def _unpack(bundle: bytes, meta: Path) -> None:
     prefix = "" if meta.name == META else f"{meta.name.removesuffix('.json')}_"
     with zipfile.ZipFile(io.BytesIO(bundle)) as archive:
         files = {prefix + name: archive.read(name) for name in archive.namelist() if name != META}
-        if not all(is_plain(name) for name in files):
+        if not all(is_plain(name) and name.isprintable() for name in files):
             raise UserInputError(f"{meta}: its images would have names that no .sog may have; write a {META}")
         text = json.loads(archive.read(META))
     for part in text.values():
@@ -119,7 +119,8 @@ def _unpack(bundle: bytes, meta: Path) -> None:
         with replacing(meta.parent / name) as temporary:
             temporary.write_bytes(content)
     with replacing(meta) as temporary:
-        temporary.write_text(json.dumps(text, separators=(",", ":")))
+        # Not escaped: `bytes_with_named` looks for the names as they are.
+        temporary.write_text(json.dumps(text, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
 
 
 def _checked(source: Source) -> Source:
