@@ -5,6 +5,8 @@ import torch
 from hac_plus_models import decoded, encoded, generator, make, published
 from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.growth import adjust_anchors
+from sw_anchors.noisy_values import draws
+from sw_anchors.testing import check_nothing_is_waited_for
 from sw_anchors.voxel_lattice import voxel_integers, within_reach
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
@@ -101,7 +103,7 @@ def bits_by_hand(model):
     n, f, k = model.num_rows, model.shape.features, model.num_offsets
     g = generator(3)
     torch.rand(n, generator=g)  # the sample
-    torch.rand(10, f + 6 + 3 * k, generator=g)  # noise of what is rendered
+    draws((10, f + 6 + 3 * k), g, torch.device("cpu"))  # noise of what is rendered
     noise = torch.rand(n, f + 6 + 3 * k, generator=g) - 0.5
     out = model.mlp_grid(model.grid(model.codes() / 65535))
     mu_f, s_f, mu_l, s_l, mu_o, s_o, t, logit = out.split([f, f, 6, 6, 3 * k, 3 * k, 3, f], dim=1)
@@ -265,21 +267,4 @@ def test_the_loss_has_a_rate_and_no_mask_term():
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_neither_values_nor_rate_are_waited_for():
-    model, rows = make().cuda().train(), torch.arange(300, device="cuda")
-    model.sample = 0.5
-
-    def step():
-        attributes = model.attributes(rows)
-        rate = attributes.extras["rate"]
-        (attributes.features.mean() + rate.bits + 1e-5 * rate.own_bits).backward()
-        return rate
-
-    step()  # what is kept on the device is made
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        rate = step()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert float(rate.bits) > 0
-    assert all(bool(torch.isfinite(p.grad).all()) for p in model.parameters() if p.grad is not None)
+    check_nothing_is_waited_for(make().cuda())
