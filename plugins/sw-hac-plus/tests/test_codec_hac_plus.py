@@ -1,16 +1,14 @@
 """The file of HAC++: exact integers on any machine, counted in full, and safe against strangers."""
 
-import copy
 import json
 import struct
 
 import pytest
 import torch
-from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method
+from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method, recorded
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sw_anchors.attribute_sections import AttributeEncoder
-from sw_anchors.sections import BOUNDS_BYTES, round_networks
+from sw_anchors.sections import BOUNDS_BYTES
 from sw_anchors.shape import GROUPS
 from sw_anchors.voxel_lattice import kept_voxels
 from sw_kit.forged_files import forged
@@ -28,33 +26,6 @@ RASTERIZER = ReferenceRasterizer()
 FEATURES = ["features.1", "features.2", "features.3"]
 SECTIONS = ["anchors", "masks", "grids", "networks", *FEATURES, "scalings", "offsets"]
 KINDS = ["full", "tiny", "none"]
-
-
-class Recorder(AttributeEncoder):
-    """An encoder that keeps integers and steps, and counts the bits of the tables."""
-
-    def __init__(self, *args):
-        super().__init__(*args)
-        self.found, self.bits = {g: [] for g in GROUPS}, 0.0
-
-    def code(self, block, context, step, present=None):
-        symbols = super().code(block, context, step, present)
-        self.found[block.group].append((symbols * step).to(torch.float32))
-        coder = self.mixtures if isinstance(context, predictors.RowMixture) else self.coder
-        self.bits += float(coder.bits(symbols, context, present).sum())
-        return symbols
-
-
-def recorded(model, mode="exact"):
-    """Blocks that a walk over the model hands to its encoder, and the geometry."""
-    model = copy.deepcopy(model)
-    model.fold_units()
-    round_networks(model.networks(), "float32")
-    geometry, rows = kept_voxels(model)
-    recorder = Recorder(model, rows, codec.sections(model.channel), mode)
-    with torch.no_grad():
-        codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
-    return recorder, geometry
 
 
 def test_the_header_lists_what_decoding_needs():
