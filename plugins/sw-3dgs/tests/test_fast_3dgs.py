@@ -33,8 +33,9 @@ Post  | densify to budget           | range(300, 8000, 250)
 Post  | halve opacity               | range(0, 8000, 2000)"""
 STEPS = 60
 SHORT = {
-    "iterations": STEPS, "densify.interval": 5_000, "fast.sh_every": 3, "fast.resolution": "dash", "fast.cap": 1_500,
-    "densify.reset_interval": 10_000, "lr.sh_dc": 2e-2, "lr.opacity": 0.1,
+    "iterations": STEPS, "densify.interval": 5_000, "fast.sh_every": 3, "fast.resolution": "dash",
+    "fast.resolution_hold": True, "fast.cap": 1_500, "densify.reset_interval": 10_000,
+    "lr.sh_dc": 2e-2, "lr.opacity": 0.1,
 }  # fmt: skip
 """Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40."""
 
