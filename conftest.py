@@ -1,8 +1,10 @@
 """How all tests of the workspace run: hypothesis without deadlines, no more threads than cores, long files first."""
 
 import os
+from collections.abc import Iterator
 from pathlib import Path
 
+import forked_children
 import pytest
 from hypothesis import HealthCheck, settings
 
@@ -30,6 +32,20 @@ LONG_FIRST = (
     "splatwizard-core/tests/cli/test_streams.py",
 )
 """The files that take tens of seconds. Begun last, one of them would leave every other worker idle at the end."""
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _fork_fresh_processes() -> Iterator[None]:
+    """Fork what `sw run` decodes and evaluates in from one process that has imported torch."""
+    with forked_children.forking():
+        yield
+
+
+@pytest.fixture(scope="module")
+def new_interpreters() -> Iterator[None]:
+    """Fresh processes of this module's tests start as users' do, with imports of their own."""
+    with forked_children.starting():
+        yield
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -79,6 +79,40 @@ def test_the_plan_scales_with_the_steps():
 
 
 @pytest.mark.parametrize(
+    ("iterations", "final", "sh_rest"),
+    [
+        (5_000, 1.6e-5, 2.5e-4),
+        (12_000, 1.6e-5, 2.5e-4),
+        (18_000, 1.6e-6 * 10**0.5, 2.5e-4),
+        (24_000, 1.6e-6, 1.25e-4),
+        (30_000, 1.6e-6, 1.25e-4),
+    ],
+)
+def test_its_learning_rates_follow_from_the_share_of_the_full_plan(iterations, final, sh_rest):
+    lr = stage_of(iterations=iterations).config.lr
+    assert (lr.position_final, lr.sh_rest) == (pytest.approx(final, rel=1e-12), sh_rest)
+
+
+def test_learning_rates_that_are_given_stay_as_those_of_a_file_of_before(tmp_path):
+    given = stage_of(iterations=30_000, lr__position_final=1e-5).config.lr
+    assert (given.position_final, given.sh_rest) == (1e-5, 1.25e-4)
+    (tmp_path / "config.toml").write_text(
+        'preset = "fast"\niterations = 30_000\n[lr]\nposition_final = 1.6e-5\nsh_rest = 2.5e-4\n'
+    )
+    before = resolve(ThreeDGS, config_file=tmp_path / "config.toml").config
+    assert (before.lr.position_final, before.lr.sh_rest) == (1.6e-5, 2.5e-4)
+    assert "rates" not in before.identity()["fast"]
+
+
+def test_learning_rates_do_not_follow_the_length_unless_asked():
+    lr = resolve(ThreeDGS, "paper", sets={"iterations": 5_000}).config.lr
+    assert (lr.position_final, lr.sh_rest) == (1.6e-6, 1.25e-4)
+    asked = resolve(ThreeDGS, "paper", sets={"iterations": 5_000, "fast.rates": "length"}).config
+    assert asked.lr.position_final == 1.6e-5
+    assert "fast" not in asked.identity()
+
+
+@pytest.mark.parametrize(
     ("sets", "gone", "come"),
     [
         ({"fast__densify": "threshold"}, "densify to budget", "prune and densify"),
@@ -90,6 +124,17 @@ def test_each_task_can_be_left_out(sets, gone, come):
     plan = format_plan(*build_schedulers(stage_of(**sets), PipelineParams()))
     assert gone not in plan
     assert come in plan
+
+
+def test_on_a_cpu_pictures_begin_small_and_opacities_are_left_alone(scene):
+    stage = ThreeDGSStage(resolve(ThreeDGS, "fast-cpu").config)
+    _, post = build_schedulers(stage, PipelineParams())
+    names = {entry.name for step in range(1, stage.iterations + 1) for entry in post.registrations if entry.due(step)}
+    assert "densify to budget" in names
+    assert not any("opacity" in name and name != "collect opacity gradients" for name in names)
+    sampler = stage.create_sampler(scene, stream(0, "sampler"))
+    assert isinstance(sampler, ResolutionSampler)
+    assert sampler.plan.times[-1] <= 0.6 * stage.iterations  # from then on whole pictures, and no new Gaussians
 
 
 def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_last_step():

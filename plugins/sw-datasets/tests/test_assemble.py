@@ -70,6 +70,18 @@ def test_cameras_at_one_place_get_extent_1_with_a_warning():
     assert "all training cameras stand at one place: the scene extent is set to 1.0" in scene.warnings[0]
 
 
+def test_cameras_that_turn_at_one_place_differ_by_rounding_alone():
+    eye, up = torch.tensor([1.3, -2.1, 0.7]), torch.tensor([0.0, 0, 1])
+    around = [eye + torch.tensor([math.sin(i), math.cos(i), 0.2]) for i in range(8)]
+    found = [Camera.look_at(eye, target, up, width=40, height=30, fov_x=1.0) for target in around]
+    assert len({tuple(camera.center.tolist()) for camera in found}) > 1
+    scene = assemble([View(camera, f"{i}") for i, camera in enumerate(found)])
+    assert (scene.radius, scene.extent) == (0.0, 1.0)
+    assert "all training cameras stand at one place" in scene.warnings[0]
+    found[3] = replace(found[3], tau=found[3].tau + 1e-3)
+    assert assemble([View(camera, f"{i}") for i, camera in enumerate(found)]).extent < 1e-2
+
+
 def test_a_view_without_picture_says_so():
     with pytest.raises(ValueError, match="view 'a' has no picture"):
         _ = views("a")[0].pixels

@@ -54,7 +54,7 @@ def read(name: str, reader: ContainerReader) -> GaussianModel:
 def test_the_section_is_the_file_of_the_format(name: str):
     model = model_of()
     reader = written(name, model)
-    own, _ = encode(from_gaussians(model), name)
+    own, _ = encode(from_gaussians(model), name, **({"level": 6} if name == "spz" else {}))
     assert reader.section("file") == own
     assert reader.size - len(own) < 350
     found, wanted = read(name, reader), to_gaussians(decode(own, name))
@@ -64,6 +64,16 @@ def test_the_section_is_the_file_of_the_format(name: str):
     # Every Gaussian is still there, wherever it went: the spread of the positions is that of the model.
     torch.testing.assert_close(found.means.mean(dim=0), model.means.mean(dim=0), atol=1e-2, rtol=0)
     torch.testing.assert_close(found.means.std(dim=0), model.means.std(dim=0), atol=1e-2, rtol=0)
+
+
+@pytest.mark.parametrize(("version", "level"), [(3, 6), (4, 12)])
+def test_spz_is_compressed_as_hard_as_by_the_tools_of_its_authors(version: int, level: int):
+    model = model_of(2000)
+    scene = from_gaussians(model)
+    files = {n: encode(scene, "spz", version=version, level=n)[0] for n in (1, 3, level)}
+    assert written("spz", model, version=version).section("file") == files[level]
+    assert written("spz", model, version=version, level=1).section("file") == files[1]
+    assert len(files[level]) < len(files[3])
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -69,6 +69,22 @@ def test_the_plan_is_the_published_one():
     assert format_plan(*build_schedulers(stage, PipelineParams())) == PLAN
 
 
+@pytest.mark.parametrize(
+    ("sets", "steps"),
+    [
+        ({"iterations": 40_000}, 40_000),
+        ({"lr.max_steps": 20_000}, 30_000),
+        ({"iterations": 6_000, "scale_schedule": True}, 6_000),
+        ({"iterations": 6_000}, 30_000),  # the plan of checkpoints of older releases
+    ],
+)
+def test_noise_is_added_until_the_last_step_whatever_the_rates_do(sets, steps):
+    stage = ThreeDGSStage(resolve(ThreeDGS, "mcmc", sets=sets).config)
+    pre, _ = build_schedulers(stage, PipelineParams())
+    (entry,) = (entry for entry in pre.registrations if isinstance(entry.task, AddNoise))
+    assert entry.when == range(steps)
+
+
 def test_it_asks_for_no_statistics():
     options = method().stages()[0].raster_options(1, torch.zeros(3))
     assert not options.grad2d

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from hac_plus_models import generator, make, published
+from hac_plus_models import decoded, encoded, generator, make, published
 from sw_anchors.growth import adjust_anchors
-from sw_anchors.voxel_lattice import voxel_integers
+from sw_anchors.voxel_lattice import voxel_integers, within_reach
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -51,6 +51,40 @@ def test_anchors_grow_on_the_lattice(factor):
     assert torch.equal(model.positions(), expected)
     torch.testing.assert_close(model.anchors.detach(), expected, atol=1e-6, rtol=0)
     assert len(torch.unique(integers, dim=0)) == model.num_rows
+
+
+def test_no_anchor_grows_beyond_what_a_file_holds():
+    """An offset of a far start point with a large scale: 29,700 units away, where 2^21 voxels of 0.01 are 20,971."""
+    model = make(n=40)
+    optimizer = SplatOptimizer(model, [ParamGroup("features", 0.1)])
+    with torch.no_grad():
+        model.log_scales[10, :3] = 5.0
+        model.offsets[10, 0] = torch.tensor([200.0, 0, 0])
+        model.offsets[10, 1] = torch.tensor([0.1, 0, 0])  # 15 units away
+        model.mask_logits.fill_(1.0)
+    model.offset_grad_accum.fill_(41 * 9e-3)
+    model.offset_denom.fill_(41)
+    report = adjust_anchors(model, optimizer, step=1, generator=generator(0))
+    assert report.grown > 0
+    assert 10 < float(model.anchors.detach().max()) < 1000
+    assert decoded(encoded(model)).num_rows == model.num_rows
+
+
+def test_anchors_on_both_sides_keep_within_the_reach_together():
+    most = 2**21 - 1
+    anchors = torch.tensor([[0.0, 0, 0], [1, 0, 0]])
+
+    def taken(*x, size=1.0):
+        found = within_reach(torch.tensor([[each * size, 0, 0] for each in x]), anchors * size, size)
+        return [each for each, held in zip(x, found.tolist(), strict=True) if held]
+
+    assert taken(most, most + 1) == [most]
+    assert taken(1 - most, -most, size=0.5) == [1 - most]
+    assert taken(-most // 2 + 9, most // 2) == [-most // 2 + 9, most // 2]  # as far as they may be together
+    assert taken(most, -5, most // 2, -most // 2 - 9) == [-5, most // 2]
+    assert taken(float("nan"), float("inf"), 7) == [7]
+    end = torch.tensor([[2.0**30 - 1, 0, 0], [2.0**30, 0, 0]], dtype=torch.float64)
+    assert within_reach(end, end[:1] - 100, 1).tolist() == [True, False]
 
 
 def rate_of(model, sample=1.0):

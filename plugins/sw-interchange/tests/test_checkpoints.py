@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from interchange_files import random_scene
-from sw_interchange import GaussianScene, from_gaussians, read, to_gaussians
+from sw_interchange import GaussianScene, Limits, from_gaussians, read, to_gaussians
 from sw_interchange.frames import transformed
 
 from splatwizard_core.api import BitstreamError, SceneError, UserInputError
@@ -38,6 +38,27 @@ def test_gsplat(tmp_path, scene):
     torch.save({"step": 7, "splats": {**splats, "features": t["means"]}}, tmp_path / "appearance.pt")
     with pytest.raises(SceneError, match="from a network"):
         read(tmp_path / "appearance.pt")
+
+
+def test_what_several_gpus_saved_is_one_scene(tmp_path, scene):
+    t = tensors(scene)
+    names = {"means": "means", "log_scales": "scales", "quats": "quats", "opacity_logits": "opacities",
+             "sh_dc": "sh0", "sh_rest": "shN"}  # fmt: skip
+    for rank, rows in enumerate((slice(0, 3), slice(3, 6), slice(6, 7))):
+        splats = {theirs: t[own][rows].clone() for own, theirs in names.items()}
+        torch.save({"step": 7, "splats": splats}, tmp_path / f"ckpt_9_rank{rank}.pt")
+    torch.save({"step": 7, "splats": splats}, tmp_path / "ckpt_8_rank0.pt")
+    found = read(tmp_path / "ckpt_9_rank0.pt")
+    assert same(found, scene)
+    assert "ckpt_9_rank1.pt, ckpt_9_rank2.pt" in found.report.warnings[0]
+    assert read(tmp_path / "ckpt_9_rank2.pt").num_gaussians == 7
+    alone = read(tmp_path / "ckpt_8_rank0.pt")
+    assert (alone.num_gaussians, alone.report.warnings) == (1, [])
+    with pytest.raises(BitstreamError, match="more than the limit"):
+        read(tmp_path / "ckpt_9_rank0.pt", limits=Limits(max_gaussians=6))
+    (tmp_path / "ckpt_9_rank1.pt").unlink()
+    with pytest.raises(SceneError, match="'ckpt_9_rank1.pt', which"):
+        read(tmp_path / "ckpt_9_rank2.pt")
 
 
 @pytest.mark.parametrize("prefix", ["_model.gauss_params.", "module._model.gauss_params.", "_model."])

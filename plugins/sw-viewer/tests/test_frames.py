@@ -20,7 +20,7 @@ from sw_viewer.frames import (
 )
 from sw_viewer.shown_cameras import looked_at, surroundings_about, surroundings_of
 
-from splatwizard_core.api import Camera, SceneOptions
+from splatwizard_core.api import Camera, Protocol, Scene, SceneError, SceneOptions, View
 from splatwizard_core.tooling import load_plugins, load_scene
 
 HALF_TURNS = [  # trace -1: the branches of the largest component
@@ -98,6 +98,23 @@ def test_the_pivot_is_where_the_cameras_look():
     np.testing.assert_allclose(looked_at(centers, forwards, 1.0), target, atol=1e-5)
     parallel = looked_at(centers, np.tile([0.0, 0, 1], (3, 1)), 4.0)
     np.testing.assert_allclose(parallel, centers.mean(axis=0) + np.array([0, 0, 4]))
+
+
+@pytest.mark.parametrize("turns", [3, 8])
+def test_cameras_that_turn_at_one_place_look_at_what_is_ahead_of_them(turns):
+    eye, up = torch.tensor([1.3, -2.1, 0.7]), torch.tensor([0.0, 0, 1])
+    angles = [2 * math.pi * i / 8 for i in range(turns)]
+    targets = [eye + torch.tensor([math.sin(a), math.cos(a), 0.2]) for a in angles]
+    cameras = [Camera.look_at(eye, target, up, width=8, height=8, fov_x=1.0) for target in targets]
+    views = [View(camera, str(i)) for i, camera in enumerate(cameras)]
+    around = surroundings_of(Scene("turning", views, [], None, Protocol("toy")))
+    assert around.size == pytest.approx(1, abs=1e-5)
+    assert np.linalg.norm(around.pivot - eye.numpy()) == pytest.approx(1, abs=1e-5)
+
+
+def test_a_model_of_nothing_that_can_be_drawn_is_refused():
+    with pytest.raises(SceneError, match="no Gaussian that can be drawn"):
+        surroundings_about(np.zeros((0, 3), np.float32))
 
 
 def test_the_demo_is_seen_from_its_test_cameras_first_with_its_up():

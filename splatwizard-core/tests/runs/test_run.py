@@ -23,7 +23,7 @@ from splatwizard_core.runs.run import run, train_in, train_only
 from splatwizard_core.runs.session import Session
 from splatwizard_core.runs.training import trained_scene
 
-pytestmark = pytest.mark.pipeline
+pytestmark = [pytest.mark.pipeline, pytest.mark.usefixtures("new_interpreters")]
 
 
 def config(plugins: PluginManager, *sets: str, method: str = "toy", rate: str | None = None) -> ResolvedConfig:

@@ -294,6 +294,10 @@ class AnchorModel(AnchorSplats):
             self.positions()[rows], self.features[rows], self.offsets[rows], self.log_scales[rows].exp()
         )
 
+    def holds(self, positions: Tensor) -> Tensor | None:
+        """[M] bool: whether there may be new anchors at `positions` [M,3], M > 0; None: anywhere."""
+        return None
+
     def rows_at(self, positions: Tensor, features: Tensor, size: float) -> dict[str, Tensor]:
         """Parameters of new anchors at `positions` [M,3] with `features` [M,F] in cells of `size` world units."""
         m = len(positions)

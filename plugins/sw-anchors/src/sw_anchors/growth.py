@@ -94,6 +94,9 @@ def adjust_anchors(
         chosen = eligible & (mean >= grad_threshold * 2**level) & (draw > 0.5 ** (level + 1))
         at, offset = torch.nonzero(chosen, as_tuple=True)
         cells, cell_features = _free_cells(sources[at, offset], features[at], model.positions().detach(), size)
+        held = model.holds(cells * size) if len(cells) else None
+        if held is not None:
+            cells, cell_features = cells[held], cell_features[held]
         if len(cells):
             rows.append_rows(model, model.rows_at(cells * size, cell_features, size))
 

@@ -62,6 +62,21 @@ def check_reach(positions: Tensor, voxel_size: float) -> None:
         raise ValueError(f"the anchors reach over more than {size}: train with a larger voxel_size")
 
 
+def within_reach(candidates: Tensor, anchors: Tensor, voxel_size: float) -> Tensor:
+    """[M] bool: those of `candidates` [M,3] with which `check_reach` holds as for `anchors` [N,3] alone; M, N > 0.
+
+    Of those that are too far from one another, on both sides of the anchors, the near ones are taken.
+    """
+    old, new = (torch.round(each.detach().to(torch.float64) / voxel_size) for each in (anchors, candidates))
+    low, high, most = old.amin(dim=0), old.amax(dim=0), (1 << MOST_BITS) - 1
+    alone = ((new >= high - most) & (new <= low + most) & (new.abs() < LARGEST)).all(dim=1)  # not a number: False
+    taken = torch.where(alone[:, None], new, low)
+    together = torch.maximum(high, taken.amax(dim=0)) - torch.minimum(low, taken.amin(dim=0)) <= most  # [3]
+    left = most - (high - low)
+    near = (new >= low - left / 2) & (new <= high + left / 2)
+    return alone & (together | near).all(dim=1)
+
+
 @dataclass(frozen=True)
 class VoxelGeometry(AnchorGeometry):
     """Positions and masks of the anchors of a file, on the CPU; `codes` are those of the hash grid.

@@ -19,7 +19,7 @@ class Codebook(Params):
         "batch-mean", description="the published loop; ema: ours over batches; kmeans: passes over all"
     )
     iterations: int = Field(ge=0, description="batches, or passes")
-    batch: int = Field(ge=1, description="Gaussians of each batch, drawn with replacement; at most as many as there are")
+    batch: int = Field(ge=1, description="Gaussians of each batch, at most all; drawn with replacement")
     decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook each batch leaves")
 
 
@@ -28,7 +28,7 @@ class Colors(Codebook):
 
     threshold: float = Field(0.6e-6, ge=0, description="more sensitive colours keep their own entry (paper: beta_c)")
     iterations: int = Field(100, ge=0, description="batches, or passes")
-    batch: int = Field(1 << 18, ge=1, description="Gaussians of each batch, drawn with replacement; at most as many as there are")
+    batch: int = Field(1 << 18, ge=1, description="Gaussians of each batch, at most all; drawn with replacement")
 
 
 class Shapes(Codebook):
@@ -36,7 +36,7 @@ class Shapes(Codebook):
 
     threshold: float = Field(0.3e-5, ge=0, description="more sensitive shapes keep their own entry (paper: beta_g)")
     iterations: int = Field(800, ge=0, description="batches, or passes")
-    batch: int = Field(1 << 20, ge=1, description="Gaussians of each batch, drawn with replacement; at most as many as there are")
+    batch: int = Field(1 << 20, ge=1, description="Gaussians of each batch, at most all; drawn with replacement")
 
 
 class Factors(Params):

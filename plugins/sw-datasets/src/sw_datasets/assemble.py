@@ -66,8 +66,7 @@ def assemble_scene(
             notes.append(f"dropped {bad} of {len(points)} points that are not finite")
         points = finite
     scene = Scene(name, train, test, points, protocol, path, dict(ground_truth or {}), notes)
-    centers = torch.stack([view.camera.center.double().cpu() for view in train])
-    if (centers == centers[0]).all():
+    if scene.radius == 0:
         reason = "there is one training camera" if len(train) == 1 else "all training cameras stand at one place"
         notes.append(f"{reason}: the scene extent is set to 1.0, which scales learning rates and thresholds")
     return scene

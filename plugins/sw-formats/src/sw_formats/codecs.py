@@ -41,6 +41,10 @@ class FormatCodec:
     def __init__(self, plugins: PluginManager, **settings: Any) -> None:
         self.settings = self.Settings(**settings)
 
+    def options(self) -> dict[str, Any]:
+        """Return the options of the format's writer."""
+        return self.settings.model_dump()
+
     def encode(self, model: GaussianModel, writer: ContainerWriter) -> None:
         """Write section `file`. Raises UserInputError for surfels, ValueError for what the format cannot hold."""
         from sw_interchange import encode, from_gaussians
@@ -53,7 +57,7 @@ class FormatCodec:
             try:
                 scene = from_gaussians(model)
                 scene.antialiased = writer.raster.get("antialias") is True
-                data, report = encode(scene, self.FORMAT, **self.settings.model_dump())
+                data, report = encode(scene, self.FORMAT, **self.options())
             except UserInputError as error:
                 raise ValueError(str(error)) from error
             for line in report.notices():
@@ -99,6 +103,12 @@ class SpzSettings(Params):
     fractional_bits: int = Field(
         12, ge=0, le=24, description="bits of a coordinate below one world unit; 24 in all, with the sign"
     )
+    level: int | None = Field(
+        None,
+        ge=1,
+        le=22,
+        description="of the compressor, gzip up to 9; none: that of Niantic's tools, 6 of gzip, 12 of zstd",
+    )
 
 
 class SpzCodec(FormatCodec):
@@ -106,6 +116,11 @@ class SpzCodec(FormatCodec):
 
     FORMAT = "spz"
     Settings = SpzSettings
+
+    def options(self) -> dict[str, Any]:
+        """Return the options of the writer, which is quicker and coarser by default than Niantic's tools are."""
+        found = super().options()
+        return found | {"level": found["level"] or (12 if found["version"] == 4 else 6)}
 
 
 class SogSettings(Params):

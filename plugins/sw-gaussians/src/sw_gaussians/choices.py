@@ -216,7 +216,7 @@ class Choosing(OptimizationParams):
 
     def completed(self: ChoosingT, plugins: PluginManager, sources: Mapping[str, str]) -> ChoosingT:
         """Return this with all settings of the providers that it names, checked. Raises ConfigError."""
-        content = self.model_dump()
+        content = super().completed(plugins, sources).model_dump()
         for path, block in _blocks(self):
             if isinstance(block, Choice):
                 content[path] |= block.completed(plugins, path, sources)

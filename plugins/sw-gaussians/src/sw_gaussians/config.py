@@ -1,10 +1,12 @@
 """Hyper-parameters of training explicit Gaussians. Defaults are those of the Splatwizard paper."""
 
+from collections.abc import Mapping
 from typing import Any, Literal
 
 from pydantic import Field
 
-from splatwizard_core.api import OptimizationParams, Params
+from splatwizard_core.api import OptimizationParams, Params, apply_overrides
+from sw_gaussians.fast import rate_factors
 
 
 class LearningRates(Params):
@@ -101,6 +103,9 @@ class Fast(Params):
         "real", description="scales of pictures: real: any; floor: whole ones, as published"
     )
     resolution_start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
+    rates: Literal["given", "length"] = Field(
+        "given", description="length: lr.position_final and lr.sh_rest, unless given, are raised by how short a run is"
+    )
 
 
 class Loss(Params):
@@ -125,9 +130,23 @@ class GaussianTraining(OptimizationParams):
     fast: Fast = Field(Fast(), description="parts of fast training, off by default")
     loss: Loss = Field(Loss(), description="photometric loss")
 
+    def completed(self, plugins: Any, sources: Mapping[str, str]) -> OptimizationParams:
+        """Return this with the learning rates that follow from its length, where `fast.rates` asks for it."""
+        asked = super().completed(plugins, sources)
+        if self.fast.rates == "given":
+            return asked
+        lr, factors = self.lr, rate_factors(self.iterations / self.FULL_ITERATIONS)
+        whole = {"lr.position_final": lr.position_final, "lr.sh_rest": lr.sh_rest}
+        rates = {key: factors[key] * rate for key, rate in whole.items() if key not in sources}
+        return apply_overrides(asked, rates, source="fast.rates")
+
     def identity(self) -> dict[str, Any]:
-        """Return all values but those of `fast` where it is off: trainings of before it existed are still found."""
+        """Return all values but `fast.rates`, which says where others come from, and those of `fast` where it is off.
+
+        Trainings of before these existed are still found.
+        """
         content = super().identity()
-        if self.fast == Fast():
+        del content["fast"]["rates"]
+        if self.fast.model_copy(update={"rates": "given"}) == Fast():
             del content["fast"]
         return content

@@ -1,6 +1,8 @@
-"""Order along a Morton curve: neighbours in space become neighbours in memory."""
+"""Morton (Z-order) codes: bit i of x, y, z becomes bit 3i, 3i+1, 3i+2. Neighbours in space follow each other."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,13 +26,11 @@ def morton_order(points: Tensor) -> Tensor:
     low, high = points.amin(dim=0), points.amax(dim=0)
     unit = ((points - low) / (high - low).clamp_min(1e-30)).double()
     cells = (unit * (2**BITS - 1)).long()
-    code = sum(_spread(cells[:, axis]) << axis for axis in range(3))
-    assert isinstance(code, Tensor)
-    return torch.argsort(code, stable=True)
+    return torch.argsort(interleave(cells), stable=True)
 
 
-def _spread(x: Tensor) -> Tensor:
-    """Put two zero bits behind each of the lowest 21 bits."""
+def interleave(cells: Any) -> Any:
+    """Return the codes [N] of int64 cells [N,3], 0 <= cell < 2^21: an array for an array, a tensor for a tensor."""
     for shift, mask in _SPREAD:
-        x = (x | (x << shift)) & mask
-    return x
+        cells = (cells | (cells << shift)) & mask
+    return cells[:, 0] | (cells[:, 1] << 1) | (cells[:, 2] << 2)

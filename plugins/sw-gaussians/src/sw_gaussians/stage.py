@@ -164,7 +164,9 @@ class ThreeDGSStage(Stage):
         if chain.enabled and chain.noise > 0:
             noise = mcmc.AddNoise(strength=chain.noise, min_opacity=chain.min_opacity)
             # First of all: it belongs to the update of the step before, and to that step's learning rate.
-            scheduler.register_task(self.when(range(lr.max_steps)), noise, name="add noise")
+            # In a run shorter than lr.max_steps it is written as "update lr" is, so that checkpoints keep their plan.
+            steps = range(max(self.iterations, self.steps(lr.max_steps)))
+            scheduler.register_task(steps, noise, name="add noise")
         update_lr = tasks.UpdateLearningRate(
             init=lr.position_init,
             final=lr.position_final,

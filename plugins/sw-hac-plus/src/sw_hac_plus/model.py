@@ -16,7 +16,7 @@ from sw_anchors.forecasts import AnchorForecast, AnchorRate
 from sw_anchors.fused_ops import anchor_values, noisy_rows
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
-from sw_anchors.voxel_lattice import voxel_integers, voxel_positions
+from sw_anchors.voxel_lattice import voxel_integers, voxel_positions, within_reach
 from torch import Tensor, nn
 
 from sw_codecs.context.channel_mixture import ChannelMixture
@@ -70,6 +70,10 @@ class HACPlusAnchors(GridAnchors):
     def lattice_places(self) -> tuple[Tensor, Tensor]:
         positions = voxel_positions(voxel_integers(self.anchors, self.voxel_size), self.voxel_size)
         return position_codes(positions, self.bounds), positions
+
+    def holds(self, positions: Tensor) -> Tensor:
+        """[M] bool: `positions` [M,3] that the file can hold beside the anchors."""
+        return within_reach(positions, self.anchors, self.voxel_size)
 
     # Rendering
 

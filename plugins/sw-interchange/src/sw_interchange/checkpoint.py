@@ -8,9 +8,13 @@ public sources of nerfstudio-project/gsplat and nerfstudio-project/nerfstudio, a
 from __future__ import annotations
 
 import io
+import os
 import pickle
 import pickletools
+import re
 from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,10 +26,32 @@ from sw_interchange.scene import GaussianScene, Limits, ReadReport
 from sw_interchange.source import Source
 
 _NERFSTUDIO = "_model.gauss_params."
+_RANK = re.compile(r"(.*_rank)(0|[1-9]\d{0,3})(\.\w+)")
+_COLUMNS = ("means", "log_scales", "quats", "opacity_logits", "sh_dc", "sh_rest")
 
 
 def read_checkpoint(source: Source, limits: Limits, report: ReadReport) -> GaussianScene:
     """Decode a checkpoint. Raises BitstreamError if it is damaged or would run code, SceneError for other models."""
+    scene = _read_one(source, limits, report)
+    others = _other_ranks(source) if report.version == "gsplat" else []
+    if not others:
+        return scene
+    report.warnings.append(f"read with it: {', '.join(path.name for path in others[:3])}"
+                           f"{', ...' * (len(others) > 3)}: each GPU saved a part of the scene")  # fmt: skip
+    parts, most = [scene], limits.max_gaussians
+    for path in others:
+        most -= parts[-1].num_gaussians
+        part = Source.open(path)
+        parts.append(_read_one(part, replace(limits, max_gaussians=most), ReadReport("checkpoint")))
+        if parts[-1].sh_degree != scene.sh_degree:
+            raise BitstreamError(f"{part.name}: its SH degree is {parts[-1].sh_degree}, that of {source.name} is "
+                                 f"{scene.sh_degree}: they are no parts of one scene")  # fmt: skip
+        report.bytes += len(part.data)
+    return GaussianScene(*(np.concatenate([getattr(part, column) for part in parts]) for column in _COLUMNS))
+
+
+def _read_one(source: Source, limits: Limits, report: ReadReport) -> GaussianScene:
+    """Decode one file; `report` gets its kind."""
     found = _unpickled(source, limits)
     for name, parts_of in _KINDS.items():
         parts = parts_of(found, source.name)
@@ -33,6 +59,24 @@ def read_checkpoint(source: Source, limits: Limits, report: ReadReport) -> Gauss
             report.version = name
             return _scene(parts, source.name, limits, report)
     raise SceneError(f"{source.name}: a checkpoint, of none of: {', '.join(_KINDS)}", path=str(source.path))
+
+
+def _other_ranks(source: Source) -> list[Path]:
+    """Files of the other GPUs of the same step, which lie beside that of one: ckpt_29999_rank0.pt, _rank1.pt, ...
+
+    Raises SceneError if one between them is absent.
+    """
+    told = _RANK.fullmatch(source.path.name) if source.path else None
+    if source.path is None or told is None:
+        return []
+    beside = [_RANK.fullmatch(name) for name in os.listdir(source.path.parent)]
+    ranks = {int(each[2]) for each in beside if each and (each[1], each[3]) == (told[1], told[3])}
+    if missing := set(range(max(ranks) + 1)) - ranks:
+        raise SceneError(
+            f"{source.name}: '{told[1]}{min(missing)}{told[3]}', which the GPU before it saved, is not beside it",
+            path=str(source.path),
+        )
+    return [source.path.with_name(f"{told[1]}{rank}{told[3]}") for rank in sorted(ranks - {int(told[2])})]
 
 
 def _unpickled(source: Source, limits: Limits) -> Any:

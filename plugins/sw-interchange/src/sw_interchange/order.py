@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
+from sw_gaussians.morton import interleave
 
 from sw_interchange.bands import Array
 
@@ -26,19 +27,10 @@ def morton_order(means: Array) -> npt.NDArray[np.intp]:
     return order
 
 
-def _codes(means: Array) -> npt.NDArray[np.uint32]:
+def _codes(means: Array) -> npt.NDArray[np.int64]:
     low, high = means.min(0), means.max(0)
     span = high - low
     scale = np.divide(1 << BITS, span, out=np.zeros(3, np.float64), where=span > 0)
-    cells = np.minimum(((means - low) * scale), (1 << BITS) - 1).astype(np.uint32)
-    codes = np.zeros(len(means), np.uint32)
-    for axis in range(3):
-        codes |= _spread(cells[:, axis]) << np.uint32(axis)
+    cells = np.minimum(((means - low) * scale), (1 << BITS) - 1).astype(np.int64)
+    codes: npt.NDArray[np.int64] = interleave(cells)
     return codes
-
-
-def _spread(x: npt.NDArray[np.uint32]) -> npt.NDArray[np.uint32]:
-    """Ten bits, two zeros between each."""
-    for shift, mask in ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249)):
-        x = (x | (x << np.uint32(shift))) & np.uint32(mask)
-    return x

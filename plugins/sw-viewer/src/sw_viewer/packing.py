@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from sw_gaussians.morton import BITS, interleave
 from sw_gaussians.surfels import as_ellipsoids
 
 from splatwizard_core.api import SH_C0, GaussianModel, SceneError, SplatModel
@@ -120,15 +121,8 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     low, high = means.min(axis=0).astype(np.float64), means.max(axis=0).astype(np.float64)
     least, most = np.percentile(means.astype(np.float64), (1, 99), axis=0, method="nearest")
     low, high = np.maximum(low, 2 * least - most), np.minimum(high, 2 * most - least)  # a far one is at the border
-    cells = ((means.clip(low, high) - low) / np.maximum(high - low, 1e-30) * (2**21 - 1)).astype(np.uint64)
-    spread = cells & np.uint64(0x1FFFFF)
-    for shift, mask in (
-        (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):  # fmt: skip
-        spread = (spread | (spread << np.uint64(shift))) & np.uint64(mask)
-    code = spread[:, 0] | (spread[:, 1] << np.uint64(1)) | (spread[:, 2] << np.uint64(2))
-    return np.argsort(code, kind="stable")
+    cells = ((means.clip(low, high) - low) / np.maximum(high - low, 1e-30) * (2**BITS - 1)).astype(np.int64)
+    return np.argsort(interleave(cells), kind="stable")
 
 
 def _places(means: NDArray[np.float32]) -> tuple[list[NDArray[np.uint16]], NDArray[np.float32]]:

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from sw_gaussians.camera_paths import nearest_to_axes
 
-from splatwizard_core.api import Camera, Scene, View
+from splatwizard_core.api import Camera, Scene, SceneError, View
 
 MOST = 64
 """Cameras of a scene that are offered, spread evenly."""
@@ -67,16 +67,27 @@ def surroundings_of(scene: Scene) -> Surroundings:
 
 
 def looked_at(centers: NDArray[np.float64], forwards: NDArray[np.float64], extent: float) -> NDArray[np.float64]:
-    """Return the point [3] that is nearest to the optical axes [V,3]; `extent` ahead where they are parallel."""
+    """Return the point [3] that is nearest to the optical axes [V,3].
+
+    `extent` ahead where they are parallel or meet in the cameras themselves, which turn at one place: of the first
+    camera if they look all around.
+    """
     point = nearest_to_axes(centers, forwards)
-    if point is not None and ((point - centers) * forwards).sum(axis=1).mean() > 0:
+    if point is not None and ((point - centers) * forwards).sum(axis=1).mean() > 1e-3 * extent:
         return point
-    ahead: NDArray[np.float64] = (centers + extent * forwards).mean(axis=0)
-    return ahead
+    ahead = forwards.mean(axis=0)
+    ahead = ahead if np.linalg.norm(ahead) > 0.1 else forwards[0]
+    middle: NDArray[np.float64] = centers.mean(axis=0) + extent * ahead / np.linalg.norm(ahead)
+    return middle
 
 
 def surroundings_about(means: NDArray[np.float32]) -> Surroundings:
-    """Return eight cameras around the middle of Gaussians [N,3]; up is -y, as in pictures of COLMAP scenes."""
+    """Return eight cameras around the middle of Gaussians [N,3]; up is -y, as in pictures of COLMAP scenes.
+
+    Raises SceneError where there is none.
+    """
+    if not len(means):
+        raise SceneError("the model has no Gaussian that can be drawn: there is nothing to look at")
     points = means.astype(np.float64)
     pivot = np.median(points, axis=0)
     radius = max(float(np.percentile(np.linalg.norm(points - pivot, axis=1), 80)), 1e-3)

@@ -98,19 +98,15 @@ class Camera:
     @property
     def K(self) -> Tensor:  # noqa: N802 (the field's name)
         """Intrinsics, [3,3]."""
-        return torch.tensor(
-            [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]],
-            dtype=self.R.dtype,
-            device=self.R.device,
-        )
+        rows = [[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]]
+        return torch.tensor(rows, dtype=self.R.dtype, device=self.R.device)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Camera:
         """The same camera with R and tau on another device or in another dtype; kept, so that it is moved once."""
         kept = self._moved.get((str(device), dtype))
         if kept is not None:
             return kept
-        R = self.R.to(device=device, dtype=dtype)
-        tau = self.tau.to(device=device, dtype=dtype)
+        R, tau = (each.to(device=device, dtype=dtype) for each in (self.R, self.tau))
         if R is self.R and tau is self.tau:
             return self
         moved = replace(self, R=R, tau=tau)

@@ -59,8 +59,7 @@ class View:
 
     def keep_on(self, device: torch.device | str) -> None:
         """Keep a copy of `pixels` in a GPU's memory, so that `image` need not send it each time; "cpu" drops it."""
-        device = torch.device(device)
-        self._resident = None if device.type == "cpu" else self.pixels.to(device)
+        self._resident = None if torch.device(device).type == "cpu" else self.pixels.to(device)
 
     @property
     def kept_on(self) -> torch.device:
@@ -154,8 +153,13 @@ class Scene:
         return torch.ones(3) if self.protocol.background == "white" else torch.zeros(3)
 
     @cached_property
-    def extent(self) -> float:
-        """E = 1.1 x the largest distance of a training camera from their mean; 1.0 for a single camera."""
+    def radius(self) -> float:
+        """Largest distance of a training camera from their mean; 0.0 where it is but rounding of float32 poses."""
         centers = torch.stack([v.camera.center.double().cpu() for v in self.train])
-        radius = 1.1 * (centers - centers.mean(0)).norm(dim=1).max().item()
-        return radius if radius > 0 else 1.0
+        radius = (centers - centers.mean(0)).norm(dim=1).max().item()
+        return radius if radius > 1e-5 * (1 + centers.norm(dim=1).max().item()) else 0.0
+
+    @cached_property
+    def extent(self) -> float:
+        """E = 1.1 x `radius`; 1.0 where all training cameras stand at one place."""
+        return 1.1 * self.radius or 1.0

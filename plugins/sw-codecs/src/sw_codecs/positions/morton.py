@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import numpy.typing as npt
+from sw_gaussians.morton import BITS as MAX_BITS
+from sw_gaussians.morton import interleave as interleave
 
-MAX_BITS = 21  # 3 x 21 = 63 bits of an int64
-
-_SPREAD = (
-    (32, 0x1F00000000FFFF),
-    (16, 0x1F0000FF0000FF),
-    (8, 0x100F00F00F00F00F),
-    (4, 0x10C30C30C30C30C3),
-    (2, 0x1249249249249249),
-)
+_EVERY_THIRD = 0x1249249249249249
 _GATHER = (
     (2, 0x10C30C30C30C30C3),
     (4, 0x100F00F00F00F00F),
@@ -39,19 +31,13 @@ def check_points(points: npt.ArrayLike, bits: int) -> np.ndarray:
 
 def encode(points: np.ndarray) -> np.ndarray:
     """Morton codes int64 [N] of points [N,3], 0 <= p < 2^21."""
-    return interleave(np.asarray(points, np.int64))
-
-
-def interleave(spread: Any) -> Any:
-    """Morton codes [N] of int64 points [N,3], 0 <= p < 2^21: an array for an array, a tensor for a tensor."""
-    for shift, mask in _SPREAD:
-        spread = (spread | (spread << shift)) & mask
-    return spread[:, 0] | (spread[:, 1] << 1) | (spread[:, 2] << 2)
+    codes: np.ndarray = interleave(np.asarray(points, np.int64))
+    return codes
 
 
 def decode(codes: np.ndarray) -> np.ndarray:
     """Points int64 [N,3] of Morton codes [N]."""
-    gathered = np.stack([np.asarray(codes, np.int64) >> axis for axis in range(3)], 1) & _SPREAD[-1][1]
+    gathered = np.stack([np.asarray(codes, np.int64) >> axis for axis in range(3)], 1) & _EVERY_THIRD
     for shift, mask in _GATHER:
         gathered = (gathered | (gathered >> shift)) & mask
     return gathered

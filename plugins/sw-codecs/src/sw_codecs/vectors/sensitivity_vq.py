@@ -46,9 +46,7 @@ class SensitivityVQSettings(Params):
     size: int = Field(4096, ge=1, le=1 << 20, description="entries that the others share")
     training: Training = Field("batch-mean", description="the published loop; ema: ours; kmeans: passes over all")
     iterations: int = Field(100, ge=0, description="batches, or passes")
-    batch: int = Field(
-        1 << 18, ge=1, description="vectors of each batch, drawn with replacement; at most as many as there are"
-    )
+    batch: int = Field(1 << 18, ge=1, description="vectors of each batch, at most all; drawn with replacement")
     decay: float = Field(0.8, ge=0, lt=1, description="how much of the codebook each batch leaves")
 
 

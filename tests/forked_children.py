@@ -1,0 +1,176 @@
+"""The fresh processes of `sw run`, forked from one that has imported torch: importing it is most of their time.
+
+`sw run` decodes and evaluates in processes of their own, which do a second of work after two seconds of imports. A
+test session starts hundreds. Here a server imports torch and the core once and forks for each: the child has an own
+working directory, environment, path of imports, input and output, and nothing of the test's memory, plugins included.
+A child that asks for what only a new interpreter gives (another locale, other threads, hash seeds) gets one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import socket
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from types import SimpleNamespace
+from typing import Any
+
+import splatwizard_core.runs.fresh
+
+MODULE = "splatwizard_core.cli.fresh_child"
+PLAIN = ("SW_", "SPLATWIZARD_", "PYTHONPATH", "PYTEST_", "COV_", "TMPDIR", "HOME", "XDG_", "TORCH_HOME", "COLUMNS")
+"""Variables that mean the same to a process that reads them late; any other difference needs a new interpreter."""
+
+
+class ForkServer:
+    """The server's process, started with the first request and ended with its socket."""
+
+    def __init__(self) -> None:
+        self._server: subprocess.Popen[bytes] | None = None
+        self._environment = dict(os.environ)
+
+    def run(self, command: Sequence[str], **options: Any) -> subprocess.CompletedProcess[str]:
+        """Do what `subprocess.run` does, of the command and the options that `run_fresh` uses."""
+        environment = options["env"]
+        if list(command[:3]) != [sys.executable, "-m", MODULE] or not self._serves(environment):
+            return subprocess.run(command, **options)
+        with contextlib.ExitStack() as open_files:
+            out, err = (open_files.enter_context(tempfile.TemporaryFile("w+")) for _ in range(2))
+            ended, end = os.pipe()
+            stderr = err.fileno() if options["stderr"] == subprocess.PIPE else 2
+            request = {
+                "arguments": command[3:],
+                "environment": environment,
+                "folder": str(options["cwd"] or os.getcwd()),
+            }
+            try:
+                self._send(json.dumps(request).encode(), [options["stdin"], out.fileno(), stderr, end])
+            finally:
+                os.close(end)
+            with open(ended, "rb") as status:
+                told = status.read()
+            if not told:
+                raise RuntimeError("the server that forks fresh processes has died")
+            out.seek(0)
+            err.seek(0)
+            return subprocess.CompletedProcess(command, int(told), out.read(), err.read())
+
+    def _serves(self, environment: Mapping[str, str]) -> bool:
+        differing = dict(environment.items() ^ self._environment.items())
+        return all(name.startswith(PLAIN) for name in differing)
+
+    def _send(self, request: bytes, files: list[int]) -> None:
+        if self._server is None:
+            self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+            with theirs:
+                self._server = subprocess.Popen(
+                    [sys.executable, __file__, str(theirs.fileno())],
+                    pass_fds=[theirs.fileno()],
+                    stdin=subprocess.DEVNULL,
+                )
+        with tempfile.TemporaryFile() as text:  # an environment may be longer than a packet
+            text.write(request)
+            text.flush()
+            socket.send_fds(self._socket, [b"run"], [text.fileno(), *files])
+
+    def close(self) -> None:
+        """End the server; children that still run go on."""
+        if self._server is not None:
+            self._socket.close()
+            self._server.wait()
+            self._server = None
+
+
+@contextlib.contextmanager
+def forking() -> Iterator[None]:
+    """Fork what `run_fresh` starts, where the system can; the block's end ends the server."""
+    if sys.platform != "linux":
+        yield
+        return
+    server, fresh = ForkServer(), splatwizard_core.runs.fresh
+    before = fresh.subprocess
+    fresh.subprocess = SimpleNamespace(run=server.run, PIPE=subprocess.PIPE)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        fresh.subprocess = before
+        server.close()
+
+
+@contextlib.contextmanager
+def starting() -> Iterator[None]:
+    """Start new interpreters inside the block, as users' runs do."""
+    fresh = splatwizard_core.runs.fresh
+    before, fresh.subprocess = fresh.subprocess, subprocess
+    try:
+        yield
+    finally:
+        fresh.subprocess = before
+
+
+def _serve(connection: socket.socket) -> dict[str, Any]:
+    """Fork for each request; return its content in the child, which does it. The server itself never returns."""
+    import signal
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # whoever asked is interrupted, and its child
+    while True:
+        _, files, _, _ = socket.recv_fds(connection, 16, 5)
+        if not files:
+            os._exit(0)  # the session has ended
+        text, *ends = files
+        if os.fork() == 0:  # one process waits for the child and tells its status, so that the server need not
+            child = os.fork()
+            if child == 0:
+                break
+            told = str(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])).encode()
+            os.write(ends[3], told)
+            os._exit(0)
+        for file in files:
+            os.close(file)
+        with contextlib.suppress(ChildProcessError):
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    connection.close()
+    with open(text, "rb") as request:
+        request.seek(0)
+        content: dict[str, Any] = json.load(request)
+    for wanted, file in enumerate(ends[:3]):
+        os.dup2(file, wanted)
+    for file in ends:
+        os.close(file)
+    return content
+
+
+def _become(content: dict[str, Any], ours: list[str]) -> None:
+    """Be the process that `python -m splatwizard_core.cli.fresh_child ARGUMENTS` would be."""
+    import runpy
+
+    import numpy as np
+    import torch
+
+    np.random.seed()  # a new interpreter draws both seeds anew; `random` does so after each fork
+    torch.seed()
+    os.chdir(content["folder"])
+    os.environ.clear()
+    os.environ.update(content["environment"])
+    paths = filter(None, content["environment"].get("PYTHONPATH", "").split(os.pathsep))
+    sys.path[:] = list(dict.fromkeys([content["folder"], *map(os.path.abspath, paths), *ours]))
+    sys.argv[:] = [MODULE, *content["arguments"]]
+    runpy.run_module(MODULE, run_name="__main__", alter_sys=True)
+
+
+if __name__ == "__main__":
+    import importlib
+
+    for name in ("torch", "numpy", "pydantic", "rich.console", "safetensors.torch", "PIL.Image", "scipy.ndimage"):
+        importlib.import_module(name)
+    for name in ("cli.main", "runs.decode", "runs.session", "runs.measure", "method", "coding.container"):
+        importlib.import_module(f"splatwizard_core.{name}")
+    given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
+    ours = [path for path in sys.path[1:] if path not in given]  # the first is this file's folder
+    _become(_serve(socket.socket(fileno=int(sys.argv[1]))), ours)
