@@ -21,13 +21,7 @@ class RahtOptions(Params):
         "batch-mean", description="how the codebook is made: by the published batches, or by passes over all"
     )
     vq_steps: int = Field(1000, ge=0, description="batches, or passes")
-<<<<<<< HEAD
-    vq_batch: int = Field(
-        262_144, ge=1, description="Gaussians of each batch, drawn with replacement; at most as many as there are"
-    )
-=======
     vq_batch: int = Field(262_144, ge=1, description="Gaussians of each batch, at most all; drawn with replacement")
->>>>>>> main
     vq_decay: float = Field(0.8, ge=0, lt=1, description="how much of an entry each batch keeps")
 
 
