@@ -53,7 +53,7 @@ def test_every_record_file_is_shown_and_every_record_is_read(tools):
 def test_every_figure_shows_what_its_records_say(tools):
     shown = [found[3] for page in tools.PAGES for found in tools.MARKED.finditer(page.read_text("utf-8"))
              if found[2] == "plot"]  # fmt: skip
-    assert sorted(shown) == ["formats-demo", "formats-fox", "fox", "lego", "room"]
+    assert sorted(shown) == ["formats-demo", "formats-fox", "formats-room", "fox", "lego", "room"]
     for scene in shown:
         assert not tools.result_plots.is_stale(scene), "python tools/results.py tables"
 

@@ -81,6 +81,19 @@ def test_comments_say_how_a_scene_was_trained(comments, antialiased):
     assert bool(found.notes) == ("Vertical Axis: z" in comments)
 
 
+def test_bytes_after_the_last_row_and_surfels_of_three_scales_are_told():
+    assert parse_gaussians(ply(REQUIRED), "a.ply").notes == ()
+    (note,) = parse_gaussians(ply(REQUIRED, rows_after=bytes(10)), "a.ply").notes
+    assert note == "10 bytes after its last row mean nothing"
+    lists = "element face 1\nproperty list uchar int vertex_indices"
+    assert parse_gaussians(ply(REQUIRED, after=lists, rows_after=b"\1abcd"), "a.ply").notes == ()
+    brush = ("SplatRenderMode: 2dgs",)
+    (note,) = parse_gaussians(ply(REQUIRED, comments=brush), "a.ply").notes
+    assert "trained as surfels" in note
+    flat = {name: value for name, value in REQUIRED.items() if name != "scale_2"}
+    assert parse_gaussians(ply(flat, comments=brush), "a.ply").notes == ()
+
+
 def test_the_filter_of_mip_splatting_becomes_part_of_the_gaussian():
     found = parse_gaussians(ply(REQUIRED | {"filter_3D": 0.1, "more": 7}), "a.ply")
     scales = [math.exp(s) for s in (-2, -3, -4)]

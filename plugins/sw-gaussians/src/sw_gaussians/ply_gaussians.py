@@ -95,6 +95,12 @@ def parse_gaussians(data: bytes | memoryview, path: str, *, max_gaussians: int |
     mode = _render_mode(header.comments)
     if any(comment.lower().startswith("vertical axis: z") for comment in header.comments):
         notes.append("its world is that of nerfstudio (z up, re-scaled), not that of the photographs")
+    if mode == "2dgs" and not flat:
+        notes.append(
+            "its comments say that it was trained as surfels (2dgs), but it has three scales: read as Gaussians"
+        )
+    if spare := header.spare_bytes(len(data)):
+        notes.append(f"{spare:,} bytes after its last row mean nothing")
     return PlyGaussians(
         _contiguous(_columns(vertex, ["x", "y", "z"])),
         _colours(vertex),
