@@ -195,7 +195,7 @@ def test_without_channels_and_masks_of_anchors_the_rate_is_that_of_hac(units):
 
     g, rows, columns = generator(3), torch.arange(40), sum(model.shape.widths)
     torch.rand(40, generator=g)  # the sample
-    torch.rand(10, columns, generator=g)  # noise of what is rendered
+    draws((10, columns), g, torch.device("cpu"))  # noise of what is rendered
     noise = torch.rand(40, columns, generator=g) - 0.5
     forecast = GridAnchors.forecast_at(model, model.context_rows())
     values = torch.cat([model.features, model.log_scales.exp(), model.offsets.flatten(1)], dim=1)
