@@ -148,7 +148,9 @@ def _serve(connection: socket.socket) -> dict[str, Any]:
 
 def _become(content: dict[str, Any], ours: list[str]) -> None:
     """Be the process that `python -m splatwizard_core.cli.fresh_child ARGUMENTS` would be."""
+    import atexit
     import runpy
+    import traceback
 
     import numpy as np
     import torch
@@ -161,16 +163,28 @@ def _become(content: dict[str, Any], ours: list[str]) -> None:
     paths = filter(None, content["environment"].get("PYTHONPATH", "").split(os.pathsep))
     sys.path[:] = list(dict.fromkeys([content["folder"], *map(os.path.abspath, paths), *ours]))
     sys.argv[:] = [MODULE, *content["arguments"]]
-    runpy.run_module(MODULE, run_name="__main__", alter_sys=True)
+    status = 1
+    try:
+        runpy.run_module(MODULE, run_name="__main__", alter_sys=True)
+    except SystemExit as end:
+        status = int(end.code or 0)
+    except BaseException:
+        traceback.print_exc()
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)  # taking the interpreter apart would copy all its memory
 
 
 if __name__ == "__main__":
+    import gc
     import importlib
 
     for name in ("torch", "numpy", "pydantic", "rich.console", "safetensors.torch", "PIL.Image", "scipy.ndimage"):
         importlib.import_module(name)
     for name in ("cli.main", "runs.decode", "runs.session", "runs.measure", "method", "coding.container"):
         importlib.import_module(f"splatwizard_core.{name}")
+    gc.freeze()  # else the children's first collections copy all its memory
     given = [os.path.abspath(path) for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path]
     ours = [path for path in sys.path[1:] if path not in given]  # the first is this file's folder
     _become(_serve(socket.socket(fileno=int(sys.argv[1]))), ours)

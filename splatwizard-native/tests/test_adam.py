@@ -135,6 +135,26 @@ def test_a_strided_gradient_is_read_right(path):
     torch.testing.assert_close(param, before - 0.01 * grad.sign(), rtol=0, atol=1e-6)
 
 
+def test_updates_together_are_those_of_each_alone(path):
+    """One of them the kernel does not take."""
+    kinds = [((30, 3), torch.float32), ((7,), torch.float64), ((600,), torch.float32), ((0, 4), torch.float32)]
+    alone, together = ([state(*shape, dtype=dtype, seed=1) for shape, dtype in kinds] for _ in range(2))
+    rates = [0.01, 0.02, 0.03, 0.04]
+    for step in (1, 2):
+        grads = [param.sin() for param, *_ in alone]
+        for (param, *moments), grad, lr in zip(alone, grads, rates, strict=True):
+            adam_step(param, grad, *moments, lr=lr, step=step, **OPTIONS)
+        adam.adam_steps(
+            [
+                adam.AdamUpdate(param, grad, *moments, lr=lr, step=step, **OPTIONS)
+                for (param, *moments), grad, lr in zip(together, grads, rates, strict=True)
+            ]
+        )
+    assert all(
+        torch.equal(a, b) for one, other in zip(alone, together, strict=True) for a, b in zip(one, other, strict=True)
+    )
+
+
 def test_autograd_notices_the_change(path):
     param, exp_avg, exp_avg_sq = state(10)
     param = torch.nn.Parameter(param)

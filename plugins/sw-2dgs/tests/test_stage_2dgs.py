@@ -20,6 +20,7 @@ from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
+from splatwizard_native import seeded
 from sw_2dgs.config import TwoDGSConfig
 from sw_2dgs.datasets import surface_of
 from sw_2dgs.method import TwoDGS
@@ -66,6 +67,25 @@ def test_the_plan_is_that_of_the_authors_code():
     assert format_plan(pre, post, total=stage.iterations) == PLAN
     assert stage.starts_from is None
     assert stage.densification().settings["min_opacity"] == 0.05
+
+
+def test_on_a_cpu_surfels_are_drawn_by_the_same_kernel_with_deterministic_sums():
+    """Its sums have one order there; on CUDA they have none, and `deterministic=true` is refused."""
+    view, gradients = scene_of().train[0], []
+    for deterministic in (False, True):
+        model = surfels_from_points(points(), generator=torch.Generator().manual_seed(0))
+        rasterizer = NegotiatedRasterizer(load_plugins(), device="cpu")
+        stage = TwoDGSStage(TwoDGSConfig())
+        with seeded(0, deterministic=deterministic):
+            found = rasterizer.render(
+                model.gaussians(view.camera, rasterizer), view.camera, stage.raster_options(1, BLACK)
+            )
+            found.image.square().mean().backward()
+        assert rasterizer.served == {"2dgs"}
+        gradients.append({name: parameter.grad for name, parameter in model.named_parameters()})
+    assert bool(gradients[0]["means"].any())
+    for name, plain in gradients[0].items():
+        assert plain is gradients[1][name] is None or torch.equal(plain, gradients[1][name]), name
 
 
 def least_opacity(**values) -> float:

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from splatwizard_core.errors import BitstreamError
+from sw_codecs import exact_native
 from sw_codecs.context import hash_grid, integer_mlp, plane_streams, triplane
 from sw_codecs.entropy import conditional, exact_streams, lattice
 from sw_codecs.exact_native import EXACT
-from sw_codecs.positions import octree
 
 
 def _assert_survives_damage(data, decode, expected, *, masks=(0x01, 0x80, 0xFF), truncations=None):
@@ -38,7 +38,7 @@ def assert_survives_damage():
 @pytest.fixture
 def kernels(monkeypatch):
     """Let the exact mode run with its compiled kernels or without: `kernels(False)`."""
-    users = (hash_grid, integer_mlp, plane_streams, triplane, conditional, exact_streams, lattice, octree)
+    users = (hash_grid, integer_mlp, plane_streams, triplane, conditional, exact_streams, lattice, exact_native)
 
     def use(compiled):
         if compiled:

@@ -53,6 +53,15 @@ def test_the_split_is_that_of_the_files(blender_folder, load):
     assert scene.protocol.id == "blender/rgba/r-1/file/white/pp-center/q8"
 
 
+def test_a_principal_point_off_the_middle_is_told(blender_folder, load):
+    folder = blender_folder(header={"cx": 7.5, "cy": 5.5})
+    scene = load(folder)
+    assert (scene.train[0].camera.cx, scene.train[0].camera.cy) == (10, 5)
+    assert "the principal point is up to 2.5 px off the image centre" in scene.warnings[0]
+    taken = load(folder, principal_point="file")
+    assert (taken.train[0].camera.cx, taken.warnings) == (7.5, [])
+
+
 def test_an_all_transparent_picture_is_all_white_truth(blender_folder, load):
     scene = load(blender_folder())
     assert scene.background.tolist() == [1, 1, 1]

@@ -8,9 +8,12 @@ from sw_gaussians import fragments
 from sw_gaussians.budget import densify_to_budget, draw_distinct, halve_opacity, linear_target
 from sw_gaussians.fast_tasks import DensifyToBudget
 from sw_gaussians.morton import morton_order
+from sw_gaussians.ply import export_ply, load_ply
 from sw_gaussians.start import logit
+from sw_gaussians.statistics import collect_statistics
+from sw_reference.rasterizer import ReferenceRasterizer
 
-from splatwizard_core.api import EmptyModel, GaussianModel, ParamGroup, SplatOptimizer, stream
+from splatwizard_core.api import Camera, EmptyModel, GaussianModel, ParamGroup, RasterOptions, SplatOptimizer, stream
 
 EXTENT = 10.0  # largest scales up to 0.1 are copied
 SMALL, LARGE = math.log(0.05), math.log(0.5)
@@ -205,6 +208,45 @@ def test_rows_in_morton_order_are_the_same_rows_with_their_moments():
     moments, squares, _ = optimizer.moments("sh_dc")
     assert torch.allclose(moments[:, 0, 0], 0.1 * (order + 1.0))
     assert torch.allclose(squares[:, 0, 0], 0.001 * (order + 1.0) ** 2)
+
+
+def drawn_once(model: GaussianModel) -> torch.Tensor:
+    """[3,16,16] of one view, whose statistics the model has afterwards."""
+    camera = Camera.look_at(
+        torch.tensor([0.5, 0.5, -2.0]), torch.full((3,), 0.5), torch.tensor([0.0, 1, 0]), width=16, height=16, fov_x=0.6
+    )
+    rasterizer = ReferenceRasterizer()
+    found = rasterizer.render(model.gaussians(camera, rasterizer), camera, RasterOptions(grad2d=True))
+    found.image.square().mean().backward()
+    collect_statistics(model, found)
+    return found.image.detach()
+
+
+def test_morton_order_changes_neither_picture_nor_statistics_nor_the_exported_set(tmp_path):
+    draws, n = stream(2, "gaussians"), 30
+    model = GaussianModel(
+        torch.rand(n, 3, generator=draws), torch.rand(n, 1, 3, generator=draws), torch.rand(n, 3, 3, generator=draws),
+        torch.rand(n, generator=draws), -3 + 0.5 * torch.randn(n, 3, generator=draws),
+        torch.randn(n, 4, generator=draws),
+    )  # fmt: skip
+    optimizer = optimizer_of(model)
+    order = morton_order(model.means.detach())
+    assert order.tolist() != list(range(n))
+    before = drawn_once(model)
+    export_ply(model, tmp_path / "before.ply")
+    statistics = {name: getattr(model, name).clone() for name in ("grad_accum", "denom", "max_radii2d")}
+    assert bool((statistics["grad_accum"] > 0).any())
+    optimizer.keep_rows(model, order)
+    for name in statistics:
+        getattr(model, name).zero_()
+    after = drawn_once(model)
+    export_ply(model, tmp_path / "after.ply")
+    torch.testing.assert_close(after, before, rtol=0, atol=1e-6)
+    for name, values in statistics.items():
+        torch.testing.assert_close(getattr(model, name), values[order], rtol=1e-5, atol=1e-8)
+    first, second = (load_ply(tmp_path / f"{name}.ply") for name in ("before", "after"))
+    for name in GaussianModel.RAW:
+        assert torch.equal(getattr(second, name), getattr(first, name)[order]), name
 
 
 def test_the_buffer_goes_as_it_came():

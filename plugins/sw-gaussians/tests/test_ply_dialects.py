@@ -81,6 +81,19 @@ def test_comments_say_how_a_scene_was_trained(comments, antialiased):
     assert bool(found.notes) == ("Vertical Axis: z" in comments)
 
 
+def test_bytes_after_the_last_row_and_surfels_of_three_scales_are_told():
+    assert parse_gaussians(ply(REQUIRED), "a.ply").notes == ()
+    (note,) = parse_gaussians(ply(REQUIRED, rows_after=bytes(10)), "a.ply").notes
+    assert note == "10 bytes after its last row mean nothing"
+    lists = "element face 1\nproperty list uchar int vertex_indices"
+    assert parse_gaussians(ply(REQUIRED, after=lists, rows_after=b"\1abcd"), "a.ply").notes == ()
+    brush = ("SplatRenderMode: 2dgs",)
+    (note,) = parse_gaussians(ply(REQUIRED, comments=brush), "a.ply").notes
+    assert "trained as surfels" in note
+    flat = {name: value for name, value in REQUIRED.items() if name != "scale_2"}
+    assert parse_gaussians(ply(flat, comments=brush), "a.ply").notes == ()
+
+
 def test_the_filter_of_mip_splatting_becomes_part_of_the_gaussian():
     found = parse_gaussians(ply(REQUIRED | {"filter_3D": 0.1, "more": 7}), "a.ply")
     scales = [math.exp(s) for s in (-2, -3, -4)]
@@ -96,6 +109,10 @@ def test_the_filter_of_mip_splatting_becomes_part_of_the_gaussian():
     ("data", "message"),
     [
         (ply({"x": 0, "y": 0, "z": 0, "red": 1}), "point cloud"),
+        (
+            ply({"x": 0, "y": 0, "z": 0}, after="element face 1\nproperty list uchar int i", rows_after=b"\0"),
+            "a mesh, not a 3DGS model",
+        ),
         (ply(REQUIRED | {"f_offset_0": 0, "f_anchor_feat_0": 0}), "anchors"),
         (ply({"packed_position": 0}), r"compressed \.ply"),
         (ply(REQUIRED, before="element codebook_centers 1\nproperty float a", rows_before=bytes(4)), "codebooks"),

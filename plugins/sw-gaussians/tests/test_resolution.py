@@ -19,8 +19,9 @@ from sw_gaussians.resolution import (
     shrunk,
 )
 from sw_gaussians.stage import ThreeDGSStage
+from sw_gaussians.tasks import UpdateLearningRate
 
-from splatwizard_core.api import Camera, CameraSampler, PipelineParams, View, stream
+from splatwizard_core.api import Camera, CameraSampler, ConfigError, PipelineParams, View, stream
 from splatwizard_core.training.scheduler import build_schedulers
 
 SIDE = 256
@@ -104,6 +105,30 @@ def test_the_scale_changes_only_where_statistics_start_again():
     scales = [drawn.scale(step) for step in range(1, 51)]
     assert [len(set(scales[i : i + 10])) for i in range(0, 50, 10)] == [1] * 5
     assert scales[::10] == sorted(set(scales), reverse=True)
+
+
+def test_the_position_rate_is_held_until_the_last_level_of_half_size():
+    config = GaussianTraining.model_validate({
+        "iterations": 3_000, "scale_schedule": True, "fast": {"resolution": "dash", "resolution_hold": True},
+    })  # fmt: skip
+    stage, scene = ThreeDGSStage(config), SimpleNamespace(train=views(), background=None)
+    pre, _ = build_schedulers(stage, PipelineParams())
+    update = next(entry.task for entry in pre.registrations if isinstance(entry.task, UpdateLearningRate))
+    drawn = stage.create_sampler(scene, stream(0, "sampler"))
+    drawn._plan = ResolutionPlan((0, 400, 600, 1500), (4.0, 2.5, 1.9, 1.0))
+    assert [update.rate(step, 2.0) for step in (1, 400)] == pytest.approx([3.2e-4] * 2)
+    assert update.rate(1_700, 2.0) == pytest.approx(3.2e-5)  # half of what is left
+    assert update.rate(3_000, 2.0) == pytest.approx(3.2e-6)
+    assert ResolutionPlan((0, 100), (1.8, 1.0)).coarse_until == ResolutionPlan((0,), (1.0,)).coarse_until == 0
+
+
+def test_holding_the_rate_is_off_unless_asked_for_and_needs_a_resolution_schedule():
+    dash = GaussianTraining.model_validate({"fast": {"resolution": "dash"}})
+    pre, _ = build_schedulers(ThreeDGSStage(dash), PipelineParams())
+    assert pre.registrations[0].task.rate(15_000, 1.0) == pytest.approx(1.6e-5)
+    assert "resolution_hold" not in dash.identity()["fast"]
+    with pytest.raises(ConfigError, match=r"set fast\.resolution=dash"):
+        ThreeDGSStage(GaussianTraining.model_validate({"fast": {"resolution_hold": True}}))
 
 
 def test_pictures_without_detail_are_whole_from_the_start():

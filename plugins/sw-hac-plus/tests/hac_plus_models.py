@@ -1,12 +1,20 @@
 """Small models of HAC++ with scattered values, and their files."""
 
+import copy
+
 import torch
+from sw_anchors.attribute_sections import AttributeEncoder
 from sw_anchors.coded_anchors import ENTROPY
+from sw_anchors.sections import round_networks
+from sw_anchors.shape import GROUPS
+from sw_anchors.voxel_lattice import kept_voxels
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
+from sw_codecs.entropy.conditional_mixture import RowMixture
+from sw_hac_plus import codec
 from sw_hac_plus.config import HACPlusConfig
 from sw_hac_plus.method import HACPlus
 from sw_hac_plus.model import HACPlusAnchors
@@ -60,6 +68,35 @@ def make(n: int = 300, *, seed: int = 0, **values) -> HACPlusAnchors:
             model.mask_logits.fill_(-6)
     model.phase = ENTROPY
     return model.eval()
+
+
+class Recorder(AttributeEncoder):
+    """An encoder that keeps integers, steps and mixtures, and counts the bits of the tables."""
+
+    def __init__(self, *args):
+        super().__init__(*args)
+        self.found, self.bits, self.mixed = {g: [] for g in GROUPS}, 0.0, []
+
+    def code(self, block, context, step, present=None):
+        symbols = super().code(block, context, step, present)
+        self.found[block.group].append((symbols * step).to(torch.float32))
+        mixed = isinstance(context, RowMixture)
+        coder = self.mixtures if mixed else self.coder
+        self.mixed += [(symbols, context)] if mixed else []
+        self.bits += float(coder.bits(symbols, context, present).sum())
+        return symbols
+
+
+def recorded(model, mode="exact"):
+    """Blocks that a walk over the model hands to its encoder, and the geometry."""
+    model = copy.deepcopy(model)
+    model.fold_units()
+    round_networks(model.networks(), "float32")
+    geometry, rows = kept_voxels(model)
+    recorder = Recorder(model, rows, codec.sections(model.channel), mode)
+    with torch.no_grad():
+        codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
+    return recorder, geometry
 
 
 def encoded(model: HACPlusAnchors, **values) -> bytes:

@@ -1,18 +1,17 @@
 """The file of HAC++: exact integers on any machine, counted in full, and safe against strangers."""
 
-import copy
 import json
 import struct
 
 import pytest
 import torch
-from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method
+from hac_plus_models import PLUGINS, decoded, encoded, generator, make, method, recorded
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from sw_anchors.attribute_sections import AttributeEncoder
-from sw_anchors.sections import BOUNDS_BYTES, round_networks
+from sw_anchors.sections import BOUNDS_BYTES
 from sw_anchors.shape import GROUPS
 from sw_anchors.voxel_lattice import kept_voxels
+from sw_kit.forged_files import forged
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -27,33 +26,6 @@ RASTERIZER = ReferenceRasterizer()
 FEATURES = ["features.1", "features.2", "features.3"]
 SECTIONS = ["anchors", "masks", "grids", "networks", *FEATURES, "scalings", "offsets"]
 KINDS = ["full", "tiny", "none"]
-
-
-class Recorder(AttributeEncoder):
-    """An encoder that keeps integers and steps, and counts the bits of the tables."""
-
-    def __init__(self, *args):
-        super().__init__(*args)
-        self.found, self.bits = {g: [] for g in GROUPS}, 0.0
-
-    def code(self, block, context, step, present=None):
-        symbols = super().code(block, context, step, present)
-        self.found[block.group].append((symbols * step).to(torch.float32))
-        coder = self.mixtures if isinstance(context, predictors.RowMixture) else self.coder
-        self.bits += float(coder.bits(symbols, context, present).sum())
-        return symbols
-
-
-def recorded(model, mode="exact"):
-    """Blocks that a walk over the model hands to its encoder, and the geometry."""
-    model = copy.deepcopy(model)
-    model.fold_units()
-    round_networks(model.networks(), "float32")
-    geometry, rows = kept_voxels(model)
-    recorder = Recorder(model, rows, codec.sections(model.channel), mode)
-    with torch.no_grad():
-        codec.Walk(mode, model.grid, model.mlp_grid, model.channel, model.shape, model.base_steps)(recorder, geometry)
-    return recorder, geometry
 
 
 def test_the_header_lists_what_decoding_needs():
@@ -165,7 +137,7 @@ def test_modes_cost_about_the_same_and_decode_to_about_the_same():
     difference = (decoded(exact).features - decoded(floats).features).abs()
     assert float(difference.detach().mean()) < 0.5
     with pytest.raises(BitstreamError, match=r"mode 'float' decodes only where it was encoded"):
-        decoded(rewritten(floats, made_on={"device": "x", "torch": "1.0"}))
+        decoded(forged(floats, made_on={"device": "x", "torch": "1.0"}))
 
 
 def test_far_positions_come_back():
@@ -202,16 +174,6 @@ def test_encoding_leaves_the_model_alone_and_repeats_itself():
     assert model.digest() == before
 
 
-def rewritten(data: bytes, sections=None, **static) -> bytes:
-    """A file with other header values and sections, whose checksums are right."""
-    reader = ContainerReader(data)
-    writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
-    writer.static.update({**reader.static, **static})
-    for name in reader.sections:
-        writer.add(name, (sections or {}).get(name, reader.section(name)))
-    return writer.to_bytes()
-
-
 BLOCK = encoded(make(n=40))
 
 
@@ -230,7 +192,7 @@ def test_a_damaged_section_is_answered(name, place, value, how):
     else:
         section[at] ^= value
     try:
-        found = decoded(rewritten(BLOCK, {name: bytes(section)}))
+        found = decoded(forged(BLOCK, {name: bytes(section)}))
     except BitstreamError:
         return
     # Some bytes are plain numbers: bounds, voxel size, weights. And the last bits of a stream may be any.
@@ -251,21 +213,21 @@ def test_a_damaged_section_is_answered(name, place, value, how):
 )  # fmt: skip
 def test_header_values_of_a_stranger_are_refused(key, value):
     with pytest.raises(BitstreamError):
-        decoded(rewritten(BLOCK, **{key: value}))
+        decoded(forged(BLOCK, **{key: value}))
 
 
 def test_a_voxel_size_that_makes_positions_infinite_is_refused():
     section = bytearray(ContainerReader(BLOCK).section("anchors"))
     section[BOUNDS_BYTES : BOUNDS_BYTES + 12] = struct.pack("<di", 9e29, (1 << 30) - 1000)
     with pytest.raises(BitstreamError, match="beyond all finite positions"):
-        decoded(rewritten(BLOCK, {"anchors": bytes(section)}))
+        decoded(forged(BLOCK, {"anchors": bytes(section)}))
 
 
 def test_networks_larger_than_the_file_may_stand_for_are_refused_before_they_are_made():
     values = {"feature_dim": 256, "num_offsets": 1, "channel.slices": [4] * 64, "channel.hidden": 1}
     data = encoded(make(n=6, **values))
     with pytest.raises(BitstreamError, match="channel networks of"):
-        decoded(rewritten(data, channel_hidden=512))
+        decoded(forged(data, channel_hidden=512))
 
 
 def test_the_header_is_plain_data_and_later_layouts_are_named():

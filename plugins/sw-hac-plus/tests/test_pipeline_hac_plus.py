@@ -2,14 +2,16 @@
 
 import pytest
 import torch
-from hac_plus_models import PLUGINS, decoded, method
+from hac_plus_models import PLUGINS, decoded, method, recorded
 from sw_anchors.coded_anchors import ENTROPY
 from sw_kit import short_training
 from sw_kit.short_training import demo, file_of, psnr
 
 from splatwizard_core.coding.container import ContainerReader
+from splatwizard_core.method import create_method
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.training.pipeline import TrainingStopped
+from sw_codecs.entropy.rates import mixture_bits
 
 pytestmark = pytest.mark.pipeline
 
@@ -24,7 +26,7 @@ SMALL = {
     "lr.channel_final": 2e-3, "rate_term.start": "statistics", "rate_term.units": "steps", "steps.scales": 0.004,
     "channel.slices": [4, 4], "channel.hidden": 8, "rate_term.sample": 0.5,
 }  # fmt: skip
-WEIGHTS = (0.001, 0.05)
+WEIGHTS = (0.001, 0.01, 0.05)
 
 
 @pytest.fixture(scope="module")
@@ -54,16 +56,23 @@ def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):
     assert model.phase == ENTROPY
     assert psnr(model, scene, rasterizer) > 22
     assert "rate" not in losses[49]
-    losses = [step["rate"] for step in trained[WEIGHTS[1]][1] if "rate" in step]
+    losses = [step["rate"] for step in trained[WEIGHTS[-1]][1] if "rate" in step]
     assert sum(losses[-10:]) < 0.6 * sum(losses[:10])
 
 
-def test_a_larger_weight_prunes_and_gives_a_smaller_file(trained):
-    (_, few), (_, many) = [(weight, trained[weight][0].counts()) for weight in reversed(WEIGHTS)]
-    assert few["num_gaussians"] < 0.9 * many["num_gaussians"]
-    small, large = (ContainerReader(file_of(trained[w][2], trained[w][0])).sections for w in reversed(WEIGHTS))
+def test_a_larger_weight_prunes_and_gives_a_smaller_and_worse_file(scene, rasterizer, trained):
+    counts, files, quality = [], [], []
+    for model, _, made in trained.values():
+        data = file_of(made, model)
+        counts.append(model.counts()["num_gaussians"])
+        files.append(ContainerReader(data))
+        quality.append(psnr(decoded(data), scene, rasterizer))
+    assert counts[0] > counts[1] > counts[2]
+    assert counts[2] < 0.9 * counts[0]
     for name in ("features.1", "features.2", "offsets"):
-        assert small[name] < large[name]
+        sizes = [reader.sections[name] for reader in files]
+        assert sizes[0] > sizes[1] > sizes[2], name
+    assert quality[0] > quality[1] > quality[2]
 
 
 def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
@@ -83,6 +92,53 @@ def test_the_file_holds_what_was_learned(scene, rasterizer, trained):
         model.eval()
     numbers = model.num_rows * (8 + 6 + 15)
     assert sum(float(rate.bits) for rate in sampled) / 40 * numbers == pytest.approx(size, rel=0.06)
+
+
+def test_the_file_is_as_small_as_the_mixtures_of_a_trained_model_ask_for(trained):
+    model, _, made = trained[WEIGHTS[0]]
+    estimate = tables = 0.0
+    recorder, _ = recorded(model)
+    for symbols, context in recorder.mixed:
+        wide = {name: torch.as_tensor(value).double() / 4096 for name, value in vars(context).items()}
+        bits = mixture_bits(
+            symbols * wide["step"],
+            torch.stack([wide["logit"], torch.zeros_like(wide["logit"])], dim=-1),
+            torch.stack([wide["mean"], wide["second_mean"]], dim=-1),
+            torch.stack([wide["scale"], wide["second_scale"]], dim=-1).clamp(min=1e-9),
+            wide["step"],
+            p_min=1e-12,
+        )
+        estimate += float(bits.sum())
+        tables += float(recorder.mixtures.bits(symbols, context).sum())
+    assert estimate < tables < 1.002 * estimate
+    sections = ContainerReader(file_of(made, model)).sections
+    size = 8 * sum(sections[name] for name in ("features.1", "features.2"))
+    assert size - tables < 2 * 8 * 20  # framing and checksums: of so small a section they are most of the difference
+
+
+@pytest.mark.slow
+@pytest.mark.skipif("hac" not in PLUGINS.methods, reason="needs sw-hac")
+def test_a_file_of_hac_plus_is_smaller_than_one_of_hac_and_no_worse(scene, rasterizer):
+    """Without the networks, which are most of so small a file; a plan of 240 steps, the same for both.
+
+    Not at equal lambda: the rate of HAC++ pulls in each step at anchors that the view does not see, so that the same
+    lambda is further down its curve (0.001: 0.4 dB below HAC in 0.73 of the bytes).
+    """
+    plan = {key: value for key, value in SMALL.items() if not key.startswith("channel.")} | {
+        "iterations": 240, "lr.max_steps": 240, "phases.quantized": 40, "phases.rebound": 79, "phases.entropy": 80,
+        "growth.start": 30, "growth.stop": 120, "rate_term.sample": 0.05, "lr.masks_init": 0.01, "lr.masks_final": 4e-3,
+    }  # fmt: skip
+    del plan["lr.channel_final"]
+    own = {"channel.slices": [4, 4], "channel.hidden": 8, "lr.channel_final": 2e-3, "rate_term.sample": 0.5}
+    sizes, quality = [], []
+    for name, values in (("hac", {"rate_term.weight": 0.004}), ("hac-plus", {"rate_term.weight": 0.001, **own})):
+        made = create_method(PLUGINS, name, {**plan, **values})
+        model = short_training.train(made, scene, rasterizer).model.eval()
+        reader = ContainerReader(file_of(made, model))
+        sizes.append(sum(reader.sections.values()) - reader.sections["networks"])
+        quality.append(psnr(made.decode(reader), scene, rasterizer))
+    assert sizes[1] < 0.95 * sizes[0], sizes
+    assert quality[1] > quality[0], quality
 
 
 def test_an_interrupted_training_ends_as_a_whole_one(scene, rasterizer, tmp_path):

@@ -6,6 +6,7 @@ import pytest
 import torch
 from hac_models import generator, make, method
 from sw_anchors.coded_anchors import ENTROPY
+from sw_anchors.testing import check_nothing_is_waited_for
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
 
@@ -167,24 +168,7 @@ def test_what_training_forecasts_for_a_sample_is_what_is_predicted(in_steps, ker
 @pytest.mark.cuda
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 def test_on_a_gpu_neither_values_nor_rate_are_waited_for():
-    model, rows = make().cuda().train(), torch.arange(300, device="cuda")
-    model.sample = 0.5
-
-    def step():
-        attributes = model.attributes(rows)
-        rate = attributes.extras["rate"]
-        (attributes.features.mean() + rate.bits + 1e-5 * rate.own_bits).backward()
-        return rate
-
-    step()  # what is kept on the device is made
-    torch.cuda.synchronize()
-    torch.cuda.set_sync_debug_mode("error")
-    try:
-        rate = step()
-    finally:
-        torch.cuda.set_sync_debug_mode("default")
-    assert float(rate.bits) > 0
-    assert all(bool(torch.isfinite(p.grad).all()) for p in model.parameters() if p.grad is not None)
+    check_nothing_is_waited_for(make().cuda())
 
 
 def test_a_copy_leaves_behind_where_anchors_lie():

@@ -23,7 +23,7 @@ SMALL = {
     "lr.masks_final": 4e-3, "lr.grid_final": 1e-3, "lr.mlp_grid_final": 1e-3, "rate_term.start": "statistics",
     "rate_term.units": "steps", "steps.scales": 0.004,
 }  # fmt: skip
-WEIGHTS = (0.001, 0.03)
+WEIGHTS = (0.001, 0.006, 0.03)
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def test_it_learns_the_scene_and_the_rate(scene, rasterizer, trained):
 
     assert mean("l1", range(220, 240)) < 0.6 * mean("l1", range(20))
     assert "rate" not in losses[79]
-    losses = trained[WEIGHTS[1]][1]
+    losses = trained[WEIGHTS[-1]][1]
     assert mean("rate", range(220, 240)) < 0.8 * mean("rate", range(80, 90))
 
 
@@ -70,8 +70,8 @@ def test_a_larger_weight_gives_a_smaller_and_worse_file(scene, rasterizer, train
         data = file_of(made, model)
         sizes.append(len(data))
         quality.append(psnr(decoded(data), scene, rasterizer))
-    assert sizes == sorted(sizes, reverse=True)
-    assert quality == sorted(quality, reverse=True)
+    assert sizes[0] > sizes[1] > sizes[2]
+    assert quality[0] > quality[1] > quality[2]
 
 
 def test_the_file_holds_what_was_learned(scene, rasterizer, trained):

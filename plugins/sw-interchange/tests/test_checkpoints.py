@@ -57,7 +57,7 @@ def test_what_several_gpus_saved_is_one_scene(tmp_path, scene):
     with pytest.raises(BitstreamError, match="more than the limit"):
         read(tmp_path / "ckpt_9_rank0.pt", limits=Limits(max_gaussians=6))
     (tmp_path / "ckpt_9_rank1.pt").unlink()
-    with pytest.raises(SceneError, match="'ckpt_9_rank1.pt', which"):
+    with pytest.raises(SceneError, match=r"'ckpt_9_rank1\.pt', which"):
         read(tmp_path / "ckpt_9_rank2.pt")
 
 

@@ -5,6 +5,7 @@ import json
 import math
 import struct
 import zipfile
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ ROOT = 2**-0.5
 
 @pytest.fixture(scope="module")
 def scene() -> GaussianScene:
-    """The identity, a negative w, y and z as largest components, no and full opacity, colours beyond the clamps, a huge
-    and a tiny scale, coordinates at the ends."""
+    """The identity, a negative w, a tie of x and y, z as largest component, no and full opacity, colours beyond the
+    clamps, a huge and a tiny scale, coordinates at the ends."""
     return GaussianScene(
         means=np.array([[0, 0, 0], [1.5, -2, 0.25], [-2047.9998, 2047.5, 1 / 4096], [0.1, 0.2, -0.3]], np.float32),
         log_scales=np.array([[0, -1, -2], [5.9375, -10, 0.03], [7, -12, -3.14], [-0.5, -0.25, -0.125]], np.float32),
@@ -137,6 +138,38 @@ def test_spz_version_4_is_a_plain_header_a_table_and_the_same_planes(scene):
         found += zstandard.decompress(data[at : at + size])
         at += size
     assert (found, at) == (planes, len(data))
+
+
+QUATS = [[0.1, 0.9, -0.3, 0.3], [0, 0.6, -0.8, 0], [0.3, 0.3, -0.1, -0.9], [-0.9, 0.3, 0.3, 0.1]]
+"""Largest are x, y, z and w, the last three of them negative."""
+
+
+@pytest.mark.parametrize("name", ["spz", "compressed-ply", "sog"])
+def test_each_component_may_be_the_largest(scene, name):
+    """Codes beside those of the scene above, in which y is largest nowhere."""
+    turned = replace(scene, quats=np.array([unit(quat) for quat in QUATS], np.float32))
+    order = [0, 1, 2, 3] if name == "spz" else morton_order(scene.means)
+    data = encode(turned, name, **({"fractional_bits": 11} if name == "spz" else {}))[0]
+    if name == "spz":
+        assert [word >> 30 for word in spz_words(turned)] == [0, 1, 2, 3]
+        at = 16 + 4 * (9 + 1 + 3 + 3)
+        assert inflate(data, 1 << 20, "")[at : at + 16] == struct.pack("<4I", *spz_words(turned))
+        return
+    wanted = [smallest_three(unit(turned.quats[i])) for i in order]
+    assert sorted(largest for largest, _ in wanted) == [0, 1, 2, 3]
+    if name == "sog":
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            image = Image.open(io.BytesIO(archive.read("quats.webp"))).convert("RGBA")
+        texels = np.asarray(image).reshape(-1, 4)[:4].tolist()
+        assert texels == [
+            [*(round(255 * (q * math.sqrt(2) * 0.5 + 0.5)) for q in others), 252 + largest]
+            for largest, others in wanted
+        ]
+        return
+    rows = np.frombuffer(data.partition(b"end_header\n")[2], "<u4", offset=72, count=16).reshape(4, 4)
+    for word, (largest, others) in zip(rows[:, 1].tolist(), wanted, strict=True):
+        a, b, c = (unorm(q * ROOT + 0.5, 0, 1, 10) for q in others)
+        assert word == largest << 30 | a << 20 | b << 10 | c
 
 
 def unorm(value: float, low: float, high: float, bits: int) -> int:

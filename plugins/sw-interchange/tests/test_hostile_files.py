@@ -6,6 +6,7 @@ import json
 import os
 import pickle
 import struct
+import time
 import tracemalloc
 import zipfile
 import zlib
@@ -14,9 +15,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from interchange_files import Sample, ksplat_file, mutants, random_scene, samples
+from sw_gaussians.ply import load_ply
 from sw_interchange import Limits, decode, encode, gltf, read, write
 
-from splatwizard_core.api import SplatwizardError, UserInputError
+from splatwizard_core.api import SceneError, SplatwizardError, UserInputError
 
 LIMITS = Limits(max_gaussians=1 << 20, max_output_bytes=1 << 28)
 MEMORY = 256 << 20
@@ -220,6 +222,8 @@ BAD = {
     "gltf with another file": (gltf_with("buffers.0.uri", "/etc/passwd"), "gltf"),
     "gltf with sparse rows": (gltf_with("accessors.0.sparse", {}), "gltf"),
     "gltf that shears": (gltf_with("nodes.0.scale", [1, 2, 1]), "gltf"),
+    "gltf that mirrors": (gltf_with("nodes.0.scale", [-1, 1, 1]), "gltf"),
+    "gltf that turns everything inside out": (gltf_with("nodes.0.scale", [-2, -2, -2]), "gltf"),
     "gltf that flattens": (gltf_with("nodes.0.scale", [0, 0, 0]), "gltf"),
     "gltf with a node of its own": (gltf_with("nodes.0.children", [0]), "gltf"),
     "gltf with a ring of nodes": (nested_gltf(2000), "gltf"),
@@ -250,6 +254,17 @@ def test_a_bad_file_is_refused_in_two_lines(name, little_memory):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_file_is_refused_within_a_second_of_work(name):
+    """Of the processor, all threads together: other programs do not count."""
+    data, format = BAD[name]
+    before = time.process_time()
+    with pytest.raises(SplatwizardError):
+        decode(data, format, limits=LIMITS)
+    assert time.process_time() - before < 1
+
+
 def test_what_stands_after_the_attributes_of_a_gzip_bomb_is_not_inflated(little_memory):
     assert decode(GZIP_BOMB, "spz", limits=LIMITS).num_gaussians == 1
 
@@ -264,11 +279,14 @@ def test_a_file_cut_off_anywhere_is_refused(name, sound):
                 decode(data[:at], sample.format, limits=LIMITS)
 
 
-@pytest.mark.parametrize("name", samples())
-def test_a_mutated_file_is_a_scene_or_a_clear_error(name, sound):
+@pytest.mark.parametrize(("name", "count"), [
+    *((name, SLOW_TO_OPEN.get(name, FLIPS)) for name in samples()),
+    *(pytest.param(name, 2000, marks=pytest.mark.slow) for name in samples()),
+])  # fmt: skip
+def test_a_mutated_file_is_a_scene_or_a_clear_error(name, count, sound):
     """100,000 of each: benchmarks/interchange_fuzz.py."""
     refused = told = 0
-    for data in mutants(sound[name], SLOW_TO_OPEN.get(name, FLIPS), seed=7):
+    for data in mutants(sound[name], count, seed=7):
         try:
             scene = decode(data, sound[name].format, limits=LIMITS)
         except SplatwizardError as error:
@@ -362,6 +380,17 @@ def test_images_beside_a_description_are_files_of_a_sound_size(tmp_path):
     os.mkfifo(image)
     with pytest.raises(UserInputError, match="is no file"):
         read(meta)
+
+
+def test_a_pipe_is_no_file(tmp_path):
+    """Also one without a writer, which another `open` would wait for."""
+    pipe = tmp_path / "a.ply"
+    os.mkfifo(pipe)
+    for reader in (read, load_ply):
+        with pytest.raises(SceneError, match=r"a\.ply: cannot be read: it is no file"):
+            reader(pipe)
+    with pytest.raises(SceneError, match="cannot be read: it is a folder"):
+        load_ply(tmp_path)
 
 
 def test_elements_and_properties_that_stand_twice_are_refused():

@@ -58,6 +58,18 @@ def test_the_factor_is_applied_twice_below_one_as_in_the_authors_set_up():
     assert published("chair", "auto", "c1").lr_factor == 1.6
 
 
+def test_values_in_force_are_those_of_the_scene_where_the_configuration_leaves_them_open(plugins):
+    sets = {"codec.settings.blocks": 7, "prune.settings.beta": 0.3}
+    (stage,) = MesonGS(plugins, resolve(MesonGS, "paper", "r2", sets=sets).config).stages()
+    stage.values = published("kitchen", "auto", "c3")
+    assert stage.in_force() == {
+        "prune.tau": 0.24, "prune.settings.beta": 0.3, "codec.settings.depth": 19, "codec.settings.blocks": 7,
+        "codec.settings.codebook_size": 8192, "lr.factor": pytest.approx(0.16),
+    }  # fmt: skip
+    (stage,) = MesonGS(plugins, resolve(MesonGS, "paper", sets={"prune": "opacity"}).config).stages()
+    assert stage.in_force()["prune.settings.beta"] == 0.1  # of the importance that weighs the colours
+
+
 @pytest.mark.parametrize("preset", MesonGS.PRESETS)
 @pytest.mark.parametrize("rate", MesonGS.RATES)
 def test_every_preset_resolves_at_every_rate_point(preset, rate):

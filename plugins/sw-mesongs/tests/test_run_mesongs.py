@@ -20,3 +20,7 @@ def test_a_run_ends_with_a_record_of_a_small_file(tmp_path):
     count = record["counts"]["num_gaussians"]
     assert 0 < record["file"]["bytes"] < 248 * count / 4
     assert record["config"]["config"]["authors"]["point"] == "c3"
+    lines = [json.loads(line) for line in path.with_name("log.jsonl").read_text().splitlines()]
+    (said,) = (line["said"] for line in lines if line.get("said", "").startswith("scene 'demo"))
+    assert "prune.tau = 0.3, prune.settings.beta = 0.1, codec.settings.depth = 14, " in said
+    assert said.endswith("codec.settings.blocks = 57, codec.settings.codebook_size = 16, lr.factor = 1")

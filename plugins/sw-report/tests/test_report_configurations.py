@@ -242,3 +242,14 @@ def test_the_page_about_the_seeds_of_one_rate_point_shows_their_mean(make, tmp_p
     assert f"{run.mean('psnr'):.2f} ± {run.deviation('psnr'):.2f}" in text
     assert "2 runs: 1 method on 1 scene" in text
     assert text.count("sw run --method toy --scene garden --preset paper --rate r1") == 2
+
+
+def test_values_by_data_set_make_no_configurations(make_run, tmp_path):
+    for scene, voxel in (("garden", 0.001), ("train", 0.01)):
+
+        def change(content, voxel=voxel):
+            configured("r1", more=(("voxel_size", voxel),))(content)
+            content["config"]["provenance"]["voxel_size"] = "data set 'x'"
+
+        make_run("r1", 8.0, out=tmp_path, scene=scene, change=change)
+    assert labels(tmp_path) == ["toy r1", "toy r1"]

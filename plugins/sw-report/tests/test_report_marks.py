@@ -74,7 +74,7 @@ def test_the_command_of_each_run_can_be_given_again(make_run, tmp_path):
         "config": {"iterations": 300, "prune": {"soft": [0.3, 0.5], "cap": None}},
         "pipeline": {"seed": 3}, "scene": {"images": "my pictures"},
         "provenance": {"iterations": "preset 'paper'", "prune.soft": "--set", "prune.cap": "--set", "seed": "--set",
-                       "images": "--set", "lr": "rate 'r1'", "log_every": "my.toml"},
+                       "images": "--set", "lr": "rate 'r1'", "background": "data set 'db'", "log_every": "my.toml"},
     }  # fmt: skip
     directory = make_run(change=lambda c: c.update(config=config))
     (run,) = collect([tmp_path]).runs

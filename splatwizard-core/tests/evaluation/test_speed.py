@@ -1,5 +1,7 @@
 """The FPS protocol on fake renderers whose time is known."""
 
+import time
+
 import pytest
 import torch
 from fresh_memory import fresh_memory
@@ -37,6 +39,35 @@ def test_frames_per_second_are_those_of_the_measured_frames_and_warm_up_is_not_c
     assert report.fps == pytest.approx(len(measured) / sum(measured))
     assert report.latency_ms_median == pytest.approx(1e3 * sorted(measured)[6])
     assert report.latency_ms_p95 == pytest.approx(14.0)
+
+
+class SleepingRenderer:
+    """Sleeps 20 ms a frame, and notes how long each took on a clock of its own."""
+
+    def __init__(self) -> None:
+        self.took: list[float] = []
+
+    def __call__(self, view: int) -> torch.Tensor:
+        start = time.monotonic()
+        time.sleep(0.020)
+        self.took.append(time.monotonic() - start)
+        return torch.zeros(3, 1, 1)
+
+
+def test_the_clock_goes_on_while_a_frame_waits():
+    """As it does for a GPU; a clock of the process's own work would tell thousands of frames per second."""
+    report = measure_speed(SleepingRenderer(), [0], "cpu")
+    assert report.latency_ms_median >= 20
+    assert report.fps <= 50
+
+
+@pytest.mark.slow
+def test_the_clock_is_right_within_5_percent():
+    renderer = SleepingRenderer()
+    report = measure_speed(renderer, list(range(20)), "cpu")
+    measured = renderer.took[report.warmup_frames :]
+    assert report.fps == pytest.approx(len(measured) / sum(measured), rel=0.05)
+    assert report.latency_ms_median == pytest.approx(1e3 * sorted(measured)[len(measured) // 2], rel=0.05)
 
 
 def test_few_views_are_repeated_for_the_warm_up_only(monkeypatch):

@@ -39,7 +39,7 @@ class Codec(Params):
 
 
 class ToyConfig(OptimizationParams):
-    iterations: int = Field(8, ge=1)
+    iterations: int = Field(8, ge=0)
     codec: Codec = Codec()
 
 

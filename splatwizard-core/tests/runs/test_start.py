@@ -86,6 +86,23 @@ def test_the_config_of_a_run_from_a_file_repeats_it(toy_plugins, tmp_path, ply):
     assert training_key(session, again) == training_key(session, first)
 
 
+def test_what_a_file_is_drawn_with_is_kept_where_nothing_is_trained(toy_plugins, tmp_path):
+    """A model without steps is the file's; one with steps has learned to be drawn as its method does."""
+    model = gaussians_from_points(PointCloud(torch.rand(9, 3), torch.full((9, 3), 0.5)), max_sh_degree=1)
+    model.origin = {"raster": {"antialias": True}}
+    export_ply(model, tmp_path / "smooth.ply")
+
+    def asked(*sets: str) -> dict[str, object]:
+        trained, _ = Run(toy_plugins, tmp_path / "out" / str(len(sets)) / sets[0]).train(
+            f"init={tmp_path / 'smooth.ply'}", *sets
+        )
+        return trained.facts["raster"]
+
+    assert asked("iterations=0") == {"antialias": True}
+    assert asked("iterations=0", "raster.antialias=false") == {}
+    assert asked("iterations=1") == {}
+
+
 def test_a_teacher_is_the_file_too(toy_plugins, tmp_path, ply):
     invocation = Run(toy_plugins, tmp_path / "out")
     found, _ = invocation.train(f"init={ply}", method="toy-taught")

@@ -3,17 +3,26 @@
 import json
 import math
 import time
+from dataclasses import replace
 
 import pytest
 import torch
 
-from splatwizard_core.errors import EmptyModel, NothingToDo, TaskError, TaskSignatureError, TrainingDiverged
+from splatwizard_core.errors import (
+    ConfigError,
+    EmptyModel,
+    NothingToDo,
+    TaskError,
+    TaskSignatureError,
+    TrainingDiverged,
+)
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.rendering.rasterizer import Rasterizer, RenderResult
 from splatwizard_core.training import timing
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import OptimizationParams, PipelineParams
+from splatwizard_core.training.pipeline import TrainingRun
 from splatwizard_core.training.rng import Streams
 from splatwizard_core.training.scheduler import STOP
 from splatwizard_core.training.trainer import Trainer
@@ -201,6 +210,16 @@ def test_the_fixed_background_is_the_scenes(toy):
     trainer = make_trainer(toy, make_stage(toy))
     trainer.run(3, lambda record: None)
     assert all(torch.equal(b, toy.scene.background) for b in trainer.rasterizer.backgrounds)
+
+
+def test_a_random_background_and_pictures_composited_at_load_are_refused(toy):
+    scene = toy.make_scene(rgba=True)
+    scene.protocol = replace(scene.protocol, composite8=True)
+    run = {"directory": None, "identity": {}, "trained": lambda method: None}
+    given = [make_stage(toy)], lambda: None, scene
+    TrainingRun(*given, PipelineParams(), None, **run)
+    with pytest.raises(ConfigError, match="leave out one"):
+        TrainingRun(*given, PipelineParams(random_background=True), None, **run)
 
 
 def test_a_random_background_is_fresh_each_step_and_the_same_for_render_and_truth(toy):

@@ -16,7 +16,7 @@ from sw_anchors.anchors import AnchorAttributes, AnchorModel
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
 from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
-from sw_anchors.noisy_values import Noise, Tables, noisy_values
+from sw_anchors.noisy_values import Noise, Tables, draws, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
 from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
@@ -247,7 +247,7 @@ class CodedAnchors(AnchorModel):
             if self.phase == ENTROPY:
                 forecast = self.forecast(rows)
                 steps = forecast.steps
-            uniform = self.uniform(len(rows), sum(self.shape.widths))
+            uniform = self.draw_noise(len(rows), sum(self.shape.widths))
             noise = Noise(steps, uniform, self._columns(steps))
             drawn = self.sampled(len(rows)) if forecast is not None else drawn
         found = noisy_values(rows, self._tables, self.mask_weights(), MASK_THRESHOLD, noise, drawn)
@@ -299,8 +299,16 @@ class CodedAnchors(AnchorModel):
 
     def uniform(self, *shape: int) -> Tensor:
         """Draws of U(0,1) on the model's device."""
+        return torch.rand(shape, generator=self._own_generator(), device=self.device)
+
+    def draw_noise(self, rows: int, numbers: int) -> Tensor:
+        """[rows, numbers] draws of U(0,1) for noise, see `noisy_values.draws`."""
+        return draws((rows, numbers), self._own_generator(), self.device)
+
+    def _own_generator(self) -> torch.Generator | None:
+        """The generator of noise, if it draws on the model's device."""
         own = self.noise is not None and self.noise.device.type == self.device.type
-        return torch.rand(shape, generator=self.noise if own else None, device=self.device)
+        return self.noise if own else None
 
     def sampled(self, count: int) -> Tensor:
         """[S] int64: those of `count` visible anchors whose bits are counted in this step."""

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from sw_anchors import row_kernels
-from sw_anchors.row_kernels import NoisyRows, SampleBits, fit_kernels
+from sw_anchors.row_kernels import NoisyRows, SampleBits, bits_fit_kernel, fit_kernels
 from sw_codecs.entropy.rates import gaussian_bits
 
 
@@ -93,7 +93,7 @@ def sample_bits(
 
     The derivative by the bits must not be negative.
     """
-    if x.dtype == torch.float32 and fit_kernels(x):
+    if bits_fit_kernel(x, mean, scale, steps, masks, counted):
         bits, by_group = SampleBits.apply(x, mean, scale, steps, masks, counted, p_min, smallest_scale)  # type: ignore[no-untyped-call]
         return bits, by_group
     offsets = 3 * masks.shape[1]

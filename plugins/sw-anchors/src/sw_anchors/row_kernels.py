@@ -1,4 +1,4 @@
-"""CUDA kernels for rows of anchors in a training step: their copies, noisy numbers with masks, the bits of a sample.
+"""Kernels for rows of anchors in a training step: copies and noisy numbers on CUDA, the bits of a sample on CPUs too.
 
 Each does what a chain of torch operations does, in one pass over memory; `fused_ops` has both forms.
 """
@@ -25,6 +25,13 @@ def fit_kernels(*tensors: Tensor) -> bool:
     if not all(t.is_cuda and t.element_size() == 4 and t.dim() > 0 for t in tensors):
         return False
     return all(t.is_contiguous() or (t.dim() == 2 and t.stride(1) == 1) for t in tensors) and ANCHORS.has_cuda()
+
+
+def bits_fit_kernel(*tensors: Tensor) -> bool:
+    """Whether there is a kernel for the bits of these tensors; loads it."""
+    if all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors):
+        return ANCHORS.try_load()
+    return tensors[0].dtype == torch.float32 and fit_kernels(tensors[0])
 
 
 def load_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""Checks for the tests of methods on anchors: the decoding in tensors of fixed sizes equals that of any number of rows.
+"""Checks for the tests of methods on anchors: decoding in tensors of fixed sizes, training without waiting for a GPU.
 
 def test_fixed_sizes_change_nothing():
     check_fixed_decoder(make_model, camera, rasterizer, counts=(0, 1, 40))
@@ -59,6 +59,29 @@ def check_fixed_decoder(
                 assert difference <= limit, f"{phase}, {count} anchors, {name}: {difference:.3g} apart"
 
 
+def check_nothing_is_waited_for(model: CodedAnchors) -> None:
+    """Raise where values and rate of 300 anchors of a model in its last phase, on a GPU, make the CPU wait for it."""
+    rows = torch.arange(300, device=model.device)
+    model.train()
+    model.sample = 0.5
+
+    def step() -> Any:
+        attributes = model.attributes(rows)
+        rate = attributes.extras["rate"]
+        (attributes.features.mean() + rate.bits + 1e-5 * rate.own_bits).backward()
+        return rate
+
+    step()  # what is kept on the device is made
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        rate = step()
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert float(rate.bits) > 0
+    assert all(bool(torch.isfinite(p.grad).all()) for p in model.parameters() if p.grad is not None)
+
+
 def _one_step(
     model: CodedAnchors, camera: Camera, rasterizer: Rasterizer, phase: str, count: int, sample: float
 ) -> dict[str, Tensor]:
@@ -87,6 +110,7 @@ def _one_step(
         mock.patch.object(PoolRows, "draw", fill),
         mock.patch.object(model, "pool_sample", pool),
         mock.patch.object(model, "uniform", lambda *shape: noise[: shape[0]].clone()),
+        mock.patch.object(model, "draw_noise", lambda *shape: noise[: shape[0]].clone()),
         mock.patch.object(model, "draw_sample", lambda n: torch.nonzero(draws[:n] < sample).squeeze(1)),
     ):
         inputs = model.decode(camera, rows)

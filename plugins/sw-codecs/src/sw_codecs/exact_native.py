@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from splatwizard_native import NativeModule
+from splatwizard_native import NativeBuildError, NativeModule
 
 EXACT = NativeModule(
     name="sw_codecs_exact",
     package="sw_codecs",
-    sources=("exact_kernels/binding.cpp", "exact_kernels/binding_networks.cpp"),
+    sources=(
+        "exact_kernels/binding.cpp",
+        "exact_kernels/binding_networks.cpp",
+        "exact_kernels/binding_mixtures.cpp",
+    ),
     kernels=(
         "exact_kernels/lattice.cpp",
         "exact_kernels/network.cpp",
@@ -15,10 +19,20 @@ EXACT = NativeModule(
         "exact_kernels/streams.cpp",
         "exact_kernels/lookups.cpp",
         "exact_kernels/mixtures.cpp",
+        "exact_kernels/mixture_rows.cpp",
         "exact_kernels/octree.cpp",
+        "exact_kernels/bits.cpp",
     ),
     headers=("exact_kernels/*.h",),
     cflags=("-fno-math-errno", "-fno-trapping-math"),  # without these GCC keeps conversions out of vector code
     seconds=15,
     without="files of anchors decode by torch and the library constriction: the same bits, five to ten times slower",
 )
+
+
+def has_exact() -> bool:
+    """Whether the kernels are built; loads them. For what any file has: compiling takes longer than it does without."""
+    try:
+        return EXACT.load_built()
+    except NativeBuildError:
+        return False

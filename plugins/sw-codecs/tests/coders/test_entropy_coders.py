@@ -152,6 +152,20 @@ def test_the_smallest_and_largest_parameters_still_code(coder, spec):
                 assert np.array_equal(coder().decode(coder().encode(symbols, model), 7, model), symbols)
 
 
+def test_bits_decode_with_and_without_the_kernel(kernels):
+    shares = np.concatenate([rng(3).random(40), [1e-9, 2.0**-24, 3e-5, 0.5, 1 / 3, 1 - 1e-6, 1 - 1e-9]])
+    coded = []
+    kernels(False)
+    for share in shares:
+        symbols = (rng(4).random(400) < np.clip(share, 0.02, 0.98)).astype(int)
+        coded.append((symbols, Bernoulli(float(share)), RangeCoder().encode(symbols, Bernoulli(float(share)))))
+    kernels(True)
+    for symbols, model, data in coded:
+        assert np.array_equal(RangeCoder().decode(data, len(symbols), model), symbols)
+    with pytest.raises(BitstreamError):
+        RangeCoder().decode(data[:20] + b"\xff" * (len(data) - 20), len(symbols), model)
+
+
 @pytest.mark.parametrize("coder", STREAMS)
 @pytest.mark.parametrize("name", ["table", "gaussian", "bernoulli"])
 def test_many_chunks(coder, name, monkeypatch):

@@ -67,6 +67,20 @@ def test_a_network_of_small_and_of_large_numbers(weight, largest, kernels):
         assert torch.equal(ours, expected)
 
 
+@pytest.mark.parametrize("widths", [(0, 7), (20, 150), (3, 4)])
+@pytest.mark.parametrize("leak", [0, 41])
+def test_a_leaky_network_of_inputs_side_by_side(leak, widths, kernels):
+    torch.manual_seed(1)
+    layers = [(torch.randn(a, b).numpy(), torch.randn(a).numpy()) for a, b in ((40, sum(widths)), (30, 40))]
+    made = IntegerMlp(layers, leak=leak)
+    whole = torch.randint(-(2**17), 2**17, (61, 200), generator=generator())
+    parts = whole[:, : widths[0]], whole[:, 10 : 10 + widths[1]]
+    ours, expected = both(kernels, lambda: made(*parts))
+    assert torch.equal(ours, expected)
+    assert torch.equal(made(torch.cat(parts, dim=1)), expected)
+    assert torch.equal(made(*parts, rows=7), expected)
+
+
 @pytest.mark.parametrize("features", [1, 4, 6, 16])
 def test_a_mixed_hash_grid(features, kernels):
     grid = MixedHashGrid(

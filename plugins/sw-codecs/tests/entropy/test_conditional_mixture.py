@@ -155,6 +155,23 @@ def test_how_many_rows_are_made_at_once_is_no_matter(monkeypatch):
         assert np.array_equal(C().decode(data, context), symbols)
 
 
+@pytest.mark.parametrize("columns", [1, 10, 130])
+@pytest.mark.parametrize("size", [1 << 13, 1 << 40])
+def test_the_kernel_makes_the_rows_that_numpy_makes(columns, size):
+    r = np.random.default_rng(columns)
+    mean, scale, second, widening, logit = (r.integers(-size, size, (50, columns)) for _ in range(5))
+    step = r.integers(64 if size < 1 << 20 else 16_000, 16_385, (50, 1))
+    second[::3] = mean[::3]
+    scale[1::2] = r.integers(0, 1 << 18, (25, columns))
+    parts = [mean, scale, second, widening, logit, step]
+    ours = conditional_mixture._kernel_rows(parts, mean.shape)
+    theirs = conditional_mixture._exact_rows(*(np.broadcast_to(each, mean.shape).reshape(-1) for each in parts))
+    for field in ("centre", "width", "order"):
+        assert np.array_equal(getattr(ours, field), getattr(theirs, field))
+    assert all(np.array_equal(a, b) for a, b in zip(ours.exact, theirs.exact, strict=True))
+    assert conditional_mixture._kernel_rows([mean, scale, second, widening, logit, step * 0], mean.shape) is None
+
+
 def test_the_kernel_and_the_library_write_the_same_words():
     """Many symbols, some of them so improbable that carries run through words of ones."""
     found, symbols = parameters(3000, 10, seed=4)

@@ -101,6 +101,16 @@ def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
     )
 
 
+def off_centre_warnings(pixels: float, rules: Rules) -> list[str]:
+    """Warn where principal points lie more than 1 px, at the most `pixels`, off the middle that is taken for them."""
+    if pixels <= 1 or rules.principal_point == "file":
+        return []
+    return [
+        f"the principal point is up to {pixels:.1f} px off the image centre and is taken as the centre, "
+        "as the 3DGS code does (principal_point = file uses it)"
+    ]
+
+
 def unused_option_warnings(options: SceneOptions, keys: Iterable[str], family: Family) -> list[str]:
     """Warn of each of `keys` that was given a value although scenes of the family have no use for it.
 

@@ -103,6 +103,9 @@ class Fast(Params):
         "real", description="scales of pictures: real: any; floor: whole ones, as published"
     )
     resolution_start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
+    resolution_hold: bool = Field(
+        False, description="with dash, lr.position_init until the last level of half size or less, as published"
+    )
     rates: Literal["given", "length"] = Field(
         "given", description="length: lr.position_final and lr.sh_rest, unless given, are raised by how short a run is"
     )
@@ -141,12 +144,14 @@ class GaussianTraining(OptimizationParams):
         return apply_overrides(asked, rates, source="fast.rates")
 
     def identity(self) -> dict[str, Any]:
-        """Return all values but `fast.rates`, which says where others come from, and those of `fast` where it is off.
+        """Return all values but `fast.rates`, which says where others come from, and those of `fast` that are off.
 
         Trainings of before these existed are still found.
         """
         content = super().identity()
         del content["fast"]["rates"]
+        if not self.fast.resolution_hold:
+            del content["fast"]["resolution_hold"]
         if self.fast.model_copy(update={"rates": "given"}) == Fast():
             del content["fast"]
         return content

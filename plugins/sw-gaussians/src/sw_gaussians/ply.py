@@ -6,7 +6,6 @@ That of 2DGS differs in one thing: a surfel has no `scale_2`. Which of the two a
 from __future__ import annotations
 
 import logging
-import mmap
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ import torch
 
 from splatwizard_core.api import GaussianModel, SceneError, SplatModel, replacing
 from sw_gaussians.drawn_as import antialias_of, lost_options
+from sw_gaussians.mapped import mapped
 from sw_gaussians.ply_gaussians import MIP_COMMENT, file_parts, parse_gaussians
 from sw_gaussians.surfels import as_ellipsoids, gaussians_of
 
@@ -28,17 +28,9 @@ def load_ply(path: str | os.PathLike[str]) -> GaussianModel:
     trained with antialiasing asks for that in the model's `origin`.
 
     Any order of properties, any type of number, binary or ASCII, is read; normals and unknown properties are ignored.
-    Raises BitstreamError if the file is damaged, SceneError if it is not a 3DGS model.
+    Raises BitstreamError if the file is damaged, SceneError if it cannot be read or is not a 3DGS model.
     """
-    path = Path(path)
-    try:
-        with path.open("rb") as file:
-            if not os.fstat(file.fileno()).st_size:
-                return from_ply(b"", str(path))
-            # Not closed here: an error on its way out still holds views of it.
-            return from_ply(memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)), str(path))
-    except OSError as error:
-        raise SceneError(f"{path}: cannot be read: {error.strerror}", path=str(path)) from error
+    return from_ply(mapped(path), os.fspath(path))
 
 
 def from_ply(data: bytes | memoryview, path: str) -> GaussianModel:

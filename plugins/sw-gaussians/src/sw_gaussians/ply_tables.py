@@ -57,6 +57,16 @@ class PlyHeader:
         """The properties of an element; empty if there is no such element."""
         return [name for each in self.elements if each.name == element for name, _ in each.fields]
 
+    def spare_bytes(self, size: int) -> int:
+        """Bytes of a file of `size` after its last row; 0 for text and where lists decide how long the rows are."""
+        if not self.order or any(each.lists for each in self.elements):
+            return 0
+        return (
+            size
+            - self.rows_at
+            - sum(each.count * sum(int(code[1]) for _, code in each.fields) for each in self.elements)
+        )
+
     def count(self, element: str) -> int:
         """The rows of an element; 0 if there is no such element."""
         return sum(each.count for each in self.elements if each.name == element)

@@ -23,7 +23,7 @@ from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.moments import keep_moments
-from sw_gaussians.resolution import by_resolution
+from sw_gaussians.resolution import ResolutionSampler, by_resolution
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 from sw_gaussians.statistics import collect_statistics
 
@@ -87,6 +87,11 @@ class ThreeDGSStage(Stage):
             raise ConfigError("densify.absgrad does not go with fast.score=opacity_variance: set fast.score=gradient")
         self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
+        if opt.fast.resolution_hold and opt.fast.resolution == "none":
+            raise ConfigError(
+                "fast.resolution_hold goes by the sizes of the pictures: set fast.resolution=dash with it"
+            )
+        self._pictures: ResolutionSampler | None = None
         self._optimizer: SplatOptimizer | None = None
         self._post: Scheduler | None = None
         self.white = False  # known when the stage begins; a plan can be printed without a scene
@@ -120,7 +125,7 @@ class ThreeDGSStage(Stage):
         sampler, fast = super().create_sampler(scene, generator), self.config.fast
         if fast.resolution == "none":
             return sampler
-        return by_resolution(
+        self._pictures = by_resolution(
             sampler,
             scene,
             full_at=self.steps(self.config.densify.stop),
@@ -128,6 +133,7 @@ class ThreeDGSStage(Stage):
             most=fast.resolution_start,
             rounding=fast.resolution_rounding,
         )
+        return self._pictures
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         lr = self.config.lr
@@ -173,6 +179,7 @@ class ThreeDGSStage(Stage):
             max_steps=self.steps(lr.max_steps),
             delay_steps=self.steps(lr.position_delay_steps),
             delay_mult=lr.position_delay_mult,
+            held=self._coarse_until if self.config.fast.resolution_hold else None,
         )
         scheduler.register_task(self.when(range(lr.max_steps)), update_lr, name="update lr")
         scheduler.register_task(
@@ -213,6 +220,9 @@ class ThreeDGSStage(Stage):
         scheduler.register_task(
             self.when(range(0, densify.stop, densify.reset_interval)), reset_opacity, name="reset opacity"
         )
+
+    def _coarse_until(self) -> int:
+        return self._pictures.plan.coarse_until if self._pictures is not None else 0
 
     def min_opacity(self) -> float:
         """Return the opacity below which density control prunes; a stage with a rule of its own overrides it."""

@@ -9,13 +9,18 @@ would lose about 0.8 dB (lego, 7,000 steps), one cut to a multiple of 3,000 almo
 short runs are taken before the densification of their last step, too.
 """
 
+from collections.abc import Callable
+
 from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, TaskLog
 from sw_gaussians import density
 from sw_gaussians.learning_rate import exponential_lr
 
 
 class UpdateLearningRate:
-    """Sets the step size of the means: exponential decay, times the scene extent."""
+    """Sets the step size of the means: exponential decay, times the scene extent.
+
+    held    () -> steps at which it stays `init`, known when the pictures have been read; None: it falls from the start
+    """
 
     def __init__(
         self,
@@ -25,8 +30,9 @@ class UpdateLearningRate:
         max_steps: int = 30_000,
         delay_steps: int = 0,
         delay_mult: float = 0.01,
+        held: Callable[[], int] | None = None,
     ) -> None:
-        self.init, self.final, self.max_steps = init, final, max_steps
+        self.init, self.final, self.max_steps, self.held = init, final, max_steps, held
         self.delay_steps, self.delay_mult = delay_steps, delay_mult
 
     def rate(self, step: int, extent: float) -> float:
@@ -38,6 +44,7 @@ class UpdateLearningRate:
             max_steps=self.max_steps,
             delay_steps=self.delay_steps,
             delay_mult=self.delay_mult,
+            held=0 if self.held is None else self.held(),
         )
 
     def __call__(self, optimizer: SplatOptimizer, scene: Scene, step: int) -> None:

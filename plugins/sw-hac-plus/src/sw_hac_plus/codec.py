@@ -115,12 +115,12 @@ class Walk:
     ) -> None:
         first = predictor.first(geometry.codes[rows])
         _, steps = first.groups["features"]
-        known = first.context[:, :0]
+        known = first.context.new_empty(len(first.context), sum(channel.slices))
         for i in range(len(channel.slices)):
             columns = channel.part(i)
-            mixture = predictor.mixture(i, columns, first, known)
+            mixture = predictor.mixture(i, columns, first, known[:, : columns.start])
             symbols = attributes.code(Block(f"features.{i + 1}", "features", rows, columns), mixture, steps)
-            known = torch.cat([known, predictor.known(symbols, first)], dim=1)
+            known[:, columns] = predictor.known(symbols, first)
         grid_sections.code_groups(attributes, first.groups, geometry.masks[rows], rows, AFTER_FEATURES)
 
 

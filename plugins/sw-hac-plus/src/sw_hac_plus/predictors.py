@@ -127,9 +127,12 @@ def _second(
     channel: ChannelMixture | ExactChannelMixture, index: int, known: Tensor, context: Tensor, width: int, numbers: int
 ) -> tuple[Tensor, ...]:
     """Means, scales and logits of slice `index`; of as many rows at once as `width` leaves room for in `numbers`."""
-    outputs = by_parts(
-        lambda rows: channel.slice(index, known[rows], context[rows]), torch.arange(len(known)), width, numbers
-    )
+
+    def part(rows: Tensor) -> Tensor:
+        at = slice(int(rows[0]), int(rows[-1]) + 1) if len(rows) else slice(0)
+        return channel.slice(index, known[at], context[at])
+
+    outputs = by_parts(part, torch.arange(len(known)), width, numbers)
     return outputs.chunk(PARTS, dim=1)
 
 

@@ -69,7 +69,13 @@ def _other_ranks(source: Source) -> list[Path]:
     told = _RANK.fullmatch(source.path.name) if source.path else None
     if source.path is None or told is None:
         return []
-    beside = [_RANK.fullmatch(name) for name in os.listdir(source.path.parent)]
+    try:
+        beside = [_RANK.fullmatch(name) for name in os.listdir(source.path.parent)]
+    except OSError as error:
+        raise SceneError(
+            f"{source.name}: its folder, where other GPUs may have saved theirs, cannot be read: {error.strerror}",
+            path=str(source.path),
+        ) from error
     ranks = {int(each[2]) for each in beside if each and (each[1], each[3]) == (told[1], told[3])}
     if missing := set(range(max(ranks) + 1)) - ranks:
         raise SceneError(

@@ -21,6 +21,7 @@ from sw_interchange.source import Source
 NO_LIMITS = Limits()
 FOLDER = "sog-folder"
 META = "meta.json"
+KEEPS_SURFELS = ("ply", "sog", FOLDER)
 
 
 def read(
@@ -108,7 +109,7 @@ def _unpack(bundle: bytes, meta: Path) -> None:
     prefix = "" if meta.name == META else f"{meta.name.removesuffix('.json')}_"
     with zipfile.ZipFile(io.BytesIO(bundle)) as archive:
         files = {prefix + name: archive.read(name) for name in archive.namelist() if name != META}
-        if not all(is_plain(name) for name in files):
+        if not all(is_plain(name) and name.isprintable() for name in files):
             raise UserInputError(f"{meta}: its images would have names that no .sog may have; write a {META}")
         text = json.loads(archive.read(META))
     for part in text.values():
@@ -118,7 +119,8 @@ def _unpack(bundle: bytes, meta: Path) -> None:
         with replacing(meta.parent / name) as temporary:
             temporary.write_bytes(content)
     with replacing(meta) as temporary:
-        temporary.write_text(json.dumps(text, separators=(",", ":")))
+        # Not escaped: `bytes_with_named` looks for the names as they are.
+        temporary.write_text(json.dumps(text, separators=(",", ":"), ensure_ascii=False), encoding="utf-8")
 
 
 def _checked(source: Source) -> Source:
@@ -157,6 +159,8 @@ def _encoded(scene: GaussianScene, chosen: Format, values: dict[str, Any]) -> tu
         scene = scene.with_degree(chosen.max_sh_degree)
     if scene.antialiased and chosen.name in ("splat", "gltf"):
         report.lost.append("that it was trained with antialiasing")
+    if scene.kind == "2dgs" and chosen.name not in KEEPS_SURFELS:
+        report.lost.append("that these are surfels: they are flat ellipsoids")
     parts = writer(replace(in_frame(scene, chosen.frame), report=None), options, report)
     report.bytes = sum(len(part) for part in parts)
     return parts, report

@@ -226,7 +226,10 @@ def _primitive(document: _Document, primitive: dict[str, Any], place: Matrix, re
 def _moved(document: _Document, scene: GaussianScene, place: Matrix) -> GaussianScene:
     if np.array_equal(place, np.eye(4)):
         return scene
-    scale = math.pow(abs(np.linalg.det(place[:3, :3])), 1 / 3) or 1.0
+    volume = np.linalg.det(place[:3, :3])
+    if volume < 0:
+        raise document.error("a node mirrors its splats, which is not read: its scale is negative")
+    scale = math.pow(volume, 1 / 3) or 1.0
     try:
         with np.errstate(all="ignore"):
             return transformed(scene, place[:3, :3] / scale, scale, place[:3, 3])

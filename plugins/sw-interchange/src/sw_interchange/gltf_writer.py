@@ -14,7 +14,7 @@ import numpy as np
 from splatwizard_core.api import SH_C0, UserInputError
 from sw_interchange.bands import Array
 from sw_interchange.options import Options
-from sw_interchange.scene import GaussianScene, WriteReport, sigmoid
+from sw_interchange.scene import GaussianScene, WriteReport, linear_scales, sigmoid
 
 EXTENSION = "KHR_gaussian_splatting"
 FLOAT, UBYTE = 5126, 5121
@@ -33,9 +33,7 @@ class GltfOptions(Options):
 
 def write_gltf(scene: GaussianScene, options: GltfOptions, report: WriteReport) -> list[bytes]:
     """Encode a scene in LUF as .glb. Raises UserInputError for one of 4 GiB and more."""
-    if scene.kind == "2dgs":
-        report.lost.append("that these are surfels: they are flat ellipsoids")
-    columns = _columns(scene, color_0=options.color_0)
+    columns = _columns(scene, linear_scales(scene.log_scales, report), color_0=options.color_0)
     accessors, views, attributes, blob = [], [], {}, []
     at = 0
     for name, values in columns.items():
@@ -65,12 +63,12 @@ def write_gltf(scene: GaussianScene, options: GltfOptions, report: WriteReport) 
     return [head + struct.pack("<I4s", at, b"BIN\0"), *blob]
 
 
-def _columns(scene: GaussianScene, *, color_0: bool) -> dict[str, Any]:
+def _columns(scene: GaussianScene, scales: Array, *, color_0: bool) -> dict[str, Any]:
     alphas = sigmoid(scene.opacity_logits)
     found: dict[str, Any] = {
         "POSITION": scene.means,
         f"{EXTENSION}:ROTATION": np.ascontiguousarray(scene.quats[:, [1, 2, 3, 0]]),
-        f"{EXTENSION}:SCALE": np.exp(scene.log_scales),
+        f"{EXTENSION}:SCALE": scales,
         f"{EXTENSION}:OPACITY": alphas,
         f"{EXTENSION}:SH_DEGREE_0_COEF_0": scene.sh_dc,
     }

@@ -19,6 +19,9 @@ FLAT = -20.0
 LARGEST_LOGIT = 13.815510
 """Logit of an opacity of 1 - 1e-6: beyond it float32 knows no difference."""
 
+SMALLEST_SCALE, LARGEST_SCALE = np.float32(-87.33), np.float32(88.72)
+"""Log scales whose exponentials are normal numbers of float32."""
+
 
 @dataclass(frozen=True)
 class Limits:
@@ -169,6 +172,13 @@ def sigmoid(logits: Array) -> Array:
     """Opacity 0..1 of a logit."""
     with np.errstate(over="ignore"):
         return (1 / (1 + np.exp(-logits))).astype(np.float32, copy=False)
+
+
+def linear_scales(log_scales: Array, report: WriteReport) -> Array:
+    """Standard deviations within the normal numbers of float32; what is clamped to them is counted."""
+    found = np.clip(log_scales, SMALLEST_SCALE, LARGEST_SCALE)
+    report.count("log_scales", found != log_scales)
+    return np.exp(found)
 
 
 def logit_of_byte(codes: npt.NDArray[np.uint8]) -> Array:

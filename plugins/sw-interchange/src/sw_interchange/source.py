@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from splatwizard_core.api import SceneError
+from sw_gaussians.mapped import mapped
 
 
 @dataclass(frozen=True)
@@ -29,14 +28,7 @@ class Source:
     def open(cls, path: str | os.PathLike[str], *, spz_frame: str = "RUB") -> Source:
         """Map a file. Raises SceneError if it cannot be read."""
         where = Path(path)
-        try:
-            with where.open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
-                # Not closed here: arrays are views of it.
-                data = memoryview(mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)) if size else b""
-        except OSError as error:
-            raise SceneError(f"{where}: cannot be read: {error.strerror}", path=str(where)) from error
-        return cls(data, where.name, where, spz_frame)
+        return cls(mapped(where), where.name, where, spz_frame)
 
     def head(self, count: int) -> bytes:
         """The first bytes, at most `count`."""

@@ -15,6 +15,7 @@ from sw_interchange.scene import (
     Limits,
     ReadReport,
     WriteReport,
+    linear_scales,
     logit_of_byte,
     normalised,
     sigmoid,
@@ -67,7 +68,7 @@ def write_splat(scene: GaussianScene, options: SplatOptions, report: WriteReport
     report.count("sh_dc", (colours < 0) | (colours > 1))
     quats = normalised(scene.quats)[0]
     rows["means"] = scene.means
-    rows["scales"] = np.exp(scene.log_scales)
+    rows["scales"] = linear_scales(scene.log_scales, report)
     rows["rgba"][:, :3] = np.rint(255 * np.clip(colours, 0, 1))
     rows["rgba"][:, 3] = np.rint(255 * sigmoid(scene.opacity_logits))
     rows["quats"] = np.clip(np.rint(128 * quats + 128), 0, 255)

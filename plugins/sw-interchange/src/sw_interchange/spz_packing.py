@@ -71,6 +71,15 @@ def unzstd(frames: Sequence[bytes | memoryview], sizes: Sequence[int], name: str
     return each_of(plain, list(zip(frames, sizes, strict=True)))
 
 
+def stored(plane: bytes | memoryview) -> bytes:
+    """Return a zstd frame that holds the plane as it is, in blocks of 128 KiB."""
+    parts = [struct.pack("<IBQ", 0xFD2FB528, 0xE0, len(plane))]  # one segment, its size in eight bytes
+    for at in range(0, len(plane), 1 << 17):
+        block = plane[at : at + (1 << 17)]
+        parts += [struct.pack("<I", len(block) << 3 | (at + len(block) == len(plane)))[:3], bytes(block)]
+    return b"".join(parts)
+
+
 def zstd(planes: Sequence[bytes | memoryview], level: int) -> list[bytes]:
     """One zstd frame for each plane, with its size in it."""
     import zstandard

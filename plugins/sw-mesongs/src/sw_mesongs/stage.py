@@ -19,6 +19,7 @@ from splatwizard_core.api import (
     SceneError,
     SplatOptimizer,
     Stage,
+    TaskLog,
     photometric_loss,
 )
 from sw_codecs.models.raht_gaussians import RahtGaussians
@@ -57,13 +58,13 @@ class MesonGSStage(Stage):
         self.values = Published()  # of the scene, once the stage begins
 
     def begin(self, context: StageContext) -> SplatModel:
-        trained, settings = context.model, self.config.codec.settings
+        trained = context.model
         if not isinstance(trained, GaussianModel):
             raise TypeError(f"mesongs compresses a GaussianModel, not a {type(trained).__name__}")
         self.values = published(context.scene.name, self.config.authors.family, self.config.authors.point)
         self._rasterizer, self._generator = context.rasterizer, context.generator("method")
-        blocks = self.values.blocks if settings.blocks is None else settings.blocks
-        model = RahtGaussians.of(trained, bits=settings.bits, blocks=blocks)
+        blocks = int(self.in_force()["codec.settings.blocks"])
+        model = RahtGaussians.of(trained, bits=self.config.codec.settings.bits, blocks=blocks)
         model.active_sh_degree = model.max_sh_degree
         for frozen in (model.means, model.sh_rest):
             frozen.requires_grad_(False)
@@ -74,11 +75,24 @@ class MesonGSStage(Stage):
         self._optimizer = SplatOptimizer(model, groups)
         return self._optimizer
 
+    def in_force(self) -> dict[str, float]:
+        """Return the values that depend on the scene, by key: those of the configuration, else the published ones."""
+        config, settings, values = self.config, self.config.codec.settings, self.values
+        own, beta = isinstance(self.pruner, Importance), getattr(self.pruner, "beta", None)
+        found = {
+            "prune.tau": (config.prune.tau, values.tau),
+            "prune.settings.beta": (beta if own else None, values.beta),
+            "codec.settings.depth": (settings.depth, values.depth),
+            "codec.settings.blocks": (settings.blocks, values.blocks),
+            "codec.settings.codebook_size": (settings.codebook_size, values.codebook_size),
+            "lr.factor": (config.lr.factor, values.lr_factor),
+        }
+        return {key: other if given is None else given for key, (given, other) in found.items()}
+
     def rates(self, step: int, scene: Scene) -> dict[str, float]:
         """Return the step size of each parameter at a step of this run."""
-        factor = self.config.lr.factor
         share = min(step / (self.config.FULL_ITERATIONS * self.config.schedule_scale or 1), 1.0)
-        return self.config.lr.of_step(share, self.values.lr_factor if factor is None else factor, scene.extent)
+        return self.config.lr.of_step(share, self.in_force()["lr.factor"], scene.extent)
 
     def register_pre_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         scheduler.register_task(1, self.score_and_prune, name="calculate importance score and prune")
@@ -93,20 +107,26 @@ class MesonGSStage(Stage):
         rasterizer: Rasterizer,
         scene: Scene,
         step: int,
+        told: TaskLog | None = None,
     ) -> None:
         """Remove all Gaussians up to the score at the share tau; the others keep their importance.
 
+        It tells the values that depend on the scene, since the configuration leaves open what is looked up by its name.
         The importance weighs the colours in the codebook, whoever decides what goes. Those of the highest score stay
         where all would go. Raises SceneError if no training view shows any.
         """
-        own = self.pruner if isinstance(self.pruner, Importance) and self.pruner.beta is not None else None
-        importance = own or Importance(beta=self.values.beta)
+        values = self.in_force()
+        line = f"scene '{scene.name}': {', '.join(f'{key} = {value:g}' for key, value in values.items())}"
+        if told is not None:
+            told.say(line)
+        else:
+            log.info(line)
+        importance = Importance(beta=values["prune.settings.beta"])
         scores = scores_of(importance, model, cameras, rasterizer, scene)
         model.importance.copy_(scores)
         if not isinstance(self.pruner, Importance):
             scores = scores_of(self.pruner, model, cameras, rasterizer, scene)
-        tau = self.config.prune.tau
-        doomed = up_to(scores, self.values.tau if tau is None else tau)
+        doomed = up_to(scores, values["prune.tau"])
         if bool(doomed.all()):  # of one Gaussian, or of equal scores, all are up to the lowest at any share
             if not bool(model.importance.any()):
                 raise SceneError(
@@ -121,11 +141,10 @@ class MesonGSStage(Stage):
 
     def settle(self, model: RahtGaussians, optimizer: SplatOptimizer) -> None:
         """Merge the Gaussians of each voxel, and train the codebook of their SH bands 1 to 3."""
-        settings, before = self.config.codec.settings, model.num_rows
+        values, before = self.in_force(), model.num_rows
         model.settle(
-            optimizer, settings, generator=self._generator,
-            depth=self.values.depth if settings.depth is None else settings.depth,
-            size=self.values.codebook_size if settings.codebook_size is None else settings.codebook_size,
+            optimizer, self.config.codec.settings, generator=self._generator,
+            depth=int(values["codec.settings.depth"]), size=int(values["codec.settings.codebook_size"]),
         )  # fmt: skip
         log.info("%d Gaussians in %d voxels, %d codebook entries", before, model.num_rows, len(model.codebook))
 

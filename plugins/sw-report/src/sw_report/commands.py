@@ -33,7 +33,8 @@ def command_of(run: Run) -> str | None:
         parts += [option, value] if value else []
     provenance = config.get("provenance")
     sources = provenance if isinstance(provenance, dict) else {}
-    files = [who for who in sources.values() if isinstance(who, str) and not who.startswith(("--", "preset ", "rate "))]
+    others = ("--", "preset ", "data set ", "rate ")
+    files = [who for who in sources.values() if isinstance(who, str) and not who.startswith(others)]
     for file in dict.fromkeys(files):
         parts += ["--config", file]
     for key, who in sources.items():

@@ -121,7 +121,7 @@ def _texts(block: object, prefix: str = "") -> dict[str, str]:
 
 
 def _sources(run: RunFacts) -> dict[str, str]:
-    """Sources of the keys that were set: "preset 'quick'", "rate 'r2'", "--set" or a file."""
+    """Sources of the keys that were set: "preset 'quick'", "data set 'db'", "rate 'r2'", "--set" or a file."""
     found = (run.config or {}).get("provenance")
     return {key: who for key, who in found.items() if isinstance(who, str)} if isinstance(found, dict) else {}
 
@@ -134,7 +134,7 @@ def _source(sources: Mapping[str, str], key: str) -> str | None:
 
 
 def _is_given(who: str | None) -> bool:
-    return who is not None and not who.startswith(("preset ", "rate "))
+    return who is not None and not who.startswith(("preset ", "data set ", "rate "))
 
 
 def _plain(text: str | None) -> str:

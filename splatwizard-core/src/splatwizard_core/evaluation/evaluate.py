@@ -9,7 +9,7 @@ import os
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +131,12 @@ def raster_header(options: RasterOptions) -> dict[str, Any]:
     """The options that belong into the file, since they change the picture: the inverse of `render_options`."""
     default = RasterOptions()
     return {key: getattr(options, key) for key in RASTER_KEYS if getattr(options, key) != getattr(default, key)}
+
+
+def kept_header(model: SplatModel, options: RasterOptions, chosen: Mapping[str, Any]) -> dict[str, Any]:
+    """The header of a model that is not trained: `chosen` wins over what its own file asks for, that over `options`."""
+    asked = raster_header(render_options(getattr(model, "origin", {}).get("raster", {}), None))
+    return raster_header(replace(options, **{**asked, **chosen}))
 
 
 def render_view(model: SplatModel, camera: Camera, rasterizer: Rasterizer, options: RasterOptions) -> RenderResult:

@@ -6,7 +6,6 @@ import contextlib
 import importlib.metadata
 import time
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ import torch
 from splatwizard_core.coding.container import ContainerWriter
 from splatwizard_core.coding.requirements import Requirement
 from splatwizard_core.errors import SplatwizardError, UserInputError
-from splatwizard_core.evaluation.evaluate import raster_header, render_options
+from splatwizard_core.evaluation.evaluate import kept_header
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.method import Method
 from splatwizard_core.plugins import Entry
@@ -108,9 +107,7 @@ def encode_ply(session: Session, resolved: ResolvedConfig, path: Path, target: P
     model = session.plugins.read_gaussians(path).to(session.device).eval().requires_grad_(False)
     method = make_method(session.plugins, resolved)
     last = list(method.stages())[-1]
-    # Those of a run win over what the file asks for, as when it is drawn.
-    asked = raster_header(render_options(model.origin.get("raster", {}), None)) | resolved.ppl.raster.options
-    raster = raster_header(replace(last.raster_options(last.iterations, torch.zeros(3)), **asked))
+    raster = kept_header(model, last.raster_options(last.iterations, torch.zeros(3)), resolved.ppl.raster.options)
     try:
         return encode(method, model, raster, target)
     except (TypeError, AttributeError) as error:

@@ -53,10 +53,9 @@ def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None) -> dict
     if told:
         print(told, file=sys.stderr, flush=True)
     try:
-        content: dict[str, Any] = json.loads(done.stdout)
-    except ValueError as error:
+        return dict(json.loads(done.stdout))
+    except (TypeError, ValueError) as error:
         raise FreshProcessError(f"`{name}` in a fresh process did not print JSON: {done.stdout[:200]!r}") from error
-    return content
 
 
 def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0) -> dict[str, Any]:
@@ -69,5 +68,4 @@ def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0)
         copy = folder / path.name
         shutil.copyfile(path, copy)
         arguments = ["decode", copy.name, "--device", device, "--repeats", str(repeats), "--json"]
-        arguments += ["--set", f"threads={threads}"]
-        return run_fresh(arguments, alone_in=folder)
+        return run_fresh([*arguments, "--set", f"threads={threads}"], alone_in=folder)

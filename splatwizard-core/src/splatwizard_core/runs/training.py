@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from splatwizard_core.errors import SplatwizardError
-from splatwizard_core.evaluation.evaluate import evaluate, raster_header
+from splatwizard_core.evaluation.evaluate import evaluate, kept_header, raster_header
 from splatwizard_core.evaluation.metrics import quick_metrics
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.plugins import Entry
@@ -145,9 +145,8 @@ def _first_finished(homes: Iterable[Path], key: str) -> Path | None:
 def _finished(directory: Path, key: str) -> dict[str, Any] | None:
     """Return the facts of this training if a run directory holds it, finished, with its own checkpoints."""
     facts = StepLog(directory).done(STEP, key)
-    if facts is None or "checkpoints" in facts or not CheckpointStore(directory / CHECKPOINTS).paths():
-        return None
-    return facts
+    own = facts is not None and "checkpoints" not in facts and CheckpointStore(directory / CHECKPOINTS).paths()
+    return facts if own else None
 
 
 def _folders(parent: Path) -> list[Path]:
@@ -234,7 +233,7 @@ def _train_stages(
         "plan": outcome.plan,
         "rasterizers": outcome.rasterizers,
         "phases": parts.phases(outcome.provided),
-        "raster": raster_header(options),
+        "raster": raster_header(options) if outcome.steps else kept_header(outcome.model, options, ppl.raster.options),
         "contended": contention("train", cores),
     }
 

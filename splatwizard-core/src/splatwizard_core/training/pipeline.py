@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from splatwizard_core.errors import CheckpointError
+from splatwizard_core.errors import CheckpointError, ConfigError
 from splatwizard_core.gaussians.splat_model import SplatModel
 from splatwizard_core.rendering.rasterizer import Rasterizer
 from splatwizard_core.scene.images import decode_all, keep_pictures
@@ -93,6 +93,8 @@ class TrainingRun:
     def __post_init__(self) -> None:
         if not self.stages:
             raise ValueError("a training needs at least one stage")
+        if self.ppl.random_background and self.scene.protocol.composite8:
+            raise ConfigError("random_background needs the alpha that legacy_8bit_composite removes: leave out one")
         self.store = None if self.directory is None else CheckpointStore(self.directory, self.ppl.keep_checkpoints)
         if self.log_path is None and self.directory is not None:
             self.log_path = self.directory / "log.jsonl"

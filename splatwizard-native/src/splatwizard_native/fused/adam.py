@@ -35,25 +35,32 @@ class AdamUpdate:
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     """Update `param`, `exp_avg` and `exp_avg_sq` of each in place, densely; as torch.optim.Adam, to 1e-6.
 
-    On CUDA in one launch. Raises ValueError if shapes differ.
+    All in one call of the kernels, on CUDA in one launch. Raises ValueError if shapes differ.
     Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
     """
-    together = [u for u in updates if u.param.is_cuda]
-    if together and TRAINING.has_cuda():
-        left = torch.ops.splatwizard_training.adam_many(
-            [u.param for u in together], [u.grad for u in together],
-            [u.exp_avg for u in together], [u.exp_avg_sq for u in together],
-            [u.lr for u in together], [u.beta1 for u in together], [u.beta2 for u in together],
-            [u.eps for u in together], [u.step for u in together],
-        )  # fmt: skip
-        for u in together:
-            torch.autograd.graph.increment_version(u.param)  # the kernels write behind autograd's back
-        updates = [u for u in updates if not u.param.is_cuda] + [together[i] for i in left]
+    left = list(updates)
+    for kind in ("cuda", "cpu"):
+        together = [u for u in left if u.param.device.type == kind]
+        if together and (TRAINING.has_cuda() if kind == "cuda" else TRAINING.try_load()):
+            left = [u for u in left if u.param.device.type != kind] + _by_kernel(together)
+    for u in left:
+        _by_torch(u)
+
+
+def _by_kernel(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
+    """Do these updates, all on the CPU or all on CUDA; return those that the kernels do not take."""
+    left = torch.ops.splatwizard_training.adam_many(
+        [u.param for u in updates], [u.grad if u.grad.is_cuda else u.grad.contiguous() for u in updates],
+        [u.exp_avg for u in updates], [u.exp_avg_sq for u in updates],
+        [u.lr for u in updates], [u.beta1 for u in updates], [u.beta2 for u in updates],
+        [u.eps for u in updates], [u.step for u in updates],
+    )  # fmt: skip
     for u in updates:
-        _step(u)
+        torch.autograd.graph.increment_version(u.param)  # the kernels write behind autograd's back
+    return [updates[i] for i in left]
 
 
-def _step(u: AdamUpdate) -> None:
+def _by_torch(u: AdamUpdate) -> None:
     param, exp_avg, exp_avg_sq = u.param, u.exp_avg, u.exp_avg_sq
     for name in ("grad", "exp_avg", "exp_avg_sq"):
         shape = getattr(u, name).shape
@@ -62,14 +69,10 @@ def _step(u: AdamUpdate) -> None:
     if u.step < 1:
         raise ValueError(f"Adam's step counts from 1, got {u.step}")
     grad = u.grad.contiguous()
-    tensors = (param, grad, exp_avg, exp_avg_sq)
-    whole = all(t.is_contiguous() for t in tensors)
-    if whole and all(t.device.type == "cpu" and t.dtype == torch.float32 for t in tensors) and TRAINING.try_load():
-        torch.ops.splatwizard_training.adam(*tensors, u.lr, u.beta1, u.beta2, u.eps, u.step)
-    else:
-        count = torch.tensor(float(u.step - 1), device=param.device)  # steps done; torch counts this one itself
-        adam(
-            [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=whole, foreach=False, amsgrad=False,
-            maximize=False, weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
-        )  # fmt: skip
+    whole = all(t.is_contiguous() for t in (param, exp_avg, exp_avg_sq))
+    count = torch.tensor(float(u.step - 1), device=param.device)  # steps done; torch counts this one itself
+    adam(
+        [param], [grad], [exp_avg], [exp_avg_sq], [], [count], fused=whole, foreach=False, amsgrad=False,
+        maximize=False, weight_decay=0.0, lr=u.lr, beta1=u.beta1, beta2=u.beta2, eps=u.eps,
+    )  # fmt: skip
     torch.autograd.graph.increment_version(param)

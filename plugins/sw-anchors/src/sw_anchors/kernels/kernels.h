@@ -12,12 +12,14 @@
 //   noisy_values     values of some anchors with noise, and all numbers of a sample of these
 //   predicted_steps  quantiser steps [count,3], the hidden layer and tanh of the outputs; backward: of `to_steps` and
 //                    `to_hidden`, sums the same for any number of threads
+//   sample_bits      bits of a sample of anchors by group, and their derivatives, row by row
 #pragma once
 
 #include <splatwizard/dispatch.h>
 #include <splatwizard/parallel.h>
 
 #include "heads.h"
+#include "sample.h"
 #include "spawn.h"
 #include "steps.h"
 #include "values.h"
@@ -49,6 +51,8 @@
   void predicted_steps_backward(const sw_anchors::StepNetwork& of, const float* hidden, const float* tangents,  \
                                 const float* to_steps, const float* to_hidden,                                  \
                                 const sw_anchors::StepGradients& to, const splatwizard::Parallel& parallel);    \
+  void sample_bits(const sw_anchors::Sample& from, const sw_anchors::SampleBits& to,                            \
+                   const splatwizard::Parallel& parallel);                                                      \
   }
 SW_FOR_EACH_ARCH(SW_DECLARE_ANCHORS)
 #undef SW_DECLARE_ANCHORS

@@ -1,7 +1,9 @@
-// Rows of anchors in a training step: what is copied, the noisy numbers, and the bits of a sample.
+// Rows of anchors in a training step, on CUDA: what is copied, and the noisy numbers.
 #pragma once
 
 #include <cstdint>
+
+#include "sample.h"
 
 namespace sw_anchors {
 
@@ -47,20 +49,6 @@ struct RowSlopes {
 struct RowGradients {
   float *features, *log_scales, *offsets, *logits;
   float* steps;  // [C,3] or null
-};
-
-// A sample of S anchors: numbers, means and deviations [S,F+6+3k], steps [S,3], [S] 1 where an anchor counts, masks [S,k].
-struct Sample {
-  int64_t count;
-  int features, offsets;
-  const float *x, *mean, *scale, *steps, *counted, *masks;
-  float smallest;        // probability
-  float smallest_scale;  // floor of the deviations
-};
-
-// Bits [S,3] by group, and derivatives of their sum.
-struct SampleBits {
-  float *bits, *x, *mean, *scale, *steps, *masks;
 };
 
 }  // namespace sw_anchors

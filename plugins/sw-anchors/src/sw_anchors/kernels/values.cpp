@@ -3,6 +3,7 @@
 #include <cmath>
 
 #include "kernels.h"
+#include "vectors.h"
 
 namespace SW_ARCH {
 
@@ -23,8 +24,29 @@ void add_noise(const float* from, const float* uniform, float step, int64_t coun
 // Gradient by the step.
 float of_step(const float* slope, const float* uniform, int64_t count) {
   float sum = 0.f;
+#pragma omp simd reduction(+ : sum)
   for (int64_t i = 0; i < count; ++i) sum += slope[i] * (uniform[i] - 0.5f);
   return sum;
+}
+
+constexpr int64_t BUFFER = 16;  // whole vectors, whatever their width
+
+// e^(sign x) of `count` numbers, at most BUFFER.
+
+void exponentials(const float* from, int64_t count, float sign, float* to) {
+  float values[BUFFER] = {};
+  for (int64_t i = 0; i < count; ++i) values[i] = sign * from[i];
+  for (int64_t i = 0; i < count; i += LANES) store(values + i, exponential(load(values + i)));
+  std::copy_n(values, count, to);
+}
+
+// Sigmoids of the mask logits [k] of an anchor.
+void soft_masks(const float* logits, int64_t k, float* to) {
+  for (int64_t first = 0; first < k; first += BUFFER) {
+    const int64_t some = std::min(BUFFER, k - first);
+    exponentials(logits + first, some, -1.f, to + first);
+    for (int64_t j = first; j < first + some; ++j) to[j] = 1.f / (1.f + to[j]);
+  }
 }
 
 const int64_t* first_drawn(const Rows& from, int64_t place) {
@@ -43,16 +65,15 @@ void noisy_values(const Rows& from, const RowValues& to, const splatwizard::Para
       const float none[kGroups] = {};
       const float* step = from.steps == nullptr ? none : from.steps + i * from.step_row;
       float scales[SCALES];
-      for (int64_t c = 0; c < SCALES; ++c) scales[c] = std::exp(from.log_scales[row * SCALES + c]);
+      exponentials(from.log_scales + row * SCALES, SCALES, 1.f, scales);
       add_noise(from.of_features + row * f, u, step[0], f, to.features + i * f);
       add_noise(scales, u == nullptr ? u : u + f, step[1], SCALES, to.scales + i * SCALES);
       add_noise(from.of_offsets + row * 3 * k, u == nullptr ? u : u + f + SCALES, step[2], 3 * k,
                 to.offsets + i * 3 * k);
       const float weight = from.mask_weights == nullptr ? 1.f : from.mask_weights[row];
-      for (int64_t j = 0; j < k; ++j) {
-        const float soft = 1.f / (1.f + std::exp(-from.mask_logits[row * k + j]));
-        to.masks[i * k + j] = soft * weight > from.threshold ? 1.f : 0.f;
-      }
+      float* const masks = to.masks + i * k;
+      soft_masks(from.mask_logits + row * k, k, masks);
+      for (int64_t j = 0; j < k; ++j) masks[j] = masks[j] * weight > from.threshold ? 1.f : 0.f;
       if (next < from.drawn + from.samples && *next == i) {
         float* sample = to.sample + (next - from.drawn) * width;
         std::copy_n(to.features + i * f, f, sample);
@@ -88,13 +109,13 @@ void noisy_values_backward(const Rows& from, const RowValues& slope, const RowGr
         to.steps[kGroups * i + 1] = of_step(scales, u + f, SCALES);
         to.steps[kGroups * i + 2] = of_step(offsets, u + f + SCALES, 3 * k);
       }
-      for (int64_t c = 0; c < SCALES; ++c)
-        to.log_scales[row * SCALES + c] = scales[c] * std::exp(from.log_scales[row * SCALES + c]);
+      float* const log_scales = to.log_scales + row * SCALES;
+      exponentials(from.log_scales + row * SCALES, SCALES, 1.f, log_scales);
+      for (int64_t c = 0; c < SCALES; ++c) log_scales[c] *= scales[c];
       const float weight = from.mask_weights == nullptr ? 1.f : from.mask_weights[row];
-      for (int64_t j = 0; j < k; ++j) {
-        const float soft = 1.f / (1.f + std::exp(-from.mask_logits[row * k + j]));
-        to.mask_logits[row * k + j] = slope.masks[i * k + j] * weight * soft * (1.f - soft);
-      }
+      float* const logits = to.mask_logits + row * k;
+      soft_masks(from.mask_logits + row * k, k, logits);
+      for (int64_t j = 0; j < k; ++j) logits[j] = slope.masks[i * k + j] * weight * logits[j] * (1.f - logits[j]);
     }
   });
 }

@@ -12,13 +12,24 @@ from types import ModuleType
 from typing import ClassVar
 
 import numpy as np
+import torch
 
 from splatwizard_core.api import BitstreamError
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader
 from sw_codecs.coders import model_spec
-from sw_codecs.coders.model_spec import Gaussian, Laplace, ModelSpec, as_symbols, changed, check_length, domain
+from sw_codecs.coders.model_spec import (
+    Bernoulli,
+    Gaussian,
+    Laplace,
+    ModelSpec,
+    as_symbols,
+    changed,
+    check_length,
+    domain,
+)
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter, check_again
+from sw_codecs.exact_native import has_exact
 
 CHUNK = 1 << 20
 HEADER = struct.Struct("<IiiII")
@@ -115,7 +126,20 @@ class RangeCoder(ChunkedCoder):
         return writer.finish()
 
     def _decode_chunk(self, payload: memoryview, count: int, spec: ModelSpec) -> np.ndarray:
+        is_plain = isinstance(spec, Bernoulli) and np.ndim(spec.p) == 0 and len(payload) % 4 == 0
+        if is_plain and not self._last_in_first_out and has_exact():
+            return _decode_bits(payload, count, float(spec.p))
         return SymbolReader(payload, last_in_first_out=self._last_in_first_out).get_unchecked(count, spec)
+
+
+def _decode_bits(payload: memoryview, count: int, share: float) -> np.ndarray:
+    words = torch.from_numpy(np.frombuffer(payload, np.uint8).copy())
+    zeros = int((1 - share) * ((1 << 24) - 2)) + 1  # docs/bitstream.md, tables of counts as models
+    bits, status = torch.ops.sw_codecs_exact.decode_bits(words, zeros, count)
+    if status:
+        raise BitstreamError("the coded words are damaged")
+    found: np.ndarray = bits.numpy()
+    return found
 
 
 class RansCoder(RangeCoder):

@@ -122,17 +122,17 @@ class ExactChannelMixture:
             if not bool(torch.isfinite(free).all()) or float(free.abs().max()) > 1 << 20:
                 raise ValueError("the free numbers of the first slice are not finite, or too large")
             self._first = torch.from_numpy(to_fixed(free.numpy().reshape(-1)))
-        self._layers = {name: [IntegerMlp([_arrays(network[i])]) for i in (0, 2)]
-                        for name, network in model.networks.items()}  # fmt: skip
+        self._networks = {
+            name: IntegerMlp([_arrays(network[i]) for i in (0, 2)], leak=LEAK)
+            for name, network in model.networks.items()
+        }
 
     def slice(self, index: int, known: Tensor, context: Tensor) -> Tensor:
         """As `ChannelMixture.slice`, int64 throughout."""
-        if f"slice{index}" not in self._layers:
+        if f"slice{index}" not in self._networks:
             assert self._first is not None
             return self._first.expand(len(known), -1)
-        first, last = self._layers[f"slice{index}"]
-        hidden = first(torch.cat([known, context], dim=1) if self._context else known)
-        return last(torch.where(hidden < 0, (LEAK * hidden) >> FRACTION, hidden))
+        return self._networks[f"slice{index}"](known, context if self._context else None)
 
 
 def _arrays(layer: nn.Module) -> tuple:

@@ -24,9 +24,10 @@ NUMBERS_AT_ONCE = 1 << 21
 
 
 class IntegerMlp:
-    """Linear layers with ReLU between them.
+    """Linear layers with ReLU or leaky ReLU between them.
 
     weights         [(W [out, in], b [out])] float32, as they stand in the file
+    leak            slope below zero between the layers, in 1/4096; 0: ReLU
     output_scale    a number or one per output of the last layer: outputs come in units of 1 / output_scale (for
                     HAC: 1 / base step); exact in float64
 
@@ -38,11 +39,13 @@ class IntegerMlp:
         weights: Sequence[tuple[np.ndarray, np.ndarray]],
         *,
         output_scale: float | np.ndarray = 1.0,
+        leak: int = 0,
         device: torch.device | str = "cpu",
     ) -> None:
         self.weights = [(np.asarray(w, np.float32), np.asarray(b, np.float32)) for w, b in weights]
         if not self.weights:
             raise ValueError("a network needs at least one layer")
+        self._leak = leak
         self._layers: list[tuple[Tensor, Tensor]] = []
         width = self.weights[0][0].shape[-1]
         for i, (w, b) in enumerate(self.weights):
@@ -94,19 +97,25 @@ class IntegerMlp:
         """Width of the last layer."""
         return len(self._layers[-1][1])
 
-    def __call__(self, inputs: Tensor, *, rows: int | None = None, out: Tensor | None = None) -> Tensor:
+    def __call__(
+        self, inputs: Tensor, further: Tensor | None = None, *, rows: int | None = None, out: Tensor | None = None
+    ) -> Tensor:
         """int64 [n, out] with 12 fractional bits, in units of 1 / output_scale.
 
         inputs  [n, in] integers with 12 fractional bits, clamped to +-2^20 (that is 256)
+        further [n, m] inputs behind them, which then are [n, in - m]
         rows    how many are evaluated at once, None: by the widest layer; the result does not depend on it
         out     contiguous int64 [n, out] to write into, on the device of the inputs
         """
-        if inputs.ndim != 2 or inputs.shape[1] != self._layers[0][0].shape[1] or inputs.is_floating_point():
-            raise ValueError(f"inputs must be integers [n, {self._layers[0][0].shape[1]}], not {list(inputs.shape)}")
+        parts = [inputs] if further is None else [inputs, further]
+        width = self._layers[0][0].shape[1]
+        if any(p.ndim != 2 or p.is_floating_point() for p in parts) or sum(p.shape[1] for p in parts) != width:
+            raise ValueError(f"inputs must be integers [n, {width}], not {[list(p.shape) for p in parts]}")
         if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
             found = torch.empty(len(inputs), self.outputs, dtype=torch.int64) if out is None else out
-            torch.ops.sw_codecs_exact.network(_for_kernel(inputs), self.tensors(), found)
+            torch.ops.sw_codecs_exact.network([_for_kernel(p) for p in parts], self.tensors(), self._leak, found)
             return found
+        inputs = torch.cat(parts, dim=1)
         rows = rows or NUMBERS_AT_ONCE // max(max(w.shape) for w, _ in self._layers)
         found = torch.cat([self._evaluate(block) for block in inputs.split(max(rows, 1))])
         return found if out is None else out.copy_(found)
@@ -133,7 +142,7 @@ class IntegerMlp:
         steps       int64 [n, groups], written
         """
         status: int = torch.ops.sw_codecs_exact.forecast(
-            _for_kernel(inputs), self.tensors(), multipliers, thresholds, centre, number, steps
+            [_for_kernel(inputs)], self.tensors(), multipliers, thresholds, centre, number, steps
         )
         return status == 0
 
@@ -143,12 +152,15 @@ class IntegerMlp:
         for i, (w, b) in enumerate(self._layers):
             a = ((a @ w.T + b) / 2.0**FRACTION).floor()
             if i < len(self._layers) - 1:
-                a = a.clamp(0, ACTIVATION_LIMIT)
+                low = -ACTIVATION_LIMIT if self._leak else 0
+                a = torch.where(a < 0, (a * (self._leak / 2.0**FRACTION)).floor(), a).clamp(low, ACTIVATION_LIMIT)
         return a.to(torch.int64).to(inputs.device)
 
 
 def _for_kernel(inputs: Tensor) -> Tensor:
-    return (inputs if inputs.dtype == torch.int16 else inputs.to(torch.int64)).contiguous()
+    """int16, or int64 with rows that have no gaps."""
+    inputs = inputs if inputs.dtype == torch.int16 else inputs.to(torch.int64)
+    return inputs if inputs.dtype == torch.int64 and inputs.stride(1) == 1 else inputs.contiguous()
 
 
 def to_fixed(values: np.ndarray) -> np.ndarray:

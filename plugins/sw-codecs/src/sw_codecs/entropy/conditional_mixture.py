@@ -27,6 +27,7 @@ from sw_codecs.coders.symbol_stream import check_again, guarded
 from sw_codecs.entropy.conditional import Numbers, _array, _where
 from sw_codecs.entropy.exact_tables import FRACTIONS, exact_tables
 from sw_codecs.entropy.gaussian_exact import SYMBOL_LIMIT, IntegerContext, _flat_lattice
+from sw_codecs.entropy.lattice import _tensor
 from sw_codecs.entropy.rates import gaussian_mass
 from sw_codecs.exact_native import EXACT
 
@@ -63,6 +64,7 @@ class _Rows:
     """Mixtures of n coded numbers: centre int64 [n] and half-width [n] of their windows, and what makes their counts.
 
     counts  (rows, half-width W) -> float64 [rows, 2 W + 2], all positive: the window, then the escape
+    order   [n] rows in the order of coding: by ascending width, those of one width in their order
     exact   what the compiled kernel takes of each number: shifts of the window [n,2] int32, tables [n,2] int16, weight
             of the first [n] int32; None: it has no such form
     """
@@ -70,12 +72,8 @@ class _Rows:
     centre: np.ndarray
     width: np.ndarray
     counts: Callable[[np.ndarray, int], np.ndarray]
+    order: np.ndarray
     exact: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
-
-    @functools.cached_property
-    def order(self) -> np.ndarray:
-        """Rows in the order of coding: by ascending width, those of one width in their order."""
-        return np.argsort(self.width.astype(np.uint16), kind="stable")
 
     def encode(self, entries: np.ndarray) -> bytes:
         """Range-coded words of entries [n]: 0 .. 2 W, or the escape."""
@@ -117,7 +115,7 @@ class _Rows:
         """Arguments of the compiled kernel, if there is one."""
         if self.exact is None or not EXACT.try_load():
             return None
-        rows = (self.order.astype(np.int32), self.width.astype(np.int32), *self.exact)
+        rows = (self.order.astype(np.int32, copy=False), self.width.astype(np.int32, copy=False), *self.exact)
         return _summed_tables(), [torch.from_numpy(each) for each in rows]
 
     def _batches(self) -> Iterator[tuple[np.ndarray, int]]:
@@ -215,11 +213,16 @@ class ConditionalMixture:
         return torch.from_numpy(found)
 
     def _rows(self, context: RowMixture, where: Any, shape: tuple[int, ...]) -> _Rows:
-        parts = [
-            np.broadcast_to(_array(each), shape)[where].reshape(-1)
+        given = [
+            _array(each)
             for each in (context.mean, context.scale, context.second_mean, context.second_scale, context.logit,
                          context.step)
         ]  # fmt: skip
+        if self.mode == "exact" and where is Ellipsis and len(shape) == 2:
+            found = _kernel_rows(given, shape)
+            if found is not None:
+                return found
+        parts = [np.broadcast_to(each, shape)[where].reshape(-1) for each in given]
         return _exact_rows(*parts) if self.mode == "exact" else _float_rows(*parts)
 
 
@@ -236,6 +239,10 @@ def _crc(symbols: np.ndarray) -> int:
 def _widths(reach: np.ndarray) -> np.ndarray:
     """The smallest half-width that covers each reach, or the largest there is."""
     return WIDTHS[np.minimum(np.searchsorted(WIDTHS, reach), len(WIDTHS) - 1)]
+
+
+def _by_width(width: np.ndarray) -> np.ndarray:
+    return np.argsort(width.astype(np.uint16), kind="stable")
 
 
 @functools.cache
@@ -270,34 +277,57 @@ def _exact_rows(
     n = len(mean)
     if not np.issubdtype(logit.dtype, np.integer):
         raise ValueError(f"the logits must be integers, not {logit.dtype}")
-    flat, middle, radius, escapes = _padded_tables()
     both = [_flat_lattice(IntegerContext(*each, step), n) for each in ((mean, scale), (second_mean, second_scale))]
     # sigmoid(d) = (1 + tanh(d / 2)) / 2: the table of step multipliers has it.
     j = np.clip(((logit.astype(np.int64) >> 1) + (1 << 15)) >> 9, 0, 127)
     top = 1 << WEIGHT_BITS
-    weight = np.clip((exact_tables().multipliers[j] + 16) >> 5, 2, top - 2).astype(np.float64)
-    weights = weight, top - weight
+    weight = np.clip((exact_tables().multipliers[j] + 16) >> 5, 2, top - 2)
     centre = np.where(weight >= top // 2, both[0][0], both[1][0])
-    reach = np.zeros(n, np.int64)
+    reach, radius = np.zeros(n, np.int64), _padded_tables()[2]
     for middles, number in both:
         reach = np.maximum(reach, radius[number] + np.abs(middles - centre))
-
-    def counts(rows: np.ndarray, width: int) -> np.ndarray:
-        # A window of a table is copied whole, several times faster than number by number.
-        windows = np.lib.stride_tricks.sliding_window_view(flat, 2 * width + 1)
-        found = np.ones((len(rows), 2 * width + 2))
-        for (middles, number), share in zip(both, weights, strict=True):
-            table = number[rows]
-            most = radius[table] + width + 1  # from there on the window lies outside of the table
-            part = windows[middle[table] - width + np.clip(centre[rows] - middles[rows], -most, most)]
-            part *= share[rows][:, None]
-            found[:, :-1] += part
-            found[:, -1] += share[rows] * escapes[table]
-        return found
-
     shifts = np.stack([np.clip(centre - middles, -FAR, FAR) for middles, _ in both], axis=1).astype(np.int32)
     numbers = np.stack([number for _, number in both], axis=1).astype(np.int16)
-    return _Rows(centre, _widths(reach), counts, (shifts, numbers, weight.astype(np.int32)))
+    width = _widths(reach)
+    return _with_counts(centre, width, _by_width(width), (shifts, numbers, weight.astype(np.int32)))
+
+
+def _kernel_rows(parts: list[np.ndarray], shape: tuple[int, ...]) -> _Rows | None:
+    """`_exact_rows` of parts as of RowMixture by the kernel; None: there is none, or it refuses them."""
+    if not EXACT.try_load() or not shape[0] * shape[1]:
+        return None
+    if not all(np.issubdtype(each.dtype, np.integer) for each in parts) or parts[-1].shape != (shape[0], 1):
+        return None
+    tables = exact_tables()
+    *rows, status = torch.ops.sw_codecs_exact.mixture_rows(
+        [_tensor(each) for each in parts], torch.from_numpy(tables.multipliers), torch.from_numpy(tables.thresholds),
+        _summed_tables()[3], torch.from_numpy(WIDTHS),
+    )  # fmt: skip
+    if status:
+        return None
+    centre, width, order, shifts, numbers, weight = (each.numpy() for each in rows)
+    return _with_counts(centre.astype(np.int64), width.astype(np.int64), order, (shifts, numbers, weight))
+
+
+def _with_counts(
+    centre: np.ndarray, width: np.ndarray, order: np.ndarray, exact: tuple[np.ndarray, np.ndarray, np.ndarray]
+) -> _Rows:
+    def counts(rows: np.ndarray, width: int) -> np.ndarray:
+        # A window of a table is copied whole, several times faster than number by number.
+        flat, middle, radius, escapes = _padded_tables()
+        windows = np.lib.stride_tricks.sliding_window_view(flat, 2 * width + 1)
+        found = np.ones((len(rows), 2 * width + 2))
+        first = exact[2][rows].astype(np.float64)
+        for c, share in enumerate((first, (1 << WEIGHT_BITS) - first)):
+            table = exact[1][rows, c]
+            most = radius[table] + width + 1  # from there on the window lies outside of the table
+            part = windows[middle[table] - width + np.clip(exact[0][rows, c], -most, most)]
+            part *= share[:, None]
+            found[:, :-1] += part
+            found[:, -1] += share * escapes[table]
+        return found
+
+    return _Rows(centre, width, counts, order, exact)
 
 
 def _float_rows(
@@ -328,4 +358,5 @@ def _float_rows(
         found[:, :-1] += np.floor(mass.numpy() * FLOAT_TOTAL)
         return found
 
-    return _Rows(centre, _widths(reach), counts)
+    width = _widths(reach)
+    return _Rows(centre, width, counts, _by_width(width))

@@ -23,7 +23,7 @@ PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits
 
 @dataclass(frozen=True)
 class RowLattice:
-    """What `lattice` makes of a block of n rows with C numbers, with the multipliers.
+    """Results of `lattice` for a block of n rows with C numbers, with the multipliers.
 
     centre      int32 [n,C] integer parts of means, in steps
     number      int16 [n,C] table numbers

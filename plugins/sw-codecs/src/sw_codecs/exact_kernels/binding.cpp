@@ -13,8 +13,7 @@
 #include <splatwizard/torch_parallel.h>
 
 #include "binding.h"
-#include "mixtures.h"
-#include "octree.h"
+#include "range_coded.h"
 
 namespace {
 
@@ -190,56 +189,6 @@ std::tuple<Tensor, Tensor> encode_streams(at::TensorList tables, const Tensor& s
   return {joined(data, offsets, sizes), sizes};
 }
 
-// Mixtures of n numbers: tables (below, escape: f64; first, radius: i32), order and width [n], shift and number [n, 2],
-// weight [n]; i32 but number, which is i16.
-MixtureArgs mixtures_of(at::TensorList tables, at::TensorList rows, const char* op) {
-  TORCH_CHECK(tables.size() == 4 && rows.size() == 5, op, ": tables must be 4 and rows 5 tensors");
-  for (size_t i = 0; i < 4; ++i) check(tables[i], i < 2 ? at::kDouble : at::kInt, 1, op, "tables");
-  TORCH_CHECK(tables[1].numel() == 512 && tables[2].numel() == 512 && tables[3].numel() == 512, op,
-              ": tables must be 512");
-  const int64_t n = rows[0].numel();
-  for (size_t i = 0; i < 5; ++i) {
-    check(rows[i], i == 3 ? at::kShort : at::kInt, i == 2 || i == 3 ? 2 : 1, op, "rows");
-    TORCH_CHECK(rows[i].size(0) == n && (rows[i].dim() == 1 || rows[i].size(1) == 2), op, ": rows differ in length");
-  }
-  const int32_t *order = rows[0].const_data_ptr<int32_t>(), *width = rows[1].const_data_ptr<int32_t>();
-  const int16_t* number = rows[3].const_data_ptr<int16_t>();
-  for (int64_t i = 0; i < n; ++i)
-    TORCH_CHECK(order[i] >= 0 && order[i] < n && width[i] >= 1 && width[i] <= 1 << 16 && number[2 * i] >= 0 &&
-                    number[2 * i] < 512 && number[2 * i + 1] >= 0 && number[2 * i + 1] < 512,
-                op, ": row ", i, " is out of range");
-  return {tables[0].const_data_ptr<double>(), tables[1].const_data_ptr<double>(), tables[2].const_data_ptr<int32_t>(),
-          tables[3].const_data_ptr<int32_t>(), order, width, rows[2].const_data_ptr<int32_t>(), number,
-          rows[4].const_data_ptr<int32_t>(), n};
-}
-
-// (entries [n] i32, status) of range-coded words.
-std::tuple<Tensor, int64_t> decode_mixtures(at::TensorList tables, at::TensorList rows, const Tensor& words) {
-  const char* op = "decode_mixtures";
-  check(words, at::kByte, 1, op, "words");
-  const MixtureArgs args = mixtures_of(tables, rows, op);
-  Tensor entries = at::empty({args.n}, rows[0].options());
-  const int32_t status = SW_SELECT(decode_mixtures)(args, words.const_data_ptr<uint8_t>(), words.numel(),
-                                                    entries.mutable_data_ptr<int32_t>());
-  return {entries, status};
-}
-
-// Range-coded words, u8, of entries [n] i32.
-Tensor encode_mixtures(at::TensorList tables, at::TensorList rows, const Tensor& entries) {
-  const char* op = "encode_mixtures";
-  check(entries, at::kInt, 1, op, "entries");
-  const MixtureArgs args = mixtures_of(tables, rows, op);
-  TORCH_CHECK(entries.numel() == args.n, op, ": entries differ in length");
-  const int32_t* entry = entries.const_data_ptr<int32_t>();
-  for (int64_t i = 0; i < args.n; ++i)
-    TORCH_CHECK(entry[i] >= 0 && entry[i] <= 2 * args.width[i] + 1, op, ": entry ", i, " is out of range");
-  Tensor words = at::empty({4 * (args.n + 2)}, entries.options().dtype(at::kByte));
-  const int64_t bytes = SW_SELECT(encode_mixtures)(args, entry, words.mutable_data_ptr<uint8_t>());
-  Tensor found = at::empty({bytes}, words.options());
-  if (bytes > 0) std::memcpy(found.mutable_data_ptr<uint8_t>(), words.const_data_ptr<uint8_t>(), static_cast<size_t>(bytes));
-  return found;
-}
-
 // (nodes [m] i64, occupancies u8 of all levels, nodes of each level and at the end [levels + 1] i64, status) of
 // range-coded words under counts [levels, 4, 255] i64, none empty; no level has more than `points` nodes.
 std::tuple<Tensor, Tensor, Tensor, int64_t> decode_octree(const Tensor& words, const Tensor& counts, int64_t points) {
@@ -256,6 +205,18 @@ std::tuple<Tensor, Tensor, Tensor, int64_t> decode_octree(const Tensor& words, c
       {words.const_data_ptr<uint8_t>(), words.numel(), depth, points, counts.const_data_ptr<int64_t>()},
       nodes.mutable_data_ptr<int64_t>(), occupancies.mutable_data_ptr<uint8_t>(), sizes.mutable_data_ptr<int64_t>());
   return {nodes, occupancies, sizes, status};
+}
+
+// (bits [count] i32, status) of range-coded words; `zeros` of 2^24 is the share of 0.
+std::tuple<Tensor, int64_t> decode_bits(const Tensor& words, int64_t zeros, int64_t count) {
+  const char* op = "decode_bits";
+  check(words, at::kByte, 1, op, "words");
+  TORCH_CHECK(zeros >= 1 && zeros < 1 << 24 && count >= 0, op, ": zeros must be 1..2^24 - 1");
+  Tensor bits = at::empty({count}, words.options().dtype(at::kInt));
+  const int32_t status =
+      SW_SELECT(decode_bits)(words.const_data_ptr<uint8_t>(), words.numel(), static_cast<uint32_t>(zeros), count,
+                             bits.mutable_data_ptr<int32_t>());
+  return {bits, status};
 }
 
 // Symbols [m] i32 as integers [n, C] i64, 0 where they are not present; values [n, C] f32 become integer * step.
@@ -366,8 +327,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
         " -> (Tensor, Tensor, int)");
   m.def("decode_streams(Tensor[] tables, Tensor data, Tensor sizes, Tensor centre, Tensor number) -> (Tensor, int)");
   m.def("encode_streams(Tensor[] tables, Tensor symbols, Tensor centre, Tensor number) -> (Tensor, Tensor)");
-  m.def("decode_mixtures(Tensor[] tables, Tensor[] rows, Tensor words) -> (Tensor, int)");
-  m.def("encode_mixtures(Tensor[] tables, Tensor[] rows, Tensor entries) -> Tensor");
+  m.def("decode_bits(Tensor words, int zeros, int count) -> (Tensor, int)");
   m.def("decode_octree(Tensor words, Tensor counts, int points) -> (Tensor, Tensor, Tensor, int)");
   m.def("put_values(Tensor symbols, Tensor? present, Tensor step, Tensor(a!) values) -> Tensor");
   m.def("present_rows(Tensor centre, Tensor number, Tensor present) -> (Tensor, Tensor)");
@@ -377,8 +337,7 @@ TORCH_LIBRARY(sw_codecs_exact, m) {
   m.impl("lattice", c10::DispatchKey::CPU, TORCH_FN(lattice));
   m.impl("decode_streams", c10::DispatchKey::CPU, TORCH_FN(decode_streams));
   m.impl("encode_streams", c10::DispatchKey::CPU, TORCH_FN(encode_streams));
-  m.impl("decode_mixtures", c10::DispatchKey::CPU, TORCH_FN(decode_mixtures));
-  m.impl("encode_mixtures", c10::DispatchKey::CPU, TORCH_FN(encode_mixtures));
+  m.impl("decode_bits", c10::DispatchKey::CPU, TORCH_FN(decode_bits));
   m.impl("decode_octree", c10::DispatchKey::CPU, TORCH_FN(decode_octree));
   m.impl("put_values", c10::DispatchKey::CPU, TORCH_FN(put_values));
   m.impl("present_rows", c10::DispatchKey::CPU, TORCH_FN(present_rows));

@@ -14,16 +14,31 @@ namespace {
 using at::Tensor;
 using namespace splatwizard;
 
-// A network on inputs [n, in] i64 or i16; layers: W [out, in] and b [out] f64 in turn.
+// A network on inputs [n, in] i64 or i16, or on two of i64 side by side; layers: W [out, in] and b [out] f64 in turn.
 struct Network {
   std::vector<Layer> layers;
   NetworkArgs args{};
 
-  Network(const Tensor& inputs, at::TensorList tensors, const char* op) {
-    const bool narrow = inputs.scalar_type() == at::kShort;
-    check(inputs, narrow ? at::kShort : at::kLong, 2, op, "inputs");
+  Network(at::TensorList inputs, at::TensorList tensors, const char* op) {
+    TORCH_CHECK(inputs.size() == 1 || inputs.size() == 2, op, ": inputs must be one or two tensors");
     TORCH_CHECK(tensors.size() >= 2 && tensors.size() % 2 == 0, op, ": weights and biases must come in pairs");
-    int64_t width = inputs.size(1);
+    args.rows = inputs[0].size(0);
+    int64_t width = 0;
+    if (inputs.size() == 1 && inputs[0].scalar_type() == at::kShort) {
+      check(inputs[0], at::kShort, 2, op, "inputs");
+      args.short_inputs = inputs[0].const_data_ptr<int16_t>();
+      width = inputs[0].size(1);
+    } else {
+      for (size_t i = 0; i < inputs.size(); ++i) {
+        const Tensor& each = inputs[i];
+        TORCH_CHECK(each.is_cpu() && each.scalar_type() == at::kLong && each.dim() == 2 && each.size(0) == args.rows &&
+                        (each.size(1) < 2 || each.stride(1) == 1),
+                    op, ": inputs must be int64 [n, columns] on the CPU");
+        args.inputs[i] = each.const_data_ptr<int64_t>();
+        args.stride[i] = each.stride(0);
+        width += args.width[i] = each.size(1);
+      }
+    }
     for (size_t i = 0; i < tensors.size(); i += 2) {
       check(tensors[i], at::kDouble, 2, op, "weights");
       check(tensors[i + 1], at::kDouble, 1, op, "biases");
@@ -32,23 +47,25 @@ struct Network {
       layers.push_back({tensors[i].const_data_ptr<double>(), tensors[i + 1].const_data_ptr<double>(), width, out});
       width = out;
     }
-    args = {layers.data(), static_cast<int64_t>(layers.size()), narrow ? nullptr : inputs.const_data_ptr<int64_t>(),
-            narrow ? inputs.const_data_ptr<int16_t>() : nullptr, inputs.size(0)};
+    args.layers = layers.data();
+    args.depth = static_cast<int64_t>(layers.size());
   }
   int64_t outputs() const { return layers.back().outputs; }
 };
 
-// Writes outputs [n, out] i64.
-void network(const Tensor& inputs, at::TensorList layers, const Tensor& outputs) {
+// Writes outputs [n, out] i64; `leak`: slope of activations below 0, in 1/4096.
+void network(at::TensorList inputs, at::TensorList layers, int64_t leak, const Tensor& outputs) {
   const char* op = "network";
-  const Network found(inputs, layers, op);
+  Network found(inputs, layers, op);
+  TORCH_CHECK(leak >= 0 && leak <= 4096, op, ": leak must be 0..4096");
+  found.args.leak = leak;
   check(outputs, at::kLong, 2, op, "outputs");
-  TORCH_CHECK(outputs.size(0) == inputs.size(0) && outputs.size(1) == found.outputs(), op, ": outputs do not fit");
+  TORCH_CHECK(outputs.size(0) == found.args.rows && outputs.size(1) == found.outputs(), op, ": outputs do not fit");
   SW_SELECT(network)(found.args, outputs.mutable_data_ptr<int64_t>(), torch_parallel());
 }
 
 // Writes centre and number [n, C] of each group and steps [n, groups] i64, for multipliers [128]; the status.
-int64_t forecast(const Tensor& inputs, at::TensorList layers, const Tensor& multipliers, const Tensor& thresholds,
+int64_t forecast(at::TensorList inputs, at::TensorList layers, const Tensor& multipliers, const Tensor& thresholds,
                  at::TensorList centre, at::TensorList number, const Tensor& steps) {
   const char* op = "forecast";
   const Network found(inputs, layers, op);
@@ -58,7 +75,7 @@ int64_t forecast(const Tensor& inputs, at::TensorList layers, const Tensor& mult
   ForecastArgs args{};
   args.groups = static_cast<int64_t>(centre.size());
   TORCH_CHECK(multipliers.numel() == 128 && thresholds.numel() == 63 && args.groups >= 1 && args.groups <= 4 &&
-                  number.size() == centre.size() && steps.size(0) == inputs.size(0) && steps.size(1) == args.groups,
+                  number.size() == centre.size() && steps.size(0) == found.args.rows && steps.size(1) == args.groups,
               op, ": one to four groups, 128 multipliers and 63 thresholds");
   args.multipliers = multipliers.const_data_ptr<int64_t>();
   for (int64_t i = 0; i < 128; ++i)
@@ -69,7 +86,7 @@ int64_t forecast(const Tensor& inputs, at::TensorList layers, const Tensor& mult
   for (size_t g = 0; g < centre.size(); ++g) {
     check(centre[g], at::kInt, 2, op, "centre");
     check(number[g], at::kShort, 2, op, "number");
-    TORCH_CHECK(centre[g].size(0) == inputs.size(0) && number[g].sizes() == centre[g].sizes(), op,
+    TORCH_CHECK(centre[g].size(0) == found.args.rows && number[g].sizes() == centre[g].sizes(), op,
                 ": centre and number must be [n, columns]");
     args.columns[g] = centre[g].size(1);
     args.centre[g] = centre[g].mutable_data_ptr<int32_t>();
@@ -158,9 +175,9 @@ Tensor triplane_features(const Tensor& places, at::TensorList planes, at::IntArr
 }  // namespace
 
 TORCH_LIBRARY_FRAGMENT(sw_codecs_exact, m) {
-  m.def("forecast(Tensor inputs, Tensor[] layers, Tensor multipliers, Tensor thresholds, Tensor(a!)[] centre,"
+  m.def("forecast(Tensor[] inputs, Tensor[] layers, Tensor multipliers, Tensor thresholds, Tensor(a!)[] centre,"
         " Tensor(b!)[] number, Tensor(c!) steps) -> int");
-  m.def("network(Tensor inputs, Tensor[] layers, Tensor(a!) outputs) -> ()");
+  m.def("network(Tensor[] inputs, Tensor[] layers, int leak, Tensor(a!) outputs) -> ()");
   m.def("grid_features(Tensor codes, int[] axes, Tensor signs, int features, Tensor levels, int dense, int log2_size,"
         " Tensor(a!) out) -> ()");
   m.def("triplane_features(Tensor places, Tensor[] planes, int[] sizes) -> Tensor");

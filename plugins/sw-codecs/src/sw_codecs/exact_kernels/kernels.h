@@ -90,9 +90,10 @@ struct Layer {
 struct NetworkArgs {
   const Layer* layers;
   int64_t depth;
-  const int64_t* inputs;        // [rows, inputs of the first layer]
-  const int16_t* short_inputs;  // the same, or null
-  int64_t rows;
+  const int64_t* inputs[2];  // of the first layer, side by side: [rows, width] each
+  int64_t width[2], stride[2];
+  const int16_t* short_inputs;  // instead [rows, inputs of the first layer], or null
+  int64_t rows, leak;           // slope of activations below 0, in 1/4096
 };
 
 // Outputs of a network in groups: means, then scales of each; at the end a step of each.

@@ -9,26 +9,6 @@ using namespace splatwizard;
 
 namespace {
 
-// Integers of a row as float64; false if one is beyond 2^48.
-bool take(const int64_t* from, int64_t n, double* to) {
-  constexpr int64_t LIMIT = int64_t{1} << 48;
-  IntVec wrong{};
-  int64_t c = 0;
-  for (; c + LANES <= n; c += LANES) {
-    const IntVec x = *reinterpret_cast<const IntLoad*>(from + c);
-    wrong |= (x <= -LIMIT) | (x >= LIMIT);
-    store(to + c, of_integers(x));
-  }
-  int64_t any = 0;
-  for (int l = 0; l < LANES; ++l) any |= wrong[l];
-  for (; c < n; ++c) {
-    any |= from[c] <= -LIMIT || from[c] >= LIMIT;
-    to[c] = static_cast<double>(from[c]);
-  }
-  for (; c % LANES; ++c) to[c] = 0;
-  return any == 0;
-}
-
 void copy(const int32_t* centre, const int16_t* number, int64_t n, int32_t* to_centre, int16_t* to_number) {
   std::memcpy(to_centre, centre, sizeof(int32_t) * static_cast<size_t>(n));
   std::memcpy(to_number, number, sizeof(int16_t) * static_cast<size_t>(n));
@@ -53,7 +33,7 @@ int32_t lattice(const LatticeArgs& a, const Parallel& parallel) {
       int64_t at = present == nullptr ? row * a.columns : a.start[row];
       for (int64_t c = 0; c < a.columns; c += COLUMNS) {
         const int64_t n = a.columns - c < COLUMNS ? a.columns - c : COLUMNS;
-        if (!take(a.mean + row * a.mean_stride + c, n, mean) || !take(a.scale + row * a.scale_stride + c, n, scale))
+        if (!take_integers(a.mean + row * a.mean_stride + c, n, mean) || !take_integers(a.scale + row * a.scale_stride + c, n, scale))
           found = PARAMETER_WRONG;
         else if (columns_of(levels, mean, scale, m, n, centre, number))
           found = BEYOND_LIMIT;

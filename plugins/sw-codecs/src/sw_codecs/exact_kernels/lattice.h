@@ -13,6 +13,7 @@ static_assert(COLUMNS % LANES == 0);
 struct Levels {
   int32_t first[BUCKETS];  // number of thresholds below the smallest number of a bucket
   double threshold[64];
+  bool several = false;  // whether a bucket has more than one, which is not so for the shipped ones
 
   explicit Levels(const int64_t* thresholds) {
     for (int i = 0; i < 63; ++i) threshold[i] = static_cast<double>(thresholds[i]);
@@ -23,7 +24,9 @@ struct Levels {
       std::memcpy(&low, &bits, 8);
       first[i] = 0;
       while (i > 0 && threshold[first[i]] < low) ++first[i];
+      several |= i > 0 && first[i] > first[i - 1] + 1;
     }
+    several |= first[BUCKETS - 1] < 63;
   }
 };
 
@@ -61,17 +64,35 @@ inline bool columns_of(const Levels& levels, const double* mean, const double* s
   }
   int64_t any = 0;
   for (int l = 0; l < LANES; ++l) any |= beyond[l];
-  int more = 0;
   for (int64_t c = 0; c < columns; ++c) {
     int32_t level = levels.first[bucket[c]];
     level += levels.threshold[level] < ratio[c];
-    more |= levels.threshold[level] < ratio[c];
     number[c] = static_cast<int16_t>(8 * level + eighths[c]);
   }
-  if (__builtin_expect(more, 0))  // a bucket with more than one threshold, which the shipped ones do not have
+  if (levels.several)
     for (int64_t c = 0; c < columns; ++c)
       while (levels.threshold[number[c] >> 3] < ratio[c]) number[c] = static_cast<int16_t>(number[c] + 8);
   return any != 0;
+}
+
+// Integers of a row as float64; false if one is beyond 2^48.
+inline bool take_integers(const int64_t* from, int64_t n, double* to) {
+  constexpr int64_t LIMIT = int64_t{1} << 48;
+  IntVec wrong{};
+  int64_t c = 0;
+  for (; c + LANES <= n; c += LANES) {
+    const IntVec x = *reinterpret_cast<const IntLoad*>(from + c);
+    wrong |= (x <= -LIMIT) | (x >= LIMIT);
+    store(to + c, of_integers(x));
+  }
+  int64_t any = 0;
+  for (int l = 0; l < LANES; ++l) any |= wrong[l];
+  for (; c < n; ++c) {
+    any |= from[c] <= -LIMIT || from[c] >= LIMIT;
+    to[c] = static_cast<double>(from[c]);
+  }
+  for (; c % LANES; ++c) to[c] = 0;
+  return any == 0;
 }
 
 // Moves the present ones of n numbers to the front; how many there are.

@@ -61,9 +61,8 @@ constexpr int SUMS = 4;
 typedef int32_t Sum __attribute__((vector_size(4 * SUMS)));
 typedef int16_t Pair __attribute__((vector_size(4 * SUMS)));
 typedef int16_t PairLoad __attribute__((vector_size(4 * SUMS), aligned(2)));
-typedef double Whole __attribute__((vector_size(8 * SUMS)));
-typedef double WholeLoad __attribute__((vector_size(8 * SUMS), aligned(8)));
-static_assert(TILE % (WIDE * SUMS) == 0);
+typedef int32_t SumStore __attribute__((vector_size(4 * SUMS), aligned(4)));
+static_assert(TILE % (WIDE * SUMS) == 0 && WIDE * SUMS % LANES == 0);
 
 // a_0 b_0 + a_1 b_1 of each pair.
 inline Sum pair_sums(Pair a, Pair b) {
@@ -93,11 +92,14 @@ inline void add_pairs(const int16_t* in, int64_t stride, const int16_t* weights,
         for (int v = 0; v < WIDE; ++v) sum[r][v] += pair_sums(a, w[v]);
       }
     }
+    int32_t found[4][WIDE * SUMS];
     for (int r = 0; r < 4; ++r)
-      for (int v = 0; v < WIDE; ++v) {
-        double* to = sums + r * TILE + part + v * SUMS;
-        *reinterpret_cast<WholeLoad*>(to) =
-            *reinterpret_cast<const WholeLoad*>(to) + __builtin_convertvector(sum[r][v], Whole) * factor;
+      for (int v = 0; v < WIDE; ++v) *reinterpret_cast<SumStore*>(found[r] + v * SUMS) = sum[r][v];
+    for (int r = 0; r < 4; ++r)
+      for (int c = 0; c < WIDE * SUMS; c += LANES) {
+        double* to = sums + r * TILE + part + c;
+        const Narrow x = *reinterpret_cast<const NarrowLoad*>(found[r] + c);
+        store(to, load(to) + __builtin_convertvector(x, Vec) * all(factor));
       }
   }
 }

@@ -54,13 +54,23 @@ int32_t decode_mixtures(const MixtureArgs& a, const uint8_t* words, int64_t byte
     const Window window(a, a.order[i]);
     const uint64_t q = coded.quantile();
     if (q >= TOP) return WORDS_LEFT;
-    int64_t entry = 0, end = window.entries;
-    while (end - entry > 1) {
-      const int64_t middle = (entry + end) / 2;
-      (window.share(middle) <= q ? entry : end) = middle;
-    }
+    // From the middle outwards, where most numbers lie, and then between the last two.
+    int64_t entry = 0, end = window.entries, step = 1;
+    uint64_t first = 0, last = TOP;
+    const auto seen = [&](int64_t at) {
+      const uint64_t share = window.share(at);
+      const bool below = share <= q;
+      (below ? entry : end) = at;
+      (below ? first : last) = share;
+      return below;
+    };
+    if (seen(end / 2 - 1))
+      while (entry + step < end && seen(entry + step)) step *= 2;
+    else
+      while (end - step > entry && !seen(end - step)) step *= 2;
+    while (end - entry > 1) seen((entry + end) / 2);
     entries[a.order[i]] = static_cast<int32_t>(entry);
-    coded.take(window.share(entry), window.share(entry + 1));
+    coded.take(first, last);
   }
   return FINE;
 }

@@ -1,6 +1,6 @@
 // Occupancies of an octree, level by level under range coding, and the nodes they stand for
 // (sw_codecs.positions.octree).
-#include "octree.h"
+#include "range_coded.h"
 
 #include "ranges.h"
 

@@ -30,6 +30,21 @@ struct RangeReader {
       point = point << 32 | next();
     }
   }
+  // A bit, 0 having `zeros` parts; -1 if the data is damaged. Without the division of `quantile`.
+  int bit(uint64_t zeros) {
+    scale = range >> BITS;
+    const uint64_t offset = point - low, border = scale * zeros;
+    if (offset >= scale << BITS) return -1;
+    const bool one = offset >= border;
+    low += one ? border : 0;
+    range = one ? (scale << BITS) - border : border;
+    if (range < uint64_t{1} << 32) {
+      low <<= 32;
+      range <<= 32;
+      point = point << 32 | next();
+    }
+    return one;
+  }
 
  private:
   uint64_t next() { return at < count ? word_at(words + 4 * at++) : 0u; }

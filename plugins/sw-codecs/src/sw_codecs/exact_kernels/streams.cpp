@@ -28,32 +28,85 @@ void order_by_table(const int16_t* number, int64_t n, uint16_t* order, int32_t* 
   for (int64_t i = 0; i < n; ++i) order[next[number[i]]++] = static_cast<uint16_t>(i);
 }
 
-int32_t decode_one(const Tables& tables, const uint8_t* data, const int64_t* sizes, const int32_t* centre,
-                   const int16_t* number, int64_t n, int32_t* symbols) {
+// A stream that is being decoded, table by table.
+struct Decoding {
+  const Tables& tables;
+  WordReader words;
+  EscapeReader escapes;
+  const int32_t* centre;
+  int32_t* symbols;
+  const int32_t* shares = nullptr;  // of the table at hand
+  const uint16_t* bucket = nullptr;
+  int32_t radius = 0, table = -1, at = 0, end = 0;  // its rows in `order`
   uint16_t order[STREAM];
   int32_t begin[TABLES + 1];
-  order_by_table(number, n, order, begin);
-  WordReader words(data, sizes[1]);
-  EscapeReader escapes(data + sizes[1], sizes[2]);
-  for (int t = 0; t < TABLES; ++t) {
-    if (begin[t] == begin[t + 1]) continue;
-    const int32_t* shares = tables.shares + tables.first[t];
-    const uint16_t* bucket = tables.bucket + 256 * t;
-    const int32_t radius = tables.radius[t];
-    for (int32_t j = begin[t]; j < begin[t + 1]; ++j) {
-      const int32_t s = words.entry(shares, bucket);
-      int64_t value = s - radius;
-      if (__builtin_expect(s > 2 * radius, 0)) {
-        value = escapes.beyond(radius);
-        if (escapes.damaged) return ESCAPES_WRONG;
-      }
-      value += centre[order[j]];
-      if (value >= SYMBOL_LIMIT || value <= -SYMBOL_LIMIT) return BEYOND_LIMIT;
-      symbols[order[j]] = static_cast<int32_t>(value);
+
+  Decoding(const Tables& all_tables, const Streams& streams, int64_t s, const int32_t* centres, const int16_t* numbers,
+           int64_t count, int32_t* found)
+      : tables(all_tables),
+        words(streams.data + streams.offset[s], streams.table[3 * s + 1]),
+        escapes(streams.data + streams.offset[s] + streams.table[3 * s + 1], streams.table[3 * s + 2]),
+        centre(centres + s * STREAM),
+        symbols(found + s * STREAM) {
+    const int64_t left = count - s * STREAM;
+    order_by_table(numbers + s * STREAM, left < STREAM ? left : STREAM, order, begin);
+    go_on();
+  }
+  // Takes up the next table that has rows, if all of this one's are decoded.
+  void go_on() {
+    while (at == end && table + 1 < TABLES) {
+      end = begin[++table + 1];
+      shares = tables.shares + tables.first[table];
+      bucket = tables.bucket + 256 * table;
+      radius = tables.radius[table];
     }
   }
-  if (!words.used_up()) return WORDS_LEFT;
-  return escapes.used_up() ? FINE : ESCAPES_WRONG;
+  bool done() const { return at == end; }
+  int32_t status() const { return !words.used_up() ? WORDS_LEFT : escapes.used_up() ? FINE : ESCAPES_WRONG; }
+};
+
+// Decodes the symbol of row number j in the order, with a copy of the words that stays in registers.
+inline int32_t decode_symbol(Decoding& d, WordReader& words, int32_t j) {
+  const int32_t s = words.entry(d.shares, d.bucket);
+  int64_t value = s - d.radius;
+  if (__builtin_expect(s > 2 * d.radius, 0)) {
+    value = d.escapes.beyond(d.radius);
+    if (d.escapes.damaged) return ESCAPES_WRONG;
+  }
+  value += d.centre[d.order[j]];
+  if (value >= SYMBOL_LIMIT || value <= -SYMBOL_LIMIT) return BEYOND_LIMIT;
+  d.symbols[d.order[j]] = static_cast<int32_t>(value);
+  return FINE;
+}
+
+int32_t decode_rest(Decoding& d) {
+  for (; !d.done(); d.go_on()) {
+    WordReader words = d.words;
+    for (; d.at < d.end; ++d.at)
+      if (const int32_t found = decode_symbol(d, words, d.at); found != FINE) return found;
+    d.words = words;
+  }
+  return d.status();
+}
+
+// Two streams at once: each symbol waits for the one before it, but not for those of the other stream.
+int32_t decode_both(Decoding& a, Decoding& b) {
+  while (!a.done() && !b.done()) {
+    const int32_t n = a.end - a.at < b.end - b.at ? a.end - a.at : b.end - b.at;
+    WordReader first = a.words, second = b.words;
+    for (int32_t k = 0; k < n; ++k) {
+      const int32_t one = decode_symbol(a, first, a.at + k), other = decode_symbol(b, second, b.at + k);
+      if (__builtin_expect(one | other, 0)) return one != FINE ? one : other;
+    }
+    a.words = first;
+    b.words = second;
+    a.at += n;
+    b.at += n;
+    a.go_on();
+    b.go_on();
+  }
+  const int32_t found = decode_rest(a);
+  return found != FINE ? found : decode_rest(b);
 }
 
 void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32_t* centre, const int16_t* number,
@@ -89,11 +142,15 @@ void encode_one(const Tables& tables, uint8_t* data, int64_t* sizes, const int32
 int32_t decode_streams(const Tables& tables, const Streams& streams, const int32_t* centre, const int16_t* number,
                        int64_t count, int32_t* symbols, const Parallel& parallel) {
   std::atomic<int32_t> status{FINE};
+  const auto streams_from = [&](int64_t s) { return Decoding(tables, streams, s, centre, number, count, symbols); };
   parallel(streams.count, 1, [&](int64_t begin, int64_t end) {
-    for (int64_t s = begin; s < end; ++s) {
-      const int64_t at = s * STREAM, n = count - at < STREAM ? count - at : STREAM;
-      raise(status, decode_one(tables, streams.data + streams.offset[s], streams.table + 3 * s, centre + at,
-                               number + at, n, symbols + at));
+    for (int64_t s = begin; s + 1 < end; s += 2) {
+      Decoding one = streams_from(s), other = streams_from(s + 1);
+      raise(status, decode_both(one, other));
+    }
+    if ((end - begin) % 2) {
+      Decoding last = streams_from(end - 1);
+      raise(status, decode_rest(last));
     }
   });
   return status;

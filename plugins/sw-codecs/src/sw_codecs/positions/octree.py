@@ -19,13 +19,12 @@ import numpy.typing as npt
 import torch
 
 from splatwizard_core.api import BitstreamError
-from splatwizard_native import NativeBuildError
 from sw_codecs.bits import checksum
 from sw_codecs.bits.packing import ByteReader, pack_fixed, packed_size, unpack_fixed, write_varint
 from sw_codecs.coders.count_tables import code_counts, count_codes, pack_tables, table_bits, unpack_tables
 from sw_codecs.coders.model_spec import Tables
 from sw_codecs.coders.symbol_stream import SymbolReader, SymbolWriter
-from sw_codecs.exact_native import EXACT
+from sw_codecs.exact_native import has_exact
 from sw_codecs.positions import morton
 from sw_codecs.positions.duplicates import decode_duplicates, encode_duplicates, without_duplicates
 from sw_codecs.positions.ordering import spatial_order
@@ -144,7 +143,7 @@ def _decode_tree(reader: ByteReader, bits: int, distinct: int) -> np.ndarray:
 
 def _decode_levels(words: memoryview, tables: np.ndarray, crc: int, limit: int) -> np.ndarray:
     """Nodes int64 below the last level; `tables` [levels, 4, 255] counts, `limit` the most nodes of a level."""
-    if len(words) % 4 == 0 and _has_kernel():
+    if len(words) % 4 == 0 and has_exact():
         coded = torch.from_numpy(np.frombuffer(words, np.uint8).copy())
         nodes, occupancies, sizes, status = torch.ops.sw_codecs_exact.decode_octree(
             coded, torch.from_numpy(tables), limit
@@ -172,14 +171,6 @@ def _decode_levels(words: memoryview, tables: np.ndarray, crc: int, limit: int) 
         contexts = (np.minimum(children, CONTEXTS) - 1)[row]
     reader.check(crc)
     return at
-
-
-def _has_kernel() -> bool:
-    """Whether there is a compiled decoder. Compiling one takes longer than a file does without."""
-    try:
-        return EXACT.load_built()
-    except NativeBuildError:
-        return False
 
 
 def _refuse_nodes(level: int, limit: int) -> NoReturn:

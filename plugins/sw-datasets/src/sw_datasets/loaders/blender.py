@@ -26,7 +26,7 @@ from sw_datasets.pictures import (
     load_picture,
     picture_header,
 )
-from sw_datasets.rules import Rules, rules_for, unused_option_warnings
+from sw_datasets.rules import Rules, off_centre_warnings, rules_for, unused_option_warnings
 
 HALF_CUBE = 1.3  # start points fill [-1.3, 1.3]^3 (3DGS)
 
@@ -53,10 +53,11 @@ def has_blender_layout(path: Path) -> bool:
 def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
     """The scene of a Blender folder, read by `rules`. Raises SceneError in one line."""
     warnings: list[str] = []
-    train = _read_views(path, "transforms_train.json", rules)
+    train, off_centre = _read_views(path, "transforms_train.json", rules)
     test: list[View] = []
     if (path / "transforms_test.json").is_file():
-        test = _read_views(path, "transforms_test.json", rules)
+        test, of_test = _read_views(path, "transforms_test.json", rules)
+        off_centre = max(off_centre, of_test)
     elif rules.split == "file" and options.split is None:
         rules = replace(rules, split="every8")
         warnings.append(f"there is no transforms_test.json: the training views are split by {rules.split}")
@@ -66,6 +67,7 @@ def load_blender(path: Path, rules: Rules, options: SceneOptions) -> Scene:
             f"{rules.family.title} has {published[0]} training and {published[1]} test views a scene, this folder "
             f"{len(train)} and {len(test)}: figures are not comparable with published ones"
         )
+    warnings += off_centre_warnings(off_centre, rules)
     warnings += unused_option_warnings(
         options, ("mask_background",), rules.family
     )  # alpha always cuts these pictures out
@@ -90,7 +92,8 @@ def random_points(count: int, seed: int) -> PointCloud:
     return PointCloud(xyz, 0.5 + SH_C0 * torch.rand(count, 3, generator=generator) / 255)
 
 
-def _read_views(path: Path, file: str, rules: Rules) -> list[View]:
+def _read_views(path: Path, file: str, rules: Rules) -> tuple[list[View], float]:
+    """The views of one transforms file, and how far a principal point lies off the middle at the most, pixels."""
     where = f"{path / file}"
     data = _read_json(path / file)
     frames = data.get("frames")
@@ -103,7 +106,7 @@ def _read_views(path: Path, file: str, rules: Rules) -> list[View]:
             raise SceneError(f"{where}: frame {i} has no 'file_path'", path=str(path))
         name = name.removeprefix("./")
         names.append(name if os.path.isfile(path / name) else name + ".png")
-    views = []
+    views, off_centre = [], 0.0
     for frame, name, picture in zip(frames, names, find_pictures(path, names), strict=True):
         merged = ChainMap(frame, data)
         if any(_number(merged.get(key, 0), key, name, where) for key in DISTORTION_KEYS):
@@ -114,6 +117,7 @@ def _read_views(path: Path, file: str, rules: Rules) -> list[View]:
             )
         width, height, has_alpha = picture_header(picture)
         fx, fy, cx, cy = _intrinsics(merged, name, where, width, height)
+        off_centre = max(off_centre, abs(cx - width / 2), abs(cy - height / 2))
         if rules.principal_point != "file":
             cx, cy = width / 2, height / 2
         R, tau = _pose(frame.get("transform_matrix"), name, where)
@@ -124,7 +128,7 @@ def _read_views(path: Path, file: str, rules: Rules) -> list[View]:
         if rules.composite8:
             load = partial(load_composited, picture, size, 0 if rules.background == "black" else 255)
         views.append(View(camera, name, load, mask))
-    return views
+    return views, off_centre
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -23,7 +23,7 @@ from sw_datasets.pictures import (
     load_picture,
     picture_header,
 )
-from sw_datasets.rules import Rules, rules_for, unused_option_warnings
+from sw_datasets.rules import Rules, off_centre_warnings, rules_for, unused_option_warnings
 
 PLAIN_FOCALS = {"SIMPLE_PINHOLE": 1, "PINHOLE": 2}
 RADIAL_FOCALS = {"SIMPLE_RADIAL": 1, "RADIAL": 1, "OPENCV": 2, "FULL_OPENCV": 2, "FOV": 2}
@@ -110,11 +110,7 @@ def load_colmap(path: Path, rules: Rules, options: SceneOptions, *, masks: MaskF
         views.append(
             View(camera.resized(*size), image.name, load, None if mask is None else partial(load_mask, mask, size))
         )
-    if off_centre > 1 and rules.principal_point != "file":
-        warnings.append(
-            f"the principal point is up to {off_centre:.1f} px off the image centre and is taken as the centre, "
-            "as the 3DGS code does (principal_point = file uses it)"
-        )
+    warnings += off_centre_warnings(off_centre, rules)
     warnings += unused_option_warnings(options, ("legacy_8bit_composite", "init_points"), rules.family)
     return assemble_scene(
         path.resolve().name,

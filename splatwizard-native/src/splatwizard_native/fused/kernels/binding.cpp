@@ -46,25 +46,40 @@ std::tuple<double, double, at::Tensor> photometric(const at::Tensor& x, const at
   return {l1 / pixels, ssim / mapped, grad};
 }
 
-void adam(const at::Tensor& param, const at::Tensor& grad, const at::Tensor& exp_avg, const at::Tensor& exp_avg_sq,
-          double lr, double beta1, double beta2, double eps, int64_t step) {
-  check(param, "adam", "param");
-  check(grad, "adam", "grad");
-  check(exp_avg, "adam", "exp_avg");
-  check(exp_avg_sq, "adam", "exp_avg_sq");
-  const int64_t count = param.numel();
-  TORCH_CHECK(grad.numel() == count && exp_avg.numel() == count && exp_avg_sq.numel() == count,
-              "adam: param, grad, exp_avg and exp_avg_sq differ in size: ", count, ", ", grad.numel(), ", ",
-              exp_avg.numel(), ", ", exp_avg_sq.numel());
-  TORCH_CHECK(step >= 1, "adam: step counts from 1, got ", step);
-  const double t = static_cast<double>(step);
-  const splatwizard::AdamArgs args{
-      param.mutable_data_ptr<float>(), grad.const_data_ptr<float>(), exp_avg.mutable_data_ptr<float>(),
-      exp_avg_sq.mutable_data_ptr<float>(), count,
-      static_cast<float>(lr / (1. - std::pow(beta1, t))), static_cast<float>(1. - beta1),
-      static_cast<float>(beta2), static_cast<float>(1. - beta2),
-      static_cast<float>(1. / std::sqrt(1. - std::pow(beta2, t))), static_cast<float>(eps)};
-  SW_SELECT(adam)(args, splatwizard::torch_parallel());
+bool fits_adam(const at::Tensor& tensor, const at::Tensor& param) {
+  return tensor.is_cpu() && tensor.scalar_type() == at::kFloat && tensor.is_contiguous() &&
+         tensor.sizes() == param.sizes();
+}
+
+// One step of many tensors. Returns the places of those that the kernel cannot take: they are left as they were.
+std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
+                               const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
+                               const std::vector<double>& lrs, const std::vector<double>& beta1s,
+                               const std::vector<double>& beta2s, const std::vector<double>& epss,
+                               const std::vector<int64_t>& steps) {
+  const size_t count = params.size();
+  TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
+                  lrs.size() == count && beta1s.size() == count && beta2s.size() == count && epss.size() == count &&
+                  steps.size() == count,
+              "adam: lists of different lengths");
+  std::vector<int64_t> left;
+  for (size_t i = 0; i < count; ++i) {
+    const at::Tensor& param = params[i];
+    if (!fits_adam(param, param) || !fits_adam(grads[i], param) || !fits_adam(exp_avgs[i], param) ||
+        !fits_adam(exp_avg_sqs[i], param) || steps[i] < 1) {
+      left.push_back(int64_t(i));
+      continue;
+    }
+    const double t = static_cast<double>(steps[i]), beta1 = beta1s[i], beta2 = beta2s[i];
+    const splatwizard::AdamArgs args{
+        param.mutable_data_ptr<float>(), grads[i].const_data_ptr<float>(), exp_avgs[i].mutable_data_ptr<float>(),
+        exp_avg_sqs[i].mutable_data_ptr<float>(), param.numel(),
+        static_cast<float>(lrs[i] / (1. - std::pow(beta1, t))), static_cast<float>(1. - beta1),
+        static_cast<float>(beta2), static_cast<float>(1. - beta2),
+        static_cast<float>(1. / std::sqrt(1. - std::pow(beta2, t))), static_cast<float>(epss[i])};
+    SW_SELECT(adam)(args, splatwizard::torch_parallel());
+  }
+  return left;
 }
 
 }  // namespace
@@ -72,8 +87,6 @@ void adam(const at::Tensor& param, const at::Tensor& grad, const at::Tensor& exp
 TORCH_LIBRARY(splatwizard_training, m) {
   m.def("photometric(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, bool with_grad)"
         " -> (float, float, Tensor)");
-  m.def("adam(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, float lr, float beta1,"
-        " float beta2, float eps, int step) -> ()");
   // On CUDA, where nothing may wait for a number: means [3] = offset + weighted sum, L1, SSIM; see binding_cuda.cpp.
   m.def("photometric_means(Tensor x, Tensor y, bool valid, float l1_weight, float ssim_weight, float offset,"
         " bool with_grad) -> (Tensor means, Tensor slopes)");
@@ -82,5 +95,5 @@ TORCH_LIBRARY(splatwizard_training, m) {
   m.def("adam_many(Tensor(a!)[] params, Tensor[] grads, Tensor(b!)[] exp_avgs, Tensor(c!)[] exp_avg_sqs, float[] lrs,"
         " float[] beta1s, float[] beta2s, float[] epss, int[] steps) -> int[]");
   m.impl("photometric", c10::DispatchKey::CPU, TORCH_FN(photometric));
-  m.impl("adam", c10::DispatchKey::CPU, TORCH_FN(adam));
+  m.impl("adam_many", c10::DispatchKey::CPU, TORCH_FN(adam_many));
 }
