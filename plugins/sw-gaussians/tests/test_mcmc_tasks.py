@@ -6,17 +6,17 @@ import pytest
 import torch
 from sw_gaussians.mcmc_tasks import AddNoise, Grow, Relocate
 from sw_gaussians.stage import ThreeDGSStage
+from sw_kit import short_training
+from sw_kit.short_training import psnr
 
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import resolve
-from splatwizard_core.scene.dataset import SceneOptions
-from splatwizard_core.scene.loading import load_scene
 from splatwizard_core.scene.scene import Scene
 from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.task_log import TaskLog
 from sw_3dgs.method import ThreeDGS
@@ -41,22 +41,11 @@ def method(**sets) -> ThreeDGS:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return load_scene("demo:tiny", SceneOptions(init_points=600), load_plugins())
+    return short_training.demo()
 
 
-def train(scene: Scene, *, directory=None, stop_after=None, seed=0, **sets):
-    made = method(**sets)
-    return TrainingRun(
-        made.stages(),
-        lambda: made.create_model(scene, stream(seed, "init")),
-        scene,
-        PipelineParams(seed=seed, checkpoint_every=1000),
-        NegotiatedRasterizer(load_plugins(), device="cpu"),
-        directory=directory,
-        identity={},
-        trained=lambda name: pytest.fail(f"asked for '{name}'"),
-        stop_after=stop_after,
-    ).train()
+def train(scene: Scene, **options):
+    return short_training.train(method(), scene, NegotiatedRasterizer(load_plugins(), device="cpu"), **options)
 
 
 @pytest.fixture(scope="module")
@@ -98,21 +87,15 @@ def test_the_start_is_half_opaque_and_small(scene):
     torch.testing.assert_close(start.scales, 0.1 * plain.scales)
 
 
-@torch.no_grad()
-def psnr(model, scene: Scene) -> float:
-    rasterizer = NegotiatedRasterizer(load_plugins(), device="cpu")
-    values = []
-    for view in scene.train:
-        options = RasterOptions(background=scene.background)
-        image = rasterizer.render(model.gaussians(view.camera, rasterizer), view.camera, options).image.clamp(0, 1)
-        values.append(-10 * (image - view.image(scene.background)).pow(2).mean().log10())
-    return float(torch.stack(values).mean())
-
-
 @pytest.mark.pipeline
 def test_it_learns_and_ends_at_the_cap(scene, whole):
-    start = method().create_model(scene, stream(0, "init"))
-    assert psnr(whole.model, scene) > psnr(start, scene) + 4  # 4.95 dB: what moves keeps its momentum
+    start, rasterizer = (
+        method().create_model(scene, stream(0, "init")),
+        NegotiatedRasterizer(load_plugins(), device="cpu"),
+    )
+    assert (
+        psnr(whole.model, scene, rasterizer) > psnr(start, scene, rasterizer) + 4
+    )  # 4.95 dB: what moves keeps its momentum
     assert whole.model.num_rows == 700
     assert all(torch.isfinite(p).all() for p in whole.model.parameters())
 

@@ -109,6 +109,10 @@ def test_the_filter_of_mip_splatting_becomes_part_of_the_gaussian():
     ("data", "message"),
     [
         (ply({"x": 0, "y": 0, "z": 0, "red": 1}), "point cloud"),
+        (
+            ply({"x": 0, "y": 0, "z": 0}, after="element face 1\nproperty list uchar int i", rows_after=b"\0"),
+            "a mesh, not a 3DGS model",
+        ),
         (ply(REQUIRED | {"f_offset_0": 0, "f_anchor_feat_0": 0}), "anchors"),
         (ply({"packed_position": 0}), r"compressed \.ply"),
         (ply(REQUIRED, before="element codebook_centers 1\nproperty float a", rows_before=bytes(4)), "codebooks"),

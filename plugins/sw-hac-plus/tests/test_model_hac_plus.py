@@ -98,18 +98,23 @@ def rate_of(model, sample=1.0):
     return model.attributes(torch.arange(10)).extras["rate"]
 
 
+def noise_of_rate(model):
+    """[N,C] noise of all anchors that `rate_of` draws, in steps."""
+    g, columns = generator(3), sum(model.shape.widths)
+    torch.rand(model.num_rows, generator=g)  # the sample
+    draws((10, columns), g, torch.device("cpu"))  # noise of what is rendered
+    return torch.rand(model.num_rows, columns, generator=g) - 0.5
+
+
 def bits_by_hand(model):
     """[N,C] bits of all anchors by the formulas, under the noise that `rate_of` draws."""
     n, f, k = model.num_rows, model.shape.features, model.num_offsets
-    g = generator(3)
-    torch.rand(n, generator=g)  # the sample
-    draws((10, f + 6 + 3 * k), g, torch.device("cpu"))  # noise of what is rendered
-    noise = torch.rand(n, f + 6 + 3 * k, generator=g) - 0.5
     out = model.mlp_grid(model.grid(model.codes() / 65535))
     mu_f, s_f, mu_l, s_l, mu_o, s_o, t, logit = out.split([f, f, 6, 6, 3 * k, 3 * k, 3, f], dim=1)
     steps = torch.tensor([1, 0.001, 0.2]) * (1 + torch.tanh(t))
     wide = steps.repeat_interleave(torch.tensor([f, 6, 3 * k]), dim=1)
-    values = torch.cat([model.features, model.log_scales.exp(), model.offsets.flatten(1)], dim=1) + noise * wide
+    values = torch.cat([model.features, model.log_scales.exp(), model.offsets.flatten(1)], dim=1)
+    values = values + noise_of_rate(model) * wide
     x, q = values[:, :f], wide[:, :f]
     p = gaussian_mass(values, torch.cat([mu_f, mu_l, mu_o], 1), torch.cat([s_f, s_l, s_o], 1).clamp(min=1e-9), wide)
     if model.channel is not None:
@@ -193,16 +198,12 @@ def test_without_channels_and_masks_of_anchors_the_rate_is_that_of_hac(units):
     gradients = {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
     model.zero_grad()
 
-    g, rows, columns = generator(3), torch.arange(40), sum(model.shape.widths)
-    torch.rand(40, generator=g)  # the sample
-    torch.rand(10, columns, generator=g)  # noise of what is rendered
-    noise = torch.rand(40, columns, generator=g) - 0.5
     forecast = GridAnchors.forecast_at(model, model.context_rows())
     values = torch.cat([model.features, model.log_scales.exp(), model.offsets.flatten(1)], dim=1)
-    values = values + noise * model.widened(forecast.steps)
+    values = values + noise_of_rate(model) * model.widened(forecast.steps)
     masks = model.masks()
     kept = masks.detach().amax(dim=1)
-    expected = GridAnchors.rate_of(model, rows, values, forecast, masks, kept, kept.mean())
+    expected = GridAnchors.rate_of(model, torch.arange(40), values, forecast, masks, kept, kept.mean())
     torch.testing.assert_close(found.bits, expected.bits, rtol=1e-6, atol=0)
     torch.testing.assert_close(found.by_group, expected.by_group, rtol=1e-6, atol=0)
     assert torch.equal(found.own_bits, expected.own_bits)

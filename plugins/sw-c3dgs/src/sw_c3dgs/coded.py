@@ -14,7 +14,6 @@ QUANTIZED = ("opacity", "factor", "dc", "rest", "shape", "quat")
 """Quantized tensors, each with one lattice: opacities, log factors; SH band 0 and the others; shapes, quaternions."""
 PER_GAUSSIAN = ("opacity", "factor")
 PER_COLOR = ("dc", "rest")
-PER_SHAPE = ("shape", "quat")
 
 
 @dataclass(frozen=True)

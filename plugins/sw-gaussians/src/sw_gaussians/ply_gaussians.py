@@ -133,7 +133,8 @@ def _check_dialect(header: PlyHeader, name: str, path: str) -> tuple[int, bool]:
     if "vertex" not in {each.name for each in header.elements}:
         raise refuse("not a 3DGS model: the header names no element 'vertex'")
     if "x" in names and not names & {"opacity", "scale_0", "rot_0"}:
-        raise refuse("a point cloud, not a 3DGS model: there is no opacity, scale or rotation")
+        found = "a mesh" if header.count("face") else "a point cloud"
+        raise refuse(f"{found}, not a 3DGS model: there is no opacity, scale or rotation")
     rest = sum(1 for each in names if re.fullmatch(r"f_rest_\d+", each))
     degree = math.isqrt(rest // 3 + 1) - 1
     if rest % 3 or (degree + 1) ** 2 != rest // 3 + 1 or degree > 4:

@@ -55,6 +55,7 @@ def train(
     stages: Sequence[Stage] | None = None,
     model: Callable[[], SplatModel] | None = None,
     trained: Callable[[str], SplatModel] = nothing_trained,
+    seed: int = 0,
     checkpoint_every: int | None = None,
     directory: Path | None = None,
     stop_after: int | None = None,
@@ -62,7 +63,7 @@ def train(
     """Train, or go on with what `directory` holds.
 
     stages      those of the method, where None
-    model       makes the model of step 0; None: the method's, drawn from seed 0
+    model       makes the model of step 0; None: the method's, drawn from `seed`
     trained     (method name) -> a trained model
     stop_after  write a checkpoint after this step and raise TrainingStopped
     """
@@ -74,9 +75,9 @@ def train(
 
     outcome = TrainingRun(
         list(method.stages()) if stages is None else stages,
-        model or (lambda: method.create_model(scene, stream(0, "init"))),
+        model or (lambda: method.create_model(scene, stream(seed, "init"))),
         scene,
-        PipelineParams() if checkpoint_every is None else PipelineParams(checkpoint_every=checkpoint_every),
+        PipelineParams(seed=seed, **({} if checkpoint_every is None else {"checkpoint_every": checkpoint_every})),
         rasterizer,
         directory=directory,
         identity={},

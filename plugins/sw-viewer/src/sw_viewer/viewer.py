@@ -34,7 +34,8 @@ def start_server(host: str, port: int) -> viser.ViserServer:
     try:
         import viser
     except ImportError as error:
-        raise CapabilityError(f"sw view needs the package viser ({error}): {INSTALL}", missing=["viser"]) from error
+        told = f"sw view needs the package viser ({error}): {INSTALL}, or write a page with --html FILE.html"
+        raise CapabilityError(told, missing=["viser"]) from error
     # It tells every connection; only what goes wrong is for the user.
     for name in ("websockets.server", "viser"):
         logging.getLogger(name).setLevel(logging.ERROR)

@@ -34,7 +34,7 @@ def encode(source: Path, out: Path | None, as_json: bool, chosen: Choices) -> No
     plugins, is_run = load_plugins(), source.is_dir()
     target = out or output_file((source if is_run else source.parent) / "scene.swz")
     if is_run and chosen.config_file is None:
-        existing(source / "config.toml")
+        existing(source / "config.toml", ": `sw train` makes the folder of a run, which has one")
         chosen = chosen.with_rate_of(source, plugins)
     resolved = chosen.resolve_one(plugins)
     session = open_session(resolved, plugins)

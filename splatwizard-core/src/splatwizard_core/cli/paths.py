@@ -12,11 +12,11 @@ from click.shell_completion import CompletionItem
 from splatwizard_core.errors import UserInputError
 
 
-def existing(path: str | Path) -> Path:
-    """A path that must be there."""
+def existing(path: str | Path, hint: str = "") -> Path:
+    """A path that must be there; `hint` ends the message of the error."""
     found = Path(path)
     if not found.exists():
-        raise UserInputError(f"{path}: there is no such file or folder")
+        raise UserInputError(f"{path}: there is no such file or folder{hint}")
     return found
 
 

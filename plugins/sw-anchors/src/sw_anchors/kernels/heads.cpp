@@ -61,16 +61,7 @@ void fill_inputs(const Anchors& from, const Seen& seen, const Heads& heads, cons
   }
 }
 
-float dot(const float* a, const float* b, int64_t count) {
-  Vec sum = Vec{};
-  for (int64_t i = 0; i < count; i += LANES) sum += load(a + i) * load(b + i);
-  float total = 0.f;
-#pragma GCC unroll 16
-  for (int i = 0; i < LANES; ++i) total += sum[i];
-  return total;
-}
-
-// Outputs of one head for one Gaussian, the rows of `weights` being its own.
+// N outputs of one head, the rows of `weights` being their own.
 template <int N>
 void outputs_of(const float* hidden, const float* weights, const float* bias, int64_t head, float* to) {
   Vec sum[N] = {};
@@ -79,13 +70,10 @@ void outputs_of(const float* hidden, const float* weights, const float* bias, in
 #pragma GCC unroll 7
     for (int c = 0; c < N; ++c) sum[c] += value * load(weights + c * head + i);
   }
+  float totals[N];
+  lane_sums(sum, totals);
 #pragma GCC unroll 7
-  for (int c = 0; c < N; ++c) {
-    float total = bias[c];
-#pragma GCC unroll 16
-    for (int i = 0; i < LANES; ++i) total += sum[c][i];
-    to[c] = total;
-  }
+  for (int c = 0; c < N; ++c) to[c] = bias[c] + totals[c];
 }
 
 // Adds to the gradients of the hidden layer, and of the weights [N, head] and biases [N] of one Gaussian.
@@ -137,10 +125,15 @@ void heads_opacities(const Anchors& from, const Seen& seen, const Heads& heads, 
         store(to + i, value > Vec{} ? value : Vec{});
       }
       float* const block_alpha = alpha + start * from.k;
-      for (int64_t a = 0; a < count; ++a)
-        for (int64_t j = 0; j < from.k; ++j)
-          block_alpha[a * from.k + j] =
-              heads.last_bias[0][j] + dot(to + a * size.width, last.of[0] + j * size.head, size.head);
+      for (int64_t a = 0; a < count; ++a) {
+        const float* row = to + a * size.width;
+        float* const own = block_alpha + a * from.k;
+        int64_t j = 0;
+        for (; j + 4 <= from.k; j += 4)
+          outputs_of<4>(row, last.of[0] + j * size.head, heads.last_bias[0] + j, size.head, own + j);
+        for (; j < from.k; ++j)
+          outputs_of<1>(row, last.of[0] + j * size.head, heads.last_bias[0] + j, size.head, own + j);
+      }
       for (int64_t i = 0; i < count * from.k; i += LANES) {  // tanh(x) = 1 - 2 / (e^2x + 1)
         float padded_values[LANES] = {};
         const int64_t some = std::min<int64_t>(LANES, count * from.k - i);

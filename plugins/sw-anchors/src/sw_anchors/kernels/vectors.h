@@ -2,6 +2,7 @@
 #pragma once
 
 #include <cstdint>
+#include <cstring>
 #include <initializer_list>
 
 namespace SW_ARCH {
@@ -31,6 +32,39 @@ inline Vec all(float x) { return Vec{x, x, x, x}; }
 #endif
 
 inline int64_t padded(int64_t count, int64_t unit) { return (count + unit - 1) / unit * unit; }
+
+// Sums of the lanes of each of N <= 8 vectors.
+template <int N>
+inline void lane_sums(const Vec (&of)[N], float* to) {
+#if defined(__AVX__)
+  // Neighbours are added three times over, in all vectors at once: one by one, each number would have to be taken out.
+  typedef float Eight __attribute__((vector_size(32)));
+  typedef int32_t Places __attribute__((vector_size(32)));
+  Eight each[8] = {};
+#pragma GCC unroll 8
+  for (int i = 0; i < N; ++i) {
+    Eight parts[LANES / 8];
+    std::memcpy(parts, &of[i], sizeof parts);
+    each[i] = parts[0];
+    if (LANES == 16) each[i] += parts[LANES / 8 - 1];
+  }
+  const auto pairs = [](Eight a, Eight b) {
+    return __builtin_shuffle(a, b, Places{0, 2, 8, 10, 4, 6, 12, 14}) +
+           __builtin_shuffle(a, b, Places{1, 3, 9, 11, 5, 7, 13, 15});
+  };
+  const Eight first = pairs(pairs(each[0], each[1]), pairs(each[2], each[3]));
+  const Eight last = pairs(pairs(each[4], each[5]), pairs(each[6], each[7]));
+  const Eight sums = __builtin_shuffle(first, last, Places{0, 1, 2, 3, 8, 9, 10, 11}) +
+                     __builtin_shuffle(first, last, Places{4, 5, 6, 7, 12, 13, 14, 15});
+#pragma GCC unroll 8
+  for (int i = 0; i < N; ++i) to[i] = sums[i];
+#else
+  for (int i = 0; i < N; ++i) {
+    to[i] = 0.f;
+    for (int lane = 0; lane < LANES; ++lane) to[i] += of[i][lane];
+  }
+#endif
+}
 
 // c [rows, columns] = (or += with kAdd) a [rows, inner] b [inner, columns]. Numbers of a stand a_row and a_inner apart;
 // rows is a multiple of ROWS, columns of TILE.

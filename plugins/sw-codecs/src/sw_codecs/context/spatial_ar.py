@@ -21,6 +21,7 @@ from sw_codecs.context import wavefront
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.context.plane_fields import NEIGHBORS
 from sw_codecs.context.plane_kernels import fit_kernels, plane_bits
+from sw_codecs.context.two_layers import UnsetLinear
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_codecs.entropy.rates import laplace_bits, lower_bound
 
@@ -44,7 +45,7 @@ class SpatialAr(nn.Module):
     def __init__(self, generator: torch.Generator | None = None) -> None:
         super().__init__()
         sizes = [(len(NEIGHBORS), HIDDEN), *[(HIDDEN, HIDDEN)] * RESIDUALS, (HIDDEN, 2)]
-        self.layers = nn.ModuleList(nn.utils.skip_init(nn.Linear, *size) for size in sizes)
+        self.layers = nn.ModuleList(UnsetLinear(*size) for size in sizes)
         for i, layer in enumerate(self._linear()):
             for parameter in layer.parameters():
                 nn.init.zeros_(parameter)

@@ -11,6 +11,16 @@ from torch import nn
 Start = Literal["fan-in", "xavier", "silent"]
 
 
+class UnsetLinear(nn.Linear):
+    """Linear layer whose numbers nobody has set, nor drawn from the global generator.
+
+    As of nn.utils.skip_init, which imports sympy on its first call: half a second of each process that decodes a file.
+    """
+
+    def reset_parameters(self) -> None:
+        """Leave weight and bias as they are."""
+
+
 @torch.no_grad()
 def two_layers(
     inputs: int,
@@ -28,11 +38,7 @@ def two_layers(
                 sqrt(6 / (fan-in + fan-out)), biases zero
     activation  None: ReLU
     """
-    # skip_init: torch's own initialisation would draw from the global generator.
-    first, last = (
-        nn.utils.skip_init(nn.Linear, *size)  # type: ignore[no-untyped-call]
-        for size in ((inputs, hidden), (hidden, outputs))
-    )
+    first, last = UnsetLinear(inputs, hidden), UnsetLinear(hidden, outputs)
     for layer in (first, last):
         bound = 1 / math.sqrt(layer.in_features)
         if start == "xavier":
