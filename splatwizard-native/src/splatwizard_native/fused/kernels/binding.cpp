@@ -54,9 +54,8 @@ bool fits_adam(const at::Tensor& tensor, const at::Tensor& param) {
 // One step of many tensors. Returns the places of those that the kernel cannot take: they are left as they were.
 std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
                                const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
-                               const std::vector<double>& lrs, const std::vector<double>& beta1s,
-                               const std::vector<double>& beta2s, const std::vector<double>& epss,
-                               const std::vector<int64_t>& steps) {
+                               at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s, at::ArrayRef<double> beta2s,
+                               at::ArrayRef<double> epss, at::IntArrayRef steps) {
   const size_t count = params.size();
   TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
                   lrs.size() == count && beta1s.size() == count && beta2s.size() == count && epss.size() == count &&
