@@ -82,6 +82,19 @@ def test_cameras_that_turn_at_one_place_differ_by_rounding_alone():
     assert assemble([View(camera, f"{i}") for i, camera in enumerate(found)]).extent < 1e-2
 
 
+def test_cameras_far_from_the_origin_keep_their_extent():
+    center, up = torch.tensor([2e5, 5e6, 0.0], dtype=torch.float64), torch.tensor([0.0, 0, 1])  # UTM: easting, northing
+    found = []
+    for angle in (i * math.pi / 4 for i in range(8)):
+        eye = torch.tensor([40 * math.cos(angle), 40 * math.sin(angle), 30.0])
+        camera = Camera.look_at(eye, torch.zeros(3), up, width=40, height=30, fov_x=1.0)
+        tau = (-camera.R.double() @ (eye.double() + center)).float()
+        found.append(View(replace(camera, tau=tau), f"{angle}"))
+    scene = assemble(found, split="all")
+    assert scene.extent == pytest.approx(44, abs=1)  # float32 numbers of this size are 0.5 apart
+    assert scene.warnings == []
+
+
 def test_a_view_without_picture_says_so():
     with pytest.raises(ValueError, match="view 'a' has no picture"):
         _ = views("a")[0].pixels

@@ -13,6 +13,7 @@ from sw_interchange import decode, encode, from_gaussians, to_gaussians
 
 from splatwizard_core.api import (
     BitstreamError,
+    ConfigError,
     ContainerReader,
     ContainerWriter,
     GaussianModel,
@@ -74,6 +75,15 @@ def test_spz_is_compressed_as_hard_as_by_the_tools_of_its_authors(version: int, 
     assert written("spz", model, version=version).section("file") == files[level]
     assert written("spz", model, version=version, level=1).section("file") == files[1]
     assert len(files[level]) < len(files[3])
+
+
+def test_levels_that_gzip_does_not_have_are_refused():
+    model = model_of(5)
+    for settings in ({"level": 10}, {"level": 15, "version": 3}):
+        with pytest.raises(ConfigError, match=r"'codec\.settings\.level'.*: must be at most 9, except with version 4"):
+            written("spz", model, **settings)
+    for settings in ({"level": 9}, {"level": 15, "version": 4}):
+        assert read("spz", written("spz", model, **settings)).num_rows == 5
 
 
 @pytest.mark.parametrize("name", NAMES)

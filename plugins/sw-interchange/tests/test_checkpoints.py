@@ -54,8 +54,12 @@ def test_what_several_gpus_saved_is_one_scene(tmp_path, scene):
     assert read(tmp_path / "ckpt_9_rank2.pt").num_gaussians == 7
     alone = read(tmp_path / "ckpt_8_rank0.pt")
     assert (alone.num_gaussians, alone.report.warnings) == (1, [])
-    with pytest.raises(BitstreamError, match="more than the limit"):
+    with pytest.raises(BitstreamError, match=r"ckpt_9_rank0\.pt: claims 7 Gaussians, more than the limit of 6"):
         read(tmp_path / "ckpt_9_rank0.pt", limits=Limits(max_gaussians=6))
+    total = sum((tmp_path / f"ckpt_9_rank{rank}.pt").stat().st_size for rank in range(3))
+    assert read(tmp_path / "ckpt_9_rank0.pt", limits=Limits(max_output_bytes=total)).report.bytes == total
+    with pytest.raises(BitstreamError, match=rf"ckpt_9_rank0\.pt: decodes to {total:,} bytes"):
+        read(tmp_path / "ckpt_9_rank0.pt", limits=Limits(max_output_bytes=total - 1))
     (tmp_path / "ckpt_9_rank1.pt").unlink()
     with pytest.raises(SceneError, match=r"'ckpt_9_rank1\.pt', which"):
         read(tmp_path / "ckpt_9_rank2.pt")

@@ -10,7 +10,7 @@ import logging
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import torch
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, ValidationInfo, field_validator
 from sw_gaussians.surfels import refuse_surfels
 
 from splatwizard_core.api import BitstreamError, GaussianModel, Params, UserInputError
@@ -109,6 +109,13 @@ class SpzSettings(Params):
         le=22,
         description="of the compressor, gzip up to 9; none: that of Niantic's tools, 6 of gzip, 12 of zstd",
     )
+
+    @field_validator("level")
+    @classmethod
+    def _known(cls, value: int | None, others: ValidationInfo) -> int | None:
+        if value is not None and value > 9 and others.data.get("version") != 4:
+            raise ValueError("at most 9, except with version 4")
+        return value
 
 
 class SpzCodec(FormatCodec):

@@ -13,7 +13,6 @@ import pickle
 import pickletools
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,15 +37,17 @@ def read_checkpoint(source: Source, limits: Limits, report: ReadReport) -> Gauss
         return scene
     report.warnings.append(f"read with it: {', '.join(path.name for path in others[:3])}"
                            f"{', ...' * (len(others) > 3)}: each GPU saved a part of the scene")  # fmt: skip
-    parts, most = [scene], limits.max_gaussians
+    parts, rows = [scene], scene.num_gaussians
     for path in others:
-        most -= parts[-1].num_gaussians
         part = Source.open(path)
-        parts.append(_read_one(part, replace(limits, max_gaussians=most), ReadReport("checkpoint")))
+        report.bytes += len(part.data)
+        limits.check(rows, report.bytes, source.name)
+        parts.append(_read_one(part, limits, ReadReport("checkpoint")))
+        rows += parts[-1].num_gaussians
         if parts[-1].sh_degree != scene.sh_degree:
             raise BitstreamError(f"{part.name}: its SH degree is {parts[-1].sh_degree}, that of {source.name} is "
                                  f"{scene.sh_degree}: they are no parts of one scene")  # fmt: skip
-        report.bytes += len(part.data)
+        limits.check(rows, report.bytes, source.name)
     return GaussianScene(*(np.concatenate([getattr(part, column) for part in parts]) for column in _COLUMNS))
 
 

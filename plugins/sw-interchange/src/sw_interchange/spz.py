@@ -196,9 +196,9 @@ def write_spz(scene: GaussianScene, options: SpzOptions, report: WriteReport) ->
         return packing.deflate([head + b"\0", *planes], options.level or 3)
     planes = [plane for plane in planes if len(plane)]
     frames = packing.zstd(planes, options.level or 3)
-    if scene.num_gaussians > _most_claimed(
-        sum(map(len, frames))
-    ):  # equal Gaussians: no reader would believe so few bytes
+    size = sum(map(len, frames))
+    # Equal Gaussians: no reader would believe so few bytes.
+    if scene.num_gaussians > _most_claimed(size):
         frames[1] = packing.stored(planes[1])
     table = b"".join(struct.pack("<QQ", len(frame), len(plane)) for frame, plane in zip(frames, planes, strict=True))
     return [head + struct.pack("<BI", len(planes), 32) + bytes(12) + table, *frames]

@@ -8,6 +8,7 @@ import sys
 from typing import Any
 
 from sw_report.blocks import Column, Table, row
+from sw_report.configurations import LAYERS
 from sw_report.facts import clean
 from sw_report.runs import Run
 
@@ -33,8 +34,7 @@ def command_of(run: Run) -> str | None:
         parts += [option, value] if value else []
     provenance = config.get("provenance")
     sources = provenance if isinstance(provenance, dict) else {}
-    others = ("--", "preset ", "data set ", "rate ")
-    files = [who for who in sources.values() if isinstance(who, str) and not who.startswith(others)]
+    files = [who for who in sources.values() if isinstance(who, str) and not who.startswith(("--", *LAYERS))]
     for file in dict.fromkeys(files):
         parts += ["--config", file]
     for key, who in sources.items():

@@ -19,6 +19,8 @@ CHANGES_NO_RESULT = frozenset((
 """Keys of the run that no score or size depends on; the seed tells repeats of one configuration apart."""
 NOT_IN_THE_PROTOCOL = ("init_points",)
 """Keys of the scene that do not stand in the protocol's id."""
+LAYERS = ("preset ", "data set ", "rate ")
+"""Beginnings of the sources that a run brings by itself: any other is a file or an option."""
 
 
 def configurations(runs: Sequence[RunFacts]) -> list[Configuration]:
@@ -134,7 +136,7 @@ def _source(sources: Mapping[str, str], key: str) -> str | None:
 
 
 def _is_given(who: str | None) -> bool:
-    return who is not None and not who.startswith(("preset ", "data set ", "rate "))
+    return who is not None and not who.startswith(LAYERS)
 
 
 def _plain(text: str | None) -> str:

@@ -53,9 +53,11 @@ def run_fresh(arguments: Sequence[str], *, alone_in: Path | None = None) -> dict
     if told:
         print(told, file=sys.stderr, flush=True)
     try:
-        return dict(json.loads(done.stdout))
-    except (TypeError, ValueError) as error:
-        raise FreshProcessError(f"`{name}` in a fresh process did not print JSON: {done.stdout[:200]!r}") from error
+        if isinstance(content := json.loads(done.stdout), dict):
+            return content
+    except ValueError:
+        pass
+    raise FreshProcessError(f"`{name}` in a fresh process did not print a JSON object: {done.stdout[:200]!r}")
 
 
 def decode_fresh(path: Path, device: str, *, repeats: int = 3, threads: int = 0) -> dict[str, Any]:

@@ -157,7 +157,7 @@ class Scene:
         """Largest distance of a training camera from their mean; 0.0 where it is but rounding of float32 poses."""
         centers = torch.stack([v.camera.center.double().cpu() for v in self.train])
         radius = (centers - centers.mean(0)).norm(dim=1).max().item()
-        return radius if radius > 1e-5 * (1 + centers.norm(dim=1).max().item()) else 0.0
+        return radius if radius > 1e-6 * (1 + centers.norm(dim=1).max().item()) else 0.0
 
     @cached_property
     def extent(self) -> float:
