@@ -4,6 +4,9 @@
 test session starts hundreds. Here a server imports torch and the core once and forks for each: the child has an own
 working directory, environment, path of imports, input and output, and nothing of the test's memory, plugins included.
 A child that asks for what only a new interpreter gives (another locale, other threads, hash seeds) gets one.
+
+Two failures stay unseen here: an import that only the server's own imports make good, and a crash while an interpreter
+ends. Tests with the fixture `new_interpreters` start what users start.
 """
 
 from __future__ import annotations
@@ -71,11 +74,15 @@ class ForkServer:
                     [sys.executable, __file__, str(theirs.fileno())],
                     pass_fds=[theirs.fileno()],
                     stdin=subprocess.DEVNULL,
+                    env=self._environment,  # not that of the test which asks first
                 )
         with tempfile.TemporaryFile() as text:  # an environment may be longer than a packet
             text.write(request)
             text.flush()
-            socket.send_fds(self._socket, [b"run"], [text.fileno(), *files])
+            try:
+                socket.send_fds(self._socket, [b"run"], [text.fileno(), *files])
+            except OSError as error:
+                raise RuntimeError("the server that forks fresh processes has died") from error
 
     def close(self) -> None:
         """End the server; children that still run go on."""
@@ -167,7 +174,9 @@ def _become(content: dict[str, Any], ours: list[str]) -> None:
     try:
         runpy.run_module(MODULE, run_name="__main__", alter_sys=True)
     except SystemExit as end:
-        status = int(end.code or 0)
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
     except BaseException:
         traceback.print_exc()
     atexit._run_exitfuncs()

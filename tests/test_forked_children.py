@@ -1,5 +1,6 @@
 """A forked process of a run is what a new interpreter would be: same folder, variables, path, plugins, exit status."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -80,6 +81,17 @@ def test_its_end_is_told():
         run_fresh(["whereabouts", "--end", "die"])
     with pytest.raises(UserInputError, match="No such option"):
         run_fresh(["whereabouts", "--no-such-option"])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="forks on Linux alone")
+def test_the_path_of_the_first_request_is_not_that_of_the_next(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    with forked_children.forking():
+        with monkeypatch.context() as patch:
+            patch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)), prepend=os.pathsep)
+            run_fresh(["whereabouts"], alone_in=tmp_path)
+        second = run_fresh(["whereabouts"], alone_in=tmp_path)
+    with forked_children.starting():
+        assert second["path"] == run_fresh(["whereabouts"], alone_in=tmp_path)["path"]
 
 
 def test_another_locale_gets_a_new_interpreter(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
