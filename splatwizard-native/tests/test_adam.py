@@ -169,6 +169,18 @@ def test_an_empty_parameter_is_fine(path):
     adam_step(param, torch.zeros(0, 3), exp_avg, exp_avg_sq, lr=0.01, step=1, **OPTIONS)
 
 
+@pytest.mark.parametrize(("length", "step"), [(9, 1), (10, 0)])
+def test_a_wrong_update_is_refused_before_any_other_is_done(path, length, step):
+    good, bad = state(10), state(10)
+    before = good[0].clone()
+    right = adam.AdamUpdate(good[0], torch.ones(10), *good[1:], lr=0.1, step=1, **OPTIONS)
+    wrong = adam.AdamUpdate(bad[0], torch.ones(length), *bad[1:], lr=0.1, step=step, **OPTIONS)
+    for updates in ([wrong, right], [right, wrong]):
+        with pytest.raises(ValueError, match=r"the parameter|counts from 1"):
+            adam.adam_steps(updates)
+        assert torch.equal(good[0], before)
+
+
 def test_wrong_arguments_are_refused():
     param, exp_avg, exp_avg_sq = state(10)
     with pytest.raises(ValueError, match=r"grad is \[9\], the parameter \[10\]"):

@@ -43,6 +43,15 @@ def test_a_probability_below_its_floor_keeps_its_bits_and_the_gradient_that_rais
     assert torch.equal(to_x, -to_mean)
 
 
+@pytest.mark.parametrize("which", [0, 1, 2])
+def test_a_nan_is_not_hidden(which):
+    tensors, counted = inputs(2, 5, 1)
+    tensors[which][0, 0] = float("nan")
+    counted.fill_(1)
+    for dtype in (torch.float32, torch.float64):
+        assert found_by(tensors, counted, dtype)[0].isnan()
+
+
 def test_anchors_that_do_not_count_cost_nothing():
     tensors, counted = inputs(9, 7, 2)
     tensors[4].zero_(), counted.zero_()

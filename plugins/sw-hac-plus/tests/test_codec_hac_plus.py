@@ -19,6 +19,7 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
+from sw_codecs.exact_native import EXACT
 from sw_hac_plus import codec, predictors
 from sw_hac_plus.method import HACPlus
 
@@ -56,6 +57,17 @@ def test_the_decoder_has_the_encoders_integers_and_values(kind):
         assert torch.equal(getattr(result, name).flatten(1), torch.cat(blocks, dim=1))
     size = sum(reader.sections[name] for name in codec.sections(model.channel))
     assert 8 * (size - 40 * len(codec.sections(model.channel))) < recorder.bits < 8 * size
+
+
+def test_a_file_without_compiled_kernels_is_the_same_to_the_byte(monkeypatch):
+    data = encoded(make(n=60))
+    expected = decoded(data)
+    monkeypatch.setattr(type(EXACT), "try_load", lambda _: False)
+    monkeypatch.setattr(type(EXACT), "load_built", lambda _: False)
+    assert encoded(make(n=60)) == data
+    found = decoded(data)
+    for name in ("features", "scales", "offsets", "masks"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
 def test_values_are_within_half_a_step_of_the_models():

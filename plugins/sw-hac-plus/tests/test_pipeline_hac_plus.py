@@ -122,7 +122,7 @@ def test_a_file_of_hac_plus_is_smaller_than_one_of_hac_and_no_worse(scene, raste
     """Without the networks, which are most of so small a file; a plan of 240 steps, the same for both.
 
     Not at equal lambda: the rate of HAC++ pulls in each step at anchors that the view does not see, so that the same
-    lambda is further down its curve (0.001: 0.3 dB below HAC in 0.74 of the bytes).
+    lambda is further down its curve (measured once, at 0.001: 0.3 dB below HAC in 0.74 of the bytes).
     """
     plan = {key: value for key, value in SMALL.items() if not key.startswith("channel.")} | {
         "iterations": 240, "lr.max_steps": 240, "phases.quantized": 40, "phases.rebound": 79, "phases.entropy": 80,

@@ -29,6 +29,7 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
 from sw_codecs.entropy.conditional import RowContext
 from sw_codecs.entropy.lattice import RowLattice, lattice
+from sw_codecs.exact_native import EXACT
 from sw_hac import codec
 from sw_hac.method import HAC
 
@@ -63,6 +64,17 @@ def test_the_decoder_has_the_encoders_integers_and_values():
     for name, symbols, step in zip(GROUPS, found.symbols, found.steps, strict=True):
         expected = (symbols * step).to(torch.float32)
         assert torch.equal(getattr(result, name).flatten(1), expected)
+
+
+def test_a_file_without_compiled_kernels_is_the_same_to_the_byte(monkeypatch):
+    data = encoded(make(n=60))
+    expected = decoded(data)
+    monkeypatch.setattr(type(EXACT), "try_load", lambda _: False)
+    monkeypatch.setattr(type(EXACT), "load_built", lambda _: False)
+    assert encoded(make(n=60)) == data
+    found = decoded(data)
+    for name in ("features", "scales", "offsets", "masks"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
 def test_values_are_within_half_a_step_of_the_models():

@@ -79,6 +79,11 @@ def test_a_leaky_network_of_inputs_side_by_side(leak, widths, kernels):
     assert torch.equal(ours, expected)
     assert torch.equal(made(torch.cat(parts, dim=1)), expected)
     assert torch.equal(made(*parts, rows=7), expected)
+    kernels(True)
+    small = [part // 8 for part in parts]
+    for narrow in ([0], [1], [0, 1]):
+        given = [part.to(torch.int16) if i in narrow else part for i, part in enumerate(small)]
+        assert torch.equal(made(*given), made(*small))
 
 
 @pytest.mark.parametrize("features", [1, 4, 6, 16])

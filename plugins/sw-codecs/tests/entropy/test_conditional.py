@@ -54,6 +54,18 @@ def test_values_are_written_into_their_place(mode, shape, compiled, kernels):
         assert bool((whole[:, [0, -1]] == -7).all())
 
 
+@pytest.mark.parametrize("compiled", [True, False])
+def test_parameters_of_rows_are_spread_over_them(compiled, kernels):
+    kernels(compiled)
+    symbols, context = block()
+    scale, wide = context.scale[:, :1], np.broadcast_to(context.scale[:, :1], symbols.shape)
+    narrow, full = (C.Context(context.mean, each, context.step) for each in (scale, wide))
+    data = C().encode(symbols, full)
+    assert C().encode(symbols, narrow) == data
+    assert np.array_equal(C().decode(data, narrow), symbols)
+    assert torch.equal(C().bits(symbols, narrow), C().bits(symbols, full))
+
+
 @pytest.mark.parametrize("mode", C.MODES)
 def test_nothing_present_costs_nothing_but_the_frame(mode):
     symbols, context = block(mode=mode)

@@ -68,6 +68,17 @@ def test_tensors_are_taken_too():
     assert np.array_equal(C().decode(data, tensors), symbols)
 
 
+@pytest.mark.parametrize(("name", "place"), [("scale", np.s_[:, :1]), ("logit", np.s_[0]), ("logit", np.s_[0, 0])])
+def test_parameters_are_spread_over_a_block(name, place):
+    symbols, context = block()
+    part = getattr(context, name)[place]
+    narrow = dataclasses.replace(context, **{name: part})
+    full = dataclasses.replace(context, **{name: np.broadcast_to(part, symbols.shape).copy()})
+    data = C().encode(symbols, full)
+    assert C().encode(symbols, narrow) == data
+    assert np.array_equal(C().decode(data, narrow), symbols)
+
+
 def test_the_size_is_that_of_the_tables_and_close_to_the_ideal():
     found, symbols = parameters(4000, 10)
     context = C.Context(*(np.rint(each * 4096).astype(np.int64) for each in found))

@@ -35,10 +35,12 @@ class AdamUpdate:
 def adam_steps(updates: Sequence[AdamUpdate]) -> None:
     """Update `param`, `exp_avg` and `exp_avg_sq` of each in place, densely; as torch.optim.Adam, to 1e-6.
 
-    All in one call of the kernels, on CUDA in one launch. Raises ValueError if shapes differ.
+    All in one call of the kernels, on CUDA in one launch. Raises ValueError before any is done if shapes differ.
     Source: Kingma & Ba (arXiv 1412.6980), bias correction as torch applies it.
     """
     left = list(updates)
+    for u in left:
+        _check(u)
     for kind in ("cuda", "cpu"):
         together = [u for u in left if u.param.device.type == kind]
         if together and (TRAINING.has_cuda() if kind == "cuda" else TRAINING.try_load()):
@@ -60,14 +62,17 @@ def _by_kernel(updates: Sequence[AdamUpdate]) -> list[AdamUpdate]:
     return [updates[i] for i in left]
 
 
-def _by_torch(u: AdamUpdate) -> None:
-    param, exp_avg, exp_avg_sq = u.param, u.exp_avg, u.exp_avg_sq
+def _check(u: AdamUpdate) -> None:
     for name in ("grad", "exp_avg", "exp_avg_sq"):
         shape = getattr(u, name).shape
-        if shape != param.shape:
-            raise ValueError(f"{name} is {list(shape)}, the parameter {list(param.shape)}")
+        if shape != u.param.shape:
+            raise ValueError(f"{name} is {list(shape)}, the parameter {list(u.param.shape)}")
     if u.step < 1:
         raise ValueError(f"Adam's step counts from 1, got {u.step}")
+
+
+def _by_torch(u: AdamUpdate) -> None:
+    param, exp_avg, exp_avg_sq = u.param, u.exp_avg, u.exp_avg_sq
     grad = u.grad.contiguous()
     whole = all(t.is_contiguous() for t in (param, exp_avg, exp_avg_sq))
     count = torch.tensor(float(u.step - 1), device=param.device)  # steps done; torch counts this one itself

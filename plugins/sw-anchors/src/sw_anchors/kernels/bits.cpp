@@ -55,10 +55,10 @@ void sample_bits(const Sample& from, const SampleBits& to, const splatwizard::Pa
       for (int64_t i = 0; i < length; i += LANES) {
         const Vec offset = load(x + i) - load(mean + i), away = magnitude(offset), half = all(0.5f) * load(step + i);
         const Vec raw = load(scale + i), least = all(from.smallest_scale);
-        const Vec deviation = raw > least ? raw : least, narrow = all(0.70710678f) / deviation;
+        const Vec deviation = raw < least ? least : raw, narrow = all(0.70710678f) / deviation;
         const Vec near = (away - half) * narrow, far = (away + half) * narrow;
         const Vec p = all(0.5f) * (erfc(near) - erfc(far)), floor = all(from.smallest);
-        const Vec bounded = p > floor ? p : floor;
+        const Vec bounded = p < floor ? floor : p;  // what is not a number stays so
         store(mass + i, bounded);
         // Below its floor a probability still has the gradient that raises it: that of bits that count is negative.
         const Vec slope = load(factor + i) * all(-1.4426950409f * 0.56418958355f) / bounded;  // 1 / ln 2, 1 / sqrt(pi)

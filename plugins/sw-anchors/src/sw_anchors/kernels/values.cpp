@@ -32,7 +32,6 @@ float of_step(const float* slope, const float* uniform, int64_t count) {
 constexpr int64_t BUFFER = 16;  // whole vectors, whatever their width
 
 // e^(sign x) of `count` numbers, at most BUFFER.
-
 void exponentials(const float* from, int64_t count, float sign, float* to) {
   float values[BUFFER] = {};
   for (int64_t i = 0; i < count; ++i) values[i] = sign * from[i];

@@ -33,6 +33,12 @@ inline Vec all(float x) { return Vec{x, x, x, x}; }
 
 inline int64_t padded(int64_t count, int64_t unit) { return (count + unit - 1) / unit * unit; }
 
+#ifdef __clang__
+#define SW_SHUFFLED(a, b, ...) __builtin_shufflevector(a, b, __VA_ARGS__)
+#else
+#define SW_SHUFFLED(a, b, ...) __builtin_shuffle(a, b, Places{__VA_ARGS__})
+#endif
+
 // Sums of the lanes of each of N <= 8 vectors.
 template <int N>
 inline void lane_sums(const Vec (&of)[N], float* to) {
@@ -49,13 +55,12 @@ inline void lane_sums(const Vec (&of)[N], float* to) {
     if (LANES == 16) each[i] += parts[LANES / 8 - 1];
   }
   const auto pairs = [](Eight a, Eight b) {
-    return __builtin_shuffle(a, b, Places{0, 2, 8, 10, 4, 6, 12, 14}) +
-           __builtin_shuffle(a, b, Places{1, 3, 9, 11, 5, 7, 13, 15});
+    return SW_SHUFFLED(a, b, 0, 2, 8, 10, 4, 6, 12, 14) + SW_SHUFFLED(a, b, 1, 3, 9, 11, 5, 7, 13, 15);
   };
   const Eight first = pairs(pairs(each[0], each[1]), pairs(each[2], each[3]));
   const Eight last = pairs(pairs(each[4], each[5]), pairs(each[6], each[7]));
-  const Eight sums = __builtin_shuffle(first, last, Places{0, 1, 2, 3, 8, 9, 10, 11}) +
-                     __builtin_shuffle(first, last, Places{4, 5, 6, 7, 12, 13, 14, 15});
+  const Eight sums = SW_SHUFFLED(first, last, 0, 1, 2, 3, 8, 9, 10, 11) +
+                     SW_SHUFFLED(first, last, 4, 5, 6, 7, 12, 13, 14, 15);
 #pragma GCC unroll 8
   for (int i = 0; i < N; ++i) to[i] = sums[i];
 #else

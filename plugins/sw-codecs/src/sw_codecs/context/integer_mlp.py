@@ -113,6 +113,7 @@ class IntegerMlp:
             raise ValueError(f"inputs must be integers [n, {width}], not {[list(p.shape) for p in parts]}")
         if rows is None and inputs.device.type == self._layers[0][0].device.type == "cpu" and EXACT.try_load():
             found = torch.empty(len(inputs), self.outputs, dtype=torch.int64) if out is None else out
+            parts = parts if further is None else [p.to(torch.int64) for p in parts]
             torch.ops.sw_codecs_exact.network([_for_kernel(p) for p in parts], self.tensors(), self._leak, found)
             return found
         inputs = torch.cat(parts, dim=1)

@@ -296,7 +296,9 @@ def _kernel_rows(parts: list[np.ndarray], shape: tuple[int, ...]) -> _Rows | Non
     """`_exact_rows` of parts as of RowMixture by the kernel; None: there is none, or it refuses them."""
     if not EXACT.try_load() or not shape[0] * shape[1]:
         return None
-    if not all(np.issubdtype(each.dtype, np.integer) for each in parts) or parts[-1].shape != (shape[0], 1):
+    if not all(np.issubdtype(each.dtype, np.integer) for each in parts):
+        return None
+    if [each.shape for each in parts] != [shape] * 5 + [(shape[0], 1)]:
         return None
     tables = exact_tables()
     *rows, status = torch.ops.sw_codecs_exact.mixture_rows(

@@ -23,7 +23,7 @@ PARAMETER_LIMIT = 1 << 48  # shifts and products below stay within 63 bits
 
 @dataclass(frozen=True)
 class RowLattice:
-    """Results of `lattice` for a block of n rows with C numbers, with the multipliers.
+    """Results of `lattice` for a block of n rows with C numbers, with the multipliers; made by the kernels.
 
     centre      int32 [n,C] integer parts of means, in steps
     number      int16 [n,C] table numbers
@@ -39,10 +39,8 @@ class RowLattice:
         if present is None:
             return self.centre.reshape(-1).numpy(), self.number.reshape(-1).numpy()
         there = torch.from_numpy(np.ascontiguousarray(present, bool))
-        if EXACT.try_load():
-            centre, number = torch.ops.sw_codecs_exact.present_rows(self.centre, self.number, there)
-            return centre.numpy(), number.numpy()
-        return self.centre[there].numpy(), self.number[there].numpy()
+        centre, number = torch.ops.sw_codecs_exact.present_rows(self.centre, self.number, there)
+        return centre.numpy(), number.numpy()
 
 
 def lattice(
@@ -60,7 +58,9 @@ def lattice(
     if not all(np.issubdtype(each.dtype, np.integer) for each in arrays):
         raise ValueError(f"mean, scale and multiplier must be integers, not {', '.join(str(a.dtype) for a in arrays)}")
     there = None if present is None else np.ascontiguousarray(present, bool)
-    if arrays[0].size and EXACT.try_load():
+    full = arrays[0].shape
+    fits = len(full) == 2 and [each.shape for each in arrays[1:]] == [full, (full[0], 1)]
+    if fits and arrays[0].size and EXACT.try_load():
         centre, number, status = torch.ops.sw_codecs_exact.lattice(
             *map(_tensor, arrays),
             None if there is None else torch.from_numpy(there),
@@ -69,7 +69,7 @@ def lattice(
         if not status:
             return centre.numpy(), number.numpy()
     where = Ellipsis if there is None else there
-    flat = [np.broadcast_to(each, arrays[0].shape)[where].reshape(-1) for each in arrays]
+    flat = [np.broadcast_to(each, full)[where].reshape(-1) for each in arrays]
     return _flat_lattice(*(each.astype(np.int64) for each in flat))
 
 
