@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sw_anchors.sections import BOUNDS_BYTES
 from sw_anchors.shape import GROUPS
+from sw_anchors.testing import check_without_kernels
 from sw_anchors.voxel_lattice import kept_voxels
 from sw_kit.forged_files import forged
 from sw_reference.rasterizer import ReferenceRasterizer
@@ -19,7 +20,6 @@ from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SceneError
 from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
-from sw_codecs.exact_native import EXACT
 from sw_hac_plus import codec, predictors
 from sw_hac_plus.method import HACPlus
 
@@ -59,15 +59,8 @@ def test_the_decoder_has_the_encoders_integers_and_values(kind):
     assert 8 * (size - 40 * len(codec.sections(model.channel))) < recorder.bits < 8 * size
 
 
-def test_a_file_without_compiled_kernels_is_the_same_to_the_byte(monkeypatch):
-    data = encoded(make(n=60))
-    expected = decoded(data)
-    monkeypatch.setattr(type(EXACT), "try_load", lambda _: False)
-    monkeypatch.setattr(type(EXACT), "load_built", lambda _: False)
-    assert encoded(make(n=60)) == data
-    found = decoded(data)
-    for name in ("features", "scales", "offsets", "masks"):
-        assert torch.equal(getattr(found, name), getattr(expected, name))
+def test_a_file_without_compiled_kernels_is_the_same_to_the_byte():
+    check_without_kernels(lambda: encoded(make(n=60)), decoded)
 
 
 def test_values_are_within_half_a_step_of_the_models():

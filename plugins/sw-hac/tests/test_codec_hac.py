@@ -17,6 +17,7 @@ from sw_anchors.float_mode import this_machine
 from sw_anchors.grid_predictors import PREDICTORS
 from sw_anchors.sections import morton_order
 from sw_anchors.shape import GROUPS
+from sw_anchors.testing import check_without_kernels
 from sw_kit.forged_files import forged
 from sw_reference.rasterizer import ReferenceRasterizer
 from sw_reference.testing.raster_scenes import front_camera
@@ -29,7 +30,6 @@ from splatwizard_core.runs.session import Session
 from splatwizard_core.scene.scene import Protocol
 from sw_codecs.entropy.conditional import RowContext
 from sw_codecs.entropy.lattice import RowLattice, lattice
-from sw_codecs.exact_native import EXACT
 from sw_hac import codec
 from sw_hac.method import HAC
 
@@ -66,15 +66,8 @@ def test_the_decoder_has_the_encoders_integers_and_values():
         assert torch.equal(getattr(result, name).flatten(1), expected)
 
 
-def test_a_file_without_compiled_kernels_is_the_same_to_the_byte(monkeypatch):
-    data = encoded(make(n=60))
-    expected = decoded(data)
-    monkeypatch.setattr(type(EXACT), "try_load", lambda _: False)
-    monkeypatch.setattr(type(EXACT), "load_built", lambda _: False)
-    assert encoded(make(n=60)) == data
-    found = decoded(data)
-    for name in ("features", "scales", "offsets", "masks"):
-        assert torch.equal(getattr(found, name), getattr(expected, name))
+def test_a_file_without_compiled_kernels_is_the_same_to_the_byte():
+    check_without_kernels(lambda: encoded(make(n=60)), decoded)
 
 
 def test_values_are_within_half_a_step_of_the_models():

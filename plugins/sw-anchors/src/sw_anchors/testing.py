@@ -15,11 +15,13 @@ from torch import Tensor
 
 from splatwizard_core.api import Camera, Rasterizer, RasterOptions
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED, CodedAnchors
+from sw_anchors.decoded_anchors import DecodedAnchors
 from sw_anchors.fixed_decoder import FixedDecoder, capacity_of
 from sw_anchors.fixed_step import FixedRows
 from sw_anchors.fused_ops import mean_product
 from sw_anchors.growth import accumulate_anchor_statistics
 from sw_anchors.pool_rows import PoolRows
+from sw_codecs.exact_native import EXACT
 
 PHASES = (FULL, QUANTIZED, ENTROPY)
 
@@ -57,6 +59,20 @@ def check_fixed_decoder(
                 limit = tolerance * max(float(expected.abs().amax()), 1e-6) if expected.numel() else 0.0
                 difference = float((expected - got).abs().amax()) if got.numel() else 0.0
                 assert difference <= limit, f"{phase}, {count} anchors, {name}: {difference:.3g} apart"
+
+
+def check_without_kernels(encoded: Callable[[], bytes], decoded: Callable[[bytes], DecodedAnchors]) -> None:
+    """Raise unless a model's file, and what it decodes to, are the same without the kernels of exact coding."""
+    data = encoded()
+    expected = decoded(data)
+    with (
+        mock.patch.object(type(EXACT), "try_load", return_value=False),
+        mock.patch.object(type(EXACT), "load_built", return_value=False),
+    ):
+        assert encoded() == data
+        found = decoded(data)
+    for name in ("features", "scales", "offsets", "masks"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
 def check_nothing_is_waited_for(model: CodedAnchors) -> None:
