@@ -111,10 +111,9 @@ class Watch:
 
         clock, judge, sleepers = CoreTime(), Judge(), Sleepers()
         while not self._leave.wait(INTERVAL):
-            threads = torch.get_num_threads()
             if not judge.look(clock.lap()):
                 sleepers.go()
-            elif threads > 1:  # one alone waits for nobody
+            elif (threads := torch.get_num_threads()) > 1:  # one alone waits for nobody
                 sleepers.come(threads)
         sleepers.go()
 
