@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
+from sw_gaussians.pictures import Pictures
 
 from splatwizard_core.api import OptimizationParams, Params
 
@@ -62,16 +63,6 @@ class AnchorLoss(Params):
 
     lambda_dssim: float = Field(0.2, ge=0, le=1, description="weight of 1 - SSIM; the rest is the weight of L1")
     volume: float = Field(0.01, ge=0, description="weight of the mean volume of a drawn Gaussian (product of scales)")
-
-
-class Pictures(Params):
-    """Sizes of the training pictures over time."""
-
-    schedule: Literal["none", "dash"] = Field(
-        "none", description="dash: begin with small pictures, whole ones from growth.stop on (DashGaussian)"
-    )
-    rounding: Literal["real", "floor"] = Field("real", description="scales: real: any; floor: whole ones, as published")
-    start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
 
 
 class AnchorParams(OptimizationParams):
