@@ -65,6 +65,22 @@ def test_pictures_grow_where_statistics_start_again_and_are_whole_at_the_end(nam
     assert {widths[step] for step in widths if step > max(rounds) + 1} == {WIDTH}
 
 
+@pytest.mark.parametrize("name", [name for name, key in KEYS.items() if key == "pictures.schedule"])
+@pytest.mark.parametrize("share", [0.2, 0.8])
+def test_pictures_may_be_whole_before_growth_is_over_or_after(name, share):
+    full = PLUGINS.methods.load(name).Config.FULL_ITERATIONS
+    stage = stage_of(name, pictures__schedule="dash", pictures__until=round(share * full))
+    sampler = stage.create_sampler(small_scene(), stream(0, "sampler"))
+    widths = {step: sampler.next(step).camera.width for step in range(1, STEPS + 1)}
+    growth = sorted(rounds_of(stage))
+    grown = [step for step, after in itertools.pairwise(widths) if widths[after] != widths[step]]
+    assert set(grown) & set(range(growth[-1])) <= set(growth)
+    until = round(share * STEPS)
+    assert until <= sampler.plan.times[-1] <= until + 10
+    assert (grown[-1] > growth[-1]) == (until > growth[-1])
+    assert widths[STEPS] == WIDTH
+
+
 @pytest.mark.parametrize("name", KEYS)
 def test_pictures_are_whole_unless_asked_for(name):
     sampler = stage_of(name).create_sampler(small_scene(), stream(0, "sampler"))

@@ -112,8 +112,6 @@ def test_small_pictures_are_off_and_trainings_of_before_they_could_be_on_are_fou
     plain, small = (resolve(Compact3DGS, "paper", sets=sets).config for sets in ({}, {"pictures.schedule": "dash"}))
     assert "pictures" not in plain.identity()
     assert small.identity()["pictures"]["schedule"] == "dash"
-    assert small.base.fast.resolution == "dash"
-    assert plain.base.fast.resolution == "none"
 
 
 def test_every_preset_ends_in_the_last_phase():

@@ -79,10 +79,7 @@ class AnchorParams(OptimizationParams):
 
     def identity(self) -> dict[str, Any]:
         """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
-        content = super().identity()
-        if self.pictures == Pictures():
-            del content["pictures"]
-        return content
+        return self.pictures.identity_in(super().identity())
 
 
 class CodedAnchorParams(AnchorParams):

@@ -77,8 +77,10 @@ class AnchorStage(Stage):
         return self.opt.pictures.sampler(
             super().create_sampler(scene, generator),
             scene,
-            full_at=self.at(self.opt.growth.stop),
-            rounds=[step for steps in self.adjustments for step in steps],
+            self,
+            growth=[step for steps in self.adjustments for step in steps],
+            growth_stop=self.opt.growth.stop,
+            every=self.opt.growth.interval,
         )
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:

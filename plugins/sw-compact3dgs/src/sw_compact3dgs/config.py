@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, OwnCodec
-from sw_gaussians.config import Densify, Fast, GaussianTraining, Loss
+from sw_gaussians.config import Densify, GaussianTraining, Loss
 from sw_gaussians.config import LearningRates as GaussianRates
 from sw_gaussians.pictures import Pictures
 
@@ -101,19 +101,14 @@ class Compact3DGSConfig(Choosing, OptimizationParams):
     @property
     def base(self) -> GaussianTraining:
         """Hyper-parameters of the stage of 3DGS inside. What they add (SH, MCMC) has no effect or is off."""
-        sizes = self.pictures
         return GaussianTraining(
             iterations=self.iterations,
             scale_schedule=self.scale_schedule,
             lr=GaussianRates(**vars(self.lr)),
             densify=self.densify,
             loss=self.loss,
-            fast=Fast(resolution=sizes.schedule, resolution_rounding=sizes.rounding, resolution_start=sizes.start),
         )
 
     def identity(self) -> dict[str, Any]:
         """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
-        content = super().identity()
-        if self.pictures == Pictures():
-            del content["pictures"]
-        return content
+        return self.pictures.identity_in(super().identity())
