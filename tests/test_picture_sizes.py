@@ -7,6 +7,7 @@ import pytest
 from small_scene import WIDTH, small_scene
 from sw_gaussians.resolution import ResolutionSampler
 
+from splatwizard_core.errors import ConfigError
 from splatwizard_core.plugins import load_plugins
 from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.runs.config import resolve
@@ -65,7 +66,16 @@ def test_pictures_grow_where_statistics_start_again_and_are_whole_at_the_end(nam
     assert {widths[step] for step in widths if step > max(rounds) + 1} == {WIDTH}
 
 
-@pytest.mark.parametrize("name", [name for name, key in KEYS.items() if key == "pictures.schedule"])
+OWN = [name for name, key in KEYS.items() if key == "pictures.schedule"]
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_an_end_of_small_pictures_without_a_schedule_is_refused(name):
+    with pytest.raises(ConfigError, match=r"set pictures\.schedule=dash"):
+        stage_of(name, pictures__until=300)
+
+
+@pytest.mark.parametrize("name", OWN)
 @pytest.mark.parametrize("share", [0.2, 0.8])
 def test_pictures_may_be_whole_before_growth_is_over_or_after(name, share):
     full = PLUGINS.methods.load(name).Config.FULL_ITERATIONS

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from splatwizard_core.api import Params
+from splatwizard_core.api import ConfigError, Params
 
 if TYPE_CHECKING:
     from splatwizard_core.api import CameraSampler, Scene, Stage
@@ -21,8 +21,15 @@ class Pictures(Params):
     )
     rounding: Literal["real", "floor"] = Field("real", description="scales: real: any; floor: whole ones, as published")
     start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
-
     until: int = Field(0, ge=0, description="step from which pictures are whole; 0: that at which growth is over")
+
+    def check(self) -> None:
+        """Raise ConfigError for a value without effect: when a stage is made, before anything runs."""
+        if self.until and self.schedule == "none":
+            raise ConfigError(
+                "pictures.until says when pictures become whole: set pictures.schedule=dash with it",
+                key="pictures.until",
+            )
 
     def identity_in(self, content: dict[str, Any]) -> dict[str, Any]:
         """Return the identity of a method without what is off here: trainings of before these keys are found."""
