@@ -55,7 +55,7 @@ class MesonGSStage(Stage):
     def __init__(self, config: MesonGSConfig, pruner: Pruner) -> None:
         super().__init__(config)
         self.config, self.pruner = config, pruner
-        self.values: dict[str, float] = {}  # looked up, once the stage begins
+        self.values = self.looked_up(None)  # of the scene, once the stage begins
 
     def begin(self, context: StageContext) -> SplatModel:
         trained = context.model
