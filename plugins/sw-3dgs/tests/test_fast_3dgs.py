@@ -146,7 +146,10 @@ def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_
 
 
 def test_the_end_has_its_own_tasks_where_it_is_asked_for():
-    plan = format_plan(*build_schedulers(stage_of(fast__settle=0.1, fast__late_prune=True), PipelineParams()))
+    plan = format_plan(
+        *build_schedulers(stage_of(fast__settle=0.1, fast__late_prune=True, fast__late_views=4), PipelineParams())
+    )
+    assert "| sum views                   | range(8000, 10001)" in plan
     assert "| settle learning rates       | range(8000, 10001)" in plan
     assert "| prune by views              | range(6000, 9000, 1000)" in plan
     unscaled = stage_of(fast__settle=0.1, scale_schedule=False, iterations=7_000)
@@ -154,7 +157,7 @@ def test_the_end_has_its_own_tasks_where_it_is_asked_for():
 
 
 def test_parts_that_came_later_change_no_identity_while_off():
-    assert not {"veto_views", "veto_pixels", "late_prune", "settle"} & set(
+    assert not {"veto_views", "veto_pixels", "late_prune", "late_views", "settle"} & set(
         resolve(ThreeDGS, "fast").config.identity()["fast"]
     )
     assert resolve(ThreeDGS, "fast", sets={"fast.settle": 0.1}).config.identity()["fast"]["settle"] == 0.1
@@ -190,6 +193,8 @@ def test_updates_in_the_backward_pass_have_a_key_that_changes_no_identity_while_
         {"mcmc__enabled": True, "fast__densify": "threshold"},
         {"mcmc__enabled": True, "fast__densify": "threshold", "fast__opacity": "reset"},
         {"fast__densify": "threshold", "fast__veto_views": 10},
+        {"fast__late_views": 4, "sparse_adam": "per_row"},
+        {"fast__late_views": 4, "fast__sh_every": 2},
         {
             "mcmc__enabled": True,
             "fast__densify": "threshold",

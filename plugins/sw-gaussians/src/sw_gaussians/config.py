@@ -116,6 +116,9 @@ class Fast(Params):
     late_prune: bool = Field(
         False, description="at 0.6, 0.7 and 0.8 of the full plan remove what is faint, or what 10 views blame (FastGS)"
     )
+    late_views: int = Field(
+        1, ge=1, description="views whose summed gradients make one update, from densify.stop on (FastGS)"
+    )
     settle: float = Field(
         1.0,
         gt=0,
@@ -124,7 +127,7 @@ class Fast(Params):
     )
 
 
-LATER = ("resolution_hold", "veto_views", "veto_pixels", "late_prune", "settle")
+LATER = ("resolution_hold", "veto_views", "veto_pixels", "late_prune", "late_views", "settle")
 """Keys of `Fast` that came after others: while they are off, trainings of before them have the same identity."""
 
 

@@ -38,6 +38,9 @@ def register_tasks(registry: Registry) -> None:
     registry.add("prune-by-views", "sw_gaussians.fast_tasks:PruneByViews",
                  summary="remove what is faint, or what several views blame for their errors (FastGS)",
                  factory=True)  # fmt: skip
+    registry.add("sum-views", "sw_gaussians.late_batches:SumViews",
+                 summary="update on the summed gradients of several views (needs late_batches.BatchingOptimizer)",
+                 factory=True)  # fmt: skip
     registry.add("settle-learning-rates", "sw_gaussians.settling:SettleLearningRates",
                  summary="let learning rates fall towards the end", factory=True)  # fmt: skip
 

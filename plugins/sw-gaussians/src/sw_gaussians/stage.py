@@ -22,6 +22,7 @@ from sw_gaussians import mcmc_tasks as mcmc
 from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fused_adam import FusingOptimizer
+from sw_gaussians.late_batches import BatchingOptimizer, SumViews
 from sw_gaussians.moments import keep_moments
 from sw_gaussians.resolution import ResolutionSampler, by_resolution
 from sw_gaussians.settling import SettleLearningRates
@@ -66,6 +67,11 @@ class ThreeDGSStage(Stage):
         if fuses_updates and (opt.sparse_adam != "off" or opt.fast.sh_every > 1):
             raise ConfigError(
                 "fused_updates updates all Gaussians at every step: leave sparse_adam off and fast.sh_every at 1"
+            )
+        if opt.fast.late_views > 1 and (fuses_updates or opt.sparse_adam != "off" or opt.fast.sh_every > 1):
+            raise ConfigError(
+                "fast.late_views sums the gradients of all Gaussians: leave fused_updates and sparse_adam off, and "
+                "fast.sh_every at 1"
             )
         if opt.sparse_adam != "off" and opt.mcmc.enabled:
             raise ConfigError(
@@ -149,7 +155,9 @@ class ThreeDGSStage(Stage):
             *(ParamGroup(name, lr=rate) for name, rate in self._rates().items()),
         ]
         sparse, every = self.config.sparse_adam, self.config.fast.sh_every
-        if sparse == "off":
+        if self.config.fast.late_views > 1:
+            self._optimizer = BatchingOptimizer(model, groups)
+        elif sparse == "off":
             self._optimizer = (
                 CadencedOptimizer(model, groups, every=every) if every > 1 else FusingOptimizer(model, groups)
             )
@@ -190,10 +198,18 @@ class ThreeDGSStage(Stage):
             tasks.increase_sh_degree,
             name="increase SH degree",
         )
-        first, factor = self.steps(chain.stop if chain.enabled else self.config.densify.stop), self.config.fast.settle
-        if factor < 1 and first < self.iterations:
-            settle = SettleLearningRates(self._rates(), first=first, last=self.iterations, factor=factor)
-            scheduler.register_task(range(first, self.iterations + 1), settle, name="settle learning rates")
+        self._register_end(scheduler)
+
+    def _register_end(self, scheduler: Scheduler) -> None:
+        """Register what is different once the number of Gaussians is settled."""
+        chain, fast = self.config.mcmc, self.config.fast
+        first = self.steps(chain.stop if chain.enabled else self.config.densify.stop)
+        end = range(first, self.iterations + 1)
+        if fast.late_views > 1:
+            scheduler.register_task(end, SumViews(views=fast.late_views, first=first), name="sum views")
+        if fast.settle < 1 and first < self.iterations:
+            settle = SettleLearningRates(self._rates(), first=first, last=self.iterations, factor=fast.settle)
+            scheduler.register_task(end, settle, name="settle learning rates")
 
     def _rates(self) -> dict[str, float]:
         """Learning rates of the parameters whose rate no task changes but that which lets them settle."""
