@@ -125,9 +125,12 @@ class Fast(Params):
         le=1,
         description="all rates but that of the means fall to so much of themselves from densify.stop on",
     )
+    average: float = Field(
+        0.0, ge=0, lt=1, description="share of the run, at its end and after densify.stop, whose mean the model becomes"
+    )
 
 
-LATER = ("resolution_hold", "veto_views", "veto_pixels", "late_prune", "late_views", "settle")
+LATER = ("resolution_hold", "veto_views", "veto_pixels", "late_prune", "late_views", "settle", "average")
 """Keys of `Fast` that came after others: while they are off, trainings of before them have the same identity."""
 
 

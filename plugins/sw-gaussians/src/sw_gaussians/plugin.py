@@ -41,6 +41,8 @@ def register_tasks(registry: Registry) -> None:
     registry.add("sum-views", "sw_gaussians.late_batches:SumViews",
                  summary="update on the summed gradients of several views (needs late_batches.BatchingOptimizer)",
                  factory=True)  # fmt: skip
+    registry.add("average-parameters", "sw_gaussians.averaging:AverageParameters",
+                 summary="make a model the mean of itself over the last steps", factory=True)  # fmt: skip
     registry.add("settle-learning-rates", "sw_gaussians.settling:SettleLearningRates",
                  summary="let learning rates fall towards the end", factory=True)  # fmt: skip
 

@@ -19,6 +19,7 @@ from splatwizard_core.api import (
 )
 from sw_gaussians import fast_tasks, fragments, tasks
 from sw_gaussians import mcmc_tasks as mcmc
+from sw_gaussians.averaging import AverageParameters
 from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fused_adam import FusingOptimizer
@@ -50,6 +51,9 @@ READERS = (collect_statistics, fragments.collect_opacity_gradients)
 
 LATE_PRUNES = range(18_000, 27_000, 3_000)
 """Steps of the full plan at which `fast.late_prune` prunes. Source: FastGS (arXiv 2511.04283), and 27,000."""
+
+AVERAGE_EVERY = 10
+"""Steps between two samples of `fast.average`: reading them takes a hundredth of a step."""
 
 
 class ThreeDGSStage(Stage):
@@ -207,6 +211,11 @@ class ThreeDGSStage(Stage):
         end = range(first, self.iterations + 1)
         if fast.late_views > 1:
             scheduler.register_task(end, SumViews(views=fast.late_views, first=first), name="sum views")
+        begin = max(first, round(self.iterations * (1 - fast.average)))
+        if begin < self.iterations:
+            begin += (self.iterations - begin) % AVERAGE_EVERY
+            average = AverageParameters(first=begin, last=self.iterations, every=AVERAGE_EVERY)
+            scheduler.register_task(average.steps, average, name="average parameters")
         if fast.settle < 1 and first < self.iterations:
             settle = SettleLearningRates(self._rates(), first=first, last=self.iterations, factor=fast.settle)
             scheduler.register_task(end, settle, name="settle learning rates")
