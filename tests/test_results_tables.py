@@ -97,8 +97,15 @@ def test_a_claim_is_held_where_ratio_and_loss_are(tools, record, tmp_path):
     assert "**" not in tools.table("claims", "all", tmp_path)
     tools.write([small], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
-    tools.write([exact, replace(small, repetition=2)], tmp_path / "lego.jsonl")  # no 3DGS of that matrix
-    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
+    elsewhere = replace(small, repetition=2)  # no 3DGS of that matrix: beside the mean of all
+    tools.write([exact, replace(exact, seed=1, psnr=31.0, gaussians=140), elsewhere], tmp_path / "lego.jsonl")
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| 37.2x, -0.80 dB † |")
+    tools.write([exact, small, elsewhere], tmp_path / "lego.jsonl")  # the one that can be compared
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, -0.30 dB** |")
+    tools.write([exact, small, replace(small, variant="own", psnr=29.0)], tmp_path / "lego.jsonl")
+    assert [line.split(" | ")[0] for line in tools.table("claims", "all", tmp_path).splitlines()[2:4]] == [
+        "| MesonGS", "| MesonGS (own)",
+    ]  # fmt: skip
     other = [replace(r, repetition=2) for r in (replace(exact, psnr=29.0), small)]
     tools.write([exact, *other], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, +0.70 dB** |")
