@@ -13,6 +13,7 @@ with SPLATWIZARD_SHARE_CORES=0, and where the environment says how to wait.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import threading
@@ -125,7 +126,8 @@ def watch_cores() -> None:
     if _watch is not None or forbidden or any(os.environ.get(name) for name in SETTINGS):
         return
     if os.path.exists("/proc/self/schedstat") and openmp_libraries():
-        _watch = Watch()
+        with contextlib.suppress(RuntimeError):  # no more threads are allowed here: the work goes on without a watch
+            _watch = Watch()
 
 
 _watch: Watch | None = None
