@@ -18,7 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.fixture
 def tools(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    for name in ("results", "result_records", "trainer_records", "result_groups", "result_plots", "result_claims"):
+    for name in ("results", "result_records", "trainer_records", "result_groups", "result_plots", "result_claims",
+                 "result_published"):  # fmt: skip
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("results")
 
@@ -97,11 +98,39 @@ def test_a_claim_is_held_where_ratio_and_loss_are(tools, record, tmp_path):
     assert "**" not in tools.table("claims", "all", tmp_path)
     tools.write([small], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
-    tools.write([exact, replace(small, repetition=2)], tmp_path / "lego.jsonl")  # no 3DGS of that matrix
-    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
+    elsewhere = replace(small, repetition=2)  # no 3DGS of that matrix: beside the mean of all
+    tools.write([exact, replace(exact, seed=1, psnr=31.0, gaussians=140), elsewhere], tmp_path / "lego.jsonl")
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| 37.2x, -0.80 dB † |")
+    tools.write([exact, small, elsewhere], tmp_path / "lego.jsonl")  # the one that can be compared
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, -0.30 dB** |")
+    tools.write([exact, small, replace(small, variant="own", psnr=29.0)], tmp_path / "lego.jsonl")
+    assert [line.split(" | ")[0] for line in tools.table("claims", "all", tmp_path).splitlines()[2:4]] == [
+        "| MesonGS", "| MesonGS (own)",
+    ]  # fmt: skip
     other = [replace(r, repetition=2) for r in (replace(exact, psnr=29.0), small)]
     tools.write([exact, *other], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, +0.70 dB** |")
+
+
+def test_records_stand_beside_the_published_figures_of_the_whole_scene(tools, record, tmp_path):
+    start = replace(record, method="3dgs", rate="r6", preset="paper", steps=30_000, psnr=33.0, bytes=2_000, seed=0)
+    small = replace(start, method="mesongs", rate="r4", starts_from="3dgs", steps=3_000, psnr=32.5, gaussians=7)
+    other = replace(small, variant="nerf_synthetic", preset="nerf_synthetic", psnr=99.0)
+    unknown = replace(small, method="chimerags", rate="r2")
+    tools.write([start, replace(start, seed=1, psnr=34.0), small, other, unknown], tmp_path / "lego.jsonl")
+    _, _, exact, mesongs = tools.table("published", "lego", tmp_path).splitlines()
+    assert exact.startswith("| 3DGS | r6 | 35.78 | 33.50 ± 0.71 | - | ")
+    assert exact.endswith(", 2023 | background black here, white there<br>preset paper here, inria there |")
+    assert mesongs.startswith("| MesonGS | r4 | 35.06 | 32.50 | 0.9801 | ")
+    assert " | 4,697,206 | 2,000 | 291,928 | 7 | 1 | ShuzhaoXie/MesonGS e491557, " in mesongs
+    assert "background not stated there<br>33,000 steps here, 38,000 there<br>" in mesongs
+    exactly = replace(start, preset="inria", variant="inria", psnr=35.0)  # the preset that is meant comes first
+    tools.write([start, exactly], tmp_path / "lego.jsonl")
+    row = tools.table("published", "lego", tmp_path).splitlines()[2]
+    assert row.startswith("| 3DGS | r6 | 35.78 | 35.00 |")
+    assert "preset" not in row
+    with pytest.raises(SystemExit, match="no published scene is known for 'fox'"):
+        tools.table("published", "fox", tmp_path)
 
 
 def test_a_trainer_stands_beside_ours_with_means_and_without_speeds_of_shared_gpus(tools, tmp_path):

@@ -6,8 +6,8 @@
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
 file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at every
-scene. Between `<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs
-± the deviation of the sample (n - 1).
+scene, and `table published SCENE` at the published figures of sw-report too. Between `<!-- plot SCENE -->` and
+`<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs ± the deviation of the sample (n - 1).
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from pathlib import Path
 
 import result_claims
 import result_plots
+import result_published
 import trainer_records
 from result_groups import BASE, NONE, TITLES, Rows, points, rate, smaller, spread, title
 from result_records import FROM, MIB, RECORDS, ROOT, extract, merged, read, write
@@ -139,10 +140,14 @@ def table(name: str, scene: str, records_at: Path = RECORDS) -> str:
         return trainer_records.table(records_at / "trainers" / f"{scene}.jsonl")
     if name == "claims":
         return result_claims.table(records_at)
+    if name == "published":
+        return result_published.table(scene, records_at)
     if name == "plot":
         return result_plots.shown(scene, records_at)
     if name not in TABLES:
-        raise SystemExit(f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers', 'claims'])}")
+        raise SystemExit(
+            f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers', 'claims', 'published'])}"
+        )
     path = records_at / f"{scene}.jsonl"
     if not path.exists():
         return f"*No records of {scene} yet.*\n"
