@@ -175,6 +175,41 @@ def test_files_stand_in_the_order_of_their_bytes_with_what_they_come_from(tools,
     ]  # fmt: skip
 
 
+def test_starts_of_two_presets_are_compared_seed_by_seed(tools, record):
+    usual = [replace(record, rate="r3", seed=i, psnr=30.0 + i, ssim=0.9, bytes=1000) for i in range(3)]
+    fast = [replace(r, variant="fast-cpu", preset="fast-cpu", psnr=r.psnr + 0.5, bytes=1500) for r in usual[:2]]
+    method = replace(usual[0], method="c3dgs", rate="r4", default_rate=True)
+    begun = replace(method, variant="from fast-cpu", psnr=29.75, bytes=900)
+    head, *rows = tools.starts_table([*usual, *fast, method, begun])
+    assert head[2:4] == ["PSNR dB, `quick`", "`fast-cpu`"]
+    assert [row[0] for row in rows] == ["3DGS", "C3DGS"]
+    assert rows[0][2:5] == ["30.50 ± 0.71", "31.00 ± 0.71", "0.50 ± 0.00"]  # without the third seed
+    assert rows[0][-2:] == ["1.50 ± 0.00", "2"]
+    assert rows[1][1:] == ["r4 *", "30.00", "29.75", "-0.25", "0.9000", "0.9000", "1,000", "900", "0.90", "1"]
+    with pytest.raises(SystemExit, match="compares two presets"):
+        tools.starts_table([*usual, *fast, method, replace(begun, variant="from fast")])
+
+
+@pytest.mark.parametrize(
+    ("preset", "before", "expected"),
+    [
+        ("quick", {}, ""),
+        ("quick", {"3dgs": "quick"}, ""),
+        ("quick", {"3dgs": "fast-cpu"}, "from fast-cpu"),
+        ("splatwizard", {"3dgs": "paper"}, "splatwizard"),  # 3dgs has no preset of that name
+        ("splatwizard", {"3dgs": "quick"}, "splatwizard from quick"),
+        ("paper", {"3dgs": None}, ""),  # a file, of which nobody knows
+        ("fast-cpu", {}, "fast-cpu"),
+    ],
+)
+def test_a_run_from_a_start_that_was_asked_for_is_a_variant(tools, preset, before, expected):
+    from result_records import _variant
+
+    from splatwizard_core.plugins import load_plugins
+
+    assert _variant(preset, before, load_plugins()) == expected
+
+
 def test_what_was_not_measured_alone_is_no_time(tools, record):
     shared = replace(record, default_rate=True, alone=False, fps_alone=False)
     head, row = tools.cost_table([shared])

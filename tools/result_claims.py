@@ -41,9 +41,10 @@ CLAIMS: dict[tuple[str, str], tuple[Claim, ...]] = {
 
 
 def table(records_at: Path = RECORDS) -> str:
-    """Write the table over all scenes that have a record of one of the methods."""
+    """Write the table over the scenes of the claims' kinds that have a record of one of the methods."""
     methods = {method for method, _ in CLAIMS}
-    scenes = {path.stem: read(path) for path in sorted(records_at.glob("*.jsonl"))}
+    kinds = {scene for claims in CLAIMS.values() for claim in claims for scene in claim.scenes}
+    scenes = {path.stem: read(path) for path in sorted(records_at.glob("*.jsonl")) if path.stem in kinds}
     scenes = {scene: found for scene, found in scenes.items() if methods & {r.method for r in found}}
     if not scenes:
         return "*No records of them yet.*\n"
