@@ -1,6 +1,6 @@
 // Forward compositing of one tile at a time.
 //
-// Every stage of kStage splats is dealt to the 16 blocks of the tile by their masks; then each block runs through its
+// Every stage of kStage splats is dealt to the blocks of the tile by their masks; then each block runs through its
 // own list with its pixels' transmittance, colours and last position in registers: no load or store of pixel state per
 // splat, one broadcast of each splat field.
 #include <memory>

@@ -1,9 +1,9 @@
 // What the forward and backward blend kernels share: a tile's geometry, and the staging of its splats.
 //
 // Splats of a tile are staged kStage at a time into small arrays, one array a field (L1-resident), and each gets a mask
-// of the blocks (4x4 pixels, or 4x2 where no pack has 16 lanes) whose pixel centres its cut-off ellipse reaches: the exact minimum of the quadratic form over
-// the box of centres, which lies on one of the two facing edges. So a pixel is tried with a splat only if its
-// block is touched.
+// of the blocks (4x4 pixels, or 4x2 where no pack has 16 lanes) whose pixel centres its cut-off ellipse reaches: the
+// exact minimum of the quadratic form over the box of centres, which lies on one of the two facing edges. So a pixel is
+// tried with a splat only if its block is touched.
 #pragma once
 
 #include <algorithm>
@@ -93,21 +93,26 @@ struct TileStage {
       const V lean_x = at(kLeanX), lean_y = at(kLeanY), zero = c(0);
       const V width = c(kBlockWidth - 1), height = c(kBlockHeight - 1);  // between the outer centres
       const V left = c(frame.x0 + 0.5) - at(kU), top = c(frame.y0 + 0.5) - at(kV);
-      V low_x[kBlocksPerRow], near_x[kBlocksPerRow], ridge_y[kBlocksPerRow];
+      V low_x[kBlocksPerRow], high_x[kBlocksPerRow], ridge_y[kBlocksPerRow];
+      V square_x[kBlocksPerRow], slope_x[kBlocksPerRow];  // of the form on the vertical line nearest to the centre
       for (int i = 0; i < kBlocksPerRow; ++i) {
         low_x[i] = left + c(kBlockWidth * i);
-        near_x[i] = clamp(zero, low_x[i], low_x[i] + width);
-        ridge_y[i] = lean_y * near_x[i];  // lowest point of the form on the vertical line near_x
+        high_x[i] = low_x[i] + width;
+        const V near_x = clamp(zero, low_x[i], high_x[i]);
+        ridge_y[i] = lean_y * near_x;  // lowest point of the form on that line
+        square_x[i] = a * near_x * near_x;
+        slope_x[i] = b * near_x;
       }
       I mask = {};
       for (int j = 0; j < kBlockRows; ++j) {
         const V low_y = top + c(kBlockHeight * j), high_y = low_y + height;
         const V near_y = clamp(zero, low_y, high_y), ridge_x = lean_x * near_y;
+        const V square_y = cc * near_y * near_y, slope_y = b * near_y;
         for (int i = 0; i < kBlocksPerRow; ++i) {
           const V y = clamp(ridge_y[i], low_y, high_y);
-          const V x = clamp(ridge_x, low_x[i], low_x[i] + width);
-          const V on_vertical = a * near_x[i] * near_x[i] + (b * near_x[i] + cc * y) * y;
-          const V on_horizontal = cc * near_y * near_y + (b * near_y + a * x) * x;
+          const V x = clamp(ridge_x, low_x[i], high_x[i]);
+          const V on_vertical = square_x[i] + (slope_x[i] + cc * y) * y;
+          const V on_horizontal = square_y + (slope_y + a * x) * x;
           const I bit = I{} + int32_t(1u << (j * kBlocksPerRow + i));
           mask |= select(minimum(on_vertical, on_horizontal) <= cutoff, bit, I{});
         }
