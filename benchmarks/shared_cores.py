@@ -1,18 +1,19 @@
 """Cost of company: how much longer work takes beside others on the same cores, in ratios.
 
-    python benchmarks/shared_cores.py [--cores 0,1] [--jobs train,plain,decode] [--steps 900] [--file cat.swz]
+    python benchmarks/shared_cores.py [--cores 0,1] [--jobs train,plain,decode] [--seconds 60] [--file cat.swz]
 
 Pins itself, and so all that it starts, to the cores named, which nobody else should use meanwhile. The jobs, each in
 a process of its own: `train`, the demo scene by 3DGS through `sw`; `plain`, both passes of the rasterizer `standard`
 from a few lines of Python; `decode`, a file of a method whose decoder computes (`--file`; without one, CAT-3DGS is
-trained for 300 steps on the demo scene). Each alone, without and with the watch over the cores in turn (the least of
-`--repeats`), two side by side, and beside busy processes of plain Python. Times are those that the jobs take
-themselves, without imports. `share` is what a record says: the part of the CPU time that a job wanted and had; 1 where
+trained for 300 steps on the demo scene). Each alone without the watch over the cores (the least of `--repeats`), two
+side by side, and beside busy processes of plain Python. Times are those that the jobs take themselves, without
+imports. What the watch costs alone is measured within one process by watch_cost.py, `--seconds` for each job, and
+given with its 95 % interval. `share` is what a record says: the part of the CPU time that a job wanted and had; 1 where
 hardly any was missing.
 
-Bars: alone with the watch at most 1.03; two at most 2.3; beside n busy ones on c cores at most 2 (c + n) / c, twice
-what is left of the cores if every thread gets the same. `--unwatched` adds these rows with SPLATWIZARD_SHARE_CORES=0,
-which show what the watch is for and can take many minutes.
+Bars: the watch alone at most 1.03; two at most 2.3; beside n busy ones on c cores at most 2 (c + n) / c, twice what is
+left of the cores if every thread gets the same. `--unwatched` adds these rows with SPLATWIZARD_SHARE_CORES=0, which
+show what the watch is for and can take many minutes.
 """
 
 from __future__ import annotations
@@ -26,33 +27,24 @@ import tempfile
 import time
 from pathlib import Path
 
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import watch_cost
+from watch_cost import SETTINGS, SWITCH
+
 HERE = Path(__file__).resolve()
-SWITCH = "SPLATWIZARD_SHARE_CORES"
-SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "MKL_NUM_THREADS")
 BUSY = "while True: pass"
 SW = [sys.executable, "-m", "splatwizard_core"]
 
 
 def plain(frames: int) -> None:
     """Draw and differentiate frames; print seconds and share as JSON. Runs in a process of its own."""
-    import torch
-
-    sys.path.insert(0, str(HERE.parent))
-    from scene import make_splats, orbit_cameras
-
-    from splatwizard_core.api import RasterOptions
     from splatwizard_native import CoreTime
-    from sw_rasterizers.standard import StandardRasterizer
 
-    rasterizer, splats = StandardRasterizer(), make_splats(20_000)
-    for x in splats.tensors().values():
-        x.requires_grad_(True)
-    cameras = orbit_cameras(4, 480, 270)
-    rasterizer.render(splats, cameras[0], RasterOptions())  # loads the kernels
+    rounds = watch_cost.frames(frames // 4)
+    next(rounds)
     cores, began = CoreTime(), time.perf_counter()
-    for i in range(frames):
-        image = rasterizer.render(splats, cameras[i % len(cameras)], RasterOptions()).image
-        torch.autograd.backward([image.square().mean()])
+    for _ in rounds:
+        pass
     seconds, share = time.perf_counter() - began, cores.shortage()
     print(json.dumps({"seconds": seconds, "share": share}))
 
@@ -132,9 +124,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", default="0,1")
     parser.add_argument("--jobs", default="train,plain,decode")
-    parser.add_argument("--steps", type=int, default=900, help="of the training")
+    watch_cost.add_options(parser, seconds=60)
     parser.add_argument("--frames", type=int, default=200, help="of the plain job")
-    parser.add_argument("--file", help="to decode")
     parser.add_argument("--busy", type=int, default=4)
     parser.add_argument("--repeats", type=int, default=3, help="of the runs alone")
     parser.add_argument("--unwatched", action="store_true", help="also the rows without the watch, which take long")
@@ -154,16 +145,13 @@ def main() -> None:
             if name == "decode" and options.file is None:
                 options.file = make_file(scratch)
             job = Job(name, options, scratch)
-            alone: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
-            for i in range(options.repeats):  # the first of two would find a cooler machine each time
-                for watch in (False, True) if i % 2 == 0 else (True, False):
-                    alone[watch].append(job.run(watch=watch))
-            base, _ = min(alone[False])
+            alone = [job.run(watch=False) for _ in range(options.repeats)]
+            base, _ = min(alone)
 
             crowd = f"beside {options.busy} busy"
             allowed = 2 * (len(cores) + options.busy) / len(cores)
-            show(job.name, base, "alone, unwatched", min(alone[False]), None)
-            show(job.name, base, "alone", min(alone[True]), 1.03)
+            show(job.name, base, "alone, unwatched", min(alone), None)
+            print(watch_cost.rows(name, options), flush=True)
             show(job.name, base, "two", job.run(together=2), 2.3)
             show(job.name, base, crowd, job.run(busy=options.busy), allowed)
             if options.unwatched:

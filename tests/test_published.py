@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
@@ -15,8 +16,9 @@ from splatwizard_core.runs.config import parse_set, resolve
 
 SCRIPT = Path(__file__).parents[1] / "benchmarks" / "published.py"
 RECORD = {
+    "schema_version": 3, "method": "3dgs", "rate": "r6", "preset": "paper", "dataset": "demo", "scene": "demo-tiny",
     "metrics": {"psnr": {"mean": 31.5}, "ssim": {"mean": 0.9}}, "file": {"bytes": 1234}, "test_views": 2,
-    "counts": {"num_gaussians": 50}, "train": {"steps": 5}, "protocol": {"id": "demo/64x48"},
+    "counts": {"num_gaussians": 50}, "train": {"steps": 5}, "protocol": {"id": "demo/64x48", "background": "white"},
 }  # fmt: skip
 
 
@@ -42,9 +44,10 @@ def start(script: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, c
         {**real, "scene": None},
     ]
     path = tmp_path / "rows.json"
-    path.write_text(json.dumps({**content, "figures": rows}))
 
-    def started(*arguments: str) -> tuple[list[list[str]], str]:
+    def started(*arguments: str, dataset: str = "nowhere") -> tuple[list[list[str]], str]:
+        rows[1] |= {"dataset": dataset, "scene": "absent" if dataset == "nowhere" else real["scene"]}
+        path.write_text(json.dumps({**content, "figures": rows}))
         given = []
 
         def run(command, **_):
@@ -75,6 +78,52 @@ def test_a_row_is_run_once_and_stands_beside_what_was_published(start, monkeypat
     given, told = start()
     assert given == []
     assert "31.50 / 35.04" in told
+
+
+@pytest.fixture
+def other_run(tmp_path: Path):
+    """other_run(seed, **changes): keep a record of hac r1 on lego below tmp_path/h200, as a matrix of runs does."""
+    ours = {"method": "hac", "rate": "r1", "preset": "paper", "dataset": "blender", "scene": "lego"}
+
+    def kept(seed: int, **changes: object) -> None:
+        folder = tmp_path / "h200" / f"seed-{seed}" / "lego" / "hac" / "r1"
+        folder.mkdir(parents=True)
+        (folder / "metrics.json").write_text(json.dumps({**RECORD, **ours, **changes}))
+
+    return kept
+
+
+def test_finished_runs_stand_for_a_row_with_their_mean_and_what_differs(start, other_run, tmp_path, monkeypatch):
+    monkeypatch.delenv("SPLATWIZARD_DATA", raising=False)
+    other_run(0, metrics={"psnr": {"mean": 33.0}})
+    other_run(1, metrics={"psnr": {"mean": 34.0}}, file={"bytes": 1236})
+    other_run(2, preset="mcmc")
+    other_run(3, rate="r2")
+    other_run(4, dataset="colmap")  # another scene of that name
+    given, told = start("--table", "--runs", str(tmp_path / "h200"), "--only", "lego", dataset="nerf_synthetic")
+    assert given == []
+    assert "33.50 / 35.04" in told
+    assert "1,235 / 1,313,656" in told
+    assert "background white here, black there" in told
+    assert "2 test views here, 200 there" in told
+    assert "preset" not in told.replace("preset paper", "")
+
+
+def test_runs_of_the_preset_that_is_meant_come_before_those_of_paper(script, other_run, tmp_path):
+    row = next(r for r in script.read_rows(script.ROWS) if (r.figure.method, r.scene, r.rate) == ("hac", "lego", "r1"))
+    row = replace(row, preset="inria")
+    other_run(0)
+    found = script.measured(row, tmp_path, script.finished([tmp_path / "h200"]))
+    assert [run.preset for run in found] == ["paper"]
+    other_run(1, preset="inria")
+    found = script.measured(row, tmp_path, script.finished([tmp_path / "h200"]))
+    assert [run.preset for run in found] == ["inria"]
+
+
+def test_a_folder_of_runs_that_is_not_there_is_named(start, tmp_path, capsys):
+    with pytest.raises(SystemExit):
+        start("--runs", str(tmp_path / "nowhere"))
+    assert f"--runs: no folder {tmp_path / 'nowhere'}" in capsys.readouterr().err
 
 
 def test_without_data_nothing_runs_but_what_needs_none(start, monkeypatch):

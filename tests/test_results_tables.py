@@ -18,7 +18,8 @@ ROOT = Path(__file__).resolve().parents[1]
 @pytest.fixture
 def tools(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(ROOT / "tools"))
-    for name in ("results", "result_records", "trainer_records", "result_groups", "result_plots", "result_claims"):
+    for name in ("results", "result_records", "trainer_records", "result_groups", "result_plots", "result_claims",
+                 "result_published"):  # fmt: skip
         monkeypatch.delitem(sys.modules, name, raising=False)
     return importlib.import_module("results")
 
@@ -97,11 +98,39 @@ def test_a_claim_is_held_where_ratio_and_loss_are(tools, record, tmp_path):
     assert "**" not in tools.table("claims", "all", tmp_path)
     tools.write([small], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
-    tools.write([exact, replace(small, repetition=2)], tmp_path / "lego.jsonl")  # no 3DGS of that matrix
-    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| - |")
+    elsewhere = replace(small, repetition=2)  # no 3DGS of that matrix: beside the mean of all
+    tools.write([exact, replace(exact, seed=1, psnr=31.0, gaussians=140), elsewhere], tmp_path / "lego.jsonl")
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| 37.2x, -0.80 dB † |")
+    tools.write([exact, small, elsewhere], tmp_path / "lego.jsonl")  # the one that can be compared
+    assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, -0.30 dB** |")
+    tools.write([exact, small, replace(small, variant="own", psnr=29.0)], tmp_path / "lego.jsonl")
+    assert [line.split(" | ")[0] for line in tools.table("claims", "all", tmp_path).splitlines()[2:4]] == [
+        "| MesonGS", "| MesonGS (own)",
+    ]  # fmt: skip
     other = [replace(r, repetition=2) for r in (replace(exact, psnr=29.0), small)]
     tools.write([exact, *other], tmp_path / "lego.jsonl")
     assert tools.table("claims", "all", tmp_path).splitlines()[2].endswith("| **31.0x, +0.70 dB** |")
+
+
+def test_records_stand_beside_the_published_figures_of_the_whole_scene(tools, record, tmp_path):
+    start = replace(record, method="3dgs", rate="r6", preset="paper", steps=30_000, psnr=33.0, bytes=2_000, seed=0)
+    small = replace(start, method="mesongs", rate="r4", starts_from="3dgs", steps=3_000, psnr=32.5, gaussians=7)
+    other = replace(small, variant="nerf_synthetic", preset="nerf_synthetic", psnr=99.0)
+    unknown = replace(small, method="chimerags", rate="r2")
+    tools.write([start, replace(start, seed=1, psnr=34.0), small, other, unknown], tmp_path / "lego.jsonl")
+    _, _, exact, mesongs = tools.table("published", "lego", tmp_path).splitlines()
+    assert exact.startswith("| 3DGS | r6 | 35.78 | 33.50 ± 0.71 | - | ")
+    assert exact.endswith(", 2023 | background black here, white there<br>preset paper here, inria there |")
+    assert mesongs.startswith("| MesonGS | r4 | 35.06 | 32.50 | 0.9801 | ")
+    assert " | 4,697,206 | 2,000 | 291,928 | 7 | 1 | ShuzhaoXie/MesonGS e491557, " in mesongs
+    assert "background not stated there<br>33,000 steps here, 38,000 there<br>" in mesongs
+    exactly = replace(start, preset="inria", variant="inria", psnr=35.0)  # the preset that is meant comes first
+    tools.write([start, exactly], tmp_path / "lego.jsonl")
+    row = tools.table("published", "lego", tmp_path).splitlines()[2]
+    assert row.startswith("| 3DGS | r6 | 35.78 | 35.00 |")
+    assert "preset" not in row
+    with pytest.raises(SystemExit, match="no published scene is known for 'fox'"):
+        tools.table("published", "fox", tmp_path)
 
 
 def test_a_trainer_stands_beside_ours_with_means_and_without_speeds_of_shared_gpus(tools, tmp_path):
@@ -144,6 +173,41 @@ def test_files_stand_in_the_order_of_their_bytes_with_what_they_come_from(tools,
     assert [(c["rate"], c["starts from"], c["taught by"], c["steps"]) for c in cells] == [
         ("r2 *", "3dgs", "-", "-"), ("r1", "points", "3dgs", "2,000"), ("r6 *", "points", "-", "2,000"),
     ]  # fmt: skip
+
+
+def test_starts_of_two_presets_are_compared_seed_by_seed(tools, record):
+    usual = [replace(record, rate="r3", seed=i, psnr=30.0 + i, ssim=0.9, bytes=1000) for i in range(3)]
+    fast = [replace(r, variant="fast-cpu", preset="fast-cpu", psnr=r.psnr + 0.5, bytes=1500) for r in usual[:2]]
+    method = replace(usual[0], method="c3dgs", rate="r4", default_rate=True)
+    begun = replace(method, variant="from fast-cpu", psnr=29.75, bytes=900)
+    head, *rows = tools.starts_table([*usual, *fast, method, begun])
+    assert head[2:4] == ["PSNR dB, `quick`", "`fast-cpu`"]
+    assert [row[0] for row in rows] == ["3DGS", "C3DGS"]
+    assert rows[0][2:5] == ["30.50 ± 0.71", "31.00 ± 0.71", "0.50 ± 0.00"]  # without the third seed
+    assert rows[0][-2:] == ["1.50 ± 0.00", "2"]
+    assert rows[1][1:] == ["r4 *", "30.00", "29.75", "-0.25", "0.9000", "0.9000", "1,000", "900", "0.90", "1"]
+    with pytest.raises(SystemExit, match="compares two presets"):
+        tools.starts_table([*usual, *fast, method, replace(begun, variant="from fast")])
+
+
+@pytest.mark.parametrize(
+    ("preset", "before", "expected"),
+    [
+        ("quick", {}, ""),
+        ("quick", {"3dgs": "quick"}, ""),
+        ("quick", {"3dgs": "fast-cpu"}, "from fast-cpu"),
+        ("splatwizard", {"3dgs": "paper"}, "splatwizard"),  # 3dgs has no preset of that name
+        ("splatwizard", {"3dgs": "quick"}, "splatwizard from quick"),
+        ("paper", {"3dgs": None}, ""),  # a file, of which nobody knows
+        ("fast-cpu", {}, "fast-cpu"),
+    ],
+)
+def test_a_run_from_a_start_that_was_asked_for_is_a_variant(tools, preset, before, expected):
+    from result_records import _variant
+
+    from splatwizard_core.plugins import load_plugins
+
+    assert _variant(preset, before, load_plugins()) == expected
 
 
 def test_what_was_not_measured_alone_is_no_time(tools, record):

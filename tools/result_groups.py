@@ -46,16 +46,21 @@ def points(records: Rows) -> list[list[SmallRecord]]:
     return sorted((sorted(group, key=lambda r: r.seed) for group in groups.values()), key=place)
 
 
+def exact(records: Rows) -> list[SmallRecord]:
+    """Select the runs of 3DGS that keep every float: those of its highest rate point."""
+    plain = [r for r in records if r.method == BASE and not r.variant]
+    highest = max((r.rate for r in plain), default="")
+    return [r for r in plain if r.rate == highest]
+
+
 def bases(group: Rows, records: Rows, *, same_matrix: bool = False) -> list[SmallRecord | None]:
     """Return the exact 3DGS of each run's seed, that of the same repetition if there is one.
 
     same_matrix     that of the same repetition or none
     """
-    plain = [r for r in records if r.method == BASE and not r.variant]
-    exact = max((r.rate for r in plain), default="")
     found: dict[tuple[int, int | None], SmallRecord] = {}
-    for r in plain:
-        if r.rate == exact and r.gaussians:
+    for r in exact(records):
+        if r.gaussians:
             found[r.seed, r.repetition] = r
             if not same_matrix:
                 found.setdefault((r.seed, None), r)

@@ -19,13 +19,16 @@ from splatwizard_core.tooling import read_record
 ROOT = Path(__file__).resolve().parents[1]
 RECORDS = ROOT / "docs" / "records"
 MIB = 2**20
+FROM = "from "
+"""Begins the variant of a run whose start was trained by a preset that was asked for."""
 
 
 @dataclass(frozen=True)
 class SmallRecord:
     """Facts of one run; None: not measured.
 
-    variant             preset, where a method has several plans worth a row ("mcmc"); else ""
+    variant             preset, where a method has several plans worth a row ("mcmc"), or "from PRESET" where what it
+                        starts from or is taught by was trained by another preset than without being asked; else ""
     rate                rate point of the file
     scene, images       name, and picture size as WxH
     steps               of the method itself, all its stages; without those of a scene that it starts from
@@ -119,7 +122,7 @@ def extract(run: Path, plugins: PluginManager, repetition: int = 0) -> SmallReco
     size = record.speed.image_size
     return SmallRecord(
         method=record.method,
-        variant="" if record.preset in ("paper", "quick", None) else str(record.preset),
+        variant=_variant(record.preset, {name: p.preset for name, p in (train.pretraining or {}).items()}, plugins),
         rate=record.rate or "",
         default_rate=record.rate == cls.DEFAULT_RATE,
         preset=record.preset or "",
@@ -157,6 +160,17 @@ def extract(run: Path, plugins: PluginManager, repetition: int = 0) -> SmallReco
         command=str(beside.get("command", "")),
         repetition=repetition,
     )  # fmt: skip
+
+
+def _variant(preset: str | None, before: Mapping[str, str | None], plugins: PluginManager) -> str:
+    """Name what sets a run apart from others of its method; before: preset of each scene that it was given."""
+    own = "" if preset in ("paper", "quick", None) else str(preset)
+    asked = {
+        found
+        for name, found in before.items()
+        if found not in (None, preset if preset in plugins.methods.load(name).PRESETS else "paper")
+    }
+    return " ".join([*filter(None, [own]), *(f"{FROM}{found}" for found in sorted(map(str, asked)))])
 
 
 def _drawn(drawn_by: Mapping[str, str]) -> str:

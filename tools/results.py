@@ -6,8 +6,8 @@
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
 file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at every
-scene. Between `<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs
-± the deviation of the sample (n - 1).
+scene, and `table published SCENE` at the published figures of sw-report too. Between `<!-- plot SCENE -->` and
+`<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs ± the deviation of the sample (n - 1).
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from pathlib import Path
 
 import result_claims
 import result_plots
+import result_published
 import trainer_records
-from result_groups import BASE, NONE, Rows, points, rate, smaller, spread, title
-from result_records import MIB, RECORDS, ROOT, extract, merged, read, write
+from result_groups import BASE, NONE, TITLES, Rows, points, rate, smaller, spread, title
+from result_records import FROM, MIB, RECORDS, ROOT, extract, merged, read, write
 
 from splatwizard_core.tooling import load_plugins
 
@@ -96,8 +97,40 @@ def formats_table(records: Rows) -> list[list[str]]:
     return rows
 
 
+def starts_table(records: Rows) -> list[list[str]]:
+    """Each method from its usual start beside the same from another one, with the difference between equal seeds."""
+    groups = points(records)
+    usual = {(g[0].method, g[0].rate): g for g in groups if not g[0].variant}
+    pairs = [(usual[g[0].method, g[0].rate], g) for g in groups if g[0].variant]
+    names = sorted({tuple(started_by(g) for g in pair) for pair in pairs})
+    if len(names) != 1:
+        raise SystemExit(f"a table of starts compares two presets, and here are {names}")
+    before, after = names[0]
+    rows = [["method", "rate", f"PSNR dB, `{before}`", f"`{after}`", "difference", f"SSIM, `{before}`", f"`{after}`",
+             f"bytes, `{before}`", f"`{after}`", "ratio", "n"]]  # fmt: skip
+    for old, new in pairs:
+        seeds = {r.seed: r for r in old}
+        same = [(seeds[r.seed], r) for r in new if r.seed in seeds]
+        psnr = [None if None in (a.psnr, b.psnr) else b.psnr - a.psnr for a, b in same]
+        rows.append([
+            TITLES.get(new[0].method, new[0].method), rate(new),
+            *(spread([pair[i].psnr for pair in same], 2) for i in (0, 1)), spread(psnr, 2),
+            *(spread([pair[i].ssim for pair in same], 4) for i in (0, 1)),
+            *(spread([pair[i].bytes for pair in same], 0) for i in (0, 1)),
+            spread([b.bytes / a.bytes for a, b in same], 2), str(len(same)),
+        ])  # fmt: skip
+    return rows
+
+
+def started_by(group: Rows) -> str:
+    """Name the preset that trained the 3DGS scene of these runs, which may be they themselves."""
+    first = group[0]
+    return first.variant.removeprefix(FROM) or first.preset
+
+
 TABLES: dict[str, Callable[[Rows], list[list[str]]]] = {
     "quality": quality_table, "cost": cost_table, "brief": brief_table, "formats": formats_table,
+    "starts": starts_table,
 }  # fmt: skip
 
 
@@ -107,10 +140,14 @@ def table(name: str, scene: str, records_at: Path = RECORDS) -> str:
         return trainer_records.table(records_at / "trainers" / f"{scene}.jsonl")
     if name == "claims":
         return result_claims.table(records_at)
+    if name == "published":
+        return result_published.table(scene, records_at)
     if name == "plot":
         return result_plots.shown(scene, records_at)
     if name not in TABLES:
-        raise SystemExit(f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers', 'claims'])}")
+        raise SystemExit(
+            f"no table is called '{name}'; one of {', '.join([*TABLES, 'trainers', 'claims', 'published'])}"
+        )
     path = records_at / f"{scene}.jsonl"
     if not path.exists():
         return f"*No records of {scene} yet.*\n"

@@ -13,7 +13,7 @@ import pytest
 
 from splatwizard_native import core_time, waiting
 from splatwizard_native.core_time import CoreTime, Lap
-from splatwizard_native.waiting import Judge
+from splatwizard_native.waiting import Judge, Watch
 
 ALONE, CROWDED = Lap(0.25, 0.5, 0.005), Lap(0.25, 0.3, 0.2)
 LIBRARY = next(iter(Path(pytest.importorskip("torch").__file__).parent.glob("lib/libgomp*")), None)
@@ -136,13 +136,38 @@ def test_the_copy_of_openmp_that_is_loaded_is_found():
 def test_the_environment_can_forbid_it(monkeypatch, name, value):
     for each in (*waiting.SETTINGS, "SPLATWIZARD_SHARE_CORES"):
         monkeypatch.delenv(each, raising=False)
-    monkeypatch.setattr(waiting, "_watcher", None)
-    monkeypatch.setattr(waiting, "_watch", lambda: None)
+    monkeypatch.setattr(waiting, "_watch", None)
     monkeypatch.setattr(waiting, "openmp_libraries", lambda: ["libgomp.so.1"])
     with monkeypatch.context() as forbidding:
         forbidding.setenv(name, value)
         waiting.watch_cores()
-        assert waiting._watcher is None
+        assert waiting._watch is None
     if Path("/proc/self/schedstat").exists():
         waiting.watch_cores()
-        assert isinstance(waiting._watcher, threading.Thread)
+        assert isinstance(waiting._watch, Watch)
+        waiting._watch.end()
+
+
+def test_a_watch_that_ends_lets_them_spin_and_another_can_begin(monkeypatch):
+    came, told = threading.Event(), []
+
+    class Sleepers:
+        def come(self, working: int) -> None:
+            told.append(working)
+            came.set()
+
+        def go(self) -> None:
+            told.append(None)
+
+    monkeypatch.setattr(waiting, "Sleepers", Sleepers)
+    monkeypatch.setattr(waiting, "INTERVAL", 0.001)
+    monkeypatch.setattr(CoreTime, "lap", lambda self: CROWDED)
+    monkeypatch.setattr("torch.get_num_threads", lambda: 2)
+    for _ in range(2):
+        came.clear()
+        watch = Watch()
+        assert came.wait(60)
+        assert told[-1] == 2
+        watch.end()
+        assert told[-1] is None
+        assert not any(thread.name == "core-watch" for thread in threading.enumerate())

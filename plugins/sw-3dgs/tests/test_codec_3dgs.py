@@ -9,6 +9,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sw_kit.forged_files import forged
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SplatwizardError, UserInputError
@@ -208,27 +209,12 @@ def test_a_few_bytes_never_stand_for_many_gaussians():
     with pytest.raises(SplatwizardError, match="more than a reader accepts"):
         encoded(many, "r1", **{"codec.settings.position_bits": 8})
     # A stranger who writes it all the same is refused before anything is allocated.
-    data = rebuilt(encoded(random_model(30), "r1"), static={"num_gaussians": 200_000})
+    data = forged(encoded(random_model(30), "r1"), num_gaussians=200_000)
     tracemalloc.start()
     with pytest.raises(BitstreamError, match="may stand for at most"):
         decoded(data)
     assert tracemalloc.get_traced_memory()[1] < 1 << 20
     tracemalloc.stop()
-
-
-def rebuilt(data: bytes, *, static=None, sections=None) -> bytes:
-    """The same file with other header values or sections, and right checksums."""
-    reader = ContainerReader(data)
-    writer = ContainerWriter(reader.method, reader.version, raster=reader.raster)
-    writer.static.update({**reader.static, **(static or {})})
-    for name in reader.sections:
-        content = reader.section(name)
-        if sections and name in sections:
-            if sections[name] is None:
-                continue
-            content = sections[name](content)
-        writer.add(name, content)
-    return writer.to_bytes()
 
 
 @pytest.mark.parametrize("rate", ["r1", "r5", "r6"])
@@ -253,15 +239,12 @@ def test_a_flipped_bit_is_refused(rate, position, bit):
 @given(section=st.integers(0, 7), position=st.floats(0, 1, exclude_max=True), value=st.integers(0, 255))
 def test_a_section_forged_with_a_right_checksum_gives_a_model_or_a_bitstream_error(section, position, value):
     data = example(30, "r4")
-    name = list(ContainerReader(data).sections)[section]
-
-    def forge(content: bytes) -> bytes:
-        changed = bytearray(content)
-        changed[int(position * len(changed))] = value
-        return bytes(changed)
-
+    reader = ContainerReader(data)
+    name = list(reader.sections)[section]
+    changed = bytearray(reader.section(name))
+    changed[int(position * len(changed))] = value
     try:
-        model = decoded(rebuilt(data, sections={name: forge}))
+        model = decoded(forged(data, {name: bytes(changed)}))
     except BitstreamError:
         return
     assert model.num_rows == 30
@@ -289,7 +272,7 @@ def test_a_section_forged_with_a_right_checksum_gives_a_model_or_a_bitstream_err
 )
 def test_a_hostile_header_is_refused(static, message):
     with pytest.raises(BitstreamError, match=message):
-        decoded(rebuilt(example(30, "r4"), static=static))
+        decoded(forged(example(30, "r4"), **static))
 
 
 @pytest.mark.parametrize(
@@ -303,12 +286,12 @@ def test_a_hostile_header_is_refused(static, message):
 )
 def test_a_hostile_header_of_an_exact_file_is_refused(static, message):
     with pytest.raises(BitstreamError, match=message):
-        decoded(rebuilt(encoded(random_model(30), "r6"), static=static))
+        decoded(forged(encoded(random_model(30), "r6"), **static))
 
 
 @pytest.mark.parametrize(("rate", "section"), [("r4", "positions"), ("r4", "sh2"), ("r6", "sh_rest")])
 def test_a_missing_section_is_named(rate, section):
-    data = rebuilt(encoded(random_model(5), rate), sections={section: None})
+    data = forged(encoded(random_model(5), rate), {section: None})
     with pytest.raises(BitstreamError, match=f"'{section}'.*missing"):
         decoded(data)
 

@@ -35,9 +35,11 @@ STEPS = 60
 SHORT = {
     "iterations": STEPS, "densify.interval": 5_000, "fast.sh_every": 3, "fast.resolution": "dash",
     "fast.resolution_hold": True, "fast.cap": 1_500, "densify.reset_interval": 10_000,
-    "lr.sh_dc": 2e-2, "lr.opacity": 0.1,
+    "lr.sh_dc": 2e-2, "lr.opacity": 0.1, "fast.veto_views": 2, "fast.veto_pixels": 1,
+    "fast.settle": 0.5, "fast.average": 0.9,
 }  # fmt: skip
-"""Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40."""
+"""Rounds 10 steps apart, the last one at step 42; halvings at 20 and 40; from step 48 on rates fall, and the mean is
+taken of samples at 50 and 60."""
 
 
 def stage_of(**sets) -> ThreeDGSStage:
@@ -145,6 +147,27 @@ def test_opacity_gradients_are_rendered_until_the_last_densification_and_in_the_
     assert not stage_of(fast__score="gradient").raster_options(1, black).fragment_grad
 
 
+def test_the_end_has_its_own_tasks_where_it_is_asked_for():
+    plan = format_plan(
+        *build_schedulers(
+            stage_of(fast__settle=0.1, fast__late_prune=True, fast__late_views=4, fast__average=0.1), PipelineParams()
+        )
+    )
+    assert "| average parameters          | range(9000, 10001, 10)" in plan
+    assert "| sum views                   | range(8000, 10001)" in plan
+    assert "| settle learning rates       | range(8000, 10001)" in plan
+    assert "| prune by views              | range(6000, 9000, 1000)" in plan
+    unscaled = stage_of(fast__settle=0.1, scale_schedule=False, iterations=7_000)
+    assert "settle" not in format_plan(*build_schedulers(unscaled, PipelineParams()))  # densification does not end
+
+
+def test_parts_that_came_later_change_no_identity_while_off():
+    assert not {"veto_views", "veto_pixels", "late_prune", "late_views", "settle", "average"} & set(
+        resolve(ThreeDGS, "fast").config.identity()["fast"]
+    )
+    assert resolve(ThreeDGS, "fast", sets={"fast.settle": 0.1}).config.identity()["fast"]["settle"] == 0.1
+
+
 def test_parts_are_off_unless_asked_for(scene):
     stage, model = ThreeDGSStage(GaussianTraining()), gaussians_from_points(scene.points)
     assert not isinstance(stage.create_optimizer(model, scene), CadencedOptimizer)
@@ -174,6 +197,16 @@ def test_updates_in_the_backward_pass_have_a_key_that_changes_no_identity_while_
         {"sparse_adam": "none"},
         {"mcmc__enabled": True, "fast__densify": "threshold"},
         {"mcmc__enabled": True, "fast__densify": "threshold", "fast__opacity": "reset"},
+        {"fast__densify": "threshold", "fast__veto_views": 10},
+        {"fast__late_views": 4, "sparse_adam": "per_row"},
+        {"fast__late_views": 4, "fast__sh_every": 2},
+        {
+            "mcmc__enabled": True,
+            "fast__densify": "threshold",
+            "fast__opacity": "reset",
+            "fast__morton": False,
+            "fast__late_prune": True,
+        },
     ],
 )
 def test_what_does_not_go_together_is_said_before_anything_runs(sets):

@@ -1,6 +1,7 @@
 """Anchors with a lattice, masks and phases: what HAC and CAT-3DGS share."""
 
 import copy
+import dataclasses
 import math
 
 import pytest
@@ -141,6 +142,25 @@ def test_the_rate_of_a_whole_sample_is_that_of_all_kept_anchors():
     bits = -torch.log2(probability.clamp(min=1e-6)) * masks.repeat_interleave(3, 1)
     torch.testing.assert_close(again.by_group[2], bits[20:].sum().detach(), rtol=1e-4, atol=0.01)
     torch.testing.assert_close(again.bits, again.by_group.sum() / rate.numbers * 40 / 60)
+
+
+@pytest.mark.parametrize("floor", [0.0, 0.05])
+def test_deviations_below_zero_learn_if_there_is_a_floor(floor):
+    """Of features half a step beside the mean; at the published floor of 1e-9 the bits say nothing of the deviation."""
+    model = make(n=20, scale_floor=floor)
+    raw = torch.full((20, 5), -0.5, requires_grad=True)
+    flat = model.predict
+    model.predict = lambda rows: dataclasses.replace(flat(rows), scales=(raw[rows], *flat(rows).scales[1:]))
+    rows = torch.arange(20)
+    forecast = model.forecast(rows)
+    values = torch.cat([torch.full((20, 5), 0.55), *(v.detach() for v in model.raw(rows)[1:])], dim=1)
+    rate = model.rate(rows, values, forecast, model.masks(rows))
+    rate.bits.backward()
+    if floor:
+        assert bool((raw.grad < 0).all())  # descent raises them
+    else:
+        assert bool((raw.grad == 0).all())
+    assert rate.by_group[0] > 100 * (2.0 if floor else 19.9)
 
 
 def test_an_empty_sample_costs_nothing():

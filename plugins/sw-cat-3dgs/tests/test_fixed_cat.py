@@ -31,6 +31,7 @@ def model(begun, little_scene, rasterizer):
 @pytest.mark.parametrize("rounded", [False, True])
 def test_fixed_sizes_change_neither_values_nor_gradients(model, little_scene, rasterizer, rounded):
     model.context.rounded = rounded
+    model.scale_floor = 0.05 if rounded else 0.0
     model.train_only("all but planes" if rounded else "everything")
     camera = little_scene.train[0].camera
     check_fixed_decoder(lambda: copy.deepcopy(model), camera, rasterizer, counts=(0, 40))

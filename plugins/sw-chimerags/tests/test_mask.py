@@ -4,6 +4,7 @@ import copy
 
 import pytest
 import torch
+from sw_kit.short_training import train_stages
 
 from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins import load_plugins
@@ -12,8 +13,6 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
-from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun
 from sw_chimerags.method import ChimeraGS
 from sw_chimerags.model import LOWER, MaskedGaussians
 
@@ -120,10 +119,9 @@ def distilled(plugins, rasterizer, student, teacher, **sets):
         **{k.replace("__", "."): v for k, v in sets.items()},
     }
     method = ChimeraGS(plugins, resolve(ChimeraGS, "paper", sets=values).config)
-    return TrainingRun(
-        method.stages()[-1:], lambda: copy.deepcopy(student), scene_of(), PipelineParams(), rasterizer,
-        directory=None, identity={}, trained=lambda name: teacher,
-    ).train().model  # fmt: skip
+    return train_stages(
+        method.stages()[-1:], scene_of(), rasterizer, model=lambda: copy.deepcopy(student), trained=lambda name: teacher
+    ).model
 
 
 def test_a_heavy_penalty_turns_every_mask_off(plugins, rasterizer):
@@ -144,9 +142,6 @@ def test_a_student_that_is_its_teacher_learns_nothing(plugins, rasterizer):
 
 
 def test_the_student_may_teach_itself(plugins, rasterizer):
-    def refuse(name):
-        raise AssertionError(name)
-
     method = ChimeraGS(
         plugins, resolve(ChimeraGS, sets={"distill.iterations": 3, "distill.teacher": "student_initial"}).config
     )
@@ -154,9 +149,7 @@ def test_the_student_may_teach_itself(plugins, rasterizer):
     assert stage.taught_by == ()
     student = splats()
     student.active_sh_degree = 1
-    TrainingRun(
-        [stage], lambda: student, scene_of(), PipelineParams(), rasterizer, directory=None, identity={}, trained=refuse
-    ).train()
+    train_stages([stage], scene_of(), rasterizer, model=lambda: student)  # nothing trained: it would be refused
     assert stage.teacher.active_sh_degree == 3
     assert not any(p.requires_grad for p in stage.teacher.parameters())
     assert torch.equal(stage.teacher.sh_dc, splats().sh_dc)

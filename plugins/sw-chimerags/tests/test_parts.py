@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 from sw_gaussians.start import gaussians_from_points
+from sw_kit.short_training import train as train_method
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import ConfigError
@@ -15,9 +16,8 @@ from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from splatwizard_core.runs.config import resolve
 from splatwizard_core.scene.dataset import SceneOptions
 from splatwizard_core.scene.loading import load_scene
-from splatwizard_core.streams import stream
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_chimerags.method import ChimeraGS
 
@@ -146,10 +146,7 @@ def test_student_teacher_score_and_coder_of_others_need_names_alone(everybody, s
         return gaussians_from_points(scene.points).requires_grad_(False)
 
     rasterizer = NegotiatedRasterizer(everybody, device="cpu")
-    model = TrainingRun(
-        [first, second], lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(), rasterizer,
-        directory=None, identity={}, trained=trained,
-    ).train().model  # fmt: skip
+    model = train_method(method, scene, rasterizer, stages=[first, second], trained=trained).model
     assert asked == ["theirs"]
     assert torch.equal(model.importance, torch.arange(model.num_rows).float())
     writer = ContainerWriter("chimerags", 1)
@@ -171,11 +168,10 @@ SHORT = {
 def run(plugins, scene, directory=None, stop_after=None):
     method = ChimeraGS(plugins, resolve(ChimeraGS, "quick", sets=SHORT, plugins=plugins).config)
     teacher = gaussians_from_points(scene.points).requires_grad_(False)
-    model = TrainingRun(
-        method.stages(), lambda: method.create_model(scene, stream(0, "init")), scene, PipelineParams(),
-        NegotiatedRasterizer(plugins, device="cpu"), directory=directory, identity={}, trained=lambda name: teacher,
+    model = train_method(
+        method, scene, NegotiatedRasterizer(plugins, device="cpu"), trained=lambda name: teacher, directory=directory,
         stop_after=stop_after,
-    ).train().model  # fmt: skip
+    ).model  # fmt: skip
     return method, model
 
 

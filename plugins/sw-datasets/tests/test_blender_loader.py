@@ -10,7 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
-from splatwizard_core.errors import SceneError
+from splatwizard_core.errors import ConfigError, SceneError
 
 C2W = [[1, 0, 0, 1.0], [0, 0, -1, -4.0], [0, 1, 0, 0.5], [0, 0, 0, 1]]  # at (1, -4, 0.5), looking along +y, z up
 
@@ -112,6 +112,21 @@ def test_without_test_file_the_training_views_are_split(blender_folder, load):
     assert "no transforms_test.json" in scene.warnings[0]
 
 
+def test_a_suffix_in_the_file_is_that_of_a_picture_which_may_have_been_converted(blender_folder, load):
+    root = blender_folder(frame={"file_path": "train/r_1.jpg"}, header={"camera_model": "OPENCV", "k1": 0}, train=1)
+    (root / "train" / "r_0.png").rename(root / "train" / "r_1.webp")
+    (root / "transforms_test.json").unlink()
+    scene = load(root, split="all")
+    assert [view.name for view in scene.train] == ["train/r_1.jpg"]
+    assert scene.train[0].pixels.shape == (4, 10, 20)
+
+
+@pytest.mark.parametrize("count", [-1, 10**12])
+def test_a_number_of_start_points_that_makes_no_sense_is_refused(blender_folder, load, count):
+    with pytest.raises(ConfigError, match=f"init_points is {count}: must be a number of points from 0 to 100,000,000"):
+        load(blender_folder(), init_points=count)
+
+
 def test_resolution_rule_applies(blender_folder, load):
     view = load(blender_folder(), resolution=2).train[0]
     assert view.pixels.shape == (4, 5, 10)
@@ -127,6 +142,10 @@ BROKEN = {
     "3 numbers": ({"matrix": [1, 2, 3]}, r"'train/r_0.png' is not a 4x4 matrix"),
     "missing images": ({"pictures": False}, r"3 of 3 images are missing: 'train/r_0.png'"),
     "distortion": ({"header": {"k1": 0.1}}, r"'train/r_0.png' has lens distortion.*sw data undistort"),
+    "distortion of high order": ({"header": {"k6": 0.1}}, r"'train/r_0.png' has lens distortion"),
+    "fisheye": ({"header": {"camera_model": "OPENCV_FISHEYE"}}, r"'train/r_0.png' is of a camera .*'OPENCV_FISHEYE'"),
+    "fisheye by flag": ({"frame": {"is_fisheye": True}}, r"'train/r_0.png' is of a camera of another kind .is_fisheye"),
+    "model of no name": ({"frame": {"camera_model": [1]}}, r"'train/r_0.png' is of a camera of another kind"),
     "text as number": ({"frame": {"fl_x": "long"}}, r"'fl_x' of image 'train/r_0.png' is 'long', not a number"),
     "angle": ({"header": {"camera_angle_x": 4.0}}, r"camera_angle_x is 4.0, must lie between 0 and pi"),
     "frames": ({"header": {"frames": 3}}, r"'frames' must be a list"),

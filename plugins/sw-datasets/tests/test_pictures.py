@@ -120,6 +120,24 @@ def test_alpha_is_kept_or_left_out(tmp_path, mode):
     np.testing.assert_array_equal(load_picture(path, alpha=False), rgba[..., :3])
 
 
+def test_16_bit_grey_with_a_transparent_value_is_a_picture_without_alpha(tmp_path):
+    path = tmp_path / "a.png"
+    Image.fromarray(RAMP.astype(np.uint16) << 8).save(path, transparency=256)
+    assert picture_header(path) == (8, 6, False)
+    assert load_picture(path).shape == (6, 8, 3)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_palette_with_alpha_becomes_rgb_without_a_warning(tmp_path):
+    path = tmp_path / "a.png"
+    picture = Image.new("P", (4, 3), 1)
+    picture.putpalette([9, 8, 7, 60, 50, 40])
+    picture.save(path, transparency=b"\x80\x00")
+    assert load_picture(path, alpha=False)[0, 0].tolist() == [60, 50, 40]
+    assert load_picture(path)[0, 0].tolist() == [60, 50, 40, 0]
+    assert not load_mask(path, (4, 3)).any()
+
+
 def test_resizing_is_pillows_bicubic_and_an_equal_size_is_untouched(tmp_path):
     rgb = np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
     path = save(tmp_path / "a.png", rgb)

@@ -416,6 +416,14 @@ def test_sog_refuses_to_write_what_it_would_not_read():
     assert decode(encode(scene, "sog")[0]).num_gaussians == 5
 
 
+def test_a_level_that_gzip_does_not_have_is_refused():
+    scene = random_scene(5, 0)
+    for version in (2, 3):
+        with pytest.raises(UserInputError, match=f"'level' is 10; version {version} is gzip, whose levels end at 9: "):
+            encode(scene, "spz", level=10, version=version)
+    assert decode(encode(scene, "spz", level=10, version=4)[0]).num_gaussians == 5
+
+
 def test_options_of_many_values_are_told_by_their_ends():
     with pytest.raises(UserInputError, match=r"'palette' is 0; it may be None, or 1 to 65536$"):
         encode(random_scene(5, 1), "sog", palette=0)

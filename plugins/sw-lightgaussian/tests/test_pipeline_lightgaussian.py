@@ -6,6 +6,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from sw_finetuning.pruning import scores_of
+from sw_kit.short_training import train_stages
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError
@@ -13,7 +14,7 @@ from splatwizard_core.gaussians.model import GaussianModel
 from splatwizard_core.plugins.catalogue import is_ours
 from splatwizard_core.runs.config import apply_overrides
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.stage import CameraIterator
 from sw_lightgaussian.config import LightGaussianConfig
 from sw_lightgaussian.method import LightGaussian
@@ -32,12 +33,11 @@ def train(plugins, rasterizer, toy):
         values = {**SHORT, **{key.replace("__", "."): value for key, value in values.items()}}
         method = LightGaussian(plugins, apply_overrides(LightGaussianConfig(), values, source="test"))
         stages = list(method.stages())
-        outcome = TrainingRun(
-            stages if only is None else stages[only : only + 1],
-            lambda: copy.deepcopy(start).requires_grad_(True), toy.scene, PipelineParams(checkpoint_every=5),
-            rasterizer, directory=directory, identity={}, trained={"3dgs": teacher or toy.truth}.__getitem__,
-            stop_after=stop_after, on_step=on_step,
-        ).train()  # fmt: skip
+        outcome = train_stages(
+            stages if only is None else stages[only : only + 1], toy.scene, rasterizer,
+            model=lambda: copy.deepcopy(start).requires_grad_(True), trained={"3dgs": teacher or toy.truth}.__getitem__,
+            checkpoint_every=5, directory=directory, stop_after=stop_after, on_step=on_step,
+        )  # fmt: skip
         return method, outcome.model
 
     return run

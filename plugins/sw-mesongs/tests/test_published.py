@@ -1,5 +1,7 @@
 """The authors' values by scene, family and configuration; presets and rate points that ask for them."""
 
+from types import SimpleNamespace
+
 import pytest
 
 from splatwizard_core.runs.config import resolve
@@ -58,16 +60,27 @@ def test_the_factor_is_applied_twice_below_one_as_in_the_authors_set_up():
     assert published("chair", "auto", "c1").lr_factor == 1.6
 
 
+def stage_of(plugins, scene, rate="r4", sets=None):
+    """Return the stage once it has begun on a scene of that name."""
+    (stage,) = MesonGS(plugins, resolve(MesonGS, "paper", rate, sets=sets or {}).config).stages()
+    stage.values = stage.looked_up(SimpleNamespace(name=scene))
+    return stage
+
+
 def test_values_in_force_are_those_of_the_scene_where_the_configuration_leaves_them_open(plugins):
-    sets = {"codec.settings.blocks": 7, "prune.settings.beta": 0.3}
-    (stage,) = MesonGS(plugins, resolve(MesonGS, "paper", "r2", sets=sets).config).stages()
-    stage.values = published("kitchen", "auto", "c3")
+    stage = stage_of(plugins, "kitchen", "r2", {"codec.settings.blocks": 7, "prune.settings.beta": 0.3})
     assert stage.in_force() == {
         "prune.tau": 0.24, "prune.settings.beta": 0.3, "codec.settings.depth": 19, "codec.settings.blocks": 7,
         "codec.settings.codebook_size": 8192, "lr.factor": pytest.approx(0.16),
     }  # fmt: skip
-    (stage,) = MesonGS(plugins, resolve(MesonGS, "paper", sets={"prune": "opacity"}).config).stages()
-    assert stage.in_force()["prune.settings.beta"] == 0.1  # of the importance that weighs the colours
+    # Of the importance that weighs the colours, whoever prunes.
+    assert stage_of(plugins, "fox", sets={"prune": "opacity"}).in_force()["prune.settings.beta"] == 0.1
+
+
+def test_only_what_the_configuration_leaves_open_is_looked_up(plugins):
+    stage = stage_of(plugins, "kitchen", "r2", {"codec.settings.blocks": 7, "prune.settings.beta": 0.3, "lr.factor": 0})
+    assert stage.values == {"prune.tau": 0.24, "codec.settings.depth": 19, "codec.settings.codebook_size": 8192}
+    assert list(stage.looked_up(None)) == list(stage.values)  # without a scene the keys are known
 
 
 @pytest.mark.parametrize("preset", MesonGS.PRESETS)

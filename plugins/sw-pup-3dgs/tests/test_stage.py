@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from sw_kit.short_training import firings, train_stages
 
 from splatwizard_core.errors import ConfigError, EmptyModel, SceneError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -14,7 +15,7 @@ from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_pup_3dgs.config import Pup3DGSConfig
 from sw_pup_3dgs.method import Pup3DGS
@@ -36,12 +37,6 @@ def config_of(**values):
 
 def stage_of(**values) -> PupStage:
     return PupStage(config_of(**values), load_plugins())
-
-
-def fires(stage):
-    """Name of each task -> the steps at which it runs."""
-    pre, post = build_schedulers(stage, PipelineParams())
-    return {r.name: list(r.fires_in(0, stage.iterations)) for r in (*pre.registrations, *post.registrations)}
 
 
 def toy_model(n=200, seed=0):
@@ -72,12 +67,8 @@ def scene(rasterizer):
     return Scene("toy", made, made[:1], None, Protocol("test"))
 
 
-def trained(stage, model, scene, rasterizer, on_step=None, directory=None, stop_after=None):
-    return TrainingRun(
-        [stage], lambda: pytest.fail("it starts from a trained scene"), scene, PipelineParams(), rasterizer,
-        directory=directory, identity={}, trained=lambda name: {"3dgs": model}[name], on_step=on_step,
-        stop_after=stop_after,
-    ).train().model  # fmt: skip
+def trained(stage, model, scene, rasterizer, **options):
+    return train_stages([stage], scene, rasterizer, trained={"3dgs": model}.__getitem__, **options).model
 
 
 def test_the_plan_is_the_papers():
@@ -86,13 +77,13 @@ def test_the_plan_is_the_papers():
 
 
 def test_it_removes_at_the_first_step_of_each_round_and_sets_the_rates_at_every_step():
-    calendar = fires(stage_of())
+    calendar = firings(stage_of())
     assert calendar == {"start round": [1, 5001], "PUP prune": [1, 5001], "update lr": list(range(1, 10_001))}
 
 
 def test_a_scaled_plan_and_one_that_is_too_short():
     stage = stage_of(iterations=1000, scale_schedule=True)
-    assert fires(stage)["PUP prune"] == [1, 500]
+    assert firings(stage)["PUP prune"] == [1, 500]
     assert dict(stage.removals()) == {1: 0.8, 500: 0.5}
     with pytest.raises(ConfigError, match="too close together"):
         stage_of(iterations=1, scale_schedule=True)
@@ -136,7 +127,7 @@ def test_the_preset_of_the_splatwizard_paper_holds_the_rates_constant(scene):
 def test_every_preset_resolves_at_every_rate_point(preset, rate):
     config = resolve(Pup3DGS, preset, rate).config
     assert config.prune.fractions == Pup3DGS.RATES[rate]["prune.fractions"]
-    assert len(fires(PupStage(config, load_plugins()))["PUP prune"]) == 2
+    assert len(firings(PupStage(config, load_plugins()))["PUP prune"]) == 2
 
 
 def test_rate_points_remove_what_the_readme_says():
@@ -261,7 +252,7 @@ def test_any_pruner_serves_with_the_same_counts(scene, rasterizer, pruner):
 def test_a_pruner_that_reads_statistics_waits_until_it_has_some():
     if "trimming-the-fat" not in load_plugins().pruners:
         pytest.skip("no pruner that reads statistics is installed")
-    calendar = fires(stage_of(prune__pruner="trimming-the-fat"))
+    calendar = firings(stage_of(prune__pruner="trimming-the-fat"))
     assert calendar["prune by trimming-the-fat"] == [100, 5001]
     assert calendar["collect gradient statistics"] == [*range(1, 100), *range(4902, 5001)]
     assert calendar["clear gradient statistics"] == [1, 4902]
@@ -271,11 +262,11 @@ def test_a_pruner_that_reads_statistics_waits_until_it_has_some():
 def test_statistics_of_two_close_removals_do_not_mix():
     if "trimming-the-fat" not in load_plugins().pruners:
         pytest.skip("no pruner that reads statistics is installed")
-    calendar = fires(stage_of(prune__pruner="trimming-the-fat", prune__steps=[1, 150]))
+    calendar = firings(stage_of(prune__pruner="trimming-the-fat", prune__steps=[1, 150]))
     assert calendar["prune by trimming-the-fat"] == [100, 150]
     assert calendar["clear gradient statistics"] == [1, 101]  # not at 51, within the window of the first
     assert calendar["collect gradient statistics"] == [*range(1, 100), *range(101, 150)]
-    next_step = fires(stage_of(prune__pruner="trimming-the-fat", prune__steps=[1, 101]))
+    next_step = firings(stage_of(prune__pruner="trimming-the-fat", prune__steps=[1, 101]))
     assert next_step["clear gradient statistics"] == [1, 101]
     assert next_step["collect gradient statistics"] == [*range(1, 100), 101]
 
@@ -283,7 +274,7 @@ def test_statistics_of_two_close_removals_do_not_mix():
 def test_the_window_of_statistics_is_scaled_with_the_plan():
     if "trimming-the-fat" not in load_plugins().pruners:
         pytest.skip("no pruner that reads statistics is installed")
-    calendar = fires(stage_of(prune__pruner="trimming-the-fat", iterations=1000, scale_schedule=True))
+    calendar = firings(stage_of(prune__pruner="trimming-the-fat", iterations=1000, scale_schedule=True))
     assert calendar["prune by trimming-the-fat"] == [11, 500]
     assert calendar["collect gradient statistics"] == [*range(1, 11), *range(490, 500)]
 
@@ -293,4 +284,4 @@ def test_a_removal_that_would_wait_beyond_the_end_is_told():
         pytest.skip("no pruner that reads statistics is installed")
     with pytest.raises(ConfigError, match=r"at step 100, after 99 steps .* ends at step 50: lower prune\.window"):
         stage_of(prune__pruner="trimming-the-fat", iterations=50)
-    assert fires(stage_of(iterations=50))["PUP prune"] == [1]  # one round, as published beside the two
+    assert firings(stage_of(iterations=50))["PUP prune"] == [1]  # one round, as published beside the two

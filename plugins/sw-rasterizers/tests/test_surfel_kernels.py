@@ -9,6 +9,7 @@ import pytest
 import torch
 from sw_reference.projection import rotation_matrices
 from sw_reference.rasterizer import ReferenceRasterizer
+from sw_reference.surfels import warn_of_low_pass
 from sw_reference.testing.raster_gradients import (
     GRADIENT_CASES,
     applies,
@@ -264,6 +265,19 @@ def test_what_is_not_offered_is_refused(options, changes, message):
     g, cam = draw_scene(replace(MANY, n=20), 1, torch.float32)
     with pytest.raises(CapabilityError, match=message):
         SurfelRasterizer().render(replace(g, **changes), cam, options)
+
+
+@pytest.mark.parametrize("rasterizer", [SurfelRasterizer, ReferenceRasterizer])
+def test_a_low_pass_that_surfels_do_not_have_is_told_once(rasterizer, caplog):
+    warn_of_low_pass.cache_clear()
+    g, cam = draw_scene(replace(MANY, n=20), 1, torch.float32)
+    plain = rasterizer().render(g, cam, RasterOptions()).image
+    assert not caplog.records
+    for _ in range(2):
+        assert torch.equal(rasterizer().render(g, cam, RasterOptions(eps2d=2.0)).image, plain)
+    assert [r.getMessage() for r in caplog.records] == [
+        "eps2d = 2 has no effect on surfels, which have a low-pass of their own"
+    ]
 
 
 def test_the_ops_read_no_further_than_there_is():

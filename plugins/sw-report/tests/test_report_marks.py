@@ -8,7 +8,7 @@ from sw_report.aggregate import dataset_tables
 from sw_report.commands import command_of, commands_table
 from sw_report.looks import looks_of
 from sw_report.plots import mean_charts, section_bars
-from sw_report.results_tables import cost_table, runs_table
+from sw_report.results_tables import config_table, cost_table, runs_table
 from sw_report.runs import collect
 
 
@@ -88,6 +88,16 @@ def test_the_command_of_each_run_can_be_given_again(make_run, tmp_path):
     (directory / "config.toml").write_text("damaged")
     assert "--scene garden " in command_of(run)
     assert texts(commands_table([run])) == [["toy r1", command_of(run)]]
+
+
+def test_a_value_that_was_looked_up_stands_in_place_of_the_open_one(make_run, tmp_path):
+    config = {"config": {"depth": None, "blocks": 7, "cap": None}, "provenance": {"blocks": "--set"}}
+    plan = [{"stage": "toy", "iterations": 3, "tasks": [], "looked_up": {"depth": 14, "blocks": 66}}]
+    make_run(change=lambda c: c.update(config=config, plan=plan))
+    (run,) = collect([tmp_path]).runs
+    assert texts(config_table(run.facts)) == [
+        ["depth", "14", "looked up for the scene"], ["blocks", "7", "--set"], ["cap", "none", "default"],
+    ]  # fmt: skip
 
 
 def test_a_record_without_a_configuration_has_no_command(make_run, tmp_path):

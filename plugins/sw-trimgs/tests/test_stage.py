@@ -4,6 +4,8 @@ import copy
 
 import pytest
 import torch
+from sw_kit.short_training import firings, train_stages
+from sw_kit.short_training import train as train_method
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, SceneError
@@ -11,7 +13,7 @@ from splatwizard_core.rendering.rasterizer import RasterOptions
 from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from sw_trimgs.config import Trim3DGSConfig
 from sw_trimgs.flat import FlatGaussians, flattened
@@ -43,11 +45,11 @@ def configured(plugins, **values):
 def train(plugins, rasterizer, toy):
     def run(directory=None, stop_after=None, on_step=None, start=None, **values):
         method = configured(plugins, **values)
-        outcome = TrainingRun(
-            list(method.stages()), lambda: None, toy.scene, PipelineParams(checkpoint_every=5), rasterizer,
-            directory=directory, identity={}, trained=lambda name: copy.deepcopy(start or toy.truth),
-            stop_after=stop_after, on_step=on_step,
-        ).train()  # fmt: skip
+        outcome = train_stages(
+            method.stages(), toy.scene, rasterizer, checkpoint_every=5,
+            trained=lambda name: copy.deepcopy(start or toy.truth), directory=directory, stop_after=stop_after,
+            on_step=on_step,
+        )  # fmt: skip
         return method, outcome.model
 
     return run
@@ -74,28 +76,23 @@ def stage_of(plugins, preset="paper", **values):
     return stage
 
 
-def fires(stage):
-    pre, post = build_schedulers(stage, PipelineParams())
-    return {r.name: list(r.fires_in(0, stage.iterations)) for r in (*pre.registrations, *post.registrations)}
-
-
 def test_the_plan_is_the_published_one(plugins):
     stage = stage_of(plugins)
     pre, post = build_schedulers(stage, PipelineParams())
     assert format_plan(pre, post, total=stage.iterations) == PLAN
     assert (stage.iterations, stage.starts_from) == (7000, "flat-3dgs")
-    calendar = fires(stage)
+    calendar = firings(stage)
     assert calendar["trim"] == list(range(1500, 7000, 500))
     assert calendar["reset opacity"] == [3000, 6000]
     assert calendar["scale split"] == list(range(100, 7000, 100))
 
 
 def test_the_presets_are_the_authors_scripts(plugins):
-    dtu = fires(stage_of(plugins, "dtu"))
+    dtu = firings(stage_of(plugins, "dtu"))
     assert dtu["draw normals"] == list(range(5001, 7001))
     assert dtu["prune and densify"] == dtu["scale split"] == list(range(100, 7000, 100))
     assert len(dtu["trim"]) == 11
-    outdoor = fires(stage_of(plugins, "mipnerf360-outdoor"))
+    outdoor = firings(stage_of(plugins, "mipnerf360-outdoor"))
     assert outdoor["trim"] == outdoor["scale split"] == list(range(1000, 7000, 1000))
     assert "reset opacity" not in outdoor
 
@@ -108,11 +105,11 @@ def test_a_trim_comes_after_a_densification_and_before_a_reset(plugins):
 
 
 def test_a_trim_needs_a_densification_at_its_step(plugins):
-    assert fires(stage_of(plugins, densify__interval=1000))["trim"] == list(range(2000, 7000, 1000))
+    assert firings(stage_of(plugins, densify__interval=1000))["trim"] == list(range(2000, 7000, 1000))
 
 
 def test_a_scaled_plan(plugins):
-    calendar = fires(stage_of(plugins, "quick"))
+    calendar = firings(stage_of(plugins, "quick"))
     assert calendar["trim"] == list(range(150, 500, 50))
     assert calendar["draw normals"] == list(range(1, 701))
 
@@ -173,7 +170,7 @@ def test_without_weight_nothing_is_drawn_for_it(train, plugins):
     seen = []
     train(iterations=2, normals__weight=0, on_step=lambda _, record: seen.append(set(record.parts)))
     assert all("normal" not in each for each in seen)
-    assert "draw normals" not in fires(stage_of(plugins, normals__weight=0))
+    assert "draw normals" not in firings(stage_of(plugins, normals__weight=0))
 
 
 def test_training_comes_nearer_to_the_photographs(train, toy):
@@ -245,10 +242,7 @@ def test_flat_3dgs_is_the_3dgs_plan_from_flat_points(plugins, toy, rasterizer):
     method = Flat3DGS(plugins, resolve(Flat3DGS, "paper", sets=sets, plugins=plugins).config)
     points = PointCloud(toy.truth.means, torch.rand(400, 3, generator=torch.Generator().manual_seed(0)))
     scene = Scene("toy", toy.scene.train, toy.scene.test, points, Protocol("toy"))
-    model = TrainingRun(
-        list(method.stages()), lambda: method.create_model(scene, torch.Generator()), scene, PipelineParams(),
-        rasterizer, directory=None, identity={}, trained=lambda name: None,
-    ).train().model  # fmt: skip
+    model = train_method(method, scene, rasterizer).model
     assert isinstance(model, FlatGaussians)
     assert model.num_rows > 400
     stored = model.log_scales[:, 0].detach()

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 from sw_gaussians.surfels import Surface, SurfelModel
+from sw_kit.short_training import firings
+from sw_kit.short_training import train as train_method
 
 from splatwizard_core.coding.container import ContainerReader, ContainerWriter
 from splatwizard_core.errors import BitstreamError, ConfigError, EmptyModel, UserInputError
@@ -14,7 +16,7 @@ from splatwizard_core.runs.config import apply_overrides, resolve
 from splatwizard_core.scene.scene import PointCloud, Protocol, Scene, View
 from splatwizard_core.training.losses import LossPack
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers
 from sw_trimgs.normals import smooth_pixels
 from sw_trimgs.surfel_config import SurfaceTuning, Trim2DGSConfig
@@ -46,19 +48,19 @@ def start(toy):
     return model
 
 
-def run_of(method, scene, rasterizer, trained, directory=None, stop_after=None, on_step=None):
-    return TrainingRun(
-        list(method.stages()), lambda: method.create_model(scene, torch.Generator().manual_seed(0)), scene,
-        PipelineParams(checkpoint_every=5), rasterizer, directory=directory, identity={},
-        trained=lambda name: copy.deepcopy(trained), stop_after=stop_after, on_step=on_step,
-    ).train().model  # fmt: skip
+def run_of(method, scene, rasterizer, trained, **options):
+    return train_method(
+        method, scene, rasterizer, trained=lambda name: copy.deepcopy(trained), checkpoint_every=5, **options
+    ).model
 
 
 @pytest.fixture(scope="module")
 def train(plugins, rasterizer, toy, start):
     def run(directory=None, stop_after=None, on_step=None, **values):
         method = configured(plugins, **values)
-        return method, run_of(method, toy.scene, rasterizer, start, directory, stop_after, on_step)
+        return method, run_of(
+            method, toy.scene, rasterizer, start, directory=directory, stop_after=stop_after, on_step=on_step
+        )
 
     return run
 
@@ -70,8 +72,7 @@ def whole(train):
 
 def fires(method):
     (stage,) = method.stages()
-    pre, post = build_schedulers(stage, PipelineParams())
-    return {r.name: list(r.fires_in(0, stage.iterations)) for r in (*pre.registrations, *post.registrations)}
+    return firings(stage)
 
 
 def preset(plugins, cls, name, **sets):

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from sw_gaussians.statistics import accumulate_statistics
+from sw_kit.short_training import firings, train_stages
 
 from splatwizard_core.errors import ConfigError, SceneError, TaskError
 from splatwizard_core.gaussians.model import GaussianModel
@@ -16,7 +17,7 @@ from splatwizard_core.scene.camera import Camera
 from splatwizard_core.scene.scene import Protocol, Scene, View
 from splatwizard_core.training.optimizer import SplatOptimizer
 from splatwizard_core.training.params import PipelineParams
-from splatwizard_core.training.pipeline import TrainingRun, TrainingStopped
+from splatwizard_core.training.pipeline import TrainingStopped
 from splatwizard_core.training.scheduler import build_schedulers, format_plan
 from splatwizard_core.training.stage import CameraIterator
 from splatwizard_core.training.tasks import TaskContext
@@ -37,12 +38,6 @@ ROWS = ("means", "sh_dc", "sh_rest", "opacity_logits", "log_scales", "quats")
 def stage_of(**values) -> TrimmingStage:
     values = {k.replace("__", "."): v for k, v in values.items()}
     return TrimmingStage(apply_overrides(TrimmingTheFatConfig(), values, source="test"), load_plugins())
-
-
-def fires(stage):
-    """Name of each task -> the steps at which it runs."""
-    pre, post = build_schedulers(stage, PipelineParams())
-    return {r.name: list(r.fires_in(0, stage.iterations)) for r in (*pre.registrations, *post.registrations)}
 
 
 def views_around(count=6, size=64):
@@ -81,11 +76,8 @@ def pictured(model, rasterizer, count=6):
     return Scene("toy", made, made[:1], None, Protocol("test"))
 
 
-def trained(stage, model, scene, rasterizer, directory=None, stop_after=None):
-    return TrainingRun(
-        [stage], lambda: pytest.fail("it starts from a trained scene"), scene, PipelineParams(), rasterizer,
-        directory=directory, identity={}, trained=lambda name: {"3dgs": model}[name], stop_after=stop_after,
-    ).train().model  # fmt: skip
+def trained(stage, model, scene, rasterizer, **options):
+    return train_stages([stage], scene, rasterizer, trained={"3dgs": model}.__getitem__, **options).model
 
 
 def test_the_plan_is_the_papers_table():
@@ -94,7 +86,7 @@ def test_the_plan_is_the_papers_table():
 
 
 def test_it_removes_ten_times_and_looks_at_99_steps():
-    calendar = fires(stage_of())
+    calendar = firings(stage_of())
     assert calendar["gradient aware prune"] == [100, 600, 1100, 1600, 2100, 2600, 3100, 3600, 4100, 4600]
     assert calendar["collect gradient statistics"] == list(range(1, 100))
     assert set(calendar) == {"update lr", "collect gradient statistics", "gradient aware prune"}
@@ -107,7 +99,7 @@ def test_collecting_comes_before_pruning_in_one_step():
 
 
 def test_a_scaled_plan():
-    calendar = fires(stage_of(iterations=1500, scale_schedule=True))
+    calendar = firings(stage_of(iterations=1500, scale_schedule=True))
     assert calendar["gradient aware prune"] == list(range(10, 500, 50))
     assert calendar["collect gradient statistics"] == list(range(1, 10))
 
@@ -116,7 +108,7 @@ def test_a_scaled_plan():
 @pytest.mark.parametrize("refresh", ["once", "every_interval"])
 def test_a_run_of_hardly_any_steps_has_statistics_at_its_first_removal(iterations, refresh):
     stage = stage_of(iterations=iterations, scale_schedule=True, prune__refresh=refresh)
-    calendar = fires(stage)
+    calendar = firings(stage)
     assert calendar["gradient aware prune"][0] == 1
     assert calendar["collect gradient statistics"][0] == 1
     _, post = build_schedulers(stage, PipelineParams())
@@ -133,25 +125,25 @@ def test_a_shortest_run_removes_what_its_one_view_says(rasterizer):
 
 def test_removals_in_successive_steps_have_statistics_of_their_own_and_none_at_all_is_a_plan():
     values = {"prune__refresh": "every_interval", "prune__start": 3, "prune__interval": 1}
-    calendar = fires(stage_of(**values, prune__stop=6))
+    calendar = firings(stage_of(**values, prune__stop=6))
     assert calendar["gradient aware prune"] == [3, 4, 5]
     assert calendar["clear gradient statistics"] == [1, 4, 5]
     assert calendar["collect gradient statistics"] == [1, 2, 4, 5]
-    assert fires(stage_of(**values, prune__stop=0))["gradient aware prune"] == []
+    assert firings(stage_of(**values, prune__stop=0))["gradient aware prune"] == []
 
 
 def test_gradients_may_be_averaged_anew_before_each_removal():
-    calendar = fires(stage_of(prune__refresh="every_interval"))
+    calendar = firings(stage_of(prune__refresh="every_interval"))
     removals = calendar["gradient aware prune"]
     assert calendar["clear gradient statistics"] == [at - 99 for at in removals]
     assert calendar["collect gradient statistics"] == [step for at in removals for step in range(at - 99, at)]
-    close = fires(stage_of(prune__refresh="every_interval", prune__interval=50, prune__stop=300))
+    close = firings(stage_of(prune__refresh="every_interval", prune__interval=50, prune__stop=300))
     assert close["clear gradient statistics"] == [1, 101, 151, 201]  # never before a removal
 
 
 def test_the_authors_flow_reads_what_the_3dgs_training_left():
     stage = TrimmingStage(resolve(TrimmingTheFat, "official").config, load_plugins())
-    calendar = fires(stage)
+    calendar = firings(stage)
     assert "collect gradient statistics" not in calendar
     assert calendar["gradient aware prune"] == list(range(1, 5000, 500))
     model, _ = toy_model()
@@ -178,7 +170,7 @@ def test_the_means_move_at_the_end_of_the_schedule_of_3dgs():
 def test_every_preset_resolves_at_every_rate_point(preset, rate):
     config = resolve(TrimmingTheFat, preset, rate).config
     assert config.prune.level == TrimmingTheFat.RATES[rate]["prune.level"]
-    assert len(fires(TrimmingStage(config, load_plugins()))["gradient aware prune"]) == 10
+    assert len(firings(TrimmingStage(config, load_plugins()))["gradient aware prune"]) == 10
 
 
 def test_rate_points_are_ordered_and_the_default_is_the_published_level():

@@ -47,6 +47,15 @@ def test_decode_all_decodes_every_view_once():
     assert pictures.masks == 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_a_picture_of_one_pixel_is_not_shared_with_whoever_decoded_it():
+    fixed = np.zeros((1, 1, 3), np.uint8)
+    fixed.setflags(write=False)  # as Pillow's are
+    view = View(CAMERA, "a", lambda: fixed)
+    view.pixels.add_(1)
+    assert not fixed.any()
+
+
 def test_checked_pictures_are_not_kept():
     pictures = Pictures(2)
     check_pictures(pictures.views)

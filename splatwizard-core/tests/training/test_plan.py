@@ -11,7 +11,6 @@ from splatwizard_core.training.params import OptimizationParams
 from splatwizard_core.training.plan import (
     check_when,
     describe_when,
-    plan_digest,
     plan_lines,
     plan_rows,
     scaled,
@@ -226,18 +225,18 @@ def test_bound_methods_of_one_object_are_the_same_callable():
     assert ["overlaps" in r for r in plan_rows([], post.registrations)] == [True, True, False]
 
 
-def test_the_digest_sees_names_steps_and_priorities():
-    def digest(when, name="a", priority=0):
+def test_what_identifies_a_plan_has_names_steps_and_priorities():
+    def identity(when, name="a", priority=0):
         s = Scheduler("pre")
         s.register_task(when, noop, name=name, priority=priority)
-        return plan_digest(plan_lines(s.registrations))
+        return plan_lines(s.registrations)
 
-    base = digest([1, 2, 3, 4, 5, 6, 7])
-    assert digest([7, 6, 5, 4, 3, 2, 1]) == base
+    base = identity([1, 2, 3, 4, 5, 6, 7])
+    assert identity([7, 6, 5, 4, 3, 2, 1]) == base
     # The printed form of these is the same.
-    assert digest([1, 2, 3, 4, 5, 6, 8]) != base
-    assert digest([1, 2, 3, 4, 5, 6, 7], name="b") != base
-    assert digest([1, 2, 3, 4, 5, 6, 7], priority=1) != base
+    assert identity([1, 2, 3, 4, 5, 6, 8]) != base
+    assert identity([1, 2, 3, 4, 5, 6, 7], name="b") != base
+    assert identity([1, 2, 3, 4, 5, 6, 7], priority=1) != base
 
 
 def test_a_schedule_is_scaled_only_when_asked():

@@ -16,7 +16,6 @@ from __future__ import annotations
 import ctypes
 import os
 import threading
-import time
 
 from splatwizard_native.core_time import CoreTime, Lap
 
@@ -94,28 +93,40 @@ def openmp_libraries() -> list[str]:
         return sorted(set(paths))
 
 
+class Watch:
+    """A thread that looks again and again whether this process gets its cores, and has OpenMP wait accordingly."""
+
+    def __init__(self) -> None:
+        self._leave = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="core-watch", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """Let OpenMP's threads spin as ever, and end."""
+        self._leave.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        import torch
+
+        clock, judge, sleepers = CoreTime(), Judge(), Sleepers()
+        while not self._leave.wait(INTERVAL):
+            threads = torch.get_num_threads()
+            if not judge.look(clock.lap()):
+                sleepers.go()
+            elif threads > 1:  # one alone waits for nobody
+                sleepers.come(threads)
+        sleepers.go()
+
+
 def watch_cores() -> None:
     """Begin to watch, once in a process, if there is something to watch and nobody has forbidden it."""
-    global _watcher
+    global _watch
     forbidden = os.environ.get("SPLATWIZARD_SHARE_CORES", "1").strip().lower() in ("0", "off", "no", "false")
-    if _watcher is not None or forbidden or any(os.environ.get(name) for name in SETTINGS):
+    if _watch is not None or forbidden or any(os.environ.get(name) for name in SETTINGS):
         return
     if os.path.exists("/proc/self/schedstat") and openmp_libraries():
-        _watcher = threading.Thread(target=_watch, name="core-watch", daemon=True)
-        _watcher.start()
+        _watch = Watch()
 
 
-_watcher: threading.Thread | None = None
-
-
-def _watch() -> None:
-    import torch
-
-    clock, judge, sleepers = CoreTime(), Judge(), Sleepers()
-    while True:
-        time.sleep(INTERVAL)
-        threads = torch.get_num_threads()
-        if not judge.look(clock.lap()):
-            sleepers.go()
-        elif threads > 1:  # one alone waits for nobody
-            sleepers.come(threads)
+_watch: Watch | None = None

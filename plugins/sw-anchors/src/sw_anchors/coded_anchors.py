@@ -18,6 +18,7 @@ from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
 from sw_anchors.noisy_values import Noise, Tables, draws, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
+from sw_codecs.entropy.rates import lower_bound
 from sw_codecs.positions.morton import interleave
 from sw_codecs.quantizers.binary import SteMask
 from sw_codecs.quantizers.rounding import SteRound
@@ -70,6 +71,7 @@ class CodedAnchors(AnchorModel):
         noise_factor: float = 1.0,
         sample: float = 0.05,
         smallest_probability: float = 1e-6,
+        scale_floor: float = 0.0,
         **kwargs: Any,
     ) -> None:
         """As AnchorModel, whose other arguments are `kwargs`.
@@ -78,6 +80,8 @@ class CodedAnchors(AnchorModel):
         noise_factor    multiplies the base steps in the phase QUANTIZED
         sample          share of the visible anchors whose rate is computed
         smallest_probability    floor of the probability of a value, in training
+        scale_floor     floor of a predicted deviation in training, quantiser steps; the gradient that would raise one
+                        from below passes. 0: SMALLEST_SCALE, below which there is none
         """
         super().__init__(anchors, features, offsets, log_scales, **kwargs)
         n, k = offsets.shape[:2]
@@ -88,6 +92,7 @@ class CodedAnchors(AnchorModel):
         self.margin: Margin = margin
         self.base_steps, self.noise_factor = base_steps, noise_factor
         self.sample, self.smallest_probability = sample, smallest_probability
+        self.scale_floor = scale_floor
         self._mask, self._round = SteMask(MASK_THRESHOLD), SteRound()
         self._lattice: tuple[tuple[Any, ...], Tensor, Tensor] | None = None
         self._order: tuple[Tensor, Tensor] | None = None
@@ -226,7 +231,8 @@ class CodedAnchors(AnchorModel):
 
     def step_key(self) -> tuple[Any, ...]:
         """Plain values that decide which operators a step of training runs."""
-        return self.phase, self.sample, self.smallest_probability, self.noise_factor, tuple(self.base_steps)
+        rate = self.sample, self.smallest_probability, self.scale_floor
+        return self.phase, *rate, self.noise_factor, tuple(self.base_steps)
 
     def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
         if self.fixed is not None and self.training and torch.is_grad_enabled() and self.features.requires_grad:
@@ -348,6 +354,15 @@ class CodedAnchors(AnchorModel):
         taken = take_rows(drawn, forecast.steps, masks, *([] if forecast.hidden is None else [forecast.hidden]))
         return self._rate_of_sample(drawn, (sample, *taken), forecast, kept.index_select(0, drawn), kept.mean())
 
+    def floored(self, scale: Tensor, steps: Tensor) -> Tensor:
+        """Keep predicted deviations [S,C] to `scale_floor`, for quantiser steps [S,C]; differentiable.
+
+        Of a column whose deviations are all at SMALLEST_SCALE no value lies where a gradient would tell: none learns.
+        """
+        if self.scale_floor:
+            return lower_bound(scale, self.scale_floor * steps.detach())
+        return scale.clamp(min=SMALLEST_SCALE)
+
     def rate_of(
         self,
         drawn: Tensor,
@@ -374,6 +389,8 @@ class CodedAnchors(AnchorModel):
         x, step, mask = taken[:3]
         hidden = taken[3] if len(taken) > 3 else None
         mean, scale = forecast.sample(drawn, hidden, x)
+        if self.scale_floor:
+            scale = self.floored(scale, self.widened(step))
         bits, by_group = sample_bits(
             x, mean, scale, step, mask, counted, p_min=self.smallest_probability, smallest_scale=SMALLEST_SCALE
         )

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import Field
+from sw_gaussians.pictures import Pictures
 
 from splatwizard_core.api import OptimizationParams, Params
 
@@ -64,16 +65,6 @@ class AnchorLoss(Params):
     volume: float = Field(0.01, ge=0, description="weight of the mean volume of a drawn Gaussian (product of scales)")
 
 
-class Pictures(Params):
-    """Sizes of the training pictures over time."""
-
-    schedule: Literal["none", "dash"] = Field(
-        "none", description="dash: begin with small pictures, whole ones from growth.stop on (DashGaussian)"
-    )
-    rounding: Literal["real", "floor"] = Field("real", description="scales: real: any; floor: whole ones, as published")
-    start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
-
-
 class AnchorParams(OptimizationParams):
     """Hyper-parameters of a method on anchors, to be subclassed."""
 
@@ -88,10 +79,7 @@ class AnchorParams(OptimizationParams):
 
     def identity(self) -> dict[str, Any]:
         """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
-        content = super().identity()
-        if self.pictures == Pictures():
-            del content["pictures"]
-        return content
+        return self.pictures.identity_in(super().identity())
 
 
 class CodedAnchorParams(AnchorParams):

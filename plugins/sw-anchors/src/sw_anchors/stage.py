@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from sw_gaussians.learning_rate import exponential_lr
-from sw_gaussians.resolution import by_resolution
 
 from splatwizard_core.api import (
     LossPack,
@@ -56,6 +55,7 @@ class AnchorStage(Stage):
 
     def __init__(self, opt: AnchorParams) -> None:
         super().__init__(opt)
+        opt.pictures.check()
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
     def at(self, step: int) -> int:
@@ -75,16 +75,13 @@ class AnchorStage(Stage):
     # Optimizer
 
     def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
-        sampler, pictures, growth = super().create_sampler(scene, generator), self.opt.pictures, self.opt.growth
-        if pictures.schedule == "none":
-            return sampler
-        return by_resolution(
-            sampler,
+        return self.opt.pictures.sampler(
+            super().create_sampler(scene, generator),
             scene,
-            full_at=self.at(growth.stop),
-            rounds=[step for steps in self.adjustments for step in steps],
-            most=pictures.start,
-            rounding=pictures.rounding,
+            self,
+            growth=[step for steps in self.adjustments for step in steps],
+            growth_stop=self.opt.growth.stop,
+            every=self.opt.growth.interval,
         )
 
     def decay(self, step: int, init: float, final: float, *, max_steps: int | None = None) -> float:

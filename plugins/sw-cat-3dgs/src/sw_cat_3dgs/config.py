@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 from sw_anchors.lattice import Margin
@@ -84,6 +84,13 @@ class RateTerm(Params):
     )
     mask_floor: float = Field(1e-3, ge=0, description="least weight of the mean sigmoid of the mask logits")
     mask_factor: float = Field(0.3, ge=0, description="that weight over lambda_ * scale, where it is more")
+    scale_floor: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="least deviation of a number in training, in its steps; 0.05: that of the coder, with a gradient "
+        "from below; 0: 1e-9 as published, where a column that starts below 0 for all anchors never learns",
+    )
     view_factor: float = Field(1.0, gt=0, description="weight of a mask of an anchor seen as often as the average one")
 
     @property
@@ -136,6 +143,13 @@ class CatConfig(Choosing, CodedAnchorParams):
     context: Context = Field(Context(), description="the models that predict attributes")
     rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what writes the file")
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values, `rate_term.scale_floor` only where there is one: trainings of before it are found."""
+        content = super().identity()
+        if not self.rate_term.scale_floor:
+            del content["rate_term"]["scale_floor"]
+        return content
 
     @property
     def margin(self) -> Margin:

@@ -49,7 +49,7 @@ class Cat3DGS(Method):
         return CatAnchors.from_points(
             scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets, feature_dim=config.feature_dim,
             hidden=config.hidden, generator=generator, margin=config.margin, sample=config.rate_term.sample,
-            view_factor=config.rate_term.view_factor, context=context,
+            view_factor=config.rate_term.view_factor, scale_floor=config.rate_term.scale_floor, context=context,
         )  # fmt: skip
 
     def shape(self) -> ContextShape:

@@ -62,6 +62,11 @@ def test_below_the_bound_the_gradient_passes_only_where_descent_raises_p():
     p.grad = None
     rates.lower_bound(p, 1e-6, grad_below_bound=False).backward(f64(3.0, -1.0, 1.0))
     assert p.grad.tolist() == [3.0, 0.0, 0.0]
+    p.grad = None
+    found = rates.lower_bound(p, f64(0.1, 0.2, 0.7))  # a bound for each
+    found.backward(f64(3.0, -1.0, 1.0))
+    assert found.tolist() == [0.5, 0.2, 0.7]
+    assert p.grad.tolist() == [3.0, -1.0, 0.0]
 
 
 def test_an_outlier_is_pulled_towards_the_mean():

@@ -1,11 +1,12 @@
 """Hyper-parameters of Compact3DGS. Defaults are those of the authors' code for real scenes."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from sw_gaussians.choices import Choosing, OwnCodec
 from sw_gaussians.config import Densify, GaussianTraining, Loss
 from sw_gaussians.config import LearningRates as GaussianRates
+from sw_gaussians.pictures import Pictures
 
 from splatwizard_core.api import OptimizationParams, Params
 
@@ -90,6 +91,7 @@ class Compact3DGSConfig(Choosing, OptimizationParams):
     lr: LearningRates = Field(LearningRates(), description="step sizes of the Gaussians")
     densify: Densify = Field(Densify(), description="adaptive density control")
     loss: Loss = Field(Loss(), description="photometric loss")
+    pictures: Pictures = Field(Pictures(), description="sizes of the training pictures")
     mask: Mask = Field(Mask(), description="the volume mask")
     grid: Grid = Field(Grid(), description="hash grid")
     network: Network = Field(Network(), description="network behind the grid")
@@ -106,3 +108,7 @@ class Compact3DGSConfig(Choosing, OptimizationParams):
             densify=self.densify,
             loss=self.loss,
         )
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values but those of `pictures` where it is off: trainings of before it existed are found."""
+        return self.pictures.identity_in(super().identity())

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable
 
+import torch
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.volume_mask import VolumeMaskedGaussians, mask_prune, prune_by_mask
 from torch import Tensor
 
 from splatwizard_core.api import (
+    CameraSampler,
     LossPack,
     OptimizationParams,
     ParamGroup,
@@ -55,8 +57,19 @@ class Compact3DGSStage(ThreeDGSStage):
 
     def __init__(self, opt: Compact3DGSConfig) -> None:
         super().__init__(opt.base)
+        opt.pictures.check()
         self.opt = opt
         self.own = opt
+
+    def create_sampler(self, scene: Scene, generator: torch.Generator) -> CameraSampler:
+        return self.own.pictures.sampler(
+            super().create_sampler(scene, generator),
+            scene,
+            self,
+            growth=self.densifications,
+            growth_stop=self.own.densify.stop,
+            every=self.own.densify.interval,
+        )
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
         lr, own = self.own.lr, self.own

@@ -193,7 +193,9 @@ def _opened(path: Path, complaint: str) -> Iterator[Image.Image]:
 
 
 def _has_alpha(picture: Image.Image) -> bool:
-    return picture.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in picture.info
+    # The one transparent value that 16-bit grey may name is lost when it becomes 8 bit.
+    keyed = "transparency" in picture.info and not picture.mode.startswith("I")
+    return picture.mode in ("RGBA", "LA", "PA", "RGBa", "La") or keyed
 
 
 def _to_8bit(picture: Image.Image, *, keep_alpha: bool = False) -> Image.Image:
@@ -204,4 +206,7 @@ def _to_8bit(picture: Image.Image, *, keep_alpha: bool = False) -> Image.Image:
         values = np.nan_to_num(np.asarray(picture).astype(np.float64))
         values = values * 255 if picture.mode == "F" else values / 256
         return Image.fromarray(np.clip(values, 0, 255).astype(np.uint8)).convert("RGB")
-    return picture.convert("RGBA" if keep_alpha and _has_alpha(picture) else "RGB")
+    if not _has_alpha(picture):
+        return picture.convert("RGB")
+    with_alpha = picture.convert("RGBA")  # also on the way to RGB: Pillow warns of palettes that lose their alpha
+    return with_alpha if keep_alpha else with_alpha.convert("RGB")

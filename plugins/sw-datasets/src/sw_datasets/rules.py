@@ -8,6 +8,8 @@ from dataclasses import dataclass, fields
 from splatwizard_core.api import ConfigError, Protocol, SceneOptions
 from sw_datasets.families import PROTOCOLS, Family
 
+MOST_POINTS = 100_000_000  # random start points: 2.4 GB
+
 
 @dataclass(frozen=True)
 class Rules:
@@ -68,8 +70,14 @@ def rules_for(family: Family, folder: str, options: SceneOptions) -> Rules:
 
     folder  name of the scene's folder
 
-    Raises ConfigError for two splits at once, and for a picture folder where there is none to choose.
+    Raises ConfigError for two splits at once, for a picture folder where there is none to choose, and for a number of
+    start points that makes no sense.
     """
+    if not 0 <= options.init_points <= MOST_POINTS:
+        raise ConfigError(
+            f"init_points is {options.init_points}: must be a number of points from 0 to {MOST_POINTS:,}",
+            key="init_points",
+        )
     if options.split is not None and options.test_every is not None and options.split != f"every{options.test_every}":
         raise ConfigError(
             f"split = {options.split} contradicts test_every = {options.test_every}: give one of them", key="split"

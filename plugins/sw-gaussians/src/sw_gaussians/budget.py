@@ -59,6 +59,7 @@ def densify_to_budget(
     min_opacity: float = 0.005,
     prune_unused: bool = True,
     morton: bool = False,
+    wanted: Tensor | None = None,
 ) -> DensityReport:
     """Prune what is not needed, and give as many Gaussians a neighbour as the budget and the evidence allow.
 
@@ -72,6 +73,8 @@ def densify_to_budget(
     min_opacity     Gaussians fainter than this are pruned
     prune_unused    also prune those that no fragment of all views was drawn from, though they were in view
     morton          put the rows in Morton order of the means
+    wanted          [N] bool: only these may get a neighbour, and only they count for `growth` (`veto.ViewEvidence`);
+                    None: all
 
     Order of rows otherwise: survivors, copies, children. Statistics start again at zero.
     Raises EmptyModel if nothing is left, ValueError for a score that is none, or whose buffer the model lacks.
@@ -96,12 +99,16 @@ def densify_to_budget(
     pruned = int(doomed.sum())
     if pruned == n:
         raise EmptyModel(step)
+    barred = doomed if wanted is None else doomed | ~wanted
     count = max(target - n, 1) + pruned
     if growth > 0:
-        count = min(count, round(growth * int((mean_gradient >= grad_threshold).sum())))
-    count = min(count, n - pruned)
-    picks = draw_distinct(scores.masked_fill(doomed, 0.0), count, model.next_split_generator())
-    picks = picks[~doomed[picks]]
+        evidence = mean_gradient >= grad_threshold
+        if wanted is not None:
+            evidence &= wanted
+        count = min(count, round(growth * int(evidence.sum())))
+    count = min(count, n - int(barred.sum()))
+    picks = draw_distinct(scores.masked_fill(barred, 0.0), count, model.next_split_generator())
+    picks = picks[~barred[picks]]
     is_small = model.scales[picks].amax(dim=1) <= percent_dense * extent
     copied, parents = picks[is_small], picks[~is_small]
     children = split_children(model, parents, 1, shrink=CHILD_SHRINK)

@@ -19,6 +19,26 @@ PENDING = "pending"
 """Key of a parameter's state: the sum of the gradients since its last update, of the parameter's shape."""
 
 
+@torch.no_grad()
+def gather(optimizer: SplatOptimizer, names: Iterable[str], *, update: bool) -> None:
+    """Add to the gradients of parameters what was kept of earlier steps; without an update keep the sums, too."""
+    for name in names:
+        param = optimizer.model.get_parameter(name)
+        gradient, state = param.grad, optimizer.states.get(name)
+        if gradient is None:
+            continue
+        kept = None if state is None else state.tensors.pop(PENDING, None)
+        if kept is not None:
+            gradient = kept.add_(gradient)
+        if update:
+            param.grad = gradient
+            continue
+        param.grad = None
+        if state is None:
+            state = optimizer.fresh_state(name, param)
+        state.tensors[PENDING] = gradient
+
+
 class CadencedOptimizer(SplatOptimizer):
     """Updates `slow` parameters at every `every`-th update of the parameter `pace`; in between their gradients add up.
 
@@ -44,26 +64,8 @@ class CadencedOptimizer(SplatOptimizer):
         """Each parameter that is updated now, as `SplatOptimizer.due`."""
         pace = self.states.get(self.pace)
         # This update of `pace` is the next one: nobody has counted it yet.
-        self._gather((0 if pace is None else pace.step) + 1)
+        gather(self, self.slow, update=((0 if pace is None else pace.step) + 1) % self.every == 0)
         yield from super().due()
-
-    @torch.no_grad()
-    def _gather(self, update: int) -> None:
-        for name in self.slow:
-            param = self.model.get_parameter(name)
-            gradient, state = param.grad, self.states.get(name)
-            if gradient is None:
-                continue
-            kept = None if state is None else state.tensors.pop(PENDING, None)
-            if kept is not None:
-                gradient = kept.add_(gradient)
-            if update % self.every == 0:
-                param.grad = gradient
-                continue
-            param.grad = None
-            if state is None:
-                state = self.fresh_state(name, param)
-            state.tensors[PENDING] = gradient
 
 
 class SparseCadencedOptimizer(CadencedOptimizer, SparseSplatOptimizer):

@@ -109,6 +109,29 @@ class Fast(Params):
     rates: Literal["given", "length"] = Field(
         "given", description="length: lr.position_final and lr.sh_rest, unless given, are raised by how short a run is"
     )
+    veto_views: int = Field(
+        0, ge=0, description="views whose badly drawn pixels say what may get company (FastGS: 10); 0: no veto"
+    )
+    veto_pixels: float = Field(5.0, ge=0, description="with the veto: in more of them a view than this, on average")
+    late_prune: bool = Field(
+        False, description="at 0.6, 0.7 and 0.8 of the full plan remove what is faint, or what 10 views blame (FastGS)"
+    )
+    late_views: int = Field(
+        1, ge=1, description="views whose summed gradients make one update, from densify.stop on (FastGS)"
+    )
+    settle: float = Field(
+        1.0,
+        gt=0,
+        le=1,
+        description="all rates but that of the means fall to so much of themselves from densify.stop on",
+    )
+    average: float = Field(
+        0.0, ge=0, lt=1, description="share of the run, at its end and after densify.stop, whose mean the model becomes"
+    )
+
+
+LATER = ("resolution_hold", "veto_views", "veto_pixels", "late_prune", "late_views", "settle", "average")
+"""Keys of `Fast` that came after others: while they are off, trainings of before them have the same identity."""
 
 
 class Loss(Params):
@@ -150,8 +173,9 @@ class GaussianTraining(OptimizationParams):
         """
         content = super().identity()
         del content["fast"]["rates"]
-        if not self.fast.resolution_hold:
-            del content["fast"]["resolution_hold"]
+        for name in LATER:
+            if getattr(self.fast, name) == Fast.model_fields[name].default:
+                del content["fast"][name]
         if self.fast.model_copy(update={"rates": "given"}) == Fast():
             del content["fast"]
         return content

@@ -5,8 +5,19 @@ As those of `tasks`, they change nothing at the last step of a stage: no update 
 
 from typing import Literal
 
-from splatwizard_core.api import GaussianModel, OptimizationParams, Scene, SplatOptimizer, TaskLog
+import torch
+
+from splatwizard_core.api import (
+    EmptyModel,
+    GaussianModel,
+    OptimizationParams,
+    Rasterizer,
+    Scene,
+    SplatOptimizer,
+    TaskLog,
+)
 from sw_gaussians import budget
+from sw_gaussians.veto import ViewEvidence, draw_views, view_evidence
 
 Score = Literal["opacity_variance", "gradient"]
 
@@ -17,6 +28,8 @@ class DensifyToBudget:
     first, last     steps between which the budget rises linearly, from the start points of the scene to `cap`
     interval        steps between two calls; a Gaussian without a fragment is pruned only if that is a whole round of
                     the training views, or nearly
+    veto_views      training views that are drawn for each round: only Gaussians in more than `veto_pixels` of their
+                    badly drawn pixels a view get a neighbour (FastGS, arXiv 2511.04283: 10 views, 5 pixels); 0: no veto
     The other settings are those of `densify_to_budget`. With the default score the model needs the buffer of
     `fragments.add_buffer`. Raises ValueError for settings outside their range.
     Curves: "cloned", "split", "pruned", numbers of Gaussians.
@@ -35,15 +48,23 @@ class DensifyToBudget:
         percent_dense: float = 0.01,
         min_opacity: float = 0.005,
         morton: bool = False,
+        veto_views: int = 0,
+        veto_pixels: float = 5,
     ) -> None:
         if score not in budget.SCORES:
             raise ValueError(f"score '{score}' is none of {', '.join(budget.SCORES)}")
-        for name, value, least in (("cap", cap, 1), ("growth", growth, 0), ("interval", interval, 1)):
+        for name, value, least in (
+            ("cap", cap, 1),
+            ("growth", growth, 0),
+            ("interval", interval, 1),
+            ("veto_views", veto_views, 0),
+        ):
             if value < least:
                 raise ValueError(f"{name} is {value}: it must be at least {least}")
         self.first, self.last, self.interval, self.cap = first, last, interval, cap
         self.growth, self.score, self.grad_threshold = growth, score, grad_threshold
         self.percent_dense, self.min_opacity, self.morton = percent_dense, min_opacity, morton
+        self.veto_views, self.veto_pixels = veto_views, veto_pixels
 
     def __call__(
         self,
@@ -53,15 +74,19 @@ class DensifyToBudget:
         opt: OptimizationParams,
         step: int,
         log: TaskLog,
+        rasterizer: Rasterizer,
     ) -> None:
         if step >= opt.iterations:
             return
+        wanted = None
+        if self.veto_views:
+            wanted = _evidence(model, scene, rasterizer, self.veto_views).wanted(self.veto_pixels)
         start = 0 if scene.points is None else len(scene.points)
         target = budget.linear_target(step, first=self.first, last=self.last, start=start, cap=self.cap)
         report = budget.densify_to_budget(
             model, optimizer, step=step, extent=scene.extent, target=target, growth=self.growth, score=self.score,
             grad_threshold=self.grad_threshold, percent_dense=self.percent_dense, min_opacity=self.min_opacity,
-            prune_unused=1.1 * self.interval >= len(scene.train), morton=self.morton,
+            prune_unused=1.1 * self.interval >= len(scene.train), morton=self.morton, wanted=wanted,
         )  # fmt: skip
         for name in ("cloned", "split", "pruned"):
             log.scalar(name, getattr(report, name))
@@ -76,3 +101,46 @@ class HalveOpacity:
     def __call__(self, model: GaussianModel, optimizer: SplatOptimizer, opt: OptimizationParams, step: int) -> None:
         if step < opt.iterations:
             budget.halve_opacity(model, optimizer, floor=self.floor)
+
+
+class PruneByViews:
+    """Removes Gaussians that are faint, or that several views blame for their badly drawn pixels.
+
+    views           training views that are drawn each time
+    min_opacity     fainter Gaussians go
+    most            those whose share of the blame exceeds this go, 0..1 (`veto.ViewEvidence.guilt`)
+
+    Raises ValueError for less than one view, EmptyModel if nothing is left. Curve: "pruned", a number of Gaussians.
+    Source: FastGS (arXiv 2511.04283), pruning after densification: 10 views, 0.1, 0.9.
+    """
+
+    def __init__(self, *, views: int = 10, min_opacity: float = 0.1, most: float = 0.9) -> None:
+        if views < 1:
+            raise ValueError(f"views is {views}: it must be at least 1")
+        self.views, self.min_opacity, self.most = views, min_opacity, most
+
+    def __call__(
+        self,
+        model: GaussianModel,
+        optimizer: SplatOptimizer,
+        scene: Scene,
+        opt: OptimizationParams,
+        step: int,
+        log: TaskLog,
+        rasterizer: Rasterizer,
+    ) -> None:
+        if step >= opt.iterations:
+            return
+        with torch.no_grad():
+            evidence = _evidence(model, scene, rasterizer, self.views)
+            stays = (model.opacities >= self.min_opacity) & (evidence.guilt() <= self.most)
+            left, before = int(stays.sum()), model.num_rows
+            if left == 0:
+                raise EmptyModel(step)
+            optimizer.keep_rows(model, stays)
+        log.scalar("pruned", before - left)
+
+
+def _evidence(model: GaussianModel, scene: Scene, rasterizer: Rasterizer, count: int) -> ViewEvidence:
+    views = draw_views(scene.train, count, model.next_split_generator())
+    return view_evidence(model, views, rasterizer, scene.background.to(model.device))

@@ -57,5 +57,6 @@ def collect_opacity_gradients(model: GaussianModel, result: RenderResult) -> Non
     if gradient is None:
         return
     sums: Tensor = model.get_buffer(BUFFER)
-    sums[:, 0].add_(gradient / (1 - model.opacities.detach()).clamp_min_(LEAST_CLEAR))  # do/dlogit = o (1 - o)
+    clear = (1 - model.opacities.detach()).clamp_min_(LEAST_CLEAR)
+    sums[:, 0].addcdiv_(gradient, clear)  # do/dlogit = o (1 - o)
     sums[:, 1:].add_(result.fragment_grad.value)

@@ -35,6 +35,16 @@ def register_tasks(registry: Registry) -> None:
                  summary="prune, and grow by a score within a budget (LiteGS)", factory=True)  # fmt: skip
     registry.add("halve-opacity", "sw_gaussians.fast_tasks:HalveOpacity",
                  summary="halve every opacity and let Adam start afresh (LiteGS)", factory=True)  # fmt: skip
+    registry.add("prune-by-views", "sw_gaussians.fast_tasks:PruneByViews",
+                 summary="remove what is faint, or what several views blame for their errors (FastGS)",
+                 factory=True)  # fmt: skip
+    registry.add("sum-views", "sw_gaussians.late_batches:SumViews",
+                 summary="update on the summed gradients of several views (needs late_batches.BatchingOptimizer)",
+                 factory=True)  # fmt: skip
+    registry.add("average-parameters", "sw_gaussians.averaging:AverageParameters",
+                 summary="make a model the mean of itself over the last steps", factory=True)  # fmt: skip
+    registry.add("settle-learning-rates", "sw_gaussians.settling:SettleLearningRates",
+                 summary="let learning rates fall towards the end", factory=True)  # fmt: skip
 
 
 @hookimpl

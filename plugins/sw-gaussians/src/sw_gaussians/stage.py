@@ -19,11 +19,14 @@ from splatwizard_core.api import (
 )
 from sw_gaussians import fast_tasks, fragments, tasks
 from sw_gaussians import mcmc_tasks as mcmc
+from sw_gaussians.averaging import AverageParameters
 from sw_gaussians.cadence import CadencedOptimizer, SparseCadencedOptimizer
 from sw_gaussians.config import GaussianTraining
 from sw_gaussians.fused_adam import FusingOptimizer
+from sw_gaussians.late_batches import BatchingOptimizer, SumViews
 from sw_gaussians.moments import keep_moments
 from sw_gaussians.resolution import ResolutionSampler, by_resolution
+from sw_gaussians.settling import SettleLearningRates
 from sw_gaussians.sparse_adam import SparseSplatOptimizer
 from sw_gaussians.statistics import collect_statistics
 
@@ -46,6 +49,12 @@ if TYPE_CHECKING:
 READERS = (collect_statistics, fragments.collect_opacity_gradients)
 """Tasks that leave all gradients alone, and read none of spherical harmonics."""
 
+LATE_PRUNES = range(18_000, 27_000, 3_000)
+"""Steps of the full plan at which `fast.late_prune` prunes. Source: FastGS (arXiv 2511.04283), and 27,000."""
+
+AVERAGE_EVERY = 10
+"""Steps between two samples of `fast.average`: reading them takes a hundredth of a step."""
+
 
 class ThreeDGSStage(Stage):
     """Adam on six parameter groups, L1 + SSIM, adaptive density control until half time.
@@ -62,6 +71,11 @@ class ThreeDGSStage(Stage):
         if fuses_updates and (opt.sparse_adam != "off" or opt.fast.sh_every > 1):
             raise ConfigError(
                 "fused_updates updates all Gaussians at every step: leave sparse_adam off and fast.sh_every at 1"
+            )
+        if opt.fast.late_views > 1 and (fuses_updates or opt.sparse_adam != "off" or opt.fast.sh_every > 1):
+            raise ConfigError(
+                "fast.late_views sums the gradients of all Gaussians: leave fused_updates and sparse_adam off, and "
+                "fast.sh_every at 1"
             )
         if opt.sparse_adam != "off" and opt.mcmc.enabled:
             raise ConfigError(
@@ -82,6 +96,10 @@ class ThreeDGSStage(Stage):
                 "fast.opacity=halve clears Adam's moments, after which sparse_adam=none makes steps of 3.2 times the "
                 "learning rate: set sparse_adam=per_row or off"
             )
+        if opt.fast.veto_views and not budget:
+            raise ConfigError("fast.veto_views is a veto of the budget's draw: set fast.densify=budget with it")
+        if opt.fast.late_prune and opt.mcmc.enabled:
+            raise ConfigError("mcmc.enabled moves Gaussians instead of pruning them: leave fast.late_prune off")
         self._fragments = budget and opt.fast.score == "opacity_variance"
         if self._fragments and opt.densify.absgrad:
             raise ConfigError("densify.absgrad does not go with fast.score=opacity_variance: set fast.score=gradient")
@@ -136,17 +154,14 @@ class ThreeDGSStage(Stage):
         return self._pictures
 
     def create_optimizer(self, model: SplatModel, scene: Scene) -> SplatOptimizer:
-        lr = self.config.lr
         groups = [
-            ParamGroup("means", lr=lr.position_init * scene.extent),
-            ParamGroup("sh_dc", lr=lr.sh_dc),
-            ParamGroup("sh_rest", lr=lr.sh_rest),
-            ParamGroup("opacity_logits", lr=lr.opacity),
-            ParamGroup("log_scales", lr=lr.scales),
-            ParamGroup("quats", lr=lr.quats),
+            ParamGroup("means", lr=self.config.lr.position_init * scene.extent),
+            *(ParamGroup(name, lr=rate) for name, rate in self._rates().items()),
         ]
         sparse, every = self.config.sparse_adam, self.config.fast.sh_every
-        if sparse == "off":
+        if self.config.fast.late_views > 1:
+            self._optimizer = BatchingOptimizer(model, groups)
+        elif sparse == "off":
             self._optimizer = (
                 CadencedOptimizer(model, groups, every=every) if every > 1 else FusingOptimizer(model, groups)
             )
@@ -187,6 +202,31 @@ class ThreeDGSStage(Stage):
             tasks.increase_sh_degree,
             name="increase SH degree",
         )
+        self._register_end(scheduler)
+
+    def _register_end(self, scheduler: Scheduler) -> None:
+        """Register what is different once the number of Gaussians is settled."""
+        chain, fast = self.config.mcmc, self.config.fast
+        first = self.steps(chain.stop if chain.enabled else self.config.densify.stop)
+        end = range(first, self.iterations + 1)
+        if fast.late_views > 1:
+            scheduler.register_task(end, SumViews(views=fast.late_views, first=first), name="sum views")
+        begin = max(first, round(self.iterations * (1 - fast.average)))
+        if begin < self.iterations:
+            begin += (self.iterations - begin) % AVERAGE_EVERY
+            average = AverageParameters(first=begin, last=self.iterations, every=AVERAGE_EVERY)
+            scheduler.register_task(average.steps, average, name="average parameters")
+        if fast.settle < 1 and first < self.iterations:
+            settle = SettleLearningRates(self._rates(), first=first, last=self.iterations, factor=fast.settle)
+            scheduler.register_task(end, settle, name="settle learning rates")
+
+    def _rates(self) -> dict[str, float]:
+        """Learning rates of the parameters whose rate no task changes but that which lets them settle."""
+        lr = self.config.lr
+        return {
+            "sh_dc": lr.sh_dc, "sh_rest": lr.sh_rest, "opacity_logits": lr.opacity, "log_scales": lr.scales,
+            "quats": lr.quats,
+        }  # fmt: skip
 
     def register_post_task(self, scheduler: Scheduler, ppl: PipelineParams, opt: OptimizationParams) -> None:
         self._post = scheduler
@@ -207,6 +247,8 @@ class ThreeDGSStage(Stage):
             scheduler.register_task(self.densifications, self._densify_to_budget(), name="densify to budget")
         else:
             scheduler.register_task(self.densifications, self.densification(), name="prune and densify")
+        if self.config.fast.late_prune:
+            scheduler.register_task(self.when(LATE_PRUNES), fast_tasks.PruneByViews(), name="prune by views")
         if self.config.fast.opacity == "halve":
             halve = self.when(range(0, densify.stop, densify.reset_interval))
             scheduler.register_task(halve, fast_tasks.HalveOpacity(), name="halve opacity")
@@ -257,6 +299,8 @@ class ThreeDGSStage(Stage):
             percent_dense=densify.percent_dense,
             min_opacity=self.min_opacity(),
             morton=fast.morton,
+            veto_views=fast.veto_views,
+            veto_pixels=fast.veto_pixels,
         )
 
     def _register_mcmc(self, scheduler: Scheduler) -> None:

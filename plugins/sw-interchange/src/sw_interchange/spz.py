@@ -34,7 +34,7 @@ class SpzOptions(Options):
     version         3 is read most widely, 4 is smaller and quicker; 2 has coarse rotations
     fractional_bits of a coordinate; less where the scene is larger than 2^(23 - bits)
     sh1_bits, sh_bits  of a coefficient of band 1, of the others
-    level           of the compressor; None: 3
+    level           of the compressor, 1 to 9 of gzip (version 2 and 3), 1 to 22 of zstd (version 4); None: 3
     frame           "RUB", or "raw": the numbers as they are in a .ply
     antialiased     None: as the scene says
     """
@@ -50,6 +50,14 @@ class SpzOptions(Options):
         "version": (2, 3, 4), "fractional_bits": range(25), "sh1_bits": range(1, 9), "sh_bits": range(1, 9),
         "level": (None, *range(1, 23)), "frame": ("RUB", "raw"), "antialiased": (None, True, False),
     }  # fmt: skip
+
+    def __init__(self, **values: Any) -> None:
+        super().__init__(**values)
+        if self.version < 4 and (self.level or 0) > packing.GZIP_LEVELS:
+            raise UserInputError(
+                f"option 'level' is {self.level}; version {self.version} is gzip, whose levels end at "
+                f"{packing.GZIP_LEVELS}: version=4 is zstd, with levels up to 22"
+            )
 
 
 @dataclass

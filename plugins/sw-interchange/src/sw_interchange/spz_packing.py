@@ -19,6 +19,7 @@ except ImportError:  # no wheel for this machine
 
 BLOCK = 1 << 22
 """Bytes that one thread deflates at a time."""
+GZIP_LEVELS = 9
 _HEAD = b"\x1f\x8b\x08\0\0\0\0\0\0\xff"
 _GZIP = 16 + zlib.MAX_WBITS
 
@@ -38,7 +39,6 @@ def inflate(data: bytes | memoryview, most: int, name: str) -> bytes:
 def deflate(parts: Sequence[bytes | memoryview], level: int) -> list[bytes]:
     """One gzip member of all parts: blocks deflated by two threads, each ended so that the next can follow."""
     content = b"".join(parts)
-    level = min(level, 9)
     blocks = [memoryview(content)[at : at + BLOCK] for at in range(0, len(content), BLOCK)]
 
     def packed(block: memoryview) -> bytes:

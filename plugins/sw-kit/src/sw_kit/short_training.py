@@ -1,6 +1,6 @@
-"""A short training inside a test: of a method, or of some of its stages; the PSNR of what came out, and its file.
+"""A short training inside a test: of a method, or of stages alone; the PSNR of what came out, and its file.
 
-from sw_kit.short_training import demo, file_of, psnr, train
+from sw_kit.short_training import demo, file_of, firings, psnr, train, train_stages
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from splatwizard_core.api import (
     Stage,
     stream,
 )
-from splatwizard_core.tooling import TrainingRun, load_plugins, load_scene
+from splatwizard_core.tooling import TrainingRun, build_schedulers, load_plugins, load_scene
 
 
 class Training(NamedTuple):
@@ -54,28 +54,50 @@ def train(
     *,
     stages: Sequence[Stage] | None = None,
     model: Callable[[], SplatModel] | None = None,
+    seed: int = 0,
+    **options: Any,
+) -> Training:
+    """Train a method, or go on with what `directory` holds.
+
+    stages      those of the method, where None
+    model       makes the model of step 0; None: the method's, drawn from `seed`
+    options     of `train_stages`
+    """
+    made = model or (lambda: method.create_model(scene, stream(seed, "init")))
+    return train_stages(stages or method.stages(), scene, rasterizer, model=made, seed=seed, **options)
+
+
+def train_stages(
+    stages: Sequence[Stage],
+    scene: Scene,
+    rasterizer: Rasterizer,
+    *,
+    model: Callable[[], SplatModel] | None = None,
     trained: Callable[[str], SplatModel] = nothing_trained,
     seed: int = 0,
     checkpoint_every: int | None = None,
     directory: Path | None = None,
     stop_after: int | None = None,
+    on_step: Callable[[Any, Any], None] | None = None,
 ) -> Training:
-    """Train, or go on with what `directory` holds.
+    """Train stages, or go on with what `directory` holds.
 
-    stages      those of the method, where None
-    model       makes the model of step 0; None: the method's, drawn from `seed`
+    model       makes the model of step 0; None: the first stage starts from a trained scene
     trained     (method name) -> a trained model
     stop_after  write a checkpoint after this step and raise TrainingStopped
+    on_step     called after each step with the model and the step's record
     """
     losses: list[dict[str, float]] = []
 
-    def on_step(_: SplatModel, record: Any) -> None:
+    def after_step(found: SplatModel, record: Any) -> None:
         parts = {name: float(part) for name, part in record.parts.items()}
         losses.append({**parts, "total": float(record.total)})
+        if on_step is not None:
+            on_step(found, record)
 
     outcome = TrainingRun(
-        list(method.stages()) if stages is None else stages,
-        model or (lambda: method.create_model(scene, stream(seed, "init"))),
+        list(stages),
+        model or (lambda: nothing_trained("nobody")),
         scene,
         PipelineParams(seed=seed, **({} if checkpoint_every is None else {"checkpoint_every": checkpoint_every})),
         rasterizer,
@@ -83,9 +105,15 @@ def train(
         identity={},
         trained=trained,
         stop_after=stop_after,
-        on_step=on_step,
+        on_step=after_step,
     ).train()
     return Training(outcome.model, losses)
+
+
+def firings(stage: Stage) -> dict[str, list[int]]:
+    """Return for each task of a stage, by name, the steps at which it runs."""
+    pre, post = build_schedulers(stage, PipelineParams())
+    return {each.name: list(each.fires_in(0, stage.iterations)) for each in (*pre.registrations, *post.registrations)}
 
 
 @torch.no_grad()

@@ -24,7 +24,7 @@ from splatwizard_core.api import (
 )
 from sw_codecs.models.raht_gaussians import RahtGaussians
 from sw_mesongs.importance import Importance
-from sw_mesongs.published import Published, published
+from sw_mesongs.published import published
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -55,13 +55,13 @@ class MesonGSStage(Stage):
     def __init__(self, config: MesonGSConfig, pruner: Pruner) -> None:
         super().__init__(config)
         self.config, self.pruner = config, pruner
-        self.values = Published()  # of the scene, once the stage begins
+        self.values = self.looked_up(None)  # of the scene, once the stage begins
 
     def begin(self, context: StageContext) -> SplatModel:
         trained = context.model
         if not isinstance(trained, GaussianModel):
             raise TypeError(f"mesongs compresses a GaussianModel, not a {type(trained).__name__}")
-        self.values = published(context.scene.name, self.config.authors.family, self.config.authors.point)
+        self.values = self.looked_up(context.scene)
         self._rasterizer, self._generator = context.rasterizer, context.generator("method")
         blocks = int(self.in_force()["codec.settings.blocks"])
         model = RahtGaussians.of(trained, bits=self.config.codec.settings.bits, blocks=blocks)
@@ -77,17 +77,33 @@ class MesonGSStage(Stage):
 
     def in_force(self) -> dict[str, float]:
         """Return the values that depend on the scene, by key: those of the configuration, else the published ones."""
-        config, settings, values = self.config, self.config.codec.settings, self.values
-        own, beta = isinstance(self.pruner, Importance), getattr(self.pruner, "beta", None)
+        return {key: self.values[key] if given is None else given for key, given in self._given().items()}
+
+    def looked_up(self, scene: Scene | None) -> dict[str, float]:
+        """Return the published values of a scene, by key, of what the configuration leaves open; None: of any other."""
+        authors = self.config.authors
+        values = published("" if scene is None else scene.name, authors.family, authors.point)
         found = {
-            "prune.tau": (config.prune.tau, values.tau),
-            "prune.settings.beta": (beta if own else None, values.beta),
-            "codec.settings.depth": (settings.depth, values.depth),
-            "codec.settings.blocks": (settings.blocks, values.blocks),
-            "codec.settings.codebook_size": (settings.codebook_size, values.codebook_size),
-            "lr.factor": (config.lr.factor, values.lr_factor),
+            "prune.tau": values.tau,
+            "prune.settings.beta": values.beta,
+            "codec.settings.depth": values.depth,
+            "codec.settings.blocks": values.blocks,
+            "codec.settings.codebook_size": values.codebook_size,
+            "lr.factor": values.lr_factor,
         }
-        return {key: other if given is None else given for key, (given, other) in found.items()}
+        return {key: found[key] for key, given in self._given().items() if given is None}
+
+    def _given(self) -> dict[str, float | None]:
+        """Return what the configuration says of the values that depend on the scene; None: it leaves them open."""
+        config, settings = self.config, self.config.codec.settings
+        return {
+            "prune.tau": config.prune.tau,
+            "prune.settings.beta": self.pruner.beta if isinstance(self.pruner, Importance) else None,
+            "codec.settings.depth": settings.depth,
+            "codec.settings.blocks": settings.blocks,
+            "codec.settings.codebook_size": settings.codebook_size,
+            "lr.factor": config.lr.factor,
+        }
 
     def rates(self, step: int, scene: Scene) -> dict[str, float]:
         """Return the step size of each parameter at a step of this run."""

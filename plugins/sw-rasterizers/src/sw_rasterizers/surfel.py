@@ -52,6 +52,10 @@ class SurfelRasterizer:
     def render(self, g: GaussianInputs, cam: Camera, opt: RasterOptions) -> RenderResult:
         """Draw one view; see the protocol. Raises CapabilityError, ConfigError or ShapeError."""
         self.info.check_request(g, opt)
+        if opt.eps2d != RasterOptions.eps2d:
+            from sw_reference.surfels import warn_of_low_pass  # here: nearly nobody asks for it
+
+            warn_of_low_pass(opt.eps2d)
         call, flags = self._call(g, cam, opt)
         sh = g.sh
         image, radii, alpha, maps = _draw(

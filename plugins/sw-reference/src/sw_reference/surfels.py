@@ -8,6 +8,8 @@ Source: 2D Gaussian Splatting (arXiv 2403.17888).
 
 from __future__ import annotations
 
+import functools
+import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -52,6 +54,7 @@ MIN_EXTENT = 1e-4
 DISTORTION_NEAR, DISTORTION_FAR = 0.2, 100.0
 """World units: depth is mapped to 0..1 between them before the distortion compares it."""
 
+log = logging.getLogger(__name__)
 _SURFELS_ONLY = ("normals", "distortion")
 
 
@@ -94,6 +97,15 @@ def check_ellipsoids(name: str, opt: RasterOptions) -> None:
             f"rasterizer '{name}' draws {' and '.join(asked)} of surfels only: scales must be [N, 2]",
             missing=frozenset(field.upper() for field in asked),
         )
+
+
+@functools.cache
+def warn_of_low_pass(eps2d: float) -> None:
+    """Say, once a process, that surfels are drawn without the low-pass of ellipsoids that was asked for.
+
+    No error: files may ask for it, and are drawn as they were measured.
+    """
+    log.warning("eps2d = %g has no effect on surfels, which have a low-pass of their own", eps2d)
 
 
 def _planes(g: GaussianInputs, rows: Tensor, cam: Camera, modifier: float) -> tuple[Tensor, Tensor]:
@@ -198,6 +210,8 @@ def draw_surfels(
     g: GaussianInputs, cam: Camera, opt: RasterOptions, *, tile: int, classic: bool, pass_clamp: bool
 ) -> RenderResult:
     """Draw one view of surfels; the options are those of the reference rasterizer."""
+    if opt.eps2d != RasterOptions.eps2d:
+        warn_of_low_pass(opt.eps2d)
     p = project_surfels(g, cam, opt)
     order = torch.argsort(p.depth.detach(), stable=True)  # ties by index: rows ascend
     tile = CLASSIC_TILE if classic else tile

@@ -145,6 +145,12 @@ class PhaseFacts(Facts):
         return found
 
 
+class StagePlan(Facts):
+    """Plan of a training stage; of it, the values that were looked up for the scene, by dotted key."""
+
+    looked_up: dict[Text, Any] = {}
+
+
 class RunFacts(Facts):
     """One record. Only method, scene, protocol, metrics and the size of the file are indispensable."""
 
@@ -170,6 +176,7 @@ class RunFacts(Facts):
     memory: MemoryFacts = MemoryFacts()
     train: TrainFacts = TrainFacts()
     geometry: dict[Text, dict[Text, Any]] | None = None
+    plan: list[StagePlan] = []
     rasterizers: dict[Text, dict[Text, Text]] = {}
     phases: list[PhaseFacts] = []
     environment: dict[Text, Any] = {}

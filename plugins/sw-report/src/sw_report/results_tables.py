@@ -362,11 +362,12 @@ def breakdown_table(facts: RunFacts) -> Table | None:
 
 
 def config_table(facts: RunFacts) -> Table | None:
-    """Every configured value of one run, and where it was set."""
+    """Every configured value of one run, and where it was set: for what it leaves open, what was looked up."""
     if not facts.config:
         return None
     provenance = facts.config.get("provenance")
     known = provenance if isinstance(provenance, dict) else {}
+    looked_up = {key: value for stage in facts.plan for key, value in stage.looked_up.items()}
     rows: list[Row] = []
     for block, values in facts.config.items():
         if block == "provenance":
@@ -374,7 +375,10 @@ def config_table(facts: RunFacts) -> Table | None:
         for key, value in _flat(values) if isinstance(values, dict) else [("", values)]:
             name = f"{block}.{key}" if key and block != "config" else key or block
             own = key if block in ("config", "pipeline", "scene") else name
-            rows.append(row([clean(name), plain(value), plain(known.get(own, "default"))]))
+            by = known.get(own, "default")
+            if value is None and block == "config" and key in looked_up:
+                value, by = looked_up[key], "looked up for the scene"
+            rows.append(row([clean(name), plain(value), plain(by)]))
     return Table("Configuration", columns(["key", "value", "set by"], text=["value", "set by"], long=["value"]), rows)
 
 

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None:
     """Print the plan that METHOD executes, stage by stage; needs no data, no device, no training.
 
-    A stage says what trained scene it starts from, and a stage or task of another package which one that is.
+    A stage says what trained scene it starts from and which values are looked up for the scene, and a stage or task of
+    another package which one that is.
     """
     from splatwizard_core.plugins.origins import Origins
     from splatwizard_core.runs.phases import stage_parts
@@ -49,7 +50,8 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
             plan = plan_rows(pre.registrations, post.registrations, total=stage.iterations, verbose=verbose)
             found.append({
                 "stage": stage.name, "iterations": stage.iterations, "starts_from": stage.starts_from, "plan": plan,
-                "taught_by": list(stage.taught_by), "provided_by": stage_parts(origins, stage, resolved.ppl),
+                "taught_by": list(stage.taught_by), "looked_up": list(stage.looked_up(None)),
+                "provided_by": stage_parts(origins, stage, resolved.ppl),
             })  # fmt: skip
             continue
         own = origins.of(stage)
@@ -67,10 +69,11 @@ def schedule(method: str, verbose: bool, as_json: bool, chosen: Choices) -> None
 
 
 def _notes(stage: Stage, method: tuple[str, str], owner: tuple[str, str]) -> list[str]:
-    """Notes beside the plan of a stage: what it starts from, and whose it is if not the method's own."""
+    """Notes beside the plan of a stage: what it starts from, whose it is if not the method's own, what is looked up."""
     notes = {
         f"starts from a trained {stage.starts_from} scene": stage.starts_from is not None,
         f"taught by a trained {' and '.join(stage.taught_by)} scene": bool(stage.taught_by),
         f"of {' '.join(owner)}": owner not in (method, ("", "")),
+        f"looked up for the scene: {', '.join(stage.looked_up(None))}": bool(stage.looked_up(None)),
     }
     return [note for note, holds in notes.items() if holds]

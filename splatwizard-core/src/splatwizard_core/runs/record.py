@@ -225,7 +225,7 @@ class Record(Part):
     memory: MemoryBlock
     train: TrainBlock
     geometry: Annotated[dict[str, dict[str, Any]] | None, WhyNull("not asked for")] = None
-    plan: list[dict[str, Any]] = Field(description="the executed plan: of each stage its name, steps and tasks")
+    plan: list[dict[str, Any]] = Field(description="of each stage its name, steps, tasks, and `looked_up`")
     rasterizers: dict[str, dict[str, str]] = Field(description="phase -> features asked for -> who served them")
     raster_options: dict[str, dict[str, Any]] = Field(
         {}, description="phase -> options of drawing that are not the defaults: profile, antialias, eps2d, clamp_color"

@@ -35,7 +35,7 @@ class View:
         """uint8 [3,H,W] or [4,H,W] (RGBA, straight alpha), host memory, decoded once."""
         if self.load is None:
             raise ValueError(f"view '{self.name}' has no picture")
-        return torch.from_numpy(np.ascontiguousarray(self.load().transpose(2, 0, 1)))
+        return torch.from_numpy(np.array(self.load().transpose(2, 0, 1), order="C"))  # a copy: what Pillow has is fixed
 
     @cached_property
     def mask(self) -> Tensor | None:

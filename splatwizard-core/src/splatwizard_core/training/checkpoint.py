@@ -28,7 +28,6 @@ from torch import Tensor
 
 from splatwizard_core.errors import CheckpointError
 from splatwizard_core.training.keys import dotted
-from splatwizard_core.training.plan import plan_digest
 from splatwizard_native import TEMPORARY, replacing
 
 T = TypeVar("T")
@@ -98,7 +97,6 @@ class CheckpointStore:
             "format": FORMAT,
             "pair": pair,
             "file": tensor_path.name,
-            "plan_digest": plan_digest(checkpoint.plan),
             "state": split_tensors(checkpoint.state, tensors),
             "tensors": {name: _crc(tensor) for name, tensor in tensors.items()},
         }

@@ -42,7 +42,7 @@ class TrainOutcome(Progress):
     """A finished training: its figures, of resumed processes too, and
 
     model   as the last stage's `finish` returned it
-    plan    of each stage: name, steps, and its tasks as printed
+    plan    of each stage: name, steps, its tasks as printed, and what was looked up for the scene
     """
 
     model: SplatModel
@@ -210,7 +210,8 @@ class TrainingRun:
         """Return a stage's plan for the record."""
         pre, post = build_schedulers(stage, self.ppl)
         rows = plan_rows(pre.registrations, post.registrations, total=stage.iterations)
-        return {"stage": name, "iterations": stage.iterations, "tasks": rows}
+        found = {"looked_up": values} if (values := stage.looked_up(self.scene)) else {}
+        return {"stage": name, "iterations": stage.iterations, "tasks": rows, **found}
 
     def _run_stage(self, trainer: Trainer) -> None:
         """Train a stage to its end, with its last checkpoint. Raises TrainingStopped where the run is to stop."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bisect
 import functools
-import hashlib
 import math
 import numbers
 from collections.abc import Callable, Collection, Sequence
@@ -184,8 +183,3 @@ def plan_lines(registrations: Sequence[Registration]) -> list[str]:
         steps = describe_when(r.when) if isinstance(r.when, int | range) else str(sorted(r.when))
         lines.append(f"{r.stage} | {r.name} | {steps} | priority {r.priority}")
     return lines
-
-
-def plan_digest(lines: Sequence[str]) -> str:
-    """Return the SHA-256 of `plan_lines`: equal plans, equal text."""
-    return hashlib.sha256("\n".join(lines).encode()).hexdigest()

@@ -119,6 +119,10 @@ class Stage:
         """Rasterizers to take first if they are installed; the user's `raster.prefer` goes before them."""
         return ()
 
+    def looked_up(self, scene: Scene | None) -> dict[str, Any]:
+        """Return values that the configuration leaves to the scene, by dotted key, JSON-able; None: its keys count."""
+        return {}
+
     def begin(self, context: StageContext) -> SplatModel:
         """Return the model that this stage trains: the one it is given, or another built from it (masks, teacher).
 

@@ -18,7 +18,7 @@ CODER_FLOOR = 2.0**-24  # the smallest probability that the range coder has
 
 class _LowerBound(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, p: Tensor, bound: float, grad_below: bool) -> Tensor:
+    def forward(ctx: Any, p: Tensor, bound: float | Tensor, grad_below: bool) -> Tensor:
         ctx.save_for_backward(p)
         ctx.bound, ctx.grad_below = bound, grad_below
         return p.clamp_min(bound)
@@ -32,9 +32,10 @@ class _LowerBound(torch.autograd.Function):
         return grad * passes, None, None
 
 
-def lower_bound(p: Tensor, bound: float, *, grad_below_bound: bool = True) -> Tensor:
+def lower_bound(p: Tensor, bound: float | Tensor, *, grad_below_bound: bool = True) -> Tensor:
     """max(p, bound); the gradient also passes below the bound where descent would raise p.
 
+    bound               a number, or one for each of p; it gets no gradient
     grad_below_bound    False: no gradient below the bound (what HAC's public code does; for parity runs)
     """
     return _LowerBound.apply(p, bound, grad_below_bound)

@@ -19,6 +19,7 @@ from splatwizard_core.api import SH_C0, Camera, PointCloud, Scene, SceneError, S
 from sw_datasets.assemble import assemble_scene
 from sw_datasets.families import BLENDER
 from sw_datasets.pictures import (
+    SUFFIXES,
     find_pictures,
     fitted_size,
     load_composited,
@@ -30,7 +31,10 @@ from sw_datasets.rules import Rules, off_centre_warnings, rules_for, unused_opti
 
 HALF_CUBE = 1.3  # start points fill [-1.3, 1.3]^3 (3DGS)
 
-DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
+DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+"""Values of `camera_model`, which some programs write, that are a pinhole camera where all coefficients are 0."""
 
 
 class BlenderDataset:
@@ -105,10 +109,20 @@ def _read_views(path: Path, file: str, rules: Rules) -> tuple[list[View], float]
         if not isinstance(name, str) or not name:
             raise SceneError(f"{where}: frame {i} has no 'file_path'", path=str(path))
         name = name.removeprefix("./")
-        names.append(name if os.path.isfile(path / name) else name + ".png")
+        # As the data set has it, without a suffix; a picture that has one and is gone may have been converted.
+        bare = os.path.splitext(name)[1].lower() not in SUFFIXES and not os.path.isfile(path / name)
+        names.append(name + ".png" if bare else name)
     views, off_centre = [], 0.0
     for frame, name, picture in zip(frames, names, find_pictures(path, names), strict=True):
         merged = ChainMap(frame, data)
+        model = merged.get("camera_model", PINHOLES[0])
+        if model not in PINHOLES or merged.get("is_fisheye"):
+            raise SceneError(
+                f"{where}: image '{name}' is of a camera of another kind ("
+                + ("is_fisheye" if model in PINHOLES else f"camera_model {str(model)[:40]!r}")
+                + "); 3DGS needs pinhole images: undistort them",
+                path=str(path),
+            )
         if any(_number(merged.get(key, 0), key, name, where) for key in DISTORTION_KEYS):
             raise SceneError(
                 f"{where}: image '{name}' has lens distortion ({', '.join(DISTORTION_KEYS)}); "

@@ -10,6 +10,7 @@
 
 #include <splatwizard/torch_parallel.h>
 
+#include "adam_lists.h"
 #include "kernels.h"
 
 namespace {
@@ -46,26 +47,17 @@ std::tuple<double, double, at::Tensor> photometric(const at::Tensor& x, const at
   return {l1 / pixels, ssim / mapped, grad};
 }
 
-bool fits_adam(const at::Tensor& tensor, const at::Tensor& param) {
-  return tensor.is_cpu() && tensor.scalar_type() == at::kFloat && tensor.is_contiguous() &&
-         tensor.sizes() == param.sizes();
-}
-
 // One step of many tensors. Returns the places of those that the kernel cannot take: they are left as they were.
 std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
                                const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
                                at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s, at::ArrayRef<double> beta2s,
                                at::ArrayRef<double> epss, at::IntArrayRef steps) {
-  const size_t count = params.size();
-  TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
-                  lrs.size() == count && beta1s.size() == count && beta2s.size() == count && epss.size() == count &&
-                  steps.size() == count,
-              "adam: lists of different lengths");
+  const size_t count =
+      splatwizard::adam_count(params, {&grads, &exp_avgs, &exp_avg_sqs}, {lrs, beta1s, beta2s, epss}, steps);
   std::vector<int64_t> left;
   for (size_t i = 0; i < count; ++i) {
     const at::Tensor& param = params[i];
-    if (!fits_adam(param, param) || !fits_adam(grads[i], param) || !fits_adam(exp_avgs[i], param) ||
-        !fits_adam(exp_avg_sqs[i], param) || steps[i] < 1) {
+    if (!splatwizard::fits_adam(at::kCPU, 1, steps[i], {&param, &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
       left.push_back(int64_t(i));
       continue;
     }

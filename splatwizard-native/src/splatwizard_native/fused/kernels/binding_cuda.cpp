@@ -15,6 +15,7 @@
 #include <tuple>
 #include <vector>
 
+#include "adam_lists.h"
 #include "cuda/kernels.h"
 
 namespace {
@@ -77,35 +78,21 @@ at::Tensor photometric_backward(const at::Tensor& x, const at::Tensor& y, const 
   return grad;
 }
 
-// Whether the kernel can update this parameter: float32, contiguous and aligned, all on the first one's GPU.
-bool fits_adam(const at::Tensor& first, int64_t step, std::initializer_list<const at::Tensor*> tensors) {
-  const at::Tensor& param = **tensors.begin();
-  for (const at::Tensor* tensor : tensors)
-    if (!tensor->is_cuda() || tensor->device() != first.device() || tensor->scalar_type() != at::kFloat ||
-        !tensor->is_contiguous() || tensor->sizes() != param.sizes() ||
-        reinterpret_cast<uintptr_t>(tensor->const_data_ptr()) % 16 != 0)
-      return false;
-  return step >= 1;
-}
-
 // One step of many tensors, in one launch. Returns the places of those that the kernel cannot take: they are left as
 // they were.
 std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std::vector<at::Tensor>& grads,
                                const std::vector<at::Tensor>& exp_avgs, const std::vector<at::Tensor>& exp_avg_sqs,
                                at::ArrayRef<double> lrs, at::ArrayRef<double> beta1s, at::ArrayRef<double> beta2s,
                                at::ArrayRef<double> epss, at::IntArrayRef steps) {
-  const size_t count = params.size();
-  TORCH_CHECK(grads.size() == count && exp_avgs.size() == count && exp_avg_sqs.size() == count &&
-                  lrs.size() == count && beta1s.size() == count && beta2s.size() == count && epss.size() == count &&
-                  steps.size() == count,
-              "adam: lists of different lengths");
+  const size_t count =
+      splatwizard::adam_count(params, {&grads, &exp_avgs, &exp_avg_sqs}, {lrs, beta1s, beta2s, epss}, steps);
   std::vector<int64_t> left;
   if (count == 0) return left;
   const c10::cuda::CUDAGuard guard(params[0].device());
   std::vector<kernels::AdamTensor> tensors;
   tensors.reserve(count);
   for (size_t i = 0; i < count; ++i) {
-    if (!fits_adam(params[0], steps[i], {&params[i], &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
+    if (!splatwizard::fits_adam(params[0].device(), 16, steps[i], {&params[i], &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
       left.push_back(int64_t(i));
       continue;
     }
