@@ -4,6 +4,7 @@
 // of groups of blocks that does not depend on the number of threads, then group by group.
 #include <algorithm>
 #include <cmath>
+#include <type_traits>
 #include <vector>
 
 #include "kernels.h"
@@ -76,24 +77,83 @@ void outputs_of(const float* hidden, const float* weights, const float* bias, in
   for (int c = 0; c < N; ++c) to[c] = bias[c] + totals[c];
 }
 
-// Adds to the gradients of the hidden layer, and of the weights [N, head] and biases [N] of one Gaussian.
+// Adds to the gradient of the hidden layer of one Gaussian's anchor.
 template <int N>
-void add_outputs(const float* hidden, const float* weights, const float* slope, int64_t head, float* to_hidden,
-                 float* to_weights, float* to_bias) {
+void add_to_hidden(const float* weights, const float* slope, int64_t head, float* to_hidden) {
   Vec factor[N];
 #pragma GCC unroll 7
-  for (int c = 0; c < N; ++c) factor[c] = all(slope[c]), to_bias[c] += slope[c];
+  for (int c = 0; c < N; ++c) factor[c] = all(slope[c]);
   for (int64_t i = 0; i < head; i += LANES) {
-    const Vec value = load(hidden + i);
     Vec sum = load(to_hidden + i);
 #pragma GCC unroll 7
-    for (int c = 0; c < N; ++c) {
-      sum += factor[c] * load(weights + c * head + i);
-      store(to_weights + c * head + i, load(to_weights + c * head + i) + factor[c] * value);
-    }
+    for (int c = 0; c < N; ++c) sum += factor[c] * load(weights + c * head + i);
     store(to_hidden + i, sum);
   }
 }
+
+// Gaussians of a block of anchors that have the same number among those of their anchor, and so the same weights.
+struct Alike {
+  int64_t count = 0;
+  int64_t drawn[BLOCK];        // their numbers
+  const float* hidden[BLOCK];  // of their anchors
+};
+
+// Adds to the gradients of the weights [N, head] and biases [N] of Gaussians alike, whose N slopes stand at
+// slope + N drawn. Sums stay in registers over all of them.
+template <int N>
+void add_to_weights(const Alike& of, int64_t layer, const float* slope, int64_t head, float* to_weights,
+                    float* to_bias) {
+  constexpr int TOGETHER = N > 4 ? 1 : 2;  // vectors of a row
+  for (int64_t n = 0; n < of.count; ++n)
+#pragma GCC unroll 7
+    for (int c = 0; c < N; ++c) to_bias[c] += slope[N * of.drawn[n] + c];
+  int64_t i = 0;
+  const auto columns = [&](auto width) {
+    constexpr int W = decltype(width)::value;
+    Vec sum[N][W];
+#pragma GCC unroll 7
+    for (int c = 0; c < N; ++c)
+#pragma GCC unroll 2
+      for (int v = 0; v < W; ++v) sum[c][v] = load(to_weights + c * head + i + v * LANES);
+    for (int64_t n = 0; n < of.count; ++n) {
+      const float* const own = slope + N * of.drawn[n];
+      const float* const from = of.hidden[n] + layer + i;
+#pragma GCC unroll 7
+      for (int c = 0; c < N; ++c) {
+        const Vec factor = all(own[c]);
+#pragma GCC unroll 2
+        for (int v = 0; v < W; ++v) sum[c][v] += factor * load(from + v * LANES);
+      }
+    }
+#pragma GCC unroll 7
+    for (int c = 0; c < N; ++c)
+#pragma GCC unroll 2
+      for (int v = 0; v < W; ++v) store(to_weights + c * head + i + v * LANES, sum[c][v]);
+  };
+  for (; i + TOGETHER * LANES <= head; i += TOGETHER * LANES) columns(std::integral_constant<int, TOGETHER>());
+  for (; i < head; i += LANES) columns(std::integral_constant<int, 1>());
+}
+
+// Sigmoids of all outputs of the Gaussians begin .. end at once.
+class Squashed {
+ public:
+  Squashed(const float* geometry, const float* color, int64_t begin, int64_t end)
+      : begin_(begin), geometry_(padded(kGeometry * (end - begin), LANES)), color_(padded(3 * (end - begin), LANES)) {
+    squash(geometry + kGeometry * begin, kGeometry * (end - begin), geometry_);
+    squash(color + 3 * begin, 3 * (end - begin), color_);
+  }
+  float geometry(int64_t at) const { return geometry_[at - kGeometry * begin_]; }
+  float color(int64_t at) const { return color_[at - 3 * begin_]; }
+
+ private:
+  static void squash(const float* from, int64_t count, std::vector<float>& to) {
+    std::copy_n(from, count, to.data());
+    for (size_t i = 0; i < to.size(); i += LANES)
+      store(&to[i], all(1.f) / (all(1.f) + exponential(-load(&to[i]))));
+  }
+  int64_t begin_;
+  std::vector<float> geometry_, color_;
+};
 
 }  // namespace
 
@@ -159,8 +219,9 @@ void heads_spawn(const Anchors& from, const Heads& heads, const float* hidden, f
                             size.head, geometry + kGeometry * m);
       outputs_of<3>(row + size.head, last.of[2] + 3 * j * size.head, heads.last_bias[2] + 3 * j, size.head,
                     color + 3 * m);
-      spawn_one(from, m, to);
     }
+    const Squashed sigmoids(geometry, color, begin, end);
+    for (int64_t m = begin; m < end; ++m) spawn_one(from, m, to, sigmoids);
   });
 }
 
@@ -181,7 +242,8 @@ void heads_backward(const Anchors& from, const Seen& seen, const Heads& heads, c
 
   parallel(GROUPS, 1, [&](int64_t begin, int64_t end) {
     std::vector<float> inputs(BLOCK * size.columns), to_inputs(BLOCK * size.columns);
-    std::vector<float> to_hidden(BLOCK * size.width + ROWS);
+    std::vector<float> to_hidden(BLOCK * size.width + ROWS), to_opacity;
+    std::vector<Alike> alike(size.k);
     for (int64_t group = begin; group < end; ++group) {
       float* const to_first = sums.data() + group * summed;
       float* const to_last = to_first + rows * size.columns;
@@ -192,20 +254,31 @@ void heads_backward(const Anchors& from, const Seen& seen, const Heads& heads, c
           return std::lower_bound(from.drawn, from.drawn + from.count, anchor * from.k) - from.drawn;
         };
         std::fill(to_hidden.begin(), to_hidden.end(), 0.f);
-        for (int64_t m = place(start), stop = place(start + count); m < stop; ++m) {
+        for (Alike& some : alike) some.count = 0;
+        const int64_t begin_drawn = place(start), end_drawn = place(start + count);
+        const Squashed sigmoids(from.geometry, from.color, begin_drawn, end_drawn);
+        to_opacity.resize(size_t(end_drawn - begin_drawn));
+        for (int64_t m = begin_drawn; m < end_drawn; ++m) {
           const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k;
-          spawn_one_backward(from, m, slope, to, [](float* where, float value) { *where += value; });
-          const float* row = hidden + a * size.width;
+          spawn_one_backward(from, m, slope, to, [](float* where, float value) { *where += value; }, sigmoids);
           float* to_row = to_hidden.data() + (a - start) * size.width;
-          const float to_opacity = to.alpha[i] * (1.f - from.alpha[i] * from.alpha[i]);
-          add_outputs<1>(row, last.of[0] + j * size.head, &to_opacity, size.head, to_row, to_last + j * size.head,
-                         to_bias + j);
+          float& own = to_opacity[size_t(m - begin_drawn)];
+          own = to.alpha[i] * (1.f - from.alpha[i] * from.alpha[i]);
+          add_to_hidden<1>(last.of[0] + j * size.head, &own, size.head, to_row);
+          add_to_hidden<kGeometry>(last.of[1] + kGeometry * j * size.head, to.geometry + kGeometry * m, size.head,
+                                   to_row + size.head);
+          add_to_hidden<3>(last.of[2] + 3 * j * size.head, to.color + 3 * m, size.head, to_row + 2 * size.head);
+          Alike& same = alike[size_t(j)];
+          same.drawn[same.count] = m, same.hidden[same.count++] = hidden + a * size.width;
+        }
+        for (int64_t j = 0; j < size.k; ++j) {
           const int64_t g = size.k + kGeometry * j, c = (1 + kGeometry) * size.k + 3 * j;
-          add_outputs<kGeometry>(row + size.head, last.of[1] + kGeometry * j * size.head,
-                                 to.geometry + kGeometry * m, size.head, to_row + size.head,
-                                 to_last + g * size.head, to_bias + g);
-          add_outputs<3>(row + 2 * size.head, last.of[2] + 3 * j * size.head, to.color + 3 * m, size.head,
-                         to_row + 2 * size.head, to_last + c * size.head, to_bias + c);
+          add_to_weights<1>(alike[size_t(j)], 0, to_opacity.data() - begin_drawn, size.head, to_last + j * size.head,
+                            to_bias + j);
+          add_to_weights<kGeometry>(alike[size_t(j)], size.head, to.geometry, size.head, to_last + g * size.head,
+                                    to_bias + g);
+          add_to_weights<3>(alike[size_t(j)], 2 * size.head, to.color, size.head, to_last + c * size.head,
+                            to_bias + c);
         }
         const float* const own = hidden + start * size.width;
         for (int64_t i = 0; i < BLOCK * size.width; i += LANES)

@@ -41,7 +41,15 @@ struct Gradients {  // of the members of Anchors; masks and positions or null; o
 
 SW_SPAWN_HD float sigmoid(float x) { return 1.f / (1.f + expf(-x)); }
 
-SW_SPAWN_HD void spawn_one(const Anchors& from, int64_t m, const Gaussians& to) {
+// Sigmoids of the outputs, by their place in Anchors::geometry and color.
+struct Sigmoids {
+  const Anchors& from;
+  SW_SPAWN_HD float geometry(int64_t at) const { return sigmoid(from.geometry[at]); }
+  SW_SPAWN_HD float color(int64_t at) const { return sigmoid(from.color[at]); }
+};
+
+template <class Found>
+SW_SPAWN_HD void spawn_one(const Anchors& from, int64_t m, const Gaussians& to, const Found& sigmoids) {
   const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k, own = from.compact ? m : i;
   const float* geometry = from.geometry + kGeometry * own;
   const float* scale = from.scales + a * from.scale_row;
@@ -49,26 +57,30 @@ SW_SPAWN_HD void spawn_one(const Anchors& from, int64_t m, const Gaussians& to) 
   for (int axis = 0; axis < 3; ++axis) {
     to.means[3 * m + axis] = from.positions[3 * a + axis] + offset[axis] * scale[axis];
     // Noise or rounding may take a base scale through zero: a Gaussian of scale -s is that of scale s.
-    to.scales[3 * m + axis] = fabsf(scale[3 + axis]) * sigmoid(geometry[axis]);
-    to.colors[3 * m + axis] = sigmoid(from.color[3 * own + axis]);
+    to.scales[3 * m + axis] = fabsf(scale[3 + axis]) * sigmoids.geometry(kGeometry * own + axis);
+    to.colors[3 * m + axis] = sigmoids.color(3 * own + axis);
   }
   const float* q = geometry + 3;
   const float norm = fmaxf(sqrtf(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]), kShortest);
   for (int c = 0; c < 4; ++c) to.quats[4 * m + c] = q[c] / norm;
   to.opacities[m] = from.masks == nullptr ? from.alpha[i] : from.alpha[i] * from.masks[i];
 }
+SW_SPAWN_HD void spawn_one(const Anchors& from, int64_t m, const Gaussians& to) {
+  spawn_one(from, m, to, Sigmoids{from});
+}
 
 // Writes what belongs to the Gaussian alone; add(place, value) sums what it shares with the others of its anchor.
-template <class Add>
+template <class Add, class Found>
 SW_SPAWN_HD void spawn_one_backward(const Anchors& from, int64_t m, const Gaussians& slope, const Gradients& to,
-                                    const Add& add) {
+                                    const Add& add, const Found& sigmoids) {
   const int64_t i = from.drawn[m], a = i / from.k, j = i % from.k, own = from.compact ? m : i;
   const float* geometry = from.geometry + kGeometry * own;
   const float* scale = from.scales + a * from.scale_row;
   const float* offset = from.offsets + a * from.offset_row + 3 * j;
   for (int axis = 0; axis < 3; ++axis) {
     const float to_mean = slope.means[3 * m + axis], to_size = slope.scales[3 * m + axis];
-    const float factor = sigmoid(geometry[axis]), base = scale[3 + axis], color = sigmoid(from.color[3 * own + axis]);
+    const float factor = sigmoids.geometry(kGeometry * own + axis), base = scale[3 + axis];
+    const float color = sigmoids.color(3 * own + axis);
     to.offsets[3 * i + axis] = to_mean * scale[axis];
     add(to.scales + 6 * a + axis, to_mean * offset[axis]);
     add(to.scales + 6 * a + 3 + axis, base > 0.f ? to_size * factor : base < 0.f ? -to_size * factor : 0.f);
@@ -84,6 +96,11 @@ SW_SPAWN_HD void spawn_one_backward(const Anchors& from, int64_t m, const Gaussi
   for (int c = 0; c < 4; ++c) to.geometry[kGeometry * own + 3 + c] = (to_quat[c] - q[c] / norm * along) / norm;
   to.alpha[i] = from.masks == nullptr ? slope.opacities[m] : slope.opacities[m] * from.masks[i];
   if (to.masks != nullptr) to.masks[i] = slope.opacities[m] * from.alpha[i];
+}
+template <class Add>
+SW_SPAWN_HD void spawn_one_backward(const Anchors& from, int64_t m, const Gaussians& slope, const Gradients& to,
+                                    const Add& add) {
+  spawn_one_backward(from, m, slope, to, add, Sigmoids{from});
 }
 
 }  // namespace sw_anchors

@@ -1,6 +1,6 @@
 // Features of places on planes, and their gradient by the planes, on the CPU.
-#include <algorithm>
 #include <atomic>
+#include <cstring>
 
 #include "kernels.h"
 
@@ -10,7 +10,20 @@ using namespace sw_sites;
 
 namespace {
 
-constexpr int TOGETHER = 32;  // channels whose gradients are summed on the stack
+constexpr int TOGETHER = 8;  // channels that are one vector
+typedef float Vector __attribute__((vector_size(4 * TOGETHER)));
+
+// body(its type, first channel) for all channels: vectors, then what is left one by one.
+template <class T>
+struct Kind {
+  using type = T;
+};
+template <class Body>
+void for_channels(int channels, const Body& body) {
+  int c = 0;
+  for (; c + TOGETHER <= channels; c += TOGETHER) body(Kind<Vector>(), c);
+  for (; c < channels; ++c) body(Kind<float>(), c);
+}
 
 }  // namespace
 
@@ -52,15 +65,18 @@ void sites_backward(const Sites& at, const float* gradient, float* const* tables
         float* rows[kCorners];
         for (int corner = 0; corner < kCorners; ++corner)
           rows[corner] = tables[scale] + int64_t(at.cells[place + corner]) * at.channels;
-        for (int first = 0; first < at.channels; first += TOGETHER) {
-          const int some = std::min(TOGETHER, at.channels - first);
-          float total[TOGETHER] = {};  // a plane is in its own feature and all finer ones
-          for (int finer = at.scales - 1 - scale; finer >= 0; --finer)
-            for (int c = 0; c < some; ++c) total[c] += from[finer * width + first + c];
-          // One after the other: cells of a place may be the same.
-          for (int corner = 0; corner < kCorners; ++corner)
-            for (int c = 0; c < some; ++c) rows[corner][first + c] += w[corner] * total[c];
-        }
+        for_channels(at.channels, [&](auto kind, int c) {
+          typename decltype(kind)::type total{}, part;  // a plane is in its own feature and all finer ones
+          for (int finer = at.scales - 1 - scale; finer >= 0; --finer) {
+            std::memcpy(&part, from + finer * width + c, sizeof part);
+            total += part;
+          }
+          for (int corner = 0; corner < kCorners; ++corner) {  // in turn: cells of a place may be the same
+            std::memcpy(&part, rows[corner] + c, sizeof part);
+            part += w[corner] * total;
+            std::memcpy(rows[corner] + c, &part, sizeof part);
+          }
+        });
       }
     }
   });

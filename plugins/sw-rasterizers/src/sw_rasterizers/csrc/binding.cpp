@@ -32,7 +32,7 @@ sw::Slots<S> slots_of(const std::vector<Tensor>& saved) {
 template <class S>
 sw::Pairs<S> pairs_of(const std::vector<Tensor>& saved) {
   return {saved[kSlot].numel(), data<int64_t>(saved[kTileStart]), data<int32_t>(saved[kSlot]),
-          data<int32_t>(saved[kOrigin]), data<uint16_t>(saved[kBlocksOfPair])};
+          data<int32_t>(saved[kOrigin]), data<uint32_t>(saved[kBlocksOfPair])};
 }
 
 template <class S>
@@ -95,7 +95,7 @@ Rendered render_as(const Inputs& in, at::ArrayRef<double> camera, int64_t width,
   saved[kTileStart] = make_as({tiles + 1}, at::kLong);
   saved[kSlot] = make_as({count}, at::kInt);
   saved[kOrigin] = make_as({save ? count : 0}, at::kInt);
-  saved[kBlocksOfPair] = make_as({save ? count : 0}, at::kShort);
+  saved[kBlocksOfPair] = make_as({save ? count : 0}, at::kInt);
   const auto pairs = pairs_of<S>(saved);
   SW_SELECT(bin_pairs<S>)(view, settings, n, used, slots, data<int32_t>(order), pairs);
   out.seconds.push_back(clock.lap());

@@ -45,9 +45,9 @@ void accumulate_as(const Inputs& in, const ScoreInputs& asked, at::ArrayRef<doub
   SW_SELECT(depth_order<S>)(n, used, slots, settings.threads, data<int32_t>(order));
   const bool sensitive = asked.wants_sensitivity();
   const Tensor tile_start = make_as({tiles + 1}, at::kLong), slot = make_as({count}, at::kInt);
-  const Tensor origin = make_as({count}, at::kInt), touched = make_as({sensitive ? count : 0}, at::kShort);
+  const Tensor origin = make_as({count}, at::kInt), touched = make_as({sensitive ? count : 0}, at::kInt);
   const Pairs<S> pairs{count, data<int64_t>(tile_start), data<int32_t>(slot), data<int32_t>(origin),
-                       data<uint16_t>(touched)};
+                       data<uint32_t>(touched)};
   SW_SELECT(bin_pairs<S>)(view, settings, n, used, slots, data<int32_t>(order), pairs);
 
   double* to[kMaxScores];

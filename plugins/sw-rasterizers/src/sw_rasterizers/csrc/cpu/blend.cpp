@@ -1,6 +1,6 @@
 // Forward compositing of one tile at a time.
 //
-// Every stage of kStage splats is dealt to the 16 blocks of the tile by their masks; then each block runs through its
+// Every stage of kStage splats is dealt to the blocks of the tile by their masks; then each block runs through its
 // own list with its pixels' transmittance, colours and last position in registers: no load or store of pixel state per
 // splat, one broadcast of each splat field.
 #include <memory>
@@ -29,6 +29,7 @@ struct TileBlender {
     PixelCentres<S> centres;
     uint8_t list[kBlocks][kStage];
     int length[kBlocks];
+    uint32_t drawn[kStage];  // blocks in which any pixel draws the splat
     alignas(64) S transmittance[kTilePixels];
     alignas(64) int32_t last[kTilePixels];
     alignas(64) int32_t median[kTilePixels];  // list position of the splat that crosses T = 1/2
@@ -45,8 +46,8 @@ struct TileBlender {
     std::fill(w.median, w.median + kTilePixels, 0);
     std::fill(w.transmittance, w.transmittance + kTilePixels, S(-1));  // outside the image: done
     frame.for_each_pixel([&](int i, int, int) { w.transmittance[i] = S(1); });
-    int live = 0;
-    for (int b = 0; b < kBlocks; ++b) live |= int(is_live(w, b)) << b;
+    unsigned live = 0;
+    for (int b = 0; b < kBlocks; ++b) live |= unsigned(is_live(w, b)) << b;
 
     for (int64_t first = begin; first < end && live != 0; first += kStage) {
       const int count = int(std::min<int64_t>(kStage, end - first));
@@ -54,9 +55,8 @@ struct TileBlender {
       w.stage.find_blocks(frame, count);
       std::fill(w.length, w.length + kBlocks, 0);
       for (int k = 0; k < count; ++k) {
-        unsigned mask = unsigned(w.stage.blocks[k] & live);
-        if (pairs.blocks != nullptr) pairs.blocks[first + k] = uint16_t(mask);
-        for (; mask != 0; mask &= mask - 1) {
+        w.drawn[k] = 0;
+        for (unsigned mask = unsigned(w.stage.blocks[k]) & live; mask != 0; mask &= mask - 1) {
           const int b = __builtin_ctz(mask);
           w.list[b][w.length[b]++] = uint8_t(k);
         }
@@ -65,8 +65,10 @@ struct TileBlender {
         if (w.length[b] == 0) continue;
         if (canvas.counters != nullptr) count_pairs(w, b);
         for (int pack = 0; pack < kPacks; ++pack) blend_pack(w, b, pack, first, int32_t(first - begin));
-        if (!is_live(w, b)) live &= ~(1 << b);
+        if (!is_live(w, b)) live &= ~(1u << b);
       }
+      // Where rounding or the shape of a small splat leaves a block without a drawn pixel, backward need not look.
+      if (pairs.blocks != nullptr) std::copy_n(w.drawn, count, pairs.blocks + first);
     }
     write(tile, frame, w, begin);
   }
@@ -102,6 +104,7 @@ struct TileBlender {
       const V before = transmittance;
       const V weight = composite(alpha, transmittance);
       const auto drawn = weight > zero;
+      w.drawn[k] |= uint32_t(any(drawn)) << block;
       last = select(drawn, I{} + (base + k + 1), last);
       if constexpr (kGeneral) {
         median = select(drawn & (before > constant<V>(0.5)), I{} + (base + k + 1), median);

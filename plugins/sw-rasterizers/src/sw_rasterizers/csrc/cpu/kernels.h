@@ -20,10 +20,6 @@
 namespace sw {
 
 constexpr int kChunk = 1024;  // Gaussians a thread takes at a time; slots of a chunk start at its first index
-constexpr int kBlock = 4;     // pixels, edge of the block that one AVX-512 pack covers
-constexpr int kBlocksPerRow = kTile / kBlock;
-constexpr int kBlocks = kBlocksPerRow * kBlocksPerRow;
-constexpr int kBlockPixels = kBlock * kBlock;
 
 // One drawn splat, 16 values: one cache line in float32.
 // clang-format off
@@ -65,7 +61,7 @@ struct Pairs {
   int64_t* tile_start;  // [tiles + 1]
   int32_t* slot;        // [P] tile-major, front to back
   int32_t* origin;      // [P] number of the pair in splat-major order, or null
-  uint16_t* blocks;     // [P] bit b: block b of the tile may be touched; filled by blend up to `last`, or null
+  uint32_t* blocks;     // [P] bit b: block b of the tile may be touched; filled by blend up to `last`, or null
 };
 
 template <class S>

@@ -51,7 +51,7 @@ struct TileScorer {
       const int count = int(std::min<int64_t>(kStage, end - first));
       w.stage.load_splats(slots, pairs.slot + first, count, end - first);
       w.stage.find_blocks(frame, count);
-      int live = 0;
+      unsigned live = 0;
       for (int k = 0; k < count; ++k) {
         if (k % kCheck == 0) {
           live = live_blocks(w);
@@ -60,7 +60,7 @@ struct TileScorer {
             return;
           }
         }
-        score_splat(w, k, unsigned(w.stage.blocks[k] & live), row(first + k));
+        score_splat(w, k, unsigned(w.stage.blocks[k]) & live, row(first + k));
       }
     }
   }
@@ -78,13 +78,13 @@ struct TileScorer {
     }
   }
 
-  static int live_blocks(const Workspace& w) {
-    int live = 0;
+  static unsigned live_blocks(const Workspace& w) {
+    unsigned live = 0;
     for (int b = 0; b < kBlocks; ++b) {
       bool found = false;
       for (int pack = 0; pack < kPacks; ++pack)
         found |= any(load<V>(w.transmittance + b * kBlockPixels + pack * L) > constant<V>(0));
-      live |= int(found) << b;
+      live |= unsigned(found) << b;
     }
     return live;
   }

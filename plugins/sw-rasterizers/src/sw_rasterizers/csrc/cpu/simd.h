@@ -62,9 +62,17 @@ SW_HD PackF round_down(PackF x) {
 SW_HD PackF absolute(PackF x) { return (PackF)((PackI)x & 0x7fffffff); }
 
 SW_HD bool any(PackI mask) {
-  int32_t found = 0;
-  for (int i = 0; i < SW_LANES; ++i) found |= mask[i];
+#if defined(__x86_64__) && SW_LANES == 8
+  return __builtin_ia32_movmskps256((PackF)mask) != 0;  // one instruction
+#elif defined(__x86_64__) && SW_LANES == 4
+  return __builtin_ia32_movmskps((PackF)mask) != 0;
+#else
+  typedef int64_t Wide __attribute__((vector_size(4 * SW_LANES)));
+  const Wide pairs = (Wide)mask;
+  int64_t found = 0;
+  for (int i = 0; i < SW_LANES / 2; ++i) found |= pairs[i];
   return found != 0;
+#endif
 }
 SW_HD bool lane(PackI mask, int i) { return mask[i] != 0; }
 SW_HD float lane(PackF x, int i) { return x[i]; }
@@ -101,14 +109,15 @@ struct BitReversed {
 
 // Sums over lanes of `count` <= SW_LANES packs, sum i in lane i; `packs` is overwritten. A tree of folds that halves
 // the number of packs and of lanes per sum at once: three operations a fold instead of log2(lanes) steps a pack.
-template <int width>
-SW_HD PackF fold_lanes(PackF* packs, int count) {
+template <int width, int count>
+SW_HD PackF fold_lanes(PackF* packs) {
+#pragma GCC unroll 8
   for (int i = 0; i < count; i += 2) {
     const PackF a = packs[i], b = i + 1 < count ? packs[i + 1] : a;
     packs[i / 2] = shuffle<HalfGroups<width, false>>(a, b) + shuffle<HalfGroups<width, true>>(a, b);
   }
   if constexpr (width > 1)
-    return fold_lanes<width / 2>(packs, (count + 1) / 2);
+    return fold_lanes<width / 2, (count + 1) / 2>(packs);
   else
     return shuffle<BitReversed>(packs[0], packs[0]);
 }
@@ -179,10 +188,11 @@ SW_HD void lane_sums(V* packs, Scalar<V>* out) {
   if constexpr (L == 1) {
     for (int i = 0; i < kCount; ++i) out[i] = packs[i];
   } else {
-    for (int first = 0; first < kCount; first += L) {
-      const int count = kCount - first < L ? kCount - first : L;
-      const V sums = fold_lanes<L / 2>(packs + first, count);
-      __builtin_memcpy(out + first, &sums, sizeof(Scalar<V>) * count);
+    constexpr int kWhole = kCount / L * L, kRest = kCount - kWhole;  // constant counts: folds stay in registers
+    for (int first = 0; first < kWhole; first += L) store(out + first, fold_lanes<L / 2, L>(packs + first));
+    if constexpr (kRest > 0) {
+      const V sums = fold_lanes<L / 2, kRest>(packs + kWhole);
+      __builtin_memcpy(out + kWhole, &sums, sizeof(Scalar<V>) * kRest);
     }
   }
 }

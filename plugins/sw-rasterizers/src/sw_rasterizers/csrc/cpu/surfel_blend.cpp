@@ -53,8 +53,8 @@ struct SurfelBlender {
     S* transmittance = w.field[kTransmittanceOf];
     std::fill(transmittance, transmittance + kTilePixels, S(-1));  // outside the image: done
     frame.for_each_pixel([&](int i, int, int) { transmittance[i] = S(1); });
-    int live = 0;
-    for (int b = 0; b < kBlocks; ++b) live |= int(is_live(w, b)) << b;
+    unsigned live = 0;
+    for (int b = 0; b < kBlocks; ++b) live |= unsigned(is_live(w, b)) << b;
 
     for (int64_t first = begin; first < end && live != 0; first += kStage) {
       const int count = int(std::min<int64_t>(kStage, end - first));
@@ -62,12 +62,12 @@ struct SurfelBlender {
       w.stage.find_blocks(frame, count);
       std::fill(w.length, w.length + kBlocks, 0);
       for (int k = 0; k < count; ++k) {
-        unsigned mask = unsigned(w.stage.blocks[k] & live);
+        unsigned mask = unsigned(w.stage.blocks[k]) & live;
         const auto& record = w.stage.field;
         const S* plane = planes + int64_t(pairs.slot[first + k]) * kPlane;
         const LargeSurfel<S> large(plane, record[kCutoff][k], record[kHalfX][k] + record[kHalfY][k]);
         if (mask != 0 && large.is_large) mask &= met_blocks(large, frame);
-        if (pairs.blocks != nullptr) pairs.blocks[first + k] = uint16_t(mask);
+        if (pairs.blocks != nullptr) pairs.blocks[first + k] = mask;
         if (mask != 0) __builtin_prefetch(plane);
         for (; mask != 0; mask &= mask - 1) {
           const int b = __builtin_ctz(mask);
@@ -78,7 +78,7 @@ struct SurfelBlender {
         if (w.length[b] == 0) continue;
         if (target.canvas.counters != nullptr) count_pairs(w, b, first);
         for (int pack = 0; pack < kPacks; ++pack) blend_pack(w, b, pack, first, int32_t(first - begin));
-        if (!is_live(w, b)) live &= ~(1 << b);
+        if (!is_live(w, b)) live &= ~(1u << b);
       }
     }
     write(tile, frame, w, begin);
@@ -90,10 +90,10 @@ struct SurfelBlender {
     for (int b = 0; b < kBlocks; b += L) {
       alignas(64) S x[L], y[L];
       for (int i = 0; i < L; ++i) {
-        x[i] = S(frame.x0 + (b + i) % kBlocksPerRow * kBlock + kBlock / 2);
-        y[i] = S(frame.y0 + (b + i) / kBlocksPerRow * kBlock + kBlock / 2);
+        x[i] = S(frame.x0 + (b + i) % kBlocksPerRow * kBlockWidth + kBlockWidth / 2);
+        y[i] = S(frame.y0 + (b + i) / kBlocksPerRow * kBlockHeight + kBlockHeight / 2);
       }
-      const auto met = large.meets(load<V>(x), load<V>(y), S(kBlock / 2));
+      const auto met = large.meets(load<V>(x), load<V>(y), S(kBlockWidth / 2));
       for (int i = 0; i < L; ++i) mask |= unsigned(lane(met, i)) << (b + i);
     }
     return mask;

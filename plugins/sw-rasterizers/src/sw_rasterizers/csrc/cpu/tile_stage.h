@@ -1,9 +1,9 @@
 // What the forward and backward blend kernels share: a tile's geometry, and the staging of its splats.
 //
 // Splats of a tile are staged kStage at a time into small arrays, one array a field (L1-resident), and each gets a mask
-// of the 4x4-pixel blocks whose pixel centres its cut-off ellipse reaches: the exact minimum of the quadratic form over
-// the box of centres, which lies on one of the two facing edges. So a pixel is tried with a splat only if its
-// block is touched.
+// of the blocks (4x4 pixels, or 4x2 where no pack has 16 lanes) whose pixel centres its cut-off ellipse reaches: the
+// exact minimum of the quadratic form over the box of centres, which lies on one of the two facing edges. So a pixel is
+// tried with a splat only if its block is touched.
 #pragma once
 
 #include <algorithm>
@@ -18,6 +18,12 @@ using namespace sw;
 
 constexpr int kStage = 128;  // list positions in a stage fit a byte
 
+// A block is one pack, or two of narrow ones: of small splats, the smaller it is the fewer pixels are tried in vain.
+constexpr int kBlockWidth = 4, kBlockHeight = SW_LANES > 8 ? 4 : 2;  // pixels
+constexpr int kBlocksPerRow = kTile / kBlockWidth, kBlockRows = kTile / kBlockHeight;
+constexpr int kBlocks = kBlocksPerRow * kBlockRows;  // of a tile, at most the bits of Pairs::blocks
+constexpr int kBlockPixels = kBlockWidth * kBlockHeight;
+
 struct TileFrame {
   int x0, y0;         // first pixel
   int columns, rows;  // pixels inside the image
@@ -29,8 +35,8 @@ struct TileFrame {
         rows(std::min(kTile, view.height - y0)) {}
 
   // Pixel of (block, index inside it), relative to the tile.
-  static int pixel_x(int block, int i) { return block % kBlocksPerRow * kBlock + i % kBlock; }
-  static int pixel_y(int block, int i) { return block / kBlocksPerRow * kBlock + i / kBlock; }
+  static int pixel_x(int block, int i) { return block % kBlocksPerRow * kBlockWidth + i % kBlockWidth; }
+  static int pixel_y(int block, int i) { return block / kBlocksPerRow * kBlockHeight + i / kBlockWidth; }
 
   template <class Visit>
   void for_each_pixel(const Visit& visit) const {  // visit(index in block order, x, y in the tile)
@@ -84,24 +90,30 @@ struct TileStage {
       const auto at = [&](int f) { return load<V>(field[f] + k); };
       // The quadratic form grows with distance: a, c > 0.
       const V a = -at(kA), b = -at(kB), cc = -at(kC), cutoff = at(kCutoff);
-      const V lean_x = at(kLeanX), lean_y = at(kLeanY), zero = c(0), edge = c(kBlock - 1);
+      const V lean_x = at(kLeanX), lean_y = at(kLeanY), zero = c(0);
+      const V width = c(kBlockWidth - 1), height = c(kBlockHeight - 1);  // between the outer centres
       const V left = c(frame.x0 + 0.5) - at(kU), top = c(frame.y0 + 0.5) - at(kV);
-      V low_x[kBlocksPerRow], near_x[kBlocksPerRow], ridge_y[kBlocksPerRow];
+      V low_x[kBlocksPerRow], high_x[kBlocksPerRow], ridge_y[kBlocksPerRow];
+      V square_x[kBlocksPerRow], slope_x[kBlocksPerRow];  // of the form on the vertical line nearest to the centre
       for (int i = 0; i < kBlocksPerRow; ++i) {
-        low_x[i] = left + c(kBlock * i);
-        near_x[i] = clamp(zero, low_x[i], low_x[i] + edge);
-        ridge_y[i] = lean_y * near_x[i];  // lowest point of the form on the vertical line near_x
+        low_x[i] = left + c(kBlockWidth * i);
+        high_x[i] = low_x[i] + width;
+        const V near_x = clamp(zero, low_x[i], high_x[i]);
+        ridge_y[i] = lean_y * near_x;  // lowest point of the form on that line
+        square_x[i] = a * near_x * near_x;
+        slope_x[i] = b * near_x;
       }
       I mask = {};
-      for (int j = 0; j < kBlocksPerRow; ++j) {
-        const V low_y = top + c(kBlock * j), high_y = low_y + edge;
+      for (int j = 0; j < kBlockRows; ++j) {
+        const V low_y = top + c(kBlockHeight * j), high_y = low_y + height;
         const V near_y = clamp(zero, low_y, high_y), ridge_x = lean_x * near_y;
+        const V square_y = cc * near_y * near_y, slope_y = b * near_y;
         for (int i = 0; i < kBlocksPerRow; ++i) {
           const V y = clamp(ridge_y[i], low_y, high_y);
-          const V x = clamp(ridge_x, low_x[i], low_x[i] + edge);
-          const V on_vertical = a * near_x[i] * near_x[i] + (b * near_x[i] + cc * y) * y;
-          const V on_horizontal = cc * near_y * near_y + (b * near_y + a * x) * x;
-          const I bit = I{} + (1 << (j * kBlocksPerRow + i));
+          const V x = clamp(ridge_x, low_x[i], high_x[i]);
+          const V on_vertical = square_x[i] + (slope_x[i] + cc * y) * y;
+          const V on_horizontal = square_y + (slope_y + a * x) * x;
+          const I bit = I{} + int32_t(1u << (j * kBlocksPerRow + i));
           mask |= select(minimum(on_vertical, on_horizontal) <= cutoff, bit, I{});
         }
       }
