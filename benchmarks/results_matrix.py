@@ -40,6 +40,7 @@ from splatwizard_native import available_cores
 METHODS = "3dgs,3dgs:mcmc,lightgaussian,chimerags,hac,cat-3dgs"
 SWEEPS = ("3dgs",)  # all of whose rate points share one training
 MOMENT = 0.2  # seconds between two looks at what runs
+COARSE = 2.0  # seconds by which a file may seem older than it is
 PATIENCE = 30.0  # seconds from an interrupt to its checkpoint
 
 
@@ -181,7 +182,7 @@ class Matrix:
         return all(self.finished(j) for j in same)
 
     def _train(self, job: Job, gpu: str) -> None:
-        began = time.monotonic()
+        began, at = time.monotonic(), time.time()
         try:
             places = len(self.args.gpu_names) * self.args.per_gpu
             words = job.command(self.root, self.args.preset, self.args.device, self.args.set)
@@ -192,6 +193,8 @@ class Matrix:
             took = time.monotonic() - began
             if status == 0:
                 for run in job.runs(self.root):
+                    if _read(run / "matrix.json") and (run / "metrics.json").stat().st_mtime < at - COARSE:
+                        continue  # made by another command, that of other rate points
                     facts = {"command": self.command(job), "processes_per_gpu": self.args.per_gpu}
                     _update(run / "matrix.json", facts)
                 _update(folder / "finished.json", {"command": self.command(job)})

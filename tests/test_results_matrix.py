@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -77,6 +78,18 @@ def test_what_is_finished_is_not_run_again_unless_it_is_asked_for_otherwise(star
     assert (kept["processes_per_gpu"], kept["command"].split()[:4]) == (1, ["sw", "run", "--method", "3dgs"])
     assert start("--methods", "3dgs", "--seeds", "0") == []
     assert len(start("--methods", "3dgs", "--seeds", "0", "--set", "iterations=7")) == 1
+
+
+def test_a_run_keeps_the_command_that_made_it_when_further_rate_points_are_made(start, tmp_path):
+    start("--methods", "3dgs@r3", "--seeds", "0", "--no-measure")
+    old = tmp_path / "seed-0" / "demo-tiny" / "3dgs" / "r1"
+    old.mkdir()
+    (old / "metrics.json").write_text("{}")
+    (old / "matrix.json").write_text('{"command": "of r1"}')
+    os.utime(old / "metrics.json", (1, 1))
+    start("--methods", "3dgs@r3+r4", "--seeds", "0", "--no-measure")
+    assert json.loads((old / "matrix.json").read_text())["command"] == "of r1"
+    assert "--rate r3,r4" in json.loads((old.parent / "r3" / "matrix.json").read_text())["command"]
 
 
 def test_settings_of_one_method_reach_that_one(start):

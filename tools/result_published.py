@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from result_groups import BASE, NONE, TITLES, Rows, points, spread
-from result_records import RECORDS, SmallRecord, read
+from result_records import FROM, RECORDS, SmallRecord, read
 from sw_report.published import Figure, read_published
 
 FULL_SCENES = {"lego": "nerf_synthetic"}  # scene of the records -> data set whose scene of that name it is made from
@@ -35,8 +35,10 @@ def table(scene: str, records_at: Path = RECORDS) -> str:
 
 
 def _group(figure: Figure, records: Rows) -> Rows:
-    """Return the runs that stand for a figure, all of one preset; none where there are none."""
-    groups = points([r for r in records if (r.method, r.rate) == (figure.method, figure.rate)])
+    """Return the runs that stand for a figure, of one preset and its usual start; none where there are none."""
+    groups = points([
+        r for r in records if (r.method, r.rate) == (figure.method, figure.rate) and FROM not in r.variant
+    ])  # fmt: skip
     for preset in (figure.preset, OTHERWISE):
         found = [r for group in groups for r in group if r.preset == preset]
         if found:

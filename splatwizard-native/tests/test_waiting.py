@@ -171,3 +171,16 @@ def test_a_watch_that_ends_lets_them_spin_and_another_can_begin(monkeypatch):
         watch.end()
         assert told[-1] is None
         assert not any(thread.name == "core-watch" for thread in threading.enumerate())
+
+
+def test_where_no_thread_can_begin_there_is_no_watch(monkeypatch):
+    def refuse(self: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    for each in (*waiting.SETTINGS, "SPLATWIZARD_SHARE_CORES"):
+        monkeypatch.delenv(each, raising=False)
+    monkeypatch.setattr(waiting, "_watch", None)
+    monkeypatch.setattr(waiting, "openmp_libraries", lambda: ["libgomp.so.1"])
+    monkeypatch.setattr(threading.Thread, "start", refuse)
+    waiting.watch_cores()
+    assert waiting._watch is None

@@ -127,6 +127,11 @@ def test_a_number_of_start_points_that_makes_no_sense_is_refused(blender_folder,
         load(blender_folder(), init_points=count)
 
 
+def test_a_folder_of_another_kind_that_is_called_a_blender_scene_is_one_clear_line(tmp_path, load):
+    with pytest.raises(SceneError, match=r"transforms_train\.json is missing: .* is no Blender scene$"):
+        load(f"blender:{tmp_path}")
+
+
 def test_resolution_rule_applies(blender_folder, load):
     view = load(blender_folder(), resolution=2).train[0]
     assert view.pixels.shape == (4, 5, 10)

@@ -190,6 +190,12 @@ def test_text_files_may_have_comments_windows_line_ends_and_no_last_keypoint_lin
     assert len(images[2].xys) == 0
 
 
+def test_text_files_may_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "cameras.txt"
+    path.write_bytes(b"\xef\xbb\xbf1 PINHOLE 4 3 5 5 2 1.5")
+    assert colmap_model.read_cameras(path)[1].params == (5, 5, 2, 1.5)
+
+
 def test_binary_is_preferred_and_a_missing_part_is_named(colmap_folder):
     folder = colmap_folder.write() / "sparse" / "0"
     (folder / "cameras.txt").write_text("nonsense")

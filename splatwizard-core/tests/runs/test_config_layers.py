@@ -261,6 +261,7 @@ def test_rate_aliases():
         ("densify.grad_threshold=inf", "must be a finite number"),
         ("densify.grad_threshold=nan", "bad value 'nan' for 'densify.grad_threshold' in --set"),
         ("iterations=0", r"bad value '0' for 'iterations' in --set: must be greater than or equal to 1"),
+        ("threads=1000000", r"bad value '1000000' for 'threads' in --set: must be less than or equal to 1024"),
         ("iterations=1.5", "expected a whole number"),
         ("codec.mode=lossy", "expected one of exact, quantized"),
         ("densify=1", "this is a block"),

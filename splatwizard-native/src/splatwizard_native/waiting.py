@@ -13,6 +13,7 @@ with SPLATWIZARD_SHARE_CORES=0, and where the environment says how to wait.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import threading
@@ -111,10 +112,9 @@ class Watch:
 
         clock, judge, sleepers = CoreTime(), Judge(), Sleepers()
         while not self._leave.wait(INTERVAL):
-            threads = torch.get_num_threads()
             if not judge.look(clock.lap()):
                 sleepers.go()
-            elif threads > 1:  # one alone waits for nobody
+            elif (threads := torch.get_num_threads()) > 1:  # one alone waits for nobody
                 sleepers.come(threads)
         sleepers.go()
 
@@ -126,7 +126,8 @@ def watch_cores() -> None:
     if _watch is not None or forbidden or any(os.environ.get(name) for name in SETTINGS):
         return
     if os.path.exists("/proc/self/schedstat") and openmp_libraries():
-        _watch = Watch()
+        with contextlib.suppress(RuntimeError):  # no more threads are allowed here: the work goes on without a watch
+            _watch = Watch()
 
 
 _watch: Watch | None = None

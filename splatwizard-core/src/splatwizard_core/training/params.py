@@ -64,7 +64,7 @@ class PipelineParams(Params):
         0, ge=0, description="one integer; init, sampler, split, background and method streams derive from it"
     )
     device: Literal["auto", "cpu", "cuda"] = Field("auto", description="auto: CUDA if its kernels can run, else CPU")
-    threads: int = Field(0, ge=0, description="CPU threads; 0: all cores that this process may use")
+    threads: int = Field(0, ge=0, le=1024, description="CPU threads; 0: all cores that this process may use")
     checkpoint_every: int = Field(1000, ge=1, description="steps between checkpoints")
     log_every: int = Field(10, ge=1, description="steps between lines of log.jsonl")
     keep_checkpoints: int = Field(1, ge=1, description="how many of the newest checkpoints stay")

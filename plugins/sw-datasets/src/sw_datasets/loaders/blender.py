@@ -148,6 +148,8 @@ def _read_views(path: Path, file: str, rules: Rules) -> tuple[list[View], float]
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         data = json.loads(path.read_bytes())
+    except FileNotFoundError:
+        raise SceneError(f"{path} is missing: {path.parent} is no Blender scene", path=str(path)) from None
     except (OSError, ValueError, RecursionError) as error:
         raise SceneError(f"{path}: not readable JSON ({error})", path=str(path)) from error
     if not isinstance(data, dict):

@@ -333,7 +333,7 @@ class _line:  # noqa: N801 (a context manager that reads like a statement)
 
 def _split_lines(path: Path) -> list[str]:
     try:
-        text = path.read_bytes().decode()
+        text = path.read_bytes().decode("utf-8-sig")  # some editors of Windows begin a file with a mark
     except UnicodeDecodeError as error:
         raise SceneError(f"{path}: not UTF-8 text at byte {error.start}", path=str(path)) from error
     except OSError as error:
