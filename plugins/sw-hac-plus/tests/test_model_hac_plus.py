@@ -169,6 +169,17 @@ def test_anchors_that_no_view_sees_have_a_rate_too():
     assert all(float(grid.table.grad.abs().max()) > 0 for grid in model.grid.grids)
 
 
+@pytest.mark.parametrize("floor", [0.0, 0.05])
+def test_deviations_below_zero_learn_if_there_is_a_floor(floor):
+    """Those of the features by the grid; without channels, which would see them too."""
+    model = make(n=40, channel__kind="none", rate_term__scale_floor=floor)
+    last = model.mlp_grid[2]
+    with torch.no_grad():
+        last.weight[8:16], last.bias[8:16] = 0, -1.0
+    rate_of(model).bits.backward()
+    assert bool((last.bias.grad[8:16] < 0).any()) == bool(floor)
+
+
 def test_an_empty_sample_costs_nothing():
     assert float(rate_of(make(n=40), sample=0.0).bits) == 0
 

@@ -354,6 +354,15 @@ class CodedAnchors(AnchorModel):
         taken = take_rows(drawn, forecast.steps, masks, *([] if forecast.hidden is None else [forecast.hidden]))
         return self._rate_of_sample(drawn, (sample, *taken), forecast, kept.index_select(0, drawn), kept.mean())
 
+    def floored(self, scale: Tensor, steps: Tensor) -> Tensor:
+        """Keep predicted deviations [S,C] to `scale_floor`, for quantiser steps [S,C]; differentiable.
+
+        Of a column whose deviations are all at SMALLEST_SCALE no value lies where a gradient would tell: none learns.
+        """
+        if self.scale_floor:
+            return lower_bound(scale, self.scale_floor * steps.detach())
+        return scale.clamp(min=SMALLEST_SCALE)
+
     def rate_of(
         self,
         drawn: Tensor,
@@ -381,8 +390,7 @@ class CodedAnchors(AnchorModel):
         hidden = taken[3] if len(taken) > 3 else None
         mean, scale = forecast.sample(drawn, hidden, x)
         if self.scale_floor:
-            # Of a column whose deviations are all at 1e-9 no value lies where a gradient would tell, and none learns.
-            scale = lower_bound(scale, self.scale_floor * self.widened(step.detach()))
+            scale = self.floored(scale, self.widened(step))
         bits, by_group = sample_bits(
             x, mean, scale, step, mask, counted, p_min=self.smallest_probability, smallest_scale=SMALLEST_SCALE
         )

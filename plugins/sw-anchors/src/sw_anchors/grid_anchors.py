@@ -89,8 +89,8 @@ class GridAnchors(CodedAnchors):
         made = cls.from_points(
             scene.points, voxel_size=config.voxel_size, num_offsets=config.num_offsets,
             feature_dim=config.feature_dim, hidden=config.hidden, margin=config.margin,
-            sample=config.rate_term.sample, base_steps=config.steps.triple, generator=generator, grid=grid,
-            grid_hidden=c.hidden, in_steps=config.rate_term.units == "steps", **kwargs,
+            sample=config.rate_term.sample, scale_floor=config.rate_term.scale_floor, base_steps=config.steps.triple,
+            generator=generator, grid=grid, grid_hidden=c.hidden, in_steps=config.rate_term.units == "steps", **kwargs,
         )  # fmt: skip
         assert isinstance(made, cls)
         return made

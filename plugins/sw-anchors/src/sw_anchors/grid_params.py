@@ -1,6 +1,6 @@
 """Hyper-parameters of methods whose anchors a binary hash grid predicts. Defaults are those of HAC on Mip-NeRF 360."""
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -55,6 +55,13 @@ class RateTerm(Params):
     weight: float = Field(0.001, ge=0, description="lambda: weight of the bits per number")
     masks: float = Field(5e-4, ge=0, description="weight of the mean soft mask, once the rate counts")
     sample: float = Field(0.05, gt=0, le=1, description="share of the visible anchors whose bits are computed")
+    scale_floor: float = Field(
+        0.0,
+        ge=0,
+        le=1,
+        description="least deviation of a number in training, in its steps; 0.05: that of the coder, with a gradient "
+        "from below; 0: 1e-9 as published, from where no deviation learns",
+    )
     start: Literal["network", "statistics"] = Field(
         "network",
         description="first prediction: the network's, as published, or mean and deviation of the values at that step",
@@ -97,6 +104,13 @@ class GridAnchorParams(CodedAnchorParams):
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
     rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
+
+    def identity(self) -> dict[str, Any]:
+        """Return all values, `rate_term.scale_floor` only where there is one: trainings of before it are found."""
+        content = super().identity()
+        if not self.rate_term.scale_floor:
+            del content["rate_term"]["scale_floor"]
+        return content
 
     @property
     def margin(self) -> Margin:

@@ -14,7 +14,6 @@ from splatwizard_core.api import Params
 
 FULL_RUN = 40_000
 """Steps of the published plan."""
-SCALE_FLOOR = "rate_term.scale_floor"
 
 
 class Phases(Params):
@@ -144,11 +143,6 @@ class CatConfig(Choosing, CodedAnchorParams):
     context: Context = Field(Context(), description="the models that predict attributes")
     rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what writes the file")
-
-    def translated(self, values: dict[str, Any]) -> dict[str, Any]:
-        """Return values of a run of before `rate_term.scale_floor`, known by all other keys of the block, as it was."""
-        missing = {f"rate_term.{name}" for name in RateTerm.model_fields} - values.keys()
-        return {**values, SCALE_FLOOR: 0.0} if missing == {SCALE_FLOOR} else values
 
     def identity(self) -> dict[str, Any]:
         """Return all values, `rate_term.scale_floor` only where there is one: trainings of before it are found."""

@@ -28,9 +28,6 @@ if TYPE_CHECKING:
 
     from splatwizard_core.api import Camera, GaussianInputs
 
-SMALLEST_SCALE = 1e-9
-"""Floor of a predicted deviation, as published."""
-
 
 @dataclass(frozen=True)
 class PoolForecast(AnchorForecast):
@@ -171,7 +168,7 @@ class HACPlusAnchors(GridAnchors):
         f, count = self.shape.features, self._distributions
         parts = torch.split(outputs[:, :count], self.shape.outputs[:-1], dim=1)
         mean = torch.cat(parts[0::2], dim=1)
-        scale = torch.cat(parts[1::2], dim=1).clamp(min=SMALLEST_SCALE)
+        scale = self.floored(torch.cat(parts[1::2], dim=1), steps)
         if self.channel is None:
             return gaussian_bits(values, mean, scale, steps, p_min=self.smallest_probability)
         base, logit = self.base_steps[0], outputs[:, count + 3 :]
@@ -181,7 +178,7 @@ class HACPlusAnchors(GridAnchors):
             values[:, :f],
             torch.stack([logit, second_logit], dim=-1),
             torch.stack([mean[:, :f], base * second_mean], dim=-1),
-            torch.stack([scale[:, :f], (base * second_scale).clamp(min=SMALLEST_SCALE)], dim=-1),
+            torch.stack([scale[:, :f], self.floored(base * second_scale, steps[:, :f])], dim=-1),
             steps[:, :f],
             p_min=self.smallest_probability,
         )
