@@ -76,6 +76,15 @@ def test_an_end_of_small_pictures_without_a_schedule_is_refused(name):
 
 
 @pytest.mark.parametrize("name", OWN)
+@pytest.mark.parametrize(
+    "values", [{"pictures__until": 10**12}, {"pictures__until": STEPS + 1, "scale_schedule": False}]
+)
+def test_pictures_that_never_become_whole_are_refused(name, values):
+    with pytest.raises(ConfigError, match=r"pictures\.until is \d+, and the plan ends at"):
+        stage_of(name, pictures__schedule="dash", **values)
+
+
+@pytest.mark.parametrize("name", OWN)
 @pytest.mark.parametrize("share", [0.2, 0.8])
 def test_pictures_may_be_whole_before_growth_is_over_or_after(name, share):
     full = PLUGINS.methods.load(name).Config.FULL_ITERATIONS

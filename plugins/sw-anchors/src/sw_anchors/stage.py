@@ -55,7 +55,7 @@ class AnchorStage(Stage):
 
     def __init__(self, opt: AnchorParams) -> None:
         super().__init__(opt)
-        opt.pictures.check()
+        opt.pictures.check(opt)
         self.extent = 1.0  # known when the stage begins; a plan can be printed without a scene
 
     def at(self, step: int) -> int:

@@ -57,7 +57,7 @@ class Compact3DGSStage(ThreeDGSStage):
 
     def __init__(self, opt: Compact3DGSConfig) -> None:
         super().__init__(opt.base)
-        opt.pictures.check()
+        opt.pictures.check(opt)
         self.opt = opt
         self.own = opt
 

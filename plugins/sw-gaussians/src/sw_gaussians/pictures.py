@@ -10,7 +10,7 @@ from pydantic import Field
 from splatwizard_core.api import ConfigError, Params
 
 if TYPE_CHECKING:
-    from splatwizard_core.api import CameraSampler, Scene, Stage
+    from splatwizard_core.api import CameraSampler, OptimizationParams, Scene, Stage
 
 
 class Pictures(Params):
@@ -23,11 +23,17 @@ class Pictures(Params):
     start: float = Field(4.0, ge=1, description="times that the first pictures are smaller, at most")
     until: int = Field(0, ge=0, description="step from which pictures are whole; 0: that at which growth is over")
 
-    def check(self) -> None:
-        """Raise ConfigError for a value without effect: when a stage is made, before anything runs."""
+    def check(self, opt: OptimizationParams) -> None:
+        """Raise ConfigError for a value without effect in a run of `opt`; for when a stage is made."""
         if self.until and self.schedule == "none":
             raise ConfigError(
                 "pictures.until says when pictures become whole: set pictures.schedule=dash with it",
+                key="pictures.until",
+            )
+        steps = opt.FULL_ITERATIONS if opt.scale_schedule else opt.iterations
+        if self.until > steps:
+            raise ConfigError(
+                f"pictures.until is {self.until}, and the plan ends at {steps}: pictures never become whole, lower it",
                 key="pictures.until",
             )
 
