@@ -16,6 +16,7 @@ from splatwizard_core.api import (
     EmptyModel,
     GaussianModel,
     ParamGroup,
+    PipelineParams,
     RasterOptions,
     SplatOptimizer,
     TaskLog,
@@ -26,6 +27,7 @@ from splatwizard_core.api import (
 SIZE = 12
 BLACK = torch.zeros(3)
 RASTERIZER = ReferenceRasterizer()
+PPL = PipelineParams()
 
 
 class Picture:
@@ -134,6 +136,30 @@ def test_guilt_is_a_share_that_one_outlier_does_not_decide():
     assert ViewEvidence(torch.zeros(2000), blame, views=1).guilt()[999] == pytest.approx(0.5, abs=1e-3)
 
 
+def test_guilt_is_a_share_of_the_largest_where_hardly_any_have_blame():
+    blame = torch.zeros(2000)
+    blame[:2] = torch.tensor([1.0, 4.0])
+    assert ViewEvidence(torch.zeros(2000), blame, views=1).guilt()[:3].tolist() == [0.25, 1.0, 0.0]
+    assert not ViewEvidence(torch.zeros(5), torch.full((5,), 3.0), views=1).guilt().any()
+
+
+def test_blame_that_is_not_finite_is_none():
+    blame = torch.tensor([float("nan"), 1.0, 4.0, float("inf"), 0.0])
+    assert ViewEvidence(torch.zeros(5), blame, views=1).guilt().tolist() == [0.0, 0.25, 1.0, 0.0, 0.0]
+
+
+def test_evidence_is_of_the_pictures_and_the_loss_that_are_trained(model, views):
+    white = torch.full((3,), 3.0)  # drawings above 1, which a clamped training does not see
+    settings = {"lambda_dssim": 0.5, "padding": "valid"}
+    found = view_evidence(model, views[:1], RASTERIZER, white, clamp=True, **settings)
+    plain = view_evidence(model, views[:1], RASTERIZER, white)
+    assert not torch.equal(found.counts, plain.counts)
+    camera, truth = views[0].camera, views[0].image()
+    drawn = RASTERIZER.render(model.gaussians(camera, RASTERIZER), camera, RasterOptions(background=white)).image
+    loss = photometric_loss(drawn.detach().clamp(0, 1), truth, **settings).total
+    assert torch.allclose(found.blame, loss * found.counts, rtol=1e-5)
+
+
 def test_evidence_without_a_view_is_an_error(model):
     with pytest.raises(ValueError, match="at least one"):
         view_evidence(model, [], RASTERIZER, BLACK)
@@ -200,7 +226,7 @@ def test_the_task_vetoes_by_the_views_that_it_draws(model, views):
     wanted = view_evidence(own, views, RASTERIZER, BLACK).wanted(5)
     assert 0 < int(wanted.sum()) < own.num_rows
     task = DensifyToBudget(first=0, last=10, cap=100, growth=0.0, veto_views=2, percent_dense=1.0)
-    task(own, optimizer_of(own), scene_of(views), SimpleNamespace(iterations=100), 10, TaskLog(), RASTERIZER)
+    task(own, optimizer_of(own), scene_of(views), SimpleNamespace(iterations=100), 10, TaskLog(), RASTERIZER, PPL)
     assert own.num_rows == 12 + int(wanted.sum())
     with pytest.raises(ValueError, match="veto_views is -1"):
         DensifyToBudget(veto_views=-1)
@@ -214,12 +240,12 @@ def test_late_pruning_takes_the_faint_and_the_guilty(model, views):
     expected = own.means.detach()[stays]
     call = (scene_of(views), SimpleNamespace(iterations=100))
     task = PruneByViews(views=2, most=0.5)
-    task(own, optimizer_of(own), *call, 100, TaskLog(), RASTERIZER)
+    task(own, optimizer_of(own), *call, 100, TaskLog(), RASTERIZER, PPL)
     assert own.num_rows == 12  # no update follows the last step
     log = TaskLog()
-    task(own, optimizer_of(own), *call, 60, log, RASTERIZER)
+    task(own, optimizer_of(own), *call, 60, log, RASTERIZER, PPL)
     assert torch.equal(own.means, expected)
     with pytest.raises(EmptyModel):
-        PruneByViews(views=1, min_opacity=1.0)(own, optimizer_of(own), *call, 60, TaskLog(), RASTERIZER)
+        PruneByViews(views=1, min_opacity=1.0)(own, optimizer_of(own), *call, 60, TaskLog(), RASTERIZER, PPL)
     with pytest.raises(ValueError, match="views is 0"):
         PruneByViews(views=0)

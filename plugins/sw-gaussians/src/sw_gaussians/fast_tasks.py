@@ -3,7 +3,7 @@
 As those of `tasks`, they change nothing at the last step of a stage: no update follows that could repair it.
 """
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 
@@ -11,6 +11,7 @@ from splatwizard_core.api import (
     EmptyModel,
     GaussianModel,
     OptimizationParams,
+    PipelineParams,
     Rasterizer,
     Scene,
     SplatOptimizer,
@@ -75,12 +76,13 @@ class DensifyToBudget:
         step: int,
         log: TaskLog,
         rasterizer: Rasterizer,
+        ppl: PipelineParams,
     ) -> None:
         if step >= opt.iterations:
             return
         wanted = None
         if self.veto_views:
-            wanted = _evidence(model, scene, rasterizer, self.veto_views).wanted(self.veto_pixels)
+            wanted = _evidence(model, scene, rasterizer, ppl, self.veto_views).wanted(self.veto_pixels)
         start = 0 if scene.points is None else len(scene.points)
         target = budget.linear_target(step, first=self.first, last=self.last, start=start, cap=self.cap)
         report = budget.densify_to_budget(
@@ -109,15 +111,26 @@ class PruneByViews:
     views           training views that are drawn each time
     min_opacity     fainter Gaussians go
     most            those whose share of the blame exceeds this go, 0..1 (`veto.ViewEvidence.guilt`)
+    lambda_dssim, padding   of the photometric loss that a view's pixels are weighted with
 
+    Views are drawn as the training draws them, but on the scene's background even where that of a step is random.
     Raises ValueError for less than one view, EmptyModel if nothing is left. Curve: "pruned", a number of Gaussians.
     Source: FastGS (arXiv 2511.04283), pruning after densification: 10 views, 0.1, 0.9.
     """
 
-    def __init__(self, *, views: int = 10, min_opacity: float = 0.1, most: float = 0.9) -> None:
+    def __init__(
+        self,
+        *,
+        views: int = 10,
+        min_opacity: float = 0.1,
+        most: float = 0.9,
+        lambda_dssim: float = 0.2,
+        padding: Literal["same", "valid"] = "same",
+    ) -> None:
         if views < 1:
             raise ValueError(f"views is {views}: it must be at least 1")
         self.views, self.min_opacity, self.most = views, min_opacity, most
+        self.lambda_dssim, self.padding = lambda_dssim, padding
 
     def __call__(
         self,
@@ -128,11 +141,13 @@ class PruneByViews:
         step: int,
         log: TaskLog,
         rasterizer: Rasterizer,
+        ppl: PipelineParams,
     ) -> None:
         if step >= opt.iterations:
             return
         with torch.no_grad():
-            evidence = _evidence(model, scene, rasterizer, self.views)
+            loss = {"lambda_dssim": self.lambda_dssim, "padding": self.padding}
+            evidence = _evidence(model, scene, rasterizer, ppl, self.views, **loss)
             stays = (model.opacities >= self.min_opacity) & (evidence.guilt() <= self.most)
             left, before = int(stays.sum()), model.num_rows
             if left == 0:
@@ -141,6 +156,9 @@ class PruneByViews:
         log.scalar("pruned", before - left)
 
 
-def _evidence(model: GaussianModel, scene: Scene, rasterizer: Rasterizer, count: int) -> ViewEvidence:
+def _evidence(
+    model: GaussianModel, scene: Scene, rasterizer: Rasterizer, ppl: PipelineParams, count: int, **loss: Any
+) -> ViewEvidence:
     views = draw_views(scene.train, count, model.next_split_generator())
-    return view_evidence(model, views, rasterizer, scene.background.to(model.device))
+    background = scene.background.to(model.device)
+    return view_evidence(model, views, rasterizer, background, clamp=ppl.clamp_render, **loss)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -34,7 +35,7 @@ class ViewEvidence:
     """Sums over views of how many badly drawn pixels each Gaussian was blended into.
 
     counts  [N] int64
-    blame   [N] float32, each view's pixels times its loss (0.8 L1 + 0.2 (1 - SSIM))
+    blame   [N] float32, each view's pixels times its photometric loss
     views   how many views there were
     """
 
@@ -49,11 +50,14 @@ class ViewEvidence:
     def guilt(self) -> Tensor:
         """Return the blame [N] as a share, 0..1, of that which a thousandth of the Gaussians exceeds.
 
-        Paper: of the largest, which one outlier decides.
+        Of the largest, as in the paper, where fewer than a thousandth have more than the least; elsewhere one outlier
+        would decide it. Blame that is not finite counts as none.
         """
-        low = self.blame.min()
-        high = torch.kthvalue(self.blame, math.ceil((1 - OUTLIERS) * len(self.blame))).values
-        return ((self.blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
+        blame = self.blame.nan_to_num(0.0, 0.0, 0.0)
+        low, most = blame.aminmax()
+        high = torch.kthvalue(blame, math.ceil((1 - OUTLIERS) * len(blame))).values
+        high = torch.where(high > low, high, most)
+        return ((blame - low) / (high - low).clamp_min(1e-30)).clamp_(0, 1)
 
 
 @torch.no_grad()
@@ -64,12 +68,17 @@ def view_evidence(
     background: Tensor,
     *,
     threshold: float = LOSS_THRESHOLD,
+    clamp: bool = False,
+    lambda_dssim: float = 0.2,
+    padding: Literal["same", "valid"] = "same",
 ) -> ViewEvidence:
     """Draw the views, find their badly drawn pixels, and count those of each Gaussian.
 
     background  [3] of the training, 0..1
     threshold   a pixel is badly drawn where its absolute error, the mean over channels, brought to 0..1 by the view's
                 least and largest, exceeds this
+    clamp       bring drawings to 0..1 first, as a training with `clamp_render` does
+    lambda_dssim, padding   of the photometric loss, whatever else a stage adds to its own
 
     A Gaussian takes part where its alpha is at least 1/255, before the pixel is opaque. Two drawings a view, no
     gradient. Raises ValueError without views, CapabilityError of a rasterizer that does not count.
@@ -83,12 +92,13 @@ def view_evidence(
         camera = view.camera.to(device)
         inputs = model.gaussians(camera, rasterizer)
         image = rasterizer.render(inputs, camera, RasterOptions(background=background)).image
+        image = image.clamp(0, 1) if clamp else image
         truth = view.image(background, device)
         hits = ScoreSpec("hits", "hits", pixel_weight=badly_drawn(image, truth, threshold))
         found = rasterizer.render(inputs, camera, RasterOptions(background=background, scores=(hits,)))
         drawn = found.scores["hits"]
         counts += drawn
-        blame += photometric_loss(image, truth).total * drawn
+        blame += photometric_loss(image, truth, lambda_dssim=lambda_dssim, padding=padding).total * drawn
     return ViewEvidence(counts, blame, len(views))
 
 
