@@ -47,6 +47,14 @@ def test_it_updates_at_each_step_until_the_first_and_then_with_sums():
     assert optimizer.states["means"].step == 5
 
 
+def test_the_last_step_updates_with_what_there_is():
+    model = model_of()
+    run(BatchingOptimizer(model, groups()), SumViews(views=8, first=2, last=4), range(1, 5))
+    expected = plain([range(1, 2), range(2, 5)])
+    for name, p in model.named_parameters():
+        assert torch.allclose(p, expected[name], rtol=1e-6, atol=1e-7), name
+
+
 def test_sums_follow_the_rows_and_are_saved():
     task, order = SumViews(views=2, first=1), torch.tensor([2, 0, 3])
     ends = []

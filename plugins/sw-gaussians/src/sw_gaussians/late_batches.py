@@ -30,13 +30,16 @@ class BatchingOptimizer(SplatOptimizer):
 class SumViews:
     """Lets the optimizer update at every `views`-th step, from step `first` on, with the sum of the views in between.
 
+    last    step that updates with what there is by then, be it fewer views; None: what is left is lost
+
     Source: FastGS (arXiv 2511.04283). Raises ValueError for less than one view.
     """
 
-    def __init__(self, *, views: int = 8, first: int = 8_000) -> None:
+    def __init__(self, *, views: int = 8, first: int = 8_000, last: int | None = None) -> None:
         if views < 1:
             raise ValueError(f"views is {views}: it must be at least 1")
-        self.views, self.first = views, first
+        self.views, self.first, self.last = views, first, last
 
     def __call__(self, optimizer: BatchingOptimizer, step: int) -> None:
-        optimizer.waits = step >= self.first and (step - self.first + 1) % self.views != 0
+        whole = (step - self.first + 1) % self.views == 0
+        optimizer.waits = step >= self.first and step != self.last and not whole
