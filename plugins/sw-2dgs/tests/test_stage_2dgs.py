@@ -202,6 +202,12 @@ def test_a_score_that_no_rasterizer_of_surfels_has_is_refused_at_once():
         TwoDGSStage(configured(fast__densify="budget"))
 
 
+@pytest.mark.parametrize("key", ["fast.veto_views", "fast.late_prune"])
+def test_what_counts_pixels_is_refused_at_once(key):
+    with pytest.raises(ConfigError, match=key):
+        TwoDGSStage(configured(fast__densify="budget", fast__score="gradient", **{key: 2 if "views" in key else True}))
+
+
 def test_a_budget_prunes_below_a_reset_as_plain_density_control_does():
     for values in ({}, {"iterations": 9_000, "scale_schedule": True}):
         stage = TwoDGSStage(configured(fast__densify="budget", fast__score="gradient", **values))

@@ -44,6 +44,11 @@ class TwoDGSStage(ThreeDGSStage):
                 "does: set fast.score=gradient",
                 key="fast.score",
             )
+        for key, on in (("fast.veto_views", opt.fast.veto_views), ("fast.late_prune", opt.fast.late_prune)):
+            if on:
+                raise ConfigError(
+                    f"{key} counts the pixels of Gaussians, which no rasterizer of surfels does: leave it off", key=key
+                )
         self.settings = opt.surface
         self.surface = self._configured(OTHER)
         self._drawn: dict[tuple[bool, bool], RasterOptions] = {}  # by the losses that are on
