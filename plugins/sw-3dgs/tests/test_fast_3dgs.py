@@ -5,6 +5,8 @@ import torch
 from sw_gaussians.cadence import CadencedOptimizer
 from sw_gaussians.config import Fast, GaussianTraining
 from sw_gaussians.fast import FAST
+from sw_gaussians.fast_tasks import PruneByViews
+from sw_gaussians.late_batches import SumViews
 from sw_gaussians.resolution import ResolutionSampler
 from sw_gaussians.stage import ThreeDGSStage
 from sw_gaussians.start import gaussians_from_points
@@ -156,9 +158,42 @@ def test_the_end_has_its_own_tasks_where_it_is_asked_for():
     assert "| average parameters          | range(9000, 10001, 10)" in plan
     assert "| sum views                   | range(8000, 10001)" in plan
     assert "| settle learning rates       | range(8000, 10001)" in plan
-    assert "| prune by views              | range(6000, 9000, 1000)" in plan
-    unscaled = stage_of(fast__settle=0.1, scale_schedule=False, iterations=7_000)
-    assert "settle" not in format_plan(*build_schedulers(unscaled, PipelineParams()))  # densification does not end
+    assert "| prune by views              | range(8400, 9600, 400)" in plan
+
+
+@pytest.mark.parametrize(
+    ("preset", "steps"),
+    [("paper", [18_000, 21_000, 24_000]), ("fast", [8_400, 8_800, 9_200]), ("quick", [1_360, 1_520, 1_680])],
+)
+def test_late_pruning_is_after_density_control_in_every_plan(preset, steps):
+    stage = ThreeDGSStage(resolve(ThreeDGS, preset, sets={"fast.late_prune": True}).config)
+    assert list(stage.late_prunes) == steps
+    assert stage.settled < steps[0] < steps[-1] < stage.iterations
+
+
+@pytest.mark.parametrize(("key", "value"), [("late_prune", True), ("late_views", 8), ("settle", 0.5), ("average", 0.1)])
+def test_parts_of_an_end_that_does_not_come_are_refused(key, value):
+    with pytest.raises(ConfigError, match=f"fast.{key} would have no effect"):
+        stage_of(**{f"fast__{key}": value}, scale_schedule=False, iterations=7_000)
+
+
+def test_an_average_over_few_steps_has_two_samples():
+    pre, _ = build_schedulers(stage_of(fast__average=0.0005), PipelineParams())
+    assert "range(9995, 10001, 5)" in {str(entry.when) for entry in pre.registrations}
+
+
+def test_late_sums_end_with_the_last_update():
+    pre, _ = build_schedulers(stage_of(fast__late_views=4), PipelineParams())
+    (task,) = (entry.task for entry in pre.registrations if isinstance(entry.task, SumViews))
+    assert task.last == 9_999  # no update follows the last step
+
+
+def test_late_pruning_goes_by_the_loss_of_the_training():
+    _, post = build_schedulers(
+        stage_of(fast__late_prune=True, loss__lambda_dssim=0.5, loss__ssim_padding="valid"), PipelineParams()
+    )
+    (task,) = (entry.task for entry in post.registrations if isinstance(entry.task, PruneByViews))
+    assert (task.lambda_dssim, task.padding) == (0.5, "valid")
 
 
 def test_parts_that_came_later_change_no_identity_while_off():

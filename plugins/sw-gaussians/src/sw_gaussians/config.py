@@ -114,23 +114,33 @@ class Fast(Params):
     )
     veto_pixels: float = Field(5.0, ge=0, description="with the veto: in more of them a view than this, on average")
     late_prune: bool = Field(
-        False, description="at 0.6, 0.7 and 0.8 of the full plan remove what is faint, or what 10 views blame (FastGS)"
+        False,
+        description="in three rounds after density control remove what is faint, or what 10 views blame (FastGS)",
     )
     late_views: int = Field(
-        1, ge=1, description="views whose summed gradients make one update, from densify.stop on (FastGS)"
+        1, ge=1, description="views whose summed gradients make one update, from the end of density control on (FastGS)"
     )
     settle: float = Field(
         1.0,
         gt=0,
         le=1,
-        description="all rates but that of the means fall to so much of themselves from densify.stop on",
+        description="all rates but that of the means fall to so much of themselves from the end of density control on",
     )
     average: float = Field(
-        0.0, ge=0, lt=1, description="share of the run, at its end and after densify.stop, whose mean the model becomes"
+        0.0,
+        ge=0,
+        lt=1,
+        description="share of the run, at its end and after density control, whose mean the model becomes",
     )
 
+    def late(self) -> list[str]:
+        """Return the keys that are on and act after density control alone."""
+        return [f"fast.{name}" for name in LATE if getattr(self, name) != type(self).model_fields[name].default]
 
-LATER = ("resolution_hold", "veto_views", "veto_pixels", "late_prune", "late_views", "settle", "average")
+
+LATE = ("late_prune", "late_views", "settle", "average")
+"""Keys of `Fast` that act after density control."""
+LATER = ("resolution_hold", "veto_views", "veto_pixels", *LATE)
 """Keys of `Fast` that came after others: while they are off, trainings of before them have the same identity."""
 
 

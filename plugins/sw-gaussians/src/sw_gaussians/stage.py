@@ -49,11 +49,8 @@ if TYPE_CHECKING:
 READERS = (collect_statistics, fragments.collect_opacity_gradients)
 """Tasks that leave all gradients alone, and read none of spherical harmonics."""
 
-LATE_PRUNES = range(18_000, 27_000, 3_000)
-"""Steps of the full plan at which `fast.late_prune` prunes. Source: FastGS (arXiv 2511.04283), and 27,000."""
-
 AVERAGE_EVERY = 10
-"""Steps between two samples of `fast.average`: reading them takes a hundredth of a step."""
+"""Steps between two samples of `fast.average`, fewer if it begins later: reading them takes a hundredth of a step."""
 
 
 class ThreeDGSStage(Stage):
@@ -67,6 +64,7 @@ class ThreeDGSStage(Stage):
 
     def __init__(self, opt: GaussianTraining, *, fuses_updates: bool = False) -> None:
         super().__init__(opt)
+        self.config = opt
         self.fuses_updates = fuses_updates
         if fuses_updates and (opt.sparse_adam != "off" or opt.fast.sh_every > 1):
             raise ConfigError(
@@ -100,10 +98,15 @@ class ThreeDGSStage(Stage):
             raise ConfigError("fast.veto_views is a veto of the budget's draw: set fast.densify=budget with it")
         if opt.fast.late_prune and opt.mcmc.enabled:
             raise ConfigError("mcmc.enabled moves Gaussians instead of pruning them: leave fast.late_prune off")
+        late = opt.fast.late()
+        if late and self.settled + 1 >= self.iterations:  # no update follows the last step
+            raise ConfigError(
+                f"{' and '.join(late)} would have no effect: density control goes on until step {self.settled}, and "
+                f"the run has {self.iterations}; set scale_schedule=true, more iterations, or an earlier stop"
+            )
         self._fragments = budget and opt.fast.score == "opacity_variance"
         if self._fragments and opt.densify.absgrad:
             raise ConfigError("densify.absgrad does not go with fast.score=opacity_variance: set fast.score=gradient")
-        self.config = opt
         self._options: RasterOptions | None = None  # of the last step: nearly always those of the next
         if opt.fast.resolution_hold and opt.fast.resolution == "none":
             raise ConfigError(
@@ -127,6 +130,22 @@ class ThreeDGSStage(Stage):
         found = self.when(range(densify.start, densify.stop, densify.interval))
         assert isinstance(found, range)
         return found
+
+    @property
+    def settled(self) -> int:
+        """Step of this run at which density control ends."""
+        chain = self.config.mcmc
+        return self.steps(chain.stop if chain.enabled else self.config.densify.stop)
+
+    @property
+    def late_prunes(self) -> range:
+        """Steps of this run at which `fast.late_prune` prunes: one, two and three fifths into what is left then.
+
+        In the full plan these are 18,000, 21,000 and 24,000. Source: FastGS (arXiv 2511.04283), which prunes at 27,000
+        too.
+        """
+        fifth = max(1, (self.iterations - self.settled) // 5)
+        return range(self.settled + fifth, self.settled + 4 * fifth, fifth)
 
     def begin(self, context: StageContext) -> SplatModel:
         self.white = context.scene.protocol.background == "white"
@@ -206,17 +225,18 @@ class ThreeDGSStage(Stage):
 
     def _register_end(self, scheduler: Scheduler) -> None:
         """Register what is different once the number of Gaussians is settled."""
-        chain, fast = self.config.mcmc, self.config.fast
-        first = self.steps(chain.stop if chain.enabled else self.config.densify.stop)
+        fast, first = self.config.fast, self.settled
         end = range(first, self.iterations + 1)
         if fast.late_views > 1:
-            scheduler.register_task(end, SumViews(views=fast.late_views, first=first), name="sum views")
+            sums = SumViews(views=fast.late_views, first=first, last=self.iterations - 1)
+            scheduler.register_task(end, sums, name="sum views")
         begin = max(first, round(self.iterations * (1 - fast.average)))
         if begin < self.iterations:
-            begin += (self.iterations - begin) % AVERAGE_EVERY
-            average = AverageParameters(first=begin, last=self.iterations, every=AVERAGE_EVERY)
+            every = min(AVERAGE_EVERY, self.iterations - begin)
+            begin += (self.iterations - begin) % every
+            average = AverageParameters(first=begin, last=self.iterations, every=every)
             scheduler.register_task(average.steps, average, name="average parameters")
-        if fast.settle < 1 and first < self.iterations:
+        if fast.settle < 1:
             settle = SettleLearningRates(self._rates(), first=first, last=self.iterations, factor=fast.settle)
             scheduler.register_task(end, settle, name="settle learning rates")
 
@@ -248,7 +268,9 @@ class ThreeDGSStage(Stage):
         else:
             scheduler.register_task(self.densifications, self.densification(), name="prune and densify")
         if self.config.fast.late_prune:
-            scheduler.register_task(self.when(LATE_PRUNES), fast_tasks.PruneByViews(), name="prune by views")
+            settings = self.config.loss
+            prune = fast_tasks.PruneByViews(lambda_dssim=settings.lambda_dssim, padding=settings.ssim_padding)
+            scheduler.register_task(self.late_prunes, prune, name="prune by views")
         if self.config.fast.opacity == "halve":
             halve = self.when(range(0, densify.stop, densify.reset_interval))
             scheduler.register_task(halve, fast_tasks.HalveOpacity(), name="halve opacity")
