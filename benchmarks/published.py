@@ -10,17 +10,19 @@ runs are not repeated, interrupted ones go on. A scene that is not there is name
 
 --runs OUT takes finished runs besides, as benchmarks/results_matrix.py and `sw run` leave them, at any depth: those of
 a row's method, rate point, scene and preset; where there is none of that preset, those of `paper`. The table has their
-mean over the seeds, and below it stands everything in which they differ from what was published. Such a row is not run.
+mean over the seeds, and below it stands everything in which they differ from what was published.
+Such a row is not run. A record that cannot be read is told and left out.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
 import os
 import statistics
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -29,6 +31,8 @@ from rich.table import Table
 from sw_report.facts import RunFacts, read_facts
 from sw_report.published import FILE as ROWS
 from sw_report.published import Figure, differences, read_published
+
+from splatwizard_core.api import UserInputError
 
 FIGURES = ("psnr", "ssim", "lpips", "bytes", "gaussians")
 METRICS = {"psnr": "psnr", "ssim": "ssim", "lpips": "lpips_vgg_3dgs"}
@@ -87,15 +91,27 @@ def missing(row: Row, data: Path | None) -> str | None:
     return f"{row.place}: {folder} is not there (docs/datasets.md)"
 
 
-def is_finished(run: Path) -> bool:
-    """Whether a run directory holds a record."""
-    return (run / "metrics.json").is_file()
+@functools.cache
+def tell(line: str) -> None:
+    """Print a line to stderr, once."""
+    print(line, file=sys.stderr, flush=True)
+
+
+def records(paths: Iterable[Path]) -> list[RunFacts]:
+    """The records in these files; what cannot be read is told and left out."""
+    found = []
+    for path in paths:
+        try:
+            found.append(read_facts(path)[0])
+        except UserInputError as error:
+            tell(f"left out: {error}")
+    return found
 
 
 def finished(roots: Sequence[Path]) -> list[RunFacts]:
     """The records of all runs below `roots`, without the trained scenes that others start from."""
     paths = sorted({path for root in roots for path in root.rglob("metrics.json") if ".trained" not in path.parts})
-    return [read_facts(path)[0] for path in paths]
+    return records(paths)
 
 
 def measured(row: Row, out: Path, others: Sequence[RunFacts]) -> list[RunFacts]:
@@ -104,9 +120,9 @@ def measured(row: Row, out: Path, others: Sequence[RunFacts]) -> list[RunFacts]:
     Since scenes of several data sets are called alike, another run counts only if it read the row's data set, or a
     folder of its own in that data set's layout.
     """
-    own = row.run(out)
-    if is_finished(own):
-        return [read_facts(own / "metrics.json")[0]]
+    own = row.run(out) / "metrics.json"
+    if own.is_file() and (found := records([own])):
+        return found
     of = row.figure
     fitting = [
         run for run in others

@@ -123,7 +123,7 @@ def show(job: str, base: float, what: str, found: tuple[float, float], bar: floa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", default="0,1")
-    parser.add_argument("--jobs", default="train,plain,decode")
+    parser.add_argument("--jobs", type=watch_cost.job_names, default="train,plain,decode")
     watch_cost.add_options(parser, seconds=60)
     parser.add_argument("--frames", type=int, default=200, help="of the plain job")
     parser.add_argument("--busy", type=int, default=4)
@@ -141,7 +141,7 @@ def main() -> None:
     print(f"{'job':8}{'':24}{'s':>8}{'ratio':>8}{'bar':>8}{'share':>8}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        for name in options.jobs.split(","):
+        for name in options.jobs:
             if name == "decode" and options.file is None:
                 options.file = make_file(scratch)
             job = Job(name, options, scratch)

@@ -38,6 +38,7 @@ from typing import Any
 HERE = Path(__file__).resolve()
 SWITCH = "SPLATWIZARD_SHARE_CORES"
 SETTINGS = ("OMP_NUM_THREADS", "OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "MKL_NUM_THREADS")
+JOBS = ("train", "plain", "decode")
 WARM_UP = 5  # s before the first block
 FEWEST = 8  # fours: of fewer a bootstrap tells nothing
 HEAD = f"{'job':8}{'':24}{'s':>8}{'ratio':>8}{'bar':>8}{'share':>8}"
@@ -223,11 +224,29 @@ def rows(job: str, options: argparse.Namespace) -> str:
     return "\n".join(lines)
 
 
+def job_names(text: str) -> list[str]:
+    """Split the names of jobs, for argparse. Raises ArgumentTypeError that names one that does not exist."""
+    names = text.split(",")
+    for name in names:
+        if name not in JOBS:
+            raise argparse.ArgumentTypeError(f"no job '{name}', choose from {', '.join(JOBS)}")
+    return names
+
+
+def positive(text: str) -> float:
+    """Read a finite number above 0, for argparse. Raises ArgumentTypeError."""
+    with contextlib.suppress(ValueError):
+        value = float(text)
+        if 0 < value < math.inf:
+            return value
+    raise argparse.ArgumentTypeError(f"'{text}' is no number above 0")
+
+
 def add_options(parser: argparse.ArgumentParser, seconds: float) -> None:
     """Add those that `rows` reads."""
-    parser.add_argument("--seconds", type=float, default=seconds, help="to measure the watch, each job, or longer")
-    parser.add_argument("--block", type=float, default=0.5, help="seconds, at least, between two switches")
-    parser.add_argument("--looks", type=float, default=4, help="a second, of the watch")
+    parser.add_argument("--seconds", type=positive, default=seconds, help="to measure the watch, each job, or longer")
+    parser.add_argument("--block", type=positive, default=0.5, help="seconds, at least, between two switches")
+    parser.add_argument("--looks", type=positive, default=4, help="a second, of the watch")
     parser.add_argument("--threads", type=int, default=0, help="of the job; 0: as many as there are cores")
     parser.add_argument("--steps", type=int, default=900, help="of a training")
     parser.add_argument("--file", help="to decode")
@@ -236,20 +255,19 @@ def add_options(parser: argparse.ArgumentParser, seconds: float) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cores", default="0,1")
-    parser.add_argument("--jobs", default="train,plain")
+    parser.add_argument("--jobs", type=job_names, default="train,plain", help=f"some of {', '.join(JOBS)}")
     add_options(parser, seconds=90)
     parser.add_argument("--child", metavar="JOB", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.child is not None:
         print(json.dumps(measure(options.child, options)))
         return
-    jobs = options.jobs.split(",")
-    if "decode" in jobs and options.file is None:
+    if "decode" in options.jobs and options.file is None:
         parser.error("the job 'decode' needs --file")
     os.sched_setaffinity(0, {int(core) for core in options.cores.split(",")})
     load = ", ".join(f"{value:.1f}" for value in os.getloadavg())
     print(f"cores {options.cores} of {os.cpu_count()}, load average {load}\n\n{HEAD}", flush=True)
-    for job in jobs:
+    for job in options.jobs:
         print(rows(job, options), flush=True)
 
 

@@ -109,6 +109,23 @@ def test_finished_runs_stand_for_a_row_with_their_mean_and_what_differs(start, o
     assert "preset" not in told.replace("preset paper", "")
 
 
+def test_a_record_that_cannot_be_read_is_told_once_and_left_out(script, other_run, tmp_path, capsys):
+    row = next(r for r in script.read_rows(script.ROWS) if (r.figure.method, r.scene, r.rate) == ("hac", "lego", "r1"))
+    own = row.run(tmp_path / "out")
+    own.mkdir(parents=True)
+    (own / "metrics.json").write_text("{")
+    other_run(0, metrics={"psnr": {"mean": 33.0}})
+    other_run(1, metrics=3)
+    others = script.finished([tmp_path / "h200"])
+    assert [run.mean("psnr") for run in script.measured(row, tmp_path / "out", others)] == [33.0]
+    script.print_table([row], tmp_path / "out", others, script.Console(width=160))
+    told, wrong = capsys.readouterr()
+    assert "33.00 / 35.04" in told
+    assert [line.split(": ")[1] for line in wrong.splitlines()] == [
+        str(tmp_path / "h200" / "seed-1" / "lego" / "hac" / "r1" / "metrics.json"), str(own / "metrics.json"),
+    ]  # fmt: skip
+
+
 def test_runs_of_the_preset_that_is_meant_come_before_those_of_paper(script, other_run, tmp_path):
     row = next(r for r in script.read_rows(script.ROWS) if (r.figure.method, r.scene, r.rate) == ("hac", "lego", "r1"))
     row = replace(row, preset="inria")

@@ -73,6 +73,24 @@ def test_the_ratio_is_what_the_watch_costs_whatever_drifts(script, monkeypatch, 
         assert ratio == pytest.approx(cost, abs=2e-3)
 
 
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--jobs", "train,trian", "no job 'trian', choose from train, plain, decode"),
+        ("--looks", "0", "'0' is no number above 0"),
+        ("--block", "-1", "'-1' is no number above 0"),
+        ("--seconds", "nan", "'nan' is no number above 0"),
+    ],
+)
+def test_a_wrong_option_is_refused_before_anything_runs(script, monkeypatch, capsys, option, value, message):
+    monkeypatch.setattr(script, "rows", lambda *_: pytest.fail("measures"))
+    monkeypatch.setattr(script.os, "sched_setaffinity", lambda *_: None)
+    monkeypatch.setattr(script.sys, "argv", ["watch_cost.py", option, value])
+    with pytest.raises(SystemExit, match="2"):
+        script.main()
+    assert message in capsys.readouterr().err
+
+
 def test_a_new_training_begins_a_new_four_without_the_watch(script, monkeypatch):
     work = FakeWork(script, monkeypatch, cost=1.0, growth=0.0)
     blocks = script.Blocks(seconds=MEASURED, block=0.5)

@@ -5,9 +5,10 @@
     python tools/results.py tables --check       # status 1 where one and its records disagree; writes nothing
 
 A table stands between `<!-- table NAME SCENE -->` and `<!-- end -->` and is wholly written by this script; SCENE is a
-file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at every
-scene, and `table published SCENE` at the published figures of sw-report too. Between `<!-- plot SCENE -->` and
-`<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs ± the deviation of the sample (n - 1).
+file docs/records/SCENE.jsonl, of `table trainers` docs/records/trainers/SCENE.jsonl; `table claims all` looks at the
+scenes that a claim names, and `table published SCENE` at the published figures of sw-report too. Between
+`<!-- plot SCENE -->` and `<!-- end -->` stands docs/images/rd-SCENE.svg. Values are means over the runs ± the deviation
+of the sample (n - 1).
 """
 
 from __future__ import annotations

@@ -112,6 +112,10 @@ def test_without_test_file_the_training_views_are_split(blender_folder, load):
     assert "no transforms_test.json" in scene.warnings[0]
 
 
+def test_a_camera_model_of_null_is_none(blender_folder, load):
+    assert len(load(blender_folder(header={"camera_model": None})).train) == 3
+
+
 def test_a_suffix_in_the_file_is_that_of_a_picture_which_may_have_been_converted(blender_folder, load):
     root = blender_folder(frame={"file_path": "train/r_1.jpg"}, header={"camera_model": "OPENCV", "k1": 0}, train=1)
     (root / "train" / "r_0.png").rename(root / "train" / "r_1.webp")

@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from sw_kit.short_training import file_of, nothing_trained, psnr
+from sw_kit.short_training import file_of, nothing_trained, psnr, train
 
 from splatwizard_core.api import ContainerReader
 
@@ -32,6 +32,11 @@ def test_an_encoder_that_changes_the_model_is_caught(sw_gaussians):
 def test_a_method_that_asks_for_a_trained_scene_must_be_given_one():
     with pytest.raises(AssertionError, match="trained by '3dgs'"):
         nothing_trained("3dgs")
+
+
+def test_an_empty_list_of_stages_does_not_train_those_of_the_method(sw_scene):
+    with pytest.raises(ValueError, match="at least one stage"):
+        train(SimpleNamespace(stages=lambda: pytest.fail("asked for its stages")), sw_scene, None, stages=[])
 
 
 def test_black_pictures_have_the_psnr_of_the_photographs_own_energy(sw_scene):

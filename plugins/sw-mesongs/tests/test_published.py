@@ -73,14 +73,19 @@ def test_values_in_force_are_those_of_the_scene_where_the_configuration_leaves_t
         "prune.tau": 0.24, "prune.settings.beta": 0.3, "codec.settings.depth": 19, "codec.settings.blocks": 7,
         "codec.settings.codebook_size": 8192, "lr.factor": pytest.approx(0.16),
     }  # fmt: skip
-    # Of the importance that weighs the colours, whoever prunes.
-    assert stage_of(plugins, "fox", sets={"prune": "opacity"}).in_force()["prune.settings.beta"] == 0.1
 
 
 def test_only_what_the_configuration_leaves_open_is_looked_up(plugins):
     stage = stage_of(plugins, "kitchen", "r2", {"codec.settings.blocks": 7, "prune.settings.beta": 0.3, "lr.factor": 0})
     assert stage.values == {"prune.tau": 0.24, "codec.settings.depth": 19, "codec.settings.codebook_size": 8192}
     assert list(stage.looked_up(None)) == list(stage.values)  # without a scene the keys are known
+
+
+def test_a_pruner_without_beta_is_given_none(plugins):
+    stage = stage_of(plugins, "kitchen", sets={"prune": "opacity"})
+    assert list(stage.looked_up(None)) == list(stage.in_force()) == [
+        "prune.tau", "codec.settings.depth", "codec.settings.blocks", "codec.settings.codebook_size", "lr.factor",
+    ]  # fmt: skip
 
 
 @pytest.mark.parametrize("preset", MesonGS.PRESETS)

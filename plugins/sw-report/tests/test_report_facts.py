@@ -49,6 +49,13 @@ def test_a_newer_record_is_read_as_far_as_it_is_understood(make_run):
     assert notes[1] == "'speed' of its record is not understood and left out"
 
 
+@pytest.mark.parametrize("wrong", [3, [["depth", 14]], "depth"])
+def test_a_plan_whose_looked_up_values_are_none_is_left_out(make_run, wrong):
+    facts, notes = read_facts(make_run(change=lambda c: c.update(plan=[{"looked_up": wrong}])) / "metrics.json")
+    assert facts.plan == []
+    assert notes == ["'plan' of its record is not understood and left out"]
+
+
 @pytest.mark.parametrize("name", ["method", "scene", "protocol", "file", "metrics"])
 def test_what_is_indispensable_is_named_when_missing(make_run, name):
     directory = make_run(change=lambda content: content.pop(name))

@@ -91,6 +91,14 @@ def test_what_would_come_back_as_something_else_is_refused(state):
         split_tensors(state, {})
 
 
+def test_steps_of_eight_digits_are_found_and_pruned(tmp_path):
+    store = CheckpointStore(tmp_path)
+    for step in (9_999_999, 10_000_000, 10_000_001):
+        store.write(make(step))
+        assert store.newest().step == step
+        assert len(list(tmp_path.iterdir())) == 2
+
+
 def test_a_failed_write_leaves_the_old_one_and_no_rest(tmp_path, monkeypatch):
     store = CheckpointStore(tmp_path)
     store.write(make(100))

@@ -22,14 +22,15 @@ def rate_factors(share: float) -> dict[str, float]:
 
 
 FAST: Mapping[str, Any] = {
-    "iterations": 10_000,
+    "iterations": 9_000,
     "scale_schedule": True,  # all plans below are in steps of 30,000
     "sh_interval": 3_000,
     "lr.opacity": 0.025,
     "densify.start": 900,
     "densify.stop": 24_000,
-    "densify.interval": 750,
+    "densify.interval": 780,
     "densify.reset_interval": 6_000,
+    "fast.average": 0.1,
     "fast.densify": "budget",
     "fast.growth": 2.0,
     "fast.opacity": "halve",
@@ -39,8 +40,8 @@ FAST: Mapping[str, Any] = {
 """Steps, growth and learning rates of fast training; `iterations` scales all of it.
 
 Source: LiteGS (arXiv 2503.01199), with new Gaussians bounded by twice what plain density control would copy: on a room
-(400x266, seed 0) a bound of once gives 31.54 dB with 526,000 Gaussians, twice 31.94 dB with 823,000, none 31.66 dB with
-1,000,000 (benchmarks/time_to_quality.py).
+(400x266, 10,000 steps, no average, seed 0) a bound of once gives 31.54 dB with 526,000 Gaussians, twice 31.94 dB with
+823,000, none 31.66 dB with 1,000,000 (benchmarks/time_to_quality.py).
 """
 
 FAST_CPU: Mapping[str, Any] = {
@@ -53,8 +54,10 @@ FAST_CPU: Mapping[str, Any] = {
     "lr.scales": 1e-2,
     "lr.quats": 2e-3,
     "densify.stop": 18_000,
+    "densify.interval": 750,
     "densify.reset_interval": 30_000,  # never: a short run does not recover from what a long one gains by
     "fast.score": "gradient",  # as good here as the variance of opacity gradients, whose sums cost a tenth of a step
+    "fast.average": 0.0,
     "fast.cap": 80_000,
     "fast.opacity": "reset",
     "fast.resolution": "dash",

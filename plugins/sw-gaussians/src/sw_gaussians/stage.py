@@ -98,11 +98,13 @@ class ThreeDGSStage(Stage):
             raise ConfigError("fast.veto_views is a veto of the budget's draw: set fast.densify=budget with it")
         if opt.fast.late_prune and opt.mcmc.enabled:
             raise ConfigError("mcmc.enabled moves Gaussians instead of pruning them: leave fast.late_prune off")
-        late = opt.fast.late()
-        if late and self.settled + 1 >= self.iterations:  # no update follows the last step
+        late, key = opt.fast.late(), "mcmc.stop" if opt.mcmc.enabled else "densify.stop"
+        stop = opt.mcmc.stop if opt.mcmc.enabled else opt.densify.stop
+        end = opt.FULL_ITERATIONS if opt.scale_schedule else opt.iterations
+        if late and stop >= end:
             raise ConfigError(
-                f"{' and '.join(late)} would have no effect: density control goes on until step {self.settled}, and "
-                f"the run has {self.iterations}; set scale_schedule=true, more iterations, or an earlier stop"
+                f"{' and '.join(late)} would have no effect: density control goes on until {key}={stop}, and the plan "
+                f"ends at {end}; leave it off, or set scale_schedule=true, more iterations or a lower {key}"
             )
         self._fragments = budget and opt.fast.score == "opacity_variance"
         if self._fragments and opt.densify.absgrad:
@@ -236,7 +238,7 @@ class ThreeDGSStage(Stage):
             begin += (self.iterations - begin) % every
             average = AverageParameters(first=begin, last=self.iterations, every=every)
             scheduler.register_task(average.steps, average, name="average parameters")
-        if fast.settle < 1:
+        if fast.settle < 1 and first < self.iterations:
             settle = SettleLearningRates(self._rates(), first=first, last=self.iterations, factor=fast.settle)
             scheduler.register_task(end, settle, name="settle learning rates")
 

@@ -64,7 +64,9 @@ def train(
     options     of `train_stages`
     """
     made = model or (lambda: method.create_model(scene, stream(seed, "init")))
-    return train_stages(stages or method.stages(), scene, rasterizer, model=made, seed=seed, **options)
+    return train_stages(
+        method.stages() if stages is None else stages, scene, rasterizer, model=made, seed=seed, **options
+    )
 
 
 def train_stages(

@@ -24,7 +24,7 @@ from splatwizard_core.api import (
 )
 from sw_codecs.models.raht_gaussians import RahtGaussians
 from sw_mesongs.importance import Importance
-from sw_mesongs.published import published
+from sw_mesongs.published import Published, published
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -81,8 +81,7 @@ class MesonGSStage(Stage):
 
     def looked_up(self, scene: Scene | None) -> dict[str, float]:
         """Return the published values of a scene, by key, of what the configuration leaves open; None: of any other."""
-        authors = self.config.authors
-        values = published("" if scene is None else scene.name, authors.family, authors.point)
+        values = self._published(scene)
         found = {
             "prune.tau": values.tau,
             "prune.settings.beta": values.beta,
@@ -93,12 +92,20 @@ class MesonGSStage(Stage):
         }
         return {key: found[key] for key, given in self._given().items() if given is None}
 
+    def _published(self, scene: Scene | None) -> Published:
+        """Return the published values of a scene; None: of any that is not listed."""
+        authors = self.config.authors
+        return published("" if scene is None else scene.name, authors.family, authors.point)
+
     def _given(self) -> dict[str, float | None]:
-        """Return what the configuration says of the values that depend on the scene; None: it leaves them open."""
+        """Return what the configuration says of the values that depend on the scene; None: it leaves them open.
+
+        Another pruner than the own one has no beta.
+        """
         config, settings = self.config, self.config.codec.settings
         return {
             "prune.tau": config.prune.tau,
-            "prune.settings.beta": self.pruner.beta if isinstance(self.pruner, Importance) else None,
+            **({"prune.settings.beta": self.pruner.beta} if isinstance(self.pruner, Importance) else {}),
             "codec.settings.depth": settings.depth,
             "codec.settings.blocks": settings.blocks,
             "codec.settings.codebook_size": settings.codebook_size,
@@ -128,16 +135,19 @@ class MesonGSStage(Stage):
         """Remove all Gaussians up to the score at the share tau; the others keep their importance.
 
         It tells the values that depend on the scene, since the configuration leaves open what is looked up by its name.
-        The importance weighs the colours in the codebook, whoever decides what goes. Those of the highest score stay
-        where all would go. Raises SceneError if no training view shows any.
+        The importance weighs the colours in the codebook, whoever decides what goes; beside another pruner its beta is
+        the published one. Those of the highest score stay where all would go. Raises SceneError if no training view
+        shows any.
         """
         values = self.in_force()
-        line = f"scene '{scene.name}': {', '.join(f'{key} = {value:g}' for key, value in values.items())}"
+        beta = values.get("prune.settings.beta", self._published(scene).beta)
+        shown = values if isinstance(self.pruner, Importance) else {**values, "beta of the colours' weights": beta}
+        line = f"scene '{scene.name}': {', '.join(f'{key} = {value:g}' for key, value in shown.items())}"
         if told is not None:
             told.say(line)
         else:
             log.info(line)
-        importance = Importance(beta=values["prune.settings.beta"])
+        importance = Importance(beta=beta)
         scores = scores_of(importance, model, cameras, rasterizer, scene)
         model.importance.copy_(scores)
         if not isinstance(self.pruner, Importance):

@@ -36,8 +36,8 @@ log = logging.getLogger(__name__)
 FORMAT = 1
 TENSOR_KEY = "$tensor"
 SHOWN_CHARACTERS = 40  # of a value that differs
-_JSON = re.compile(r"\d{2}-\d{7}\.json")
-_TENSORS = re.compile(r"\d{2}-\d{7}(-[0-9a-f]{8})?\.safetensors")
+_JSON = re.compile(r"\d{2}-\d{7,}\.json")
+_TENSORS = re.compile(r"\d{2}-\d{7,}(-[0-9a-f]{8})?\.safetensors")
 _KINDS: dict[str, Any] = {
     "stage": int, "stage_name": str, "step": int, "finished": bool, "identity": dict, "plan": list,
     "extent": (int, float), "progress": dict,
@@ -121,7 +121,9 @@ class CheckpointStore:
 
     def paths(self) -> list[Path]:
         """The JSON files, newest first."""
-        return sorted((p for p in self.directory.glob("*.json") if _JSON.fullmatch(p.name)), reverse=True)
+        found = (p for p in self.directory.glob("*.json") if _JSON.fullmatch(p.name))
+        # By number: names of steps past 9,999,999 are longer.
+        return sorted(found, key=lambda p: tuple(map(int, p.stem.split("-"))), reverse=True)
 
     def restored(self, use: Callable[[Checkpoint], T]) -> T | None:
         """Return what `use` makes of the newest checkpoint that can be read and used, or None if there is none.
@@ -153,10 +155,8 @@ class CheckpointStore:
     def last_of(self, stage: int) -> Checkpoint:
         """Return the checkpoint that finished a stage. Raises CheckpointError."""
         for path in self.paths():
-            if path.name.startswith(f"{stage:02d}-"):
-                found = read_checkpoint(path)
-                if found.finished:
-                    return found
+            if path.name.startswith(f"{stage:02d}-") and (found := read_checkpoint(path)).finished:
+                return found
         raise CheckpointError(
             f"{self.directory}: the last checkpoint of stage {stage} is missing; start again (--fresh)"
         )

@@ -115,11 +115,11 @@ def _read_views(path: Path, file: str, rules: Rules) -> tuple[list[View], float]
     views, off_centre = [], 0.0
     for frame, name, picture in zip(frames, names, find_pictures(path, names), strict=True):
         merged = ChainMap(frame, data)
-        model = merged.get("camera_model", PINHOLES[0])
-        if model not in PINHOLES or merged.get("is_fisheye"):
+        model = merged.get("camera_model")
+        if model not in (None, *PINHOLES) or merged.get("is_fisheye"):
             raise SceneError(
                 f"{where}: image '{name}' is of a camera of another kind ("
-                + ("is_fisheye" if model in PINHOLES else f"camera_model {str(model)[:40]!r}")
+                + ("is_fisheye" if model in (None, *PINHOLES) else f"camera_model {str(model)[:40]!r}")
                 + "); 3DGS needs pinhole images: undistort them",
                 path=str(path),
             )

@@ -92,7 +92,8 @@ std::vector<int64_t> adam_many(const std::vector<at::Tensor>& params, const std:
   std::vector<kernels::AdamTensor> tensors;
   tensors.reserve(count);
   for (size_t i = 0; i < count; ++i) {
-    if (!splatwizard::fits_adam(params[0].device(), 16, steps[i], {&params[i], &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
+    if (!splatwizard::fits_adam(params[0].device(), 16, steps[i],
+                                {&params[i], &grads[i], &exp_avgs[i], &exp_avg_sqs[i]})) {
       left.push_back(int64_t(i));
       continue;
     }
