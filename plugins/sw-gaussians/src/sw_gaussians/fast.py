@@ -57,7 +57,6 @@ FAST_CPU: Mapping[str, Any] = {
     "densify.interval": 750,
     "densify.reset_interval": 30_000,  # never: a short run does not recover from what a long one gains by
     "fast.score": "gradient",  # as good here as the variance of opacity gradients, whose sums cost a tenth of a step
-    "fast.average": 0.0,
     "fast.cap": 80_000,
     "fast.opacity": "reset",
     "fast.resolution": "dash",
