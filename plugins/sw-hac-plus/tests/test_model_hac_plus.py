@@ -171,7 +171,7 @@ def test_anchors_that_no_view_sees_have_a_rate_too():
 
 @pytest.mark.parametrize("floor", [0.0, 0.05])
 def test_deviations_below_zero_learn_if_there_is_a_floor(floor):
-    """Those of the features by the grid; without channels, which would see them too."""
+    """Deviations of the features as the grid predicts them; without channels, which would see the floor too."""
     model = make(n=40, channel__kind="none", rate_term__scale_floor=floor)
     last = model.mlp_grid[2]
     with torch.no_grad():
