@@ -1,6 +1,6 @@
 """Hyper-parameters of methods whose anchors a binary hash grid predicts. Defaults are those of HAC on Mip-NeRF 360."""
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -104,13 +104,6 @@ class GridAnchorParams(CodedAnchorParams):
     phases: Phases = Field(Phases(), description="when training turns to noise, and to a rate")
     rate_term: RateTerm = Field(RateTerm(), description="rate term of the loss")
     steps: Steps = Field(Steps(), description="quantiser steps before they are predicted")
-
-    def identity(self) -> dict[str, Any]:
-        """Return all values, `rate_term.scale_floor` only where there is one: trainings of before it are found."""
-        content = super().identity()
-        if not self.rate_term.scale_floor:
-            del content["rate_term"]["scale_floor"]
-        return content
 
     @property
     def margin(self) -> Margin:

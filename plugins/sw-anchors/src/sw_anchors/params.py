@@ -92,10 +92,13 @@ class CodedAnchorParams(AnchorParams):
         """Return all values but `graphs`, which says how and not what is computed.
 
         `growth.subvoxel` is there only where it says something else than releases of before the key, which had cells
-        of fractions of a voxel: runs and trained scenes of then stay what they are.
+        of fractions of a voxel: runs and trained scenes of then stay what they are. `rate_term.scale_floor`, of
+        the methods that have it, is there only where it is on.
         """
         content = super().identity()
         del content["graphs"]
         if self.growth.subvoxel or self.growth.whole_voxels:
             del content["growth"]["subvoxel"]
+        if not content.get("rate_term", {}).get("scale_floor", True):
+            del content["rate_term"]["scale_floor"]
         return content

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 from sw_anchors.lattice import Margin
@@ -143,13 +143,6 @@ class CatConfig(Choosing, CodedAnchorParams):
     context: Context = Field(Context(), description="the models that predict attributes")
     rate_term: RateTerm = Field(RateTerm(), description="rate term and masks")
     codec: Codec = Field(Codec(), description="what writes the file")
-
-    def identity(self) -> dict[str, Any]:
-        """Return all values, `rate_term.scale_floor` only where there is one: trainings of before it are found."""
-        content = super().identity()
-        if not self.rate_term.scale_floor:
-            del content["rate_term"]["scale_floor"]
-        return content
 
     @property
     def margin(self) -> Margin:
