@@ -7,8 +7,6 @@ import pytest
 import torch
 from sw_anchors.testing import check_fixed_decoder
 
-from splatwizard_core.plugins import load_plugins
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
 from sw_cat_3dgs.plane_bits import FixedPlaneBits
 
 
@@ -29,12 +27,12 @@ def model(begun, little_scene, rasterizer):
 
 
 @pytest.mark.parametrize("rounded", [False, True])
-def test_fixed_sizes_change_neither_values_nor_gradients(model, little_scene, rasterizer, rounded):
+def test_fixed_sizes_change_neither_values_nor_gradients(model, little_scene, rounded):
     model.context.rounded = rounded
     model.scale_floor = 0.05 if rounded else 0.0
     model.train_only("all but planes" if rounded else "everything")
     camera = little_scene.train[0].camera
-    check_fixed_decoder(lambda: copy.deepcopy(model), camera, rasterizer, counts=(0, 40))
+    check_fixed_decoder(lambda: copy.deepcopy(model), camera, counts=(0, 40))
 
 
 def plane_bits(model, fixed, share, seed=0):
@@ -98,12 +96,11 @@ def test_a_gpu_that_refuses_graphs_of_the_planes_is_named_once(kind, model, monk
 
 @pytest.mark.cuda
 def test_graphs_change_neither_values_nor_gradients(model, little_scene):
-    gpu = NegotiatedRasterizer(load_plugins(), device="cuda")
     camera, model = little_scene.train[0].camera.to("cuda"), model.to("cuda")
     for rounded in (False, True):
         model.context.rounded = rounded
         model.train_only("all but planes" if rounded else "everything")
-        check_fixed_decoder(lambda: copy.deepcopy(model), camera, gpu, counts=(0, 40, 20), graphs=True)
+        check_fixed_decoder(lambda: copy.deepcopy(model), camera, counts=(0, 40, 20), graphs=True)
 
 
 @pytest.mark.cuda

@@ -5,16 +5,14 @@ from contextlib import nullcontext
 
 import pytest
 import torch
-from hac_models import PLUGINS, make
+from hac_models import make
 from sw_anchors.coded_anchors import ENTROPY, FULL, QUANTIZED
+from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.fixed_decoder import FixedDecoder, capacity_of
 from sw_anchors.fixed_step import FixedRows, sample_capacity, sample_of
 from sw_anchors.testing import check_fixed_decoder
 from sw_reference.testing.raster_scenes import front_camera
 
-from splatwizard_core.rendering.negotiation import NegotiatedRasterizer
-
-RASTERIZER = NegotiatedRasterizer(PLUGINS, device="cpu")
 N = 330
 
 
@@ -27,7 +25,7 @@ def trained(device="cpu"):
 
 
 def test_fixed_sizes_change_neither_values_nor_gradients():
-    check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(0, 1, 120, 255, N))
+    check_fixed_decoder(trained, front_camera(), counts=(0, 1, 120, 255, N))
 
 
 @pytest.mark.parametrize("kept", [True, False])
@@ -35,7 +33,7 @@ def test_without_a_kernel_for_the_grid_it_is_the_same(kept, monkeypatch):
     monkeypatch.setattr("sw_codecs.context.hash_grid.signs_fit_kernel", lambda *_: False)
     monkeypatch.setattr("sw_anchors.grid_anchors.PLACES_LIMIT", 1 << 30 if kept else 0)
     assert len(trained().context_rows()) == (4 if kept else 1)
-    check_fixed_decoder(trained, front_camera(), RASTERIZER, counts=(90,), phases=(ENTROPY,))
+    check_fixed_decoder(trained, front_camera(), counts=(90,), phases=(ENTROPY,))
 
 
 def test_what_stood_beyond_the_count_does_not_matter():
@@ -97,6 +95,70 @@ def test_steps_are_prepared_once_for_a_capacity_and_anew_when_networks_or_phase_
     assert captures(11) == 6
 
 
+class Seen:
+    """Stands in for a rasterizer whose visibility test lets the anchors `rows` through."""
+
+    def __init__(self, rows):
+        self.rows = rows
+
+    def visible_filter(self, balls, camera):
+        radii = torch.zeros(len(balls), dtype=torch.int32, device=balls.means.device)
+        return radii.index_fill_(0, torch.tensor(self.rows, dtype=torch.int64, device=radii.device), 1)
+
+
+def gradients_of(model, camera, rows):
+    model.zero_grad()
+    found = model.gaussians(camera, Seen(rows))
+    chosen = found.extras["anchors"].rows
+    assert sorted(chosen.tolist()) == sorted(rows)
+    owner = chosen[found.extras["anchors"].drawn // model.num_offsets]  # rows may stand in another order
+    total = sum((t.flatten(1) * (1 + owner[:, None] % 7)).sum() for t in (found.means, found.scales, found.colors))
+    (total + (found.opacities * (1 + owner % 5)).sum()).backward()
+    return {name: p.grad.clone() for name, p in model.named_parameters() if p.grad is not None}
+
+
+def check_views_that_come_again(device, graphs):
+    camera, model = front_camera().to(device), trained(device).train()
+    plain = trained(device).train()
+    model.phase = plain.phase = FULL  # without noise, whose draws depend on the places
+    fixed = model.fixed = FixedDecoder(graphs=graphs)
+    asked = []
+    made = fixed.expected
+    fixed.expected = lambda *args: asked.append(made(*args)) or asked[-1]
+    # First seen; as before; a few more; far more than expected; few; none; all after none.
+    for rows in (range(100), range(100), range(5, 120), range(330), range(40, 52), (), range(330)):
+        expected, got = gradients_of(plain, camera, list(rows)), gradients_of(model, camera, list(rows))
+        for name in expected.keys() | got.keys():
+            torch.testing.assert_close(*(each.get(name, torch.zeros((), device=device)).expand_as(got[name])
+                                         for each in (expected, got)), rtol=1e-4, atol=1e-5)  # fmt: skip
+    assert asked == [None, 256, 256, 256, 384, 256, 256]
+
+
+def test_a_view_that_comes_again_is_decoded_before_its_anchors_are_counted():
+    check_views_that_come_again("cpu", graphs=False)
+
+
+def test_anchors_are_expected_in_proportion_to_how_many_there_are():
+    model, camera, fixed = trained().train(), front_camera(), FixedDecoder(graphs=False)
+    model.fixed = fixed
+    assert fixed.expected(camera, 1000) is None
+    model.decode(camera, torch.arange(300))
+    assert fixed.expected(camera, N) == capacity_of(312)
+    assert fixed.expected(camera, 2 * N) == capacity_of(624)
+    assert fixed.expected(front_camera(), N) is None  # another camera, though it stands there too
+
+
+@pytest.mark.parametrize("seen", [0, 1, 9, 10, 11, 50])
+def test_rows_beyond_the_places_are_left_out_and_told(seen):
+    order = torch.randperm(50, generator=torch.Generator().manual_seed(0))
+    mask = torch.zeros(50, dtype=torch.bool)
+    mask[torch.randperm(50, generator=torch.Generator().manual_seed(1))[:seen]] = True
+    rows = ExpectedRows(order, mask, 10)
+    assert rows.number() == int(rows.count) == seen
+    assert rows.rows.tolist() == (order[mask].tolist() + [0] * 10)[:10]
+    assert torch.equal(rows.known(), order[mask])
+
+
 def test_random_draws_are_centred_and_new_at_each_step():
     model = trained().train()
     model.fixed = FixedDecoder(graphs=False)
@@ -138,19 +200,14 @@ def test_a_gpu_that_refuses_graphs_is_named_once_and_training_goes_on(kind, monk
     assert model.fixed._rows_held("positions") == 0
 
 
-@pytest.fixture(scope="module")
-def gpu():
-    return NegotiatedRasterizer(PLUGINS, device="cuda")
-
-
 @pytest.mark.cuda
-def test_graphs_change_neither_values_nor_gradients(gpu):
+def test_graphs_change_neither_values_nor_gradients():
     camera = front_camera().to("cuda")
-    check_fixed_decoder(lambda: trained("cuda"), camera, gpu, counts=(0, 1, 120, 255, 256, 50, N), graphs=True)
+    check_fixed_decoder(lambda: trained("cuda"), camera, counts=(0, 1, 120, 255, 256, 50, N), graphs=True)
 
 
 @pytest.mark.cuda
-def test_graphs_are_made_anew_when_networks_or_phase_change(gpu):
+def test_graphs_are_made_anew_when_networks_or_phase_change():
     camera, model = front_camera().to("cuda"), trained("cuda").train()
     fixed = model.fixed = FixedDecoder()
     rows = torch.arange(100, device="cuda")
@@ -165,3 +222,17 @@ def test_graphs_are_made_anew_when_networks_or_phase_change(gpu):
     model.phase = QUANTIZED
     assert "rate" not in model.decode(camera, rows).extras
     assert (fixed.captures, fixed._failed) == (3, False)
+
+
+@pytest.mark.cuda
+def test_graphs_of_a_view_that_comes_again_wait_for_no_count():
+    check_views_that_come_again("cuda", graphs=True)
+    order, seen = torch.arange(1000, device="cuda"), torch.arange(1000, device="cuda") % 3 == 0
+    torch.cuda.synchronize()
+    torch.cuda.set_sync_debug_mode("error")
+    try:
+        rows = ExpectedRows(order, seen, 512)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+    assert rows.number() == 334
+    assert rows.rows[:334].tolist() == list(range(0, 1000, 3))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from sw_anchors.anchors import AnchorAttributes, AnchorModel
+from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
 from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
@@ -138,11 +139,25 @@ class CodedAnchors(AnchorModel):
         of grids and planes: kernels add those up before they write."""
         if not (self.training and self.device.type == "cuda"):
             return super().visible_anchors(camera, rasterizer)
+        order, seen = self._seen_in_order(camera, rasterizer)
+        return order[seen]
+
+    def _seen_in_order(self, camera: Camera, rasterizer: Rasterizer) -> tuple[Tensor, Tensor]:
+        """Rows [N] int64 of all anchors, neighbours together, and whether each is visible [N]."""
         codes = self.codes()
         if self._order is None or self._order[0] is not codes:
             self._order = codes, torch.argsort(interleave(codes))
         order = self._order[1]
-        return order[rasterizer.visible_filter(self.balls(), camera).index_select(0, order) > 0]
+        return order, rasterizer.visible_filter(self.balls(), camera).index_select(0, order) > 0
+
+    def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
+        """As of AnchorModel. A view that was drawn before is decoded before the host knows how many anchors it sees."""
+        places = self.fixed.expected(camera, self.num_rows) if self.fixed is not None and self._replays() else None
+        if places is None:
+            return super().gaussians(camera, rasterizer)
+        with torch.no_grad():
+            rows = ExpectedRows(*self._seen_in_order(camera, rasterizer), places)
+        return self.decode(camera, rows)
 
     # Masks
 
@@ -234,12 +249,19 @@ class CodedAnchors(AnchorModel):
         rate = self.sample, self.smallest_probability, self.scale_floor
         return self.phase, *rate, self.noise_factor, tuple(self.base_steps)
 
-    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
-        if self.fixed is not None and self.training and torch.is_grad_enabled() and self.features.requires_grad:
+    def _replays(self) -> bool:
+        """Whether a FixedDecoder, if there is one, decodes."""
+        return self.training and torch.is_grad_enabled() and self.features.requires_grad
+
+    def decode(self, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs:
+        if self.fixed is not None and self._replays():
             found = self.fixed.decode(self, camera, rows)
+            if found is None and isinstance(rows, ExpectedRows):
+                rows = rows.known()
+                found = self.fixed.decode(self, camera, rows)
             if found is not None:
                 return found
-        return super().decode(camera, rows)
+        return super().decode(camera, rows if isinstance(rows, Tensor) else rows.known())
 
     def attributes(self, rows: Tensor) -> AnchorAttributes:
         """Full-precision, noisy or rounded attributes, by phase and mode; each of `rows` at most once."""

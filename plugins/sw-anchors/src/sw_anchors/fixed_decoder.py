@@ -9,8 +9,10 @@ from __future__ import annotations
 
 import functools
 import logging
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
+from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
@@ -18,6 +20,7 @@ from torch.autograd.function import once_differentiable
 
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
+from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
 from sw_anchors.fused_ops import put_rows
 from sw_anchors.pool_rows import PoolRows
@@ -29,6 +32,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 SMALLEST = 256
+MORE = 1.04
+"""Of the anchors that a camera saw last, as many are expected the next time."""
 KEPT = 16
 """Capacities whose steps are kept; views of one scene ask for fewer."""
 
@@ -61,11 +66,23 @@ class FixedDecoder:
         self._key: tuple[Any, ...] = ()
         self._watched = Watched([])
         self._shared: dict[str, Tensor] = {}
+        self._seen: WeakKeyDictionary[Camera, tuple[int, int]] = WeakKeyDictionary()  # anchors, and of how many
 
-    def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor) -> GaussianInputs | None:
+    def expected(self, camera: Camera, num_rows: int) -> int | None:
+        """Places for the anchors that this camera sees, of `num_rows`; None: it was not drawn before, or nothing is replayed.
+
+        A little more than it saw last: between two of its turns anchors grow, are pruned and change their size.
+        """
+        if self._failed or camera not in self._seen:
+            return None
+        seen, of = self._seen[camera]
+        return capacity_of(math.ceil(seen * num_rows / of * MORE))
+
+    def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs | None:
         """Decode the anchors `rows` [V]: their Gaussians with opacity > 0.
 
         None where the model has no form for it, or the GPU refused a graph or had no memory for it; that is said once.
+        Also where more are seen than was expected.
         """
         parts = model.context_rows() if model.phase == ENTROPY else ()
         if self._failed or parts is None:
@@ -73,7 +90,8 @@ class FixedDecoder:
         pooled = model.SAMPLES_ALL and model.phase == ENTROPY
         places = capacity_of(sample_capacity(model.num_rows, model.sample)) if pooled else 0
         try:
-            prepared = self._prepared(model, parts, capacity_of(len(rows)), places)
+            capacity = len(rows.rows) if isinstance(rows, ExpectedRows) else capacity_of(len(rows))
+            prepared = self._prepared(model, parts, capacity, places)
         except RuntimeError as error:
             self._failed = True
             log.warning("training goes on without CUDA graphs, slower: %s", str(error).partition("\n")[0])
@@ -87,9 +105,12 @@ class FixedDecoder:
             at.load(model, camera, rows, parts)
             if pool is not None:
                 pool.load(model, [source.detach() for source in sources], parts)
-        places_of = (rows,) if pool is None else (rows, pool.rows)
-        results, others = _Decoded.found(prepared.step, places_of, self._watched.learning, sources)
-        return inputs_of(model, at, rows, (results, others))
+        pool_rows = None if pool is None else pool.rows
+        results, others = _Decoded.found(prepared.step, rows, pool_rows, self._watched.learning, sources)
+        found = inputs_of(model, at, rows, (results, others))
+        if found is not None:
+            self._seen[camera] = len(found.extras["anchors"].rows), model.num_rows
+        return found
 
     def _prepared(self, model: CodedAnchors, parts: tuple[Tensor, ...], capacity: int, places: int) -> _Prepared:
         key = (*model.step_key(), *(part.shape[1:] for part in parts))
@@ -171,21 +192,32 @@ class _Decoded(torch.autograd.Function):
 
     @classmethod
     def found(
-        cls, step: FixedStep, rows: tuple[Tensor, ...], networks: list[Tensor], sources: list[Tensor]
+        cls,
+        step: FixedStep,
+        rows: Tensor | ExpectedRows,
+        pool: Tensor | None,
+        networks: list[Tensor],
+        sources: list[Tensor],
     ) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """(differentiable results, others). rows: of the visible anchors, and perhaps of a sample of all."""
+        """(differentiable results, others). rows: of the visible anchors; pool: perhaps of a sample of all."""
         counts: list[int] = []
-        found = cls.apply(step, rows, networks, counts, *sources)  # type: ignore[no-untyped-call]
+        found = cls.apply(step, rows, pool, networks, counts, *sources)  # type: ignore[no-untyped-call]
         return found[: counts[0]], found[counts[0] :]
 
     @staticmethod
     def forward(
-        ctx: Any, step: FixedStep, rows: tuple[Tensor, ...], networks: list[Tensor], counts: list[int], *sources: Tensor
+        ctx: Any,
+        step: FixedStep,
+        rows: Tensor | ExpectedRows,
+        pool: Tensor | None,
+        networks: list[Tensor],
+        counts: list[int],
+        *sources: Tensor,
     ) -> tuple[Tensor, ...]:
         results, others = step.forward()
-        ctx.step, ctx.networks, ctx.count = step, networks, len(results)
+        ctx.step, ctx.networks, ctx.count, ctx.rows = step, networks, len(results), rows
         ctx.shapes = [source.shape for source in sources]
-        ctx.save_for_backward(*rows)
+        ctx.save_for_backward(pool)
         ctx.set_materialize_grads(False)
         counts.append(len(results))
         results, others = tuple(each.detach() for each in results), tuple(each.detach() for each in others)
@@ -195,19 +227,20 @@ class _Decoded(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *slopes: Tensor | None) -> tuple[Tensor | None, ...]:
-        rows, *others = ctx.saved_tensors
-        count = len(ctx.shapes)
+        (pool,) = ctx.saved_tensors
+        rows, count = ctx.rows, len(ctx.shapes)
+        if isinstance(rows, ExpectedRows):
+            rows = rows.rows[: rows.number()]
         grads = ctx.step.backward(slopes[: ctx.count])
-        add_gradients(ctx.networks, grads[count * (1 + len(others)) :])
+        add_gradients(ctx.networks, grads[count * (1 if pool is None else 2) :])
         found = put_rows(rows, grads[:count], ctx.shapes[0][0])
-        for i, others_rows in enumerate(others, 1):
-            for j, grad in enumerate(grads[count * i : count * (i + 1)]):
-                into = found[j]
-                if grad is not None:
-                    into = grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None else into
-                    found[j] = into.index_add_(0, others_rows, grad)
+        for j, grad in enumerate(() if pool is None else grads[count : 2 * count]):
+            into = found[j]
+            if grad is not None:
+                into = grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None else into
+                found[j] = into.index_add_(0, pool, grad)
         shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
-        return None, None, None, None, *shaped
+        return None, None, None, None, None, *shaped
 
 
 def capacity_of(count: int) -> int:

@@ -18,6 +18,7 @@ from torch import Tensor
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.anchors import AnchorSelection
 from sw_anchors.coded_anchors import ENTROPY, MASK_THRESHOLD, QUANTIZED
+from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorRate
 from sw_anchors.fused_ops import load_rows, noisy_rows
 from sw_anchors.neural_gaussians import visible_gaussians
@@ -53,10 +54,13 @@ class FixedRows:
     parts: tuple[Tensor, ...]
     random: Tensor
 
-    def load(self, model: CodedAnchors, camera: Camera, rows: Tensor, parts: Sequence[Tensor]) -> None:
+    def load(self, model: CodedAnchors, camera: Camera, rows: Tensor | ExpectedRows, parts: Sequence[Tensor]) -> None:
         """Copy the anchors `rows` [V] of the model, V < C, and draw anew."""
-        v = len(rows)
-        self.count.fill_(v)
+        if isinstance(rows, ExpectedRows):
+            self.count.copy_(rows.count)
+            rows = rows.rows
+        else:
+            self.count.fill_(len(rows))
         self.center.copy_(camera.center)
         weights = model.mask_weights()
         pairs = [(model.positions(), self.positions), *zip(parts, self.parts, strict=True)]
@@ -134,13 +138,17 @@ def sample_capacity(capacity: int, share: float) -> int:
     return min(capacity, math.ceil(capacity * share + 6 * math.sqrt(capacity * share * (1 - share)) + 8))
 
 
-def inputs_of(model: CodedAnchors, at: FixedRows, rows: Tensor, found: Found) -> GaussianInputs:
+def inputs_of(model: CodedAnchors, at: FixedRows, rows: Tensor | ExpectedRows, found: Found) -> GaussianInputs | None:
     """The Gaussians with opacity > 0, from what `decode_rows` found; anchors `rows` are those that were loaded.
 
-    Waits for the device once, for their number.
+    None: more anchors are seen than there were places for. Waits for the device once, for the number of Gaussians.
     """
     (alpha, geometry, color, offsets, scales, masks, *rate), counts = found
     spawned = visible_gaussians(alpha, geometry, color, at.positions, offsets, scales, masks)
+    if isinstance(rows, ExpectedRows):
+        if rows.number() >= len(at.positions):
+            return None
+        rows = rows.rows[: rows.number()]
     seen = spawned.alphas if model.COUNTS_MASKED else spawned.all_opacities
     extras: dict[str, Any] = {"masks": masks, "anchors": AnchorSelection(rows, seen[: len(rows)], spawned.drawn)}
     if rate:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
 from sw_anchors.coded_anchors import MASK_THRESHOLD
+from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorForecast, AnchorRate
 from sw_anchors.fused_ops import anchor_values, noisy_rows
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
@@ -78,7 +79,7 @@ class HACPlusAnchors(GridAnchors):
         found = super().attributes(rows)
         return dataclasses.replace(found, extras={**found.extras, "masks": found.masks}) if self.training else found
 
-    def decode(self, camera: Camera, rows: Tensor) -> GaussianInputs:
+    def decode(self, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs:
         """The Gaussians of the anchors `rows` [V]; masks have a gradient through opacities and scales alike."""
         found = super().decode(camera, rows)
         if "masks" not in found.extras:
