@@ -3,7 +3,7 @@
 import pytest
 import torch
 from sw_anchors.fixed_step import sample_capacity
-from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, widen
+from sw_anchors.fused_ops import anchor_values, mean_product, take_rows, weighted_sum, widen
 from sw_anchors.neural_gaussians import spawn
 from sw_anchors.noisy_values import Noise, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
@@ -199,3 +199,17 @@ def test_a_sample_of_all_rows_draws_each_with_its_probability(share):
     spread = (share * (1 - share) * 50) ** 0.5
     assert abs(float(found.mean()) - 50 * share) <= 4 * spread / n**0.5 + 1e-6
     assert float(found.std()) == pytest.approx(spread, rel=0.05, abs=1e-6)  # rows are drawn independently
+
+
+def test_a_weighted_sum_is_the_sum_of_products():
+    start, a, b = (torch.tensor(x, dtype=torch.float64, requires_grad=True) for x in (0.3, -2.0, 5.0))
+    total, *parts = weighted_sum(start, (0.5, a), (-3.0, b))
+    assert float(total.detach()) == pytest.approx(0.3 - 1 - 15)
+    assert [float(part) for part in parts] == [-1, -15]
+    assert total.requires_grad
+    assert not any(part.requires_grad for part in parts)
+    assert torch.autograd.gradcheck(lambda *x: weighted_sum(x[0], (0.5, x[1]), (-3.0, x[2]))[0], (start, a, b))
+    alone = weighted_sum(start)
+    assert len(alone) == 1
+    alone[0].backward()
+    assert float(start.grad) == 1

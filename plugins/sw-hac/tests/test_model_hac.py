@@ -70,7 +70,8 @@ def training_loss(model, stage=None):
     cam = front_camera()
     result = RASTERIZER.render(model.gaussians(cam, RASTERIZER), cam, RasterOptions(grad2d=True))
     stage = stage or HACStage(method().config)
-    return result, stage.extra_loss(model, result, 1)
+    terms = stage.extra_loss(model, result, 1)
+    return result, {name: weight * term for name, (weight, term) in terms.items()}
 
 
 def test_the_loss_has_rate_grid_and_mask_terms():

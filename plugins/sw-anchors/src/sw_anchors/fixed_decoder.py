@@ -69,7 +69,7 @@ class FixedDecoder:
         self._seen: WeakKeyDictionary[Camera, tuple[int, int]] = WeakKeyDictionary()  # anchors, and of how many
 
     def expected(self, camera: Camera, num_rows: int) -> int | None:
-        """Places for the anchors that this camera sees, of `num_rows`; None: it was not drawn before, or nothing is replayed.
+        """Places for the anchors that this camera sees, of `num_rows`; None: it was not drawn before.
 
         A little more than it saw last: between two of its turns anchors grow, are pruned and change their size.
         """

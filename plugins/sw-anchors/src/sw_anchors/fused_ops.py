@@ -234,3 +234,31 @@ class _MeanProduct(torch.autograd.Function):
         (scales,) = ctx.saved_tensors
         found: Tensor = grad / max(len(scales), 1) * scales.roll(1, 1) * scales.roll(-1, 1)
         return found
+
+
+Weighted = tuple[float, Tensor]
+"""Weight of a scalar in a sum, and the scalar."""
+
+
+def weighted_sum(start: Tensor, *terms: Weighted) -> tuple[Tensor, ...]:
+    """(start plus all terms times their weights; the weighted terms, without gradient); all scalars of one device.
+
+    A product and a sum a term would launch four kernels each, forward and backward, for one number.
+    """
+    found: tuple[Tensor, ...] = _WeightedSum.apply([weight for weight, _ in terms], start, *(t for _, t in terms))  # type: ignore[no-untyped-call]
+    return found
+
+
+class _WeightedSum(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, weights: list[float], start: Tensor, *terms: Tensor) -> tuple[Tensor, ...]:
+        ctx.weights = weights
+        weighted = torch._foreach_mul(terms, weights) if terms else []
+        ctx.mark_non_differentiable(*weighted)
+        return torch.stack([start, *weighted]).sum(), *weighted
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
+        slopes = torch._foreach_mul([slope] * len(ctx.weights), ctx.weights) if ctx.weights else []
+        return None, slope, *slopes

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
 from sw_anchors.forecasts import AnchorRate
+from sw_anchors.fused_ops import Weighted
 from sw_anchors.grid_anchors import GridAnchors
 from sw_anchors.grid_params import GridAnchorParams
 from sw_anchors.phase_switch import PhaseSwitch
@@ -13,8 +14,6 @@ from sw_anchors.stage import CodedAnchorStage
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
-
-    from torch import Tensor
 
     from splatwizard_core.api import OptimizationParams, PipelineParams, RenderResult, Scheduler
 
@@ -45,14 +44,14 @@ class GridStage(CodedAnchorStage):
         """Let the network predict from statistics of the values."""
         model.start_from_statistics()
 
-    def extra_loss(self, model: GridAnchors, result: RenderResult, step: int) -> dict[str, Tensor]:
+    def extra_loss(self, model: GridAnchors, result: RenderResult, step: int) -> dict[str, Weighted]:
         rate: AnchorRate | None = result.extras.get("rate")
         if rate is None:
             return {}
         assert rate.own_bits is not None
         weights = self.opt.rate_term
         terms = {
-            "rate": weights.weight * rate.bits,
-            "grid": weights.weight * rate.own_bits / (model.num_rows * sum(model.shape.widths)),
+            "rate": (weights.weight, rate.bits),
+            "grid": (weights.weight / (model.num_rows * sum(model.shape.widths)), rate.own_bits),
         }
-        return {**terms, "masks": weights.masks * model.soft_masks().mean()} if weights.masks else terms
+        return {**terms, "masks": (weights.masks, model.soft_masks().mean())} if weights.masks else terms

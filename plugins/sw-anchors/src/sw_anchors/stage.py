@@ -24,7 +24,7 @@ from splatwizard_core.api import (
 from sw_anchors.anchors import AnchorModel
 from sw_anchors.coded_anchors import CodedAnchors
 from sw_anchors.fixed_decoder import FixedDecoder
-from sw_anchors.fused_ops import mean_product
+from sw_anchors.fused_ops import Weighted, mean_product, weighted_sum
 from sw_anchors.growth import accumulate_anchor_statistics, adjust_anchors
 from sw_anchors.params import AnchorParams, CodedAnchorParams
 
@@ -158,8 +158,8 @@ class AnchorStage(Stage):
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         return RasterOptions(background=background, grad2d=True)
 
-    def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Tensor]:
-        """Further terms of the loss, weighted, by name."""
+    def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
+        """Further terms of the loss by name: (weight, scalar)."""
         return {}
 
     def mean_volume(self, result: RenderResult) -> Tensor:
@@ -171,9 +171,9 @@ class AnchorStage(Stage):
         settings = self.opt.loss
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
-        terms = {"volume": settings.volume * self.mean_volume(result), **self.extra_loss(model, result, step)}
-        total = sum(terms.values(), start=found.total)
-        return LossPack(total, found.parts | {name: term.detach() for name, term in terms.items()})
+        terms = {"volume": (settings.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
+        total, *weighted = weighted_sum(found.total, *terms.values())
+        return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
 
 
 class CodedAnchorStage(AnchorStage):

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.coded_anchors import ENTROPY, QUANTIZED
+from sw_anchors.fused_ops import Weighted
 from sw_anchors.phase_switch import PhaseSwitch
 from sw_anchors.stage import CodedAnchorStage
 
@@ -128,15 +129,16 @@ class CatStage(CodedAnchorStage):
 
     # Loss
 
-    def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Tensor]:
-        rate, terms = self.opt.rate_term, {}
+    def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
+        rate = self.opt.rate_term
+        terms: dict[str, Weighted] = {}
         if step >= self.at(self.opt.phases.quantize):
             weight = max(rate.mask_floor, rate.mask_factor * rate.weight)
-            terms["masks"] = weight * torch.sigmoid(model.mask_logits).mean()
+            terms["masks"] = weight, torch.sigmoid(model.mask_logits).mean()
         if "rate" in result.extras:
-            terms["rate"] = rate.weight * result.extras["rate"].bits
+            terms["rate"] = rate.weight, result.extras["rate"].bits
         if model.context.rounded:
-            terms["triplane"] = rate.weight * rate.triplane * self._plane_bits(model)
+            terms["triplane"] = rate.weight * rate.triplane, self._plane_bits(model)
         return terms
 
     def _plane_bits(self, model: CatAnchors) -> Tensor:
