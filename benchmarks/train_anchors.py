@@ -15,7 +15,9 @@ and kernels launched; and how often the host waits for the GPU (on a CPU: operat
 profiler slows the host down: shares are those of a profiled step. --syncs lists the lines that wait (CUDA only).
 --graphs on,off trains twice, with the decoding as CUDA graphs and without, and prints both with the loss at the end.
 --fused off,on trains twice, without and with the kernels for rows and networks of anchors, bits and lookups of planes.
-Rows at the end compare the last phase of all trainings, and on a GPU the peak of their memory with that of HAC.
+Rows at the end compare the last phase of all trainings: steps a second of all of it and of its second quarter
+(settled), what the GPU works a step and which share of a settled step that is; and on a GPU the peak of their memory
+with that of HAC.
 
 3DGS beside: the Gaussians that all anchors spawn for one view, thinned at random until views draw as many on average
 as the anchors' last steps did, trained as 3DGS without densification and with all its spherical harmonics.
@@ -100,6 +102,7 @@ class Phase:
     seconds: float = 0.0
     steps: int = 0
     busy: float = 0.0  # milliseconds of the GPU a step, in the window that was watched
+    settled: float = math.nan  # steps a second before that window: few graphs are captured, nothing grows any more
     lines: list[str] = field(default_factory=list)
 
     @property
@@ -110,10 +113,12 @@ class Phase:
 
 @dataclass(frozen=True)
 class Summary:
-    """Outcome of one training: speed, milliseconds of the GPU a step and loss of its last phase, peak in GB."""
+    """Outcome of one training: speed of its last phase and of that phase's second quarter, milliseconds of the GPU a
+    step, loss, peak in GB."""
 
     method: str
     rate: float
+    settled: float
     busy: float
     peak: float
     loss: float
@@ -124,7 +129,8 @@ class Summary:
         memory = "" if math.isnan(self.peak) else f"  peak {self.peak:5.2f} GB"
         memory += f", {self.peak / hac.peak:.2f} of HAC's" if memory and hac is not None else ""
         return (
-            f"  {self.method:10} {how:24} {self.rate:7.1f} it/s  GPU {self.busy:6.2f} ms  {self.anchors:9,} anchors  "
+            f"  {self.method:10} {how:24} {self.rate:7.1f} it/s, settled {self.settled:7.1f}  GPU {self.busy:6.2f} ms, "
+            f"{self.settled * self.busy / 10:3.0f} %  {self.anchors:9,} anchors  "
             f"loss {self.loss:.5f}{memory}"
         )
 
@@ -150,6 +156,7 @@ class Watch:
     kernels: int
     losses: collections.deque[torch.Tensor] = field(default_factory=lambda: collections.deque(maxlen=500))
     _since: float = 0.0
+    _settled_since: float = 0.0
     _profile: Any = None
     _caught: Any = None
 
@@ -166,6 +173,11 @@ class Watch:
         length = min(self.window, phase.end - middle - 1)
         if self._profile is None:
             phase.steps += 1
+        quarter = (phase.end - phase.start) // 4
+        if step == middle - quarter:
+            self._settled_since = self._now()
+        if step == middle:  # not after the window: what profiles stays in the process
+            phase.settled = quarter / (self._now() - self._settled_since)
         if step == middle and length > 0:
             phase.seconds += self._now() - self._since
             self._profile = profile(activities=_activities(self.device))
@@ -281,7 +293,8 @@ def anchors(
             return result
 
         object.__setattr__(trainer.rasterizer, "render", counted)
-        mark_parts(trainer)
+        if not args.brief:  # the marks take time
+            mark_parts(trainer)
 
         def run() -> None:
             watch.begin()
@@ -307,7 +320,7 @@ def anchors(
         print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {phase.rate:7.1f} it/s{used}")
         if not args.brief:
             print("\n".join(phase.lines), flush=True)
-    found = Summary(method, phases[-1].rate, phases[-1].busy, peak, loss, trainer.model.num_rows)
+    found = Summary(method, phases[-1].rate, phases[-1].settled, phases[-1].busy, peak, loss, trainer.model.num_rows)
     if args.baseline_steps < 1:
         return found
     rate, drawn_there = explicit(trainer.model, count, args, session, scene, folder)

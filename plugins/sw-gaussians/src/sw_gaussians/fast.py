@@ -22,13 +22,13 @@ def rate_factors(share: float) -> dict[str, float]:
 
 
 FAST: Mapping[str, Any] = {
-    "iterations": 9_000,
+    "iterations": 8_700,
     "scale_schedule": True,  # all plans below are in steps of 30,000
     "sh_interval": 3_000,
     "lr.opacity": 0.025,
     "densify.start": 900,
     "densify.stop": 24_000,
-    "densify.interval": 780,
+    "densify.interval": 810,
     "densify.reset_interval": 6_000,
     "fast.average": 0.1,
     "fast.densify": "budget",
