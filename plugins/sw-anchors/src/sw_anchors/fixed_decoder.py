@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
-from sw_anchors.fused_ops import put_rows
+from sw_anchors.fused_ops import add_rows, put_rows
 from sw_anchors.pool_rows import PoolRows
 from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
@@ -201,11 +201,12 @@ class _Decoded(torch.autograd.Function):
         add_gradients(ctx.networks, grads[count * (1 + len(others)) :])
         found = put_rows(rows, grads[:count], ctx.shapes[0][0])
         for i, others_rows in enumerate(others, 1):
-            for j, grad in enumerate(grads[count * i : count * (i + 1)]):
-                into = found[j]
-                if grad is not None:
-                    into = grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None else into
-                    found[j] = into.index_add_(0, others_rows, grad)
+            own = grads[count * i : count * (i + 1)]
+            found = [
+                grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None and grad is not None else into
+                for into, grad in zip(found, own, strict=True)
+            ]
+            add_rows(others_rows, own, found)
         shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
         return None, None, None, None, *shaped
 

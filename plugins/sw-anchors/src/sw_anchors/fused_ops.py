@@ -171,6 +171,20 @@ def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list
     ]
 
 
+def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tensor | None]) -> None:
+    """Add row i of each float32 source [S,...] to row rows[i] of its target; a source that is None adds nothing.
+
+    rows    [S] int64, which may name one more than once
+    """
+    pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
+    given, targets = [s for s, _ in pairs], [t for _, t in pairs]
+    if fit_kernels(*given) and fit_kernels(*targets):
+        row_kernels.add_rows(rows, given, targets)
+        return
+    for source, target in pairs:
+        target.index_add_(0, rows, source)
+
+
 class _TakeRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
