@@ -202,6 +202,30 @@ class _TakeRows(torch.autograd.Function):
         return None, *put_rows(rows, [grad if needed else None for grad, needed in wanted], ctx.count)
 
 
+def times_ones(values: Tensor, factors: Tensor, rows: Tensor) -> Tensor:
+    """Values [M,C] times the factors [...] at `rows` [M] (int64, each at most once) of them all, which are 1.
+
+    So it is the same values, and the factors get their gradient.
+    """
+    found: Tensor = _TimesOnes.apply(values, factors, rows)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _TimesOnes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factors: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(values, rows)
+        ctx.shape = factors.shape
+        return values.view_as(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        values, rows = ctx.saved_tensors
+        to_factors = grad.new_zeros(ctx.shape.numel()).index_copy_(0, rows, (grad * values).sum(dim=1))
+        return grad, to_factors.view(ctx.shape), None
+
+
 def widen(steps: Tensor, group: Tensor, one_hot: Tensor) -> Tensor:
     """Steps [V,3] of the groups, one for each column: [V,C].
 

@@ -12,12 +12,12 @@ from typing import TYPE_CHECKING, Any
 import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
 from sw_anchors.channel_networks import ChannelNetworks
-from sw_anchors.coded_anchors import MASK_THRESHOLD, SMALLEST_SCALE
+from sw_anchors.coded_anchors import MASK_THRESHOLD
 from sw_anchors.forecasts import AnchorForecast, AnchorRate
-from sw_anchors.fused_ops import anchor_values, noisy_rows
+from sw_anchors.fused_ops import anchor_values, noisy_rows, times_ones
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
-from sw_anchors.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
+from sw_anchors.mixture_bits import MaskKind, fit_mixture_kernel, mixture_bits
 from sw_anchors.predicted_outputs import steps_and_outputs
 from sw_anchors.voxel_lattice import voxel_integers, voxel_positions, within_reach
 from torch import Tensor, nn
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PoolForecast(AnchorForecast):
     """An AnchorForecast whose sample is drawn from all anchors of the model.
 
@@ -90,8 +90,9 @@ class HACPlusAnchors(GridAnchors):
         if "masks" not in found.extras:
             return found
         # Of those drawn all masks are 1; what is masked would be drawn with scale 0, and is left out.
-        masks = found.extras["masks"].reshape(-1).index_select(0, found.extras["anchors"].drawn)
-        return dataclasses.replace(found, scales=found.scales * masks[:, None])
+        assert found.scales is not None
+        drawn = found.extras["anchors"].drawn
+        return dataclasses.replace(found, scales=times_ones(found.scales, found.extras["masks"], drawn))
 
     # Rate
 
@@ -112,7 +113,7 @@ class HACPlusAnchors(GridAnchors):
             part=slice(count, count + 3), start=visible, offset=1.0, smallest=SMALLEST_STEP,
         )  # fmt: skip
         seen, sampled = torch.split(steps, [visible, len(pool[0])])
-        return PoolForecast(seen, bits, None, self._no_sample, None, sampled, outputs)
+        return PoolForecast(seen, bits, None, self._no_sample, rows=None, sample_steps=sampled, outputs=outputs)
 
     @property
     def _distributions(self) -> int:
@@ -164,9 +165,8 @@ class HACPlusAnchors(GridAnchors):
         given = (values, forecast.outputs, forecast.sample_steps, masks, counted)
         if fit_mixture_kernel(*given, self.units, *parameters):
             kind = MaskKind.GATED_MEAN if self.anchor_gradient else MaskKind.GATED
-            bounds = (self.smallest_probability, SMALLEST_SCALE, self.scale_floor)
-            predicted = Predicted(self.units, self.base_steps[0], *bounds, kind)
-            return mixture_bits(*given, predicted, self._networks_on(values.device), parameters)
+            networks = self._networks_on(values.device)
+            return mixture_bits(*given, self.read_as(self.units, kind), networks, parameters)
         bits = self._bits(values, self.widened(forecast.sample_steps), forecast.outputs)
         bits = bits * (self._shares(masks) * counted[:, None])
         return bits.sum(), bits.detach().sum(dim=0) @ self._columns(bits)[1]

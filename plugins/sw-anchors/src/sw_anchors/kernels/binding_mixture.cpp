@@ -1,5 +1,5 @@
-// Bits of a sample of anchors under predicted distributions, and inputs of the networks of channels, as torch ops: on the
-// CPU, and on CUDA on the current stream.
+// Bits of a sample of anchors under predicted distributions, and inputs of the networks of channels, as torch ops: on
+// the CPU, and on CUDA on the current stream.
 #include <ATen/core/Tensor.h>
 #include <ATen/ops/empty.h>
 #include <torch/library.h>

@@ -138,7 +138,8 @@ void add_rows(const Tensor& rows, const std::vector<Tensor>& sources, const std:
   for (const Tensor& t : sources)
     TORCH_CHECK(t.scalar_type() == at::kFloat && t.size(0) == rows.size(0),
                 "sw_anchors: float32 tensors with a row for each index are added");
-  for (const Tensor& t : into) TORCH_CHECK(t.scalar_type() == at::kFloat, "sw_anchors: rows are added to float32 tensors");
+  for (const Tensor& t : into)
+    TORCH_CHECK(t.scalar_type() == at::kFloat, "sw_anchors: rows are added to float32 tensors");
   const c10::cuda::CUDAGuard guard(rows.device());
   cuda::add(copies_of(sources, into), rows.const_data_ptr<int64_t>(), rows.size(0),
             c10::cuda::getCurrentCUDAStream());

@@ -27,7 +27,7 @@ struct MixtureBounds {
 };
 
 // Of S anchors, F features, k offsets. A row of `outputs` has means and deviations of features, then of 6 scales, then
-// of 3 k coordinates, then numbers that mean nothing here; if there is a second Gaussian, at its end logits of features.
+// of 3 k coordinates, then numbers that say nothing here; if there is a second Gaussian, logits of features at its end.
 struct Mixture {
   int64_t count;
   int features, offsets, width;  // F, k, W
@@ -66,7 +66,7 @@ struct Channels {
   bool context;
 };
 
-// Derivatives of the bits by x [S,numbers], outputs [S,width] and inputs [S,inputs] (or null), and by the bits (scalar).
+// Derivatives of the bits by x [S,numbers], outputs [S,width] and inputs [S,inputs] (or null), by the bits a scalar.
 struct ChannelSlopes {
   const float *slope, *x, *outputs, *inputs;
 };
@@ -96,8 +96,8 @@ SW_MIXTURE_HD int channel_input_of_output(int column, int features, int width, b
   return column < width - features ? -1 : 4 * features + column - width;
 }
 
-// Math: a Real, which is float or a vector of floats; `number`, `exponential`, and `complement`, the complementary error
-// function. So each instruction set has functions of its own.
+// Math: a Real, which is float or a vector of floats; `number`, `exponential`, and `complement`, the complementary
+// error function. So each instruction set has functions of its own.
 template <class Math, class Real = typename Math::Real>
 struct BinMass {
   Real value, by_x, by_deviation, by_step;  // by the mean: -by_x
@@ -142,8 +142,8 @@ SW_MIXTURE_HD Real through_floor(Real slope, Real scale, Real least, const Mixtu
   return scale < least ? below : slope;
 }
 
-// A number's probability, at least the smallest, and the derivatives of its bits times `factor` >= 0. Below the smallest
-// a probability still has the gradient that raises it: that of bits that count is negative.
+// A number's probability, at least the smallest, and the derivatives of its bits times `factor` >= 0. Below the
+// smallest a probability still has the gradient that raises it: that of bits that count is negative.
 template <class Math, class Real = typename Math::Real>
 struct OneBits {
   Real probability, by_x, by_step;
