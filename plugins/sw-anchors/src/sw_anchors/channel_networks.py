@@ -113,7 +113,7 @@ class ChannelNetworks:
         """The numbers of each parameter among packed ones, times a scalar."""
         taken = packed.index_select(0, self._places).mul_(factor)
         sizes = [_padded(shape.numel()) for shape in self._shapes]
-        parts = zip(taken.split(sizes), self._shapes, strict=True)
+        parts = zip(torch.split(taken, sizes), self._shapes, strict=True)
         return [part[: shape.numel()].view(shape) for part, shape in parts]
 
     def forward(self, packed: Tensor, inputs: Tensor) -> tuple[Tensor, Tensor]:

@@ -306,13 +306,13 @@ class CodedAnchors(AnchorModel):
 
     def uniform(self, *shape: int) -> Tensor:
         """Draws of U(0,1) on the model's device."""
-        return torch.rand(shape, generator=self._own_generator(), device=self.device)
+        return torch.rand(shape, generator=self.own_generator(), device=self.device)
 
     def draw_noise(self, rows: int, numbers: int) -> Tensor:
         """[rows, numbers] draws of U(0,1) for noise, see `noisy_values.draws`."""
-        return draws((rows, numbers), self._own_generator(), self.device)
+        return draws((rows, numbers), self.own_generator(), self.device)
 
-    def _own_generator(self) -> torch.Generator | None:
+    def own_generator(self) -> torch.Generator | None:
         """The generator of noise, if it draws on the model's device."""
         own = self.noise is not None and self.noise.device.type == self.device.type
         return self.noise if own else None
