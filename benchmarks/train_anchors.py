@@ -45,7 +45,7 @@ os.environ.setdefault("TEARDOWN_CUPTI", "0")
 
 import torch
 from step_parts import SECTION, kernel_times, longest_kernels, report
-from sw_anchors import fused_ops, view_networks
+from sw_anchors import fused_ops, mixture_bits, view_networks
 from torch.profiler import ProfilerActivity, profile, record_function
 
 from splatwizard_core.gaussians.inputs import rgb_to_dc
@@ -142,6 +142,7 @@ def kernels_off() -> Iterator[None]:
         for module in (fused_ops, spatial_ar, triplane):
             stack.enter_context(mock.patch.object(module, "fit_kernels", return_value=False))
         stack.enter_context(mock.patch.object(view_networks, "fit_kernel", return_value=False))
+        stack.enter_context(mock.patch.object(mixture_bits, "bits_fit_kernel", return_value=False))
         yield
 
 

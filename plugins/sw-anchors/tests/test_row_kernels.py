@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from sw_anchors import fused_ops
-from sw_anchors.fused_ops import load_rows, noisy_rows, put_rows, sample_bits, take_rows
+from sw_anchors.fused_ops import add_rows, load_rows, noisy_rows, put_rows, sample_bits, take_rows
 from sw_anchors.native import ANCHORS
 
 ON_CUDA = ANCHORS.available(cuda=True)
@@ -104,3 +104,21 @@ def test_bits_of_a_sample_and_their_gradients_are_those_of_torch(both_forms, cou
         return [bits.detach(), by_group, *torch.autograd.grad(0.5 * bits, leaves)]
 
     both_forms(compute, 1e-4)
+
+
+def test_rows_are_added_where_they_are_named(both_forms):
+    draw = drawer(4)
+    rows = torch.tensor([3, 0, 7, 9, 9, 9], device="cuda")
+    sources = [draw(6, 50), None, draw(6, 3), draw(6, 1)]
+    before = [draw(10, 50), draw(10, 2), draw(10, 3), draw(10, 1)]
+
+    def compute():
+        into = [each.clone() for each in before]
+        add_rows(rows, sources, into)
+        return into
+
+    both_forms(compute, 1e-6)
+    expected = before[2].clone()
+    for i, row in enumerate(rows.tolist()):
+        expected[row] += sources[2][i]
+    torch.testing.assert_close(compute()[2], expected)

@@ -180,6 +180,27 @@ def test_deviations_below_zero_learn_if_there_is_a_floor(floor):
     assert bool((last.bias.grad[8:16] < 0).any()) == bool(floor)
 
 
+@pytest.mark.parametrize("kind", ["full", "tiny", "none"])
+@pytest.mark.parametrize("floor", [0.0, 0.05])
+@pytest.mark.parametrize("anchor_gradient", [True, False])
+def test_one_node_gives_the_rate_and_gradients_of_torch_operations(kind, floor, anchor_gradient, monkeypatch):
+    values = {"channel__kind": kind, "rate_term__scale_floor": floor, "rate_term__anchor_gradient": anchor_gradient}
+    found = []
+    for by_node in (True, False):
+        if not by_node:
+            monkeypatch.setattr("sw_hac_plus.model.fit_mixture_kernel", lambda *_: False)
+        model = make(n=40, **values)
+        rate = rate_of(model)
+        (100 * rate.bits).backward()
+        grads = {name: p.grad for name, p in model.named_parameters() if p.grad is not None}
+        found.append({"bits": rate.bits.detach(), "by group": rate.by_group, **grads})
+    assert found[0].keys() == found[1].keys()
+    assert {"features", "mask_logits", "mlp_grid.2.bias"} <= found[0].keys()
+    for name, expected in found[1].items():
+        small = 1e-4 * float(expected.abs().max())
+        torch.testing.assert_close(found[0][name], expected, rtol=1e-4, atol=small, msg=name)
+
+
 def test_an_empty_sample_costs_nothing():
     assert float(rate_of(make(n=40), sample=0.0).bits) == 0
 

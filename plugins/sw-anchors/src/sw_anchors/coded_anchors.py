@@ -17,6 +17,7 @@ from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorContext, AnchorForecast, AnchorRate, Triple, triple
 from sw_anchors.fused_ops import anchor_values, sample_bits, take_rows, widen
 from sw_anchors.lattice import Margin, bounds_of, coded_positions, position_codes
+from sw_anchors.mixture_bits import MaskKind, Predicted, fit_mixture_kernel, mixture_bits
 from sw_anchors.noisy_values import Noise, Tables, draws, noisy_values
 from sw_anchors.pool_rows import bernoulli_rows
 from sw_codecs.entropy.rates import lower_bound
@@ -327,13 +328,13 @@ class CodedAnchors(AnchorModel):
 
     def uniform(self, *shape: int) -> Tensor:
         """Draws of U(0,1) on the model's device."""
-        return torch.rand(shape, generator=self._own_generator(), device=self.device)
+        return torch.rand(shape, generator=self.own_generator(), device=self.device)
 
     def draw_noise(self, rows: int, numbers: int) -> Tensor:
         """[rows, numbers] draws of U(0,1) for noise, see `noisy_values.draws`."""
-        return draws((rows, numbers), self._own_generator(), self.device)
+        return draws((rows, numbers), self.own_generator(), self.device)
 
-    def _own_generator(self) -> torch.Generator | None:
+    def own_generator(self) -> torch.Generator | None:
         """The generator of noise, if it draws on the model's device."""
         own = self.noise is not None and self.noise.device.type == self.device.type
         return self.noise if own else None
@@ -410,14 +411,24 @@ class CodedAnchors(AnchorModel):
         """`rate_of` values, steps and masks `taken` of the sample, and of what the forecast starts from."""
         x, step, mask = taken[:3]
         hidden = taken[3] if len(taken) > 3 else None
-        mean, scale = forecast.sample(drawn, hidden, x)
-        if self.scale_floor:
-            scale = self.floored(scale, self.widened(step))
-        bits, by_group = sample_bits(
-            x, mean, scale, step, mask, counted, p_min=self.smallest_probability, smallest_scale=SMALLEST_SCALE
-        )
+        outputs_of, units = forecast.outputs_of, forecast.units
+        if outputs_of and hidden is not None and units is not None and fit_mixture_kernel(x, hidden, step, mask):
+            predicted = self.read_as(units, MaskKind.ALONE)
+            bits, by_group = mixture_bits(x, outputs_of(hidden), step, mask, counted, predicted)
+        else:
+            mean, scale = forecast.sample(drawn, hidden, x)
+            if self.scale_floor:
+                scale = self.floored(scale, self.widened(step))
+            bits, by_group = sample_bits(
+                x, mean, scale, step, mask, counted, p_min=self.smallest_probability, smallest_scale=SMALLEST_SCALE
+            )
         numbers = counted.sum() * sum(self.shape.widths)
         return AnchorRate(bits * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
+
+    def read_as(self, units: Tensor, masks: MaskKind) -> Predicted:
+        """How the outputs of the context's network give bits: `units` [W] of the outputs, and what masks do to them."""
+        bounds = (self.smallest_probability, SMALLEST_SCALE, self.scale_floor)
+        return Predicted(units, self.base_steps[0], *bounds, masks)
 
     # State
 

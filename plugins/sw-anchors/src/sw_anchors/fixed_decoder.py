@@ -22,7 +22,7 @@ from splatwizard_core.api import Camera, GaussianInputs
 from sw_anchors.coded_anchors import ENTROPY
 from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.fixed_step import PARAMETERS, FixedRows, decode_rows, inputs_of, sample_capacity
-from sw_anchors.fused_ops import put_rows
+from sw_anchors.fused_ops import add_rows, put_rows
 from sw_anchors.pool_rows import PoolRows
 from sw_anchors.step_graphs import CapturedStep, FixedStep, PlainStep, Watched, add_gradients
 
@@ -234,11 +234,13 @@ class _Decoded(torch.autograd.Function):
         grads = ctx.step.backward(slopes[: ctx.count])
         add_gradients(ctx.networks, grads[count * (1 if pool is None else 2) :])
         found = put_rows(rows, grads[:count], ctx.shapes[0][0])
-        for j, grad in enumerate(() if pool is None else grads[count : 2 * count]):
-            into = found[j]
-            if grad is not None:
-                into = grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None else into
-                found[j] = into.index_add_(0, pool, grad)
+        if pool is not None:
+            own = grads[count : 2 * count]
+            found = [
+                grad.new_zeros(ctx.shapes[0][0], *grad.shape[1:]) if into is None and grad is not None else into
+                for into, grad in zip(found, own, strict=True)
+            ]
+            add_rows(pool, own, found)
         shaped = (None if grad is None else grad.view(shape) for grad, shape in zip(found, ctx.shapes, strict=True))
         return None, None, None, None, None, *shaped
 

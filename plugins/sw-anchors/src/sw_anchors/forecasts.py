@@ -34,12 +34,16 @@ class AnchorForecast:
     hidden      [V,H] what `sample` starts from, or None; rows of the sample are taken from it
     sample      (rows [S] of the V, their rows of `hidden`, their values [S,C]) -> means and scales [S,C]; the columns
                 are those of all groups side by side
+    outputs_of  (the rows of `hidden`) -> the same as outputs of a network, see `mixture_bits`; None: only as `sample`
+    units       [W] factors of these outputs
     """
 
     steps: Tensor
     own_bits: Tensor | None
     hidden: Tensor | None
     sample: Callable[[Tensor, Tensor | None, Tensor], tuple[Tensor, Tensor]]
+    outputs_of: Callable[[Tensor], Tensor] | None = None
+    units: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -171,6 +171,20 @@ def put_rows(rows: Tensor, sources: Sequence[Tensor | None], count: int) -> list
     ]
 
 
+def add_rows(rows: Tensor, sources: Sequence[Tensor | None], into: Sequence[Tensor | None]) -> None:
+    """Add row i of each float32 source [S,...] to row rows[i] of its target; a source that is None adds nothing.
+
+    rows    [S] int64, which may name one more than once
+    """
+    pairs = [(s, t) for s, t in zip(sources, into, strict=True) if s is not None and t is not None]
+    given, targets = [s for s, _ in pairs], [t for _, t in pairs]
+    if fit_kernels(*given) and fit_kernels(*targets):
+        row_kernels.add_rows(rows, given, targets)
+        return
+    for source, target in pairs:
+        target.index_add_(0, rows, source)
+
+
 class _TakeRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:
@@ -186,6 +200,30 @@ class _TakeRows(torch.autograd.Function):
         (rows,) = ctx.saved_tensors
         wanted = zip(grads, ctx.needs_input_grad[1:], strict=True)
         return None, *put_rows(rows, [grad if needed else None for grad, needed in wanted], ctx.count)
+
+
+def times_ones(values: Tensor, factors: Tensor, rows: Tensor) -> Tensor:
+    """Values [M,C] times the factors [...] at `rows` [M] (int64, each at most once) of them all, which are 1.
+
+    So it is the same values, and the factors get their gradient.
+    """
+    found: Tensor = _TimesOnes.apply(values, factors, rows)  # type: ignore[no-untyped-call]
+    return found
+
+
+class _TimesOnes(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factors: Tensor, rows: Tensor) -> Tensor:
+        ctx.save_for_backward(values, rows)
+        ctx.shape = factors.shape
+        return values.view_as(values)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        values, rows = ctx.saved_tensors
+        to_factors = grad.new_zeros(ctx.shape.numel()).index_copy_(0, rows, (grad * values).sum(dim=1))
+        return grad, to_factors.view(ctx.shape), None
 
 
 def widen(steps: Tensor, group: Tensor, one_hot: Tensor) -> Tensor:

@@ -129,13 +129,15 @@ class GridAnchors(CodedAnchors):
         base = self.base_steps_like(features)
         steps, hidden = predicted_steps(features, parameters, base, offset=1.0, smallest=SMALLEST_STEP)
 
+        def outputs(hidden: Tensor) -> Tensor:
+            return torch.nn.functional.linear(hidden, weights[0], biases[0])
+
         def sample(drawn: Tensor, hidden: Tensor | None, values: Tensor) -> tuple[Tensor, Tensor]:
             assert hidden is not None
-            outputs = torch.nn.functional.linear(hidden, weights[0], biases[0]) * self.units[:count]
-            parts = torch.split(outputs, widths, dim=1)
+            parts = torch.split(outputs(hidden) * self.units[:count], widths, dim=1)
             return torch.cat(parts[0::2], dim=1), torch.cat(parts[1::2], dim=1)
 
-        return AnchorForecast(steps, bits, hidden, sample)
+        return AnchorForecast(steps, bits, hidden, sample, outputs, self.units[:count])
 
     def predict(self, rows: Tensor) -> AnchorContext:
         features, bits = self._looked_up(tuple(part.index_select(0, rows) for part in self.context_rows()))

@@ -46,7 +46,7 @@ class PoolRows:
 
     def draw(self, model: CodedAnchors) -> None:
         """Draw noise."""
-        self.random.copy_(model.uniform(len(self.random))).sub_(0.5)
+        self.random.uniform_(-0.5, 0.5, generator=model.own_generator())
 
 
 def bernoulli_rows(uniform: Tensor, count: int, share: float) -> tuple[Tensor, Tensor]:
@@ -61,6 +61,6 @@ def bernoulli_rows(uniform: Tensor, count: int, share: float) -> tuple[Tensor, T
         gaps = torch.ones_like(uniform)
     else:
         rate = max(-math.log1p(-share), 1e-30)
-        gaps = (uniform.clamp(min=1e-30).log().neg() / rate).floor().add(1).clamp(max=count + 1)
-    places = gaps.cumsum(0).clamp(max=count + 1).to(torch.int64) - 1
-    return places.clamp(max=count - 1), (places < count).to(uniform)
+        gaps = uniform.log().mul_(-1 / rate).floor_().add_(1).clamp_(max=count + 1)
+    places = gaps.cumsum(0)  # from 1 on
+    return places.clamp(max=count).sub_(1).to(torch.int64), (places <= count).to(uniform)

@@ -54,6 +54,11 @@ def scatter_rows(rows: Tensor, sources: Sequence[Tensor], count: int) -> list[Te
     return found
 
 
+def add_rows(rows: Tensor, sources: Sequence[Tensor], into: Sequence[Tensor]) -> None:
+    """Add row i of each float32 source [S,...] to row rows[i] (int64) of its target; rows may be named again."""
+    torch.ops.sw_anchors.add_rows(rows, list(sources), list(into))
+
+
 class NoisyRows(torch.autograd.Function):
     """`fused_ops.noisy_rows` by one kernel each way."""
 

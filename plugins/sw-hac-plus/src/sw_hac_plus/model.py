@@ -11,17 +11,20 @@ from typing import TYPE_CHECKING, Any
 
 import torch
 from sw_anchors.anchors import AnchorAttributes, linear_layers
+from sw_anchors.channel_networks import ChannelNetworks
 from sw_anchors.coded_anchors import MASK_THRESHOLD
 from sw_anchors.expected_rows import ExpectedRows
 from sw_anchors.forecasts import AnchorForecast, AnchorRate
-from sw_anchors.fused_ops import anchor_values, noisy_rows
+from sw_anchors.fused_ops import anchor_values, noisy_rows, times_ones
 from sw_anchors.grid_anchors import SMALLEST_STEP, GridAnchors
 from sw_anchors.lattice import position_codes
+from sw_anchors.mixture_bits import MaskKind, fit_mixture_kernel, mixture_bits
+from sw_anchors.predicted_outputs import steps_and_outputs
 from sw_anchors.voxel_lattice import voxel_integers, voxel_positions, within_reach
 from torch import Tensor, nn
 
 from sw_codecs.context.channel_mixture import ChannelMixture
-from sw_codecs.entropy.rates import gaussian_bits, mixture_bits
+from sw_codecs.entropy import rates
 from sw_codecs.quantizers.rounding import add_noise
 
 if TYPE_CHECKING:
@@ -30,16 +33,18 @@ if TYPE_CHECKING:
     from splatwizard_core.api import Camera, GaussianInputs
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class PoolForecast(AnchorForecast):
     """An AnchorForecast whose sample is drawn from all anchors of the model.
 
     rows            [S] int64, the sample; None: whoever asked has its rows
-    sample_steps    [S,3] quantiser steps of it; `hidden` is that of the sample too
+    sample_steps    [S,3] quantiser steps of it
+    outputs         [S,W] of the network behind the grid, over `units`
     """
 
     rows: Tensor | None
     sample_steps: Tensor
+    outputs: Tensor
 
 
 class HACPlusAnchors(GridAnchors):
@@ -61,6 +66,7 @@ class HACPlusAnchors(GridAnchors):
         super().__init__(*tensors, further=0 if channel is None else tensors[1].shape[1], **kwargs)
         self.channel = None if channel is None else channel.to(self.features)
         self.anchor_gradient = anchor_gradient
+        self._layouts: dict[torch.device, ChannelNetworks] = {}
 
     def networks(self) -> dict[str, nn.Module]:
         return super().networks() | ({} if self.channel is None else {"channel": self.channel})
@@ -85,8 +91,9 @@ class HACPlusAnchors(GridAnchors):
         if "masks" not in found.extras:
             return found
         # Of those drawn all masks are 1; what is masked would be drawn with scale 0, and is left out.
-        masks = found.extras["masks"].reshape(-1).index_select(0, found.extras["anchors"].drawn)
-        return dataclasses.replace(found, scales=found.scales * masks[:, None])
+        assert found.scales is not None
+        drawn = found.extras["anchors"].drawn
+        return dataclasses.replace(found, scales=times_ones(found.scales, found.extras["masks"], drawn))
 
     # Rate
 
@@ -100,12 +107,14 @@ class HACPlusAnchors(GridAnchors):
         both = tuple(torch.cat(pair) for pair in zip(parts, pool, strict=True))
         features, bits = self._looked_up(both)
         first, last = linear_layers(self.mlp_grid)
-        hidden = torch.relu(first(features))
-        part = slice(self._distributions, self._distributions + 3)
-        steps = torch.tanh(nn.functional.linear(hidden, last.weight[part], last.bias[part]))
-        steps = (1 + steps).clamp(min=SMALLEST_STEP) * self.base_steps_like(steps)
-        visible, sampled = torch.split(steps, [len(parts[0]), len(pool[0])])
-        return PoolForecast(visible, bits, hidden[len(parts[0]) :], self._no_sample, None, sampled)
+        parameters = (first.weight, first.bias, last.weight, last.bias)
+        visible, count = len(parts[0]), self._distributions
+        steps, outputs = steps_and_outputs(
+            features, parameters, self.base_steps_like(features),
+            part=slice(count, count + 3), start=visible, offset=1.0, smallest=SMALLEST_STEP,
+        )  # fmt: skip
+        seen, sampled = torch.split(steps, [visible, len(pool[0])])
+        return PoolForecast(seen, bits, None, self._no_sample, rows=None, sample_steps=sampled, outputs=outputs)
 
     @property
     def _distributions(self) -> int:
@@ -145,11 +154,29 @@ class HACPlusAnchors(GridAnchors):
 
     def _rate_of(self, values: Tensor, masks: Tensor, counted: Tensor, forecast: PoolForecast) -> AnchorRate:
         """Estimate the bits of noisy values [S,C] of anchors; those that are not counted [S] are as if not there."""
-        steps = self.widened(forecast.sample_steps)
-        bits = self._bits(values, steps, forecast) * (self._shares(masks) * counted[:, None])
-        by_group = bits.detach().sum(dim=0) @ self._columns(bits)[1]
+        total, by_group = self._total_bits(values, masks, counted, forecast)
         numbers = counted.sum() * values.shape[1]
-        return AnchorRate(bits.sum() / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
+        return AnchorRate(total / numbers.clamp(min=1), by_group, numbers, forecast.own_bits)
+
+    def _total_bits(
+        self, values: Tensor, masks: Tensor, counted: Tensor, forecast: PoolForecast
+    ) -> tuple[Tensor, Tensor]:
+        """(bits of all that count, by group [3] without gradient); other arguments as of `_rate_of`."""
+        parameters = () if self.channel is None else tuple(ChannelNetworks.parameters(self.channel))
+        given = (values, forecast.outputs, forecast.sample_steps, masks, counted)
+        if fit_mixture_kernel(*given, self.units, *parameters):
+            kind = MaskKind.GATED_MEAN if self.anchor_gradient else MaskKind.GATED
+            networks = self._networks_on(values.device)
+            return mixture_bits(*given, self.read_as(self.units, kind), networks, parameters)
+        bits = self._bits(values, self.widened(forecast.sample_steps), forecast.outputs)
+        bits = bits * (self._shares(masks) * counted[:, None])
+        return bits.sum(), bits.detach().sum(dim=0) @ self._columns(bits)[1]
+
+    def _networks_on(self, device: torch.device) -> ChannelNetworks | None:
+        """The layout of the networks of channels; none replaces another: graphs read their tensors where they stand."""
+        if self.channel is not None and device not in self._layouts:
+            self._layouts[device] = ChannelNetworks(self.channel, device)
+        return self._layouts.get(device)
 
     def _shares(self, masks: Tensor) -> Tensor:
         """[S,C] factors of the bits: whether the anchor is there, for an offset times its mask; with gradient."""
@@ -161,21 +188,19 @@ class HACPlusAnchors(GridAnchors):
         offsets = (there[:, None] * masks)[:, :, None].expand(-1, -1, 3).flatten(1)
         return torch.cat([there[:, None].expand(-1, widths[0] + widths[1]), offsets], dim=1)
 
-    def _bits(self, values: Tensor, steps: Tensor, forecast: PoolForecast) -> Tensor:
+    def _bits(self, values: Tensor, steps: Tensor, outputs: Tensor) -> Tensor:
         """[S,C] bits of noisy values under the grid's Gaussians, of features under the mixture with the channels'."""
-        assert forecast.hidden is not None
-        _, last = linear_layers(self.mlp_grid)
-        outputs = nn.functional.linear(forecast.hidden, last.weight, last.bias) * self.units
+        outputs = outputs * self.units
         f, count = self.shape.features, self._distributions
         parts = torch.split(outputs[:, :count], self.shape.outputs[:-1], dim=1)
         mean = torch.cat(parts[0::2], dim=1)
         scale = self.floored(torch.cat(parts[1::2], dim=1), steps)
         if self.channel is None:
-            return gaussian_bits(values, mean, scale, steps, p_min=self.smallest_probability)
+            return rates.gaussian_bits(values, mean, scale, steps, p_min=self.smallest_probability)
         base, logit = self.base_steps[0], outputs[:, count + 3 :]
         context = torch.cat([parts[0] / base, parts[1] / base, logit], dim=1)
         second_mean, second_scale, second_logit = self.channel(values[:, :f] / base, context)
-        features = mixture_bits(
+        features = rates.mixture_bits(
             values[:, :f],
             torch.stack([logit, second_logit], dim=-1),
             torch.stack([mean[:, :f], base * second_mean], dim=-1),
@@ -183,5 +208,7 @@ class HACPlusAnchors(GridAnchors):
             steps[:, :f],
             p_min=self.smallest_probability,
         )
-        others = gaussian_bits(values[:, f:], mean[:, f:], scale[:, f:], steps[:, f:], p_min=self.smallest_probability)
+        others = rates.gaussian_bits(
+            values[:, f:], mean[:, f:], scale[:, f:], steps[:, f:], p_min=self.smallest_probability
+        )
         return torch.cat([features, others], dim=1)

@@ -6,6 +6,8 @@ TORCH_LIBRARY_FRAGMENT(sw_anchors, m) {
   m.def("load_rows(Tensor rows, Tensor[] sources, Tensor(a!)[] into) -> ()");
   m.def("take_rows(Tensor rows, Tensor[] sources) -> Tensor[]");
   m.def("scatter_rows(Tensor rows, Tensor[] sources, int count) -> Tensor[]");
+  // Rows i of sources are added to rows[i] of others.
+  m.def("add_rows(Tensor rows, Tensor[] sources, Tensor(a!)[] into) -> ()");
   // Values, masks, whether kept; gradients by features, log_scales, offsets, logits and, if they learn, steps.
   m.def("row_values(Tensor features, Tensor log_scales, Tensor offsets, Tensor logits, Tensor? weights, Tensor? valid,"
         " Tensor? noise, Tensor? steps, float threshold) -> (Tensor, Tensor, Tensor)");
@@ -130,6 +132,20 @@ std::vector<Tensor> scatter_rows(const Tensor& rows, const std::vector<Tensor>& 
   return found;
 }
 
+void add_rows(const Tensor& rows, const std::vector<Tensor>& sources, const std::vector<Tensor>& into) {
+  check_rows(rows, sources), check_rows(rows, into);
+  TORCH_CHECK(sources.size() == into.size(), "sw_anchors: as many sources as targets are needed");
+  for (const Tensor& t : sources)
+    TORCH_CHECK(t.scalar_type() == at::kFloat && t.size(0) == rows.size(0),
+                "sw_anchors: float32 tensors with a row for each index are added");
+  for (const Tensor& t : into)
+    TORCH_CHECK(t.scalar_type() == at::kFloat, "sw_anchors: rows are added to float32 tensors");
+  const c10::cuda::CUDAGuard guard(rows.device());
+  cuda::add(copies_of(sources, into), rows.const_data_ptr<int64_t>(), rows.size(0),
+            c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+}
+
 Rows rows_of(const Tensor& features, const Tensor& log_scales, const Tensor& offsets, const Tensor& logits,
              const std::optional<Tensor>& weights, const std::optional<Tensor>& valid,
              const std::optional<Tensor>& noise, const std::optional<Tensor>& steps, double threshold) {
@@ -238,6 +254,7 @@ TORCH_LIBRARY_IMPL(sw_anchors, CUDA, m) {
   m.impl("load_rows", load_rows);
   m.impl("take_rows", take_rows);
   m.impl("scatter_rows", scatter_rows);
+  m.impl("add_rows", add_rows);
   m.impl("row_values", row_values);
   m.impl("row_values_backward", row_values_backward);
   m.impl("sample_bits", sample_bits);

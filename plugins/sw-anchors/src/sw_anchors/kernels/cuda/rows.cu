@@ -23,6 +23,21 @@ __global__ void __launch_bounds__(kWarp* kRows)
   }
 }
 
+// Row i of each `from` is added to row rows[i] of `to`; rows may be named more than once.
+__global__ void __launch_bounds__(kWarp* kRows)
+    add_kernel(const __grid_constant__ RowCopies copies, const int64_t* rows, int64_t n) {
+  const int64_t row = own_row();
+  if (row >= n) return;
+  const int64_t target = rows[row];
+  for (int word = int(threadIdx.x), i = 0; word < copies.words; word += kWarp) {
+    while (word >= copies.last[i]) ++i;
+    const int own = word - (i == 0 ? 0 : copies.last[i - 1]);
+    const float value = reinterpret_cast<const float*>(copies.from[i])[row * copies.from_row[i] + own];
+    // Places that no anchor was drawn for all name one row, and have zeros for it: they need not wait for one another.
+    if (value != 0.f) atomicAdd(reinterpret_cast<float*>(copies.to[i]) + target * copies.to_row[i] + own, value);
+  }
+}
+
 __device__ __forceinline__ float sigmoid(float x) { return 1.f / (1.f + expf(-x)); }
 
 __device__ __forceinline__ int group_of(int column, int features) {
@@ -156,6 +171,10 @@ void gather(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_
 
 void scatter(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream) {
   if (n > 0) copy_kernel<false><<<blocks_of(n), threads(), 0, stream>>>(copies, rows, n);
+}
+
+void add(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream) {
+  if (n > 0) add_kernel<<<blocks_of(n), threads(), 0, stream>>>(copies, rows, n);
 }
 
 void values(const Rows& from, float* values, float* masks, float* kept, cudaStream_t stream) {

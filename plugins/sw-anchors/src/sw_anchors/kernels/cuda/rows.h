@@ -11,6 +11,8 @@ namespace sw_anchors::cuda {
 void gather(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream);
 // Row i of each `from` -> row rows[i] of `to`.
 void scatter(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream);
+// Row i of each `from`, float32, is added to row rows[i] of `to`; rows may be named more than once.
+void add(const RowCopies& copies, const int64_t* rows, int64_t n, cudaStream_t stream);
 
 // Values [C,F+6+3k]: features, exp of scales, offsets, each plus noise times the step of its group; masks [C,k] of 0 or
 // 1; kept [C]: whether one of an anchor's masks is 1.

@@ -1,0 +1,126 @@
+"""Bits of a sample of anchors straight from what networks predict, with their derivatives: one node, one kernel.
+
+Means, deviations and weights need no tensors of their own. `ChannelNetworks` are part of the node: they see the numbers
+whose bits are counted, and so both gradients are added where they are written.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from sw_anchors.channel_networks import ChannelNetworks
+from sw_anchors.row_kernels import bits_fit_kernel
+
+
+class MaskKind(IntEnum):
+    """What masks do to the bits of their anchor: `MaskKind` of kernels/mixture.h."""
+
+    ALONE = 0
+    GATED = 1
+    GATED_MEAN = 2
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """How outputs of networks are read.
+
+    units           [W] factors of the outputs
+    base            base step of the features, in which the networks of channels count
+    smallest        floor of a probability
+    smallest_scale  floor of a deviation, without gradient below
+    scale_floor     floor of a deviation in steps instead, with the gradient that raises it; 0: none
+    masks           what they do
+    """
+
+    units: Tensor
+    base: float
+    smallest: float
+    smallest_scale: float
+    scale_floor: float
+    masks: MaskKind
+
+
+def fit_mixture_kernel(*tensors: Tensor) -> bool:
+    """Whether there are kernels for such tensors, all float32 of one device; loads them."""
+    return len({(t.device, t.dtype) for t in tensors}) == 1 and bits_fit_kernel(*tensors)
+
+
+def mixture_bits(
+    x: Tensor,
+    outputs: Tensor,
+    steps: Tensor,
+    masks: Tensor,
+    counted: Tensor,
+    predicted: Predicted,
+    networks: ChannelNetworks | None = None,
+    parameters: tuple[Tensor, ...] = (),
+) -> tuple[Tensor, Tensor]:
+    """(bits of S anchors, differentiable; the same by group [3]), where `fit_mixture_kernel` says so.
+
+    x           [S,F+6+3k]
+    outputs     [S,W] as `shape.AnchorShape` has them, then any others; with networks the last F are logits of the
+                weight of the first Gaussian of each feature
+    steps       [S,3] widths of the bins by group
+    masks       [S,k] 0 or 1
+    counted     [S] factors of the bits of an anchor
+    networks    of channels, of `parameters`: they give the second Gaussian; None: there is one
+
+    The derivative by the bits must not be negative.
+    """
+    given = [each.contiguous() for each in (x, outputs, steps, masks, counted)]
+    bits, by_group = _MixtureBits.apply(*given, predicted, networks, *parameters)  # type: ignore[no-untyped-call]
+    return bits, by_group
+
+
+class _MixtureBits(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any,
+        x: Tensor,
+        outputs: Tensor,
+        steps: Tensor,
+        masks: Tensor,
+        counted: Tensor,
+        predicted: Predicted,
+        networks: ChannelNetworks | None,
+        *parameters: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        p, features = predicted, x.shape[1] - 6 - 3 * masks.shape[1]
+        # What `channel_inputs` and `channel_slopes` are told.
+        ctx.read = p.units, features, p.base, networks is not None and networks.context
+        second = columns = None
+        kept: list[Tensor] = []
+        if networks is not None:
+            columns, packed = networks.columns, networks.packed(parameters)
+            inputs = torch.ops.sw_anchors.channel_inputs(x, outputs, *ctx.read)
+            hidden, second = networks.forward(packed, inputs)
+            kept = [packed, inputs, hidden]
+        bits, *slopes = torch.ops.sw_anchors.mixture_bits(
+            x, outputs, p.units, second, columns, steps, masks, counted,
+            p.base, p.smallest, p.smallest_scale, p.scale_floor, int(p.masks),
+        )  # fmt: skip
+        ctx.networks = networks
+        ctx.save_for_backward(*slopes, *kept)
+        by_group = bits.sum(dim=0)
+        ctx.mark_non_differentiable(by_group)
+        return by_group.sum(), by_group
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, slope: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:
+        by_x, by_outputs, by_steps, by_masks, *rest = ctx.saved_tensors
+        networks: ChannelNetworks | None = ctx.networks
+        to_inputs, to_parameters = None, []
+        if networks is not None:
+            by_second, packed, inputs, hidden = rest
+            to_inputs, to_packed = networks.backward(packed, inputs, hidden, by_second)
+            to_parameters = networks.unpacked(to_packed, slope)
+        to_x, to_outputs = torch.ops.sw_anchors.channel_slopes(slope, by_x, by_outputs, to_inputs, *ctx.read)
+        to_steps, to_masks = torch._foreach_mul([by_steps, by_masks], slope)
+        return to_x, to_outputs, to_steps, to_masks, None, None, None, *to_parameters
