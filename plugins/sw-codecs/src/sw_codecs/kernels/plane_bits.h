@@ -44,13 +44,11 @@ struct Place {
   int64_t at;  // in values[scale]
 };
 
-// Value `index` of an orientation, counted over all scales.
-SW_PLANES_INLINE Place place_of(const Planes& planes, int orientation, int64_t index) {
-  int scale = 0;
-  while (scale + 1 < planes.scales && index >= planes.count[scale]) index -= planes.count[scale], ++scale;
-  const int64_t line = index / planes.width[scale];
-  return {scale, int(line % planes.height[scale]), int(index - line * planes.width[scale]),
-          index + orientation * planes.count[scale]};
+// Value `index` of a scale and an orientation. Planes have fewer than 2^31 values.
+SW_PLANES_INLINE Place place_of(const Planes& planes, int orientation, int scale, int index) {
+  const unsigned at = unsigned(index), width = unsigned(planes.width[scale]), line = at / width;
+  return {scale, int(line % unsigned(planes.height[scale])), int(at - line * width),
+          at + orientation * planes.count[scale]};
 }
 
 // Neighbour i of a place: rows down, columns right.
