@@ -55,9 +55,14 @@ SW_PLANES_INLINE Place place_of(const Planes& planes, int orientation, int scale
 SW_PLANES_INLINE int down_of(int i) { return i < 5 ? -2 : i < 10 ? -1 : 0; }
 SW_PLANES_INLINE int right_of(int i) { return (i < 10 ? i % 5 : i - 10) - 2; }
 
-SW_PLANES_INLINE bool has_neighbor(const Planes& planes, const Place& place, int i) {
-  const int column = place.column + right_of(i);
-  return place.row + down_of(i) >= 0 && column >= 0 && column < planes.width[place.scale];
+// Neighbours that a place has, a bit each.
+SW_PLANES_INLINE unsigned neighbors_of(const Planes& planes, const Place& place) {
+  constexpr int kAcross = 2 * kBeside + 1;
+  unsigned across = 0;
+  for (int i = 0; i < kAcross; ++i)
+    across |= unsigned(unsigned(place.column + i - kBeside) < unsigned(planes.width[place.scale])) << i;
+  return (place.row > 1 ? across : 0) | (place.row > 0 ? across << kAcross : 0) |
+         (across & ((1u << kBeside) - 1)) << (kAbove * kAcross);
 }
 
 SW_PLANES_INLINE int64_t neighbor_of(const Planes& planes, const Place& place, int i) {

@@ -220,8 +220,7 @@ __global__ void __launch_bounds__(kThreads, kBlocksPerProcessor)
   for (int i = thread; i < 2 * kHidden; i += kThreads) last[i] = weights[kLast + i];
   const float last_biases[2] = {weights[kLastBias], weights[kLastBias + 1]};
 
-  // Neighbours come from each value's own thread: rows of their blocks are swapped, or else four threads would meet in a
-  // bank.
+  // Neighbours come from each value's own thread: rows of their blocks are swapped, or else four would meet in a bank.
   uint32_t* const of_warp = shared + kAtWarps + thread / kWarp * kOfWarp;
   const int row = row_of(lane), swapped = row ^ lane / 8 % 2 * 8;
   const Rows neighbors{{of_warp + swapped, of_warp + 4 * kBlock + (swapped ^ 16)}};
@@ -244,14 +243,10 @@ __global__ void __launch_bounds__(kThreads, kBlocksPerProcessor)
     const Place place = place_of(planes, orientation, scale, index);
     const float* const values = planes.values[scale];
     const float value = valid ? values[place.at] : 0.f;
-    unsigned has = 0;  // neighbours
+    const unsigned has = valid ? neighbors_of(planes, place) : 0;
     float around[kHidden] = {};
 #pragma unroll
-    for (int i = 0; i < kNeighbors; ++i) {
-      const bool is_there = valid && has_neighbor(planes, place, i);
-      around[i] = is_there ? values[neighbor_of(planes, place, i)] : 0.f;
-      has |= unsigned(is_there) << i;
-    }
+    for (int i = 0; i < kNeighbors; ++i) around[i] = has >> i & 1 ? values[neighbor_of(planes, place, i)] : 0.f;
     around[kNeighbors] = 1.f;
 
     __syncwarp();  // all have read what they need of the values before
