@@ -34,7 +34,7 @@ static_assert(kWarps * kSums <= kShared && kWarp * kNeighbors <= kBackward * kMa
 using Tile = float[2][4];
 using Parts = uint32_t[4];  // those of a tile in twos: rows g, g + 8, then the other columns
 struct Rows {
-  uint32_t* tile[2];  // of a matrix, what a thread tells of when blocks are read or written
+  uint32_t* tile[2];  // of a matrix: the row of which a thread gives the address when blocks are read or written
 };
 
 // c += a b: a [16, 16] as a tile's parts; b [16, 8]: rows 2t .. and 2t + 8 .. of column g; c as half a tile.
@@ -49,7 +49,7 @@ __device__ __forceinline__ void multiply(float (&c)[4], const Parts& a, uint32_t
 #endif
 }
 
-// Parts of a tile are its blocks in the order 0, 2, 1, 3: the word of row lane % 8 of the one that is lane / 8 in it.
+// Parts of a tile are its blocks in the order 0, 2, 1, 3: the first word of row lane % 8 of the block lane / 8 in it.
 __device__ __forceinline__ int row_of(int lane) { return (lane / 8 % 2 * 2 + lane / 16) * kBlock + lane % 8 * 4; }
 
 // Four blocks of a matrix, of each two numbers of row g, columns 2t and 2t + 1. `row`: of block lane / 8, row lane % 8.
@@ -194,7 +194,7 @@ __device__ __forceinline__ void add_to_plane(const Planes& planes, const Place& 
         (from == (from & (kWarp - 1)) ? within : beyond) += x;
       }
     float* const to = planes.to[place.scale] + place.at + int64_t(line - kAbove) * planes.width[place.scale];
-    // Places outside of the planes have 0.
+    // What would go beyond the planes is 0.
     if (within != 0.f) atomicAdd(to, within);
     if (beyond != 0.f) atomicAdd(lane < kWarp / 2 ? to + kWarp : to - kWarp, beyond);
   }
