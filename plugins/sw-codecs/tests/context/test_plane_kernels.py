@@ -43,6 +43,16 @@ def test_there_are_none_for_planes_of_more_cells_than_a_grid_has_rows_for(monkey
     assert not fit_kernels([on_cuda(1, 1), on_cuda(65_535, 33)])
 
 
+@pytest.mark.parametrize(("capability", "taken"), [((7, 5), False), ((8, 0), True), ((12, 0), True)])
+def test_bits_of_planes_are_taken_by_the_kernel_where_there_are_tensor_cores_for_it(capability, taken, monkeypatch):
+    networks, plane = [SpatialAr(generator())], torch.ones(1, 2, 3, 4)
+    expected = SpatialAr.joint_bits(networks, [plane])
+    monkeypatch.setattr(spatial_ar, "fit_kernels", lambda _: True)
+    monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _: capability)
+    monkeypatch.setattr(spatial_ar, "plane_bits", lambda *_, planes_learn: (torch.full((1, 1060), -1.0), []))
+    torch.testing.assert_close(SpatialAr.joint_bits(networks, [plane]), torch.tensor(-1.0) if taken else expected)
+
+
 @pytest.mark.cuda
 @needs_gpu
 @pytest.mark.parametrize(
@@ -53,6 +63,7 @@ def test_there_are_none_for_planes_of_more_cells_than_a_grid_has_rows_for(monkey
         (2, 3, ((7, 13),), 40.0),  # far from every mean: probabilities at their floor
         (1, 1, ((1, 1),), 1.0),
         (3, 1, ((1, 3), (2, 1), (128, 1), (1, 129)), 2.0),
+        (2, 2, ((5, 7), (33, 31), (2, 2)), 3.0),  # no multiples of a warp
     ],
 )
 @pytest.mark.parametrize("planes_learn", [True, False])

@@ -32,6 +32,11 @@ def fit_kernels(planes: Sequence[Tensor]) -> bool:
     return CODECS.has_cuda()
 
 
+def has_tensor_cores(tensor: Tensor) -> bool:
+    """Whether its GPU multiplies bfloat16 on tensor cores, as `plane_bits` does: capability 8.0 (Ampere) or later."""
+    return torch.cuda.get_device_capability(tensor.device) >= (8, 0)
+
+
 def plane_bits(planes: Sequence[Tensor], parameters: Tensor, *, planes_learn: bool) -> tuple[Tensor, list[Tensor]]:
     """Bits of planes [K,C,H,W] per size and all derivatives, in one pass.
 

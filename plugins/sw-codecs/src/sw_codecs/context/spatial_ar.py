@@ -20,7 +20,7 @@ from splatwizard_core.api import BitstreamError
 from sw_codecs.context import wavefront
 from sw_codecs.context.integer_mlp import FRACTION, IntegerMlp
 from sw_codecs.context.plane_fields import NEIGHBORS
-from sw_codecs.context.plane_kernels import fit_kernels, plane_bits
+from sw_codecs.context.plane_kernels import fit_kernels, has_tensor_cores, plane_bits
 from sw_codecs.context.two_layers import UnsetLinear
 from sw_codecs.entropy.exact_tables import LEVELS
 from sw_codecs.entropy.rates import laplace_bits, lower_bound
@@ -151,7 +151,7 @@ class _JointBits(torch.autograd.Function):
         k, channels = planes[0].shape[:2]
         planes_learn, learns = any(ctx.needs_input_grad[1 : 1 + scales]), any(ctx.needs_input_grad)
         flat = torch.cat([p.reshape(-1) for p in parameters]).view(k, -1)
-        if fit_kernels(planes):
+        if fit_kernels(planes) and has_tensor_cores(planes[0]):
             sums, to_planes = plane_bits(planes, flat, planes_learn=planes_learn)
             ctx.save_for_backward(sums, *to_planes)
             return sums[:, -2].sum()

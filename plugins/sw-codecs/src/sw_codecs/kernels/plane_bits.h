@@ -44,22 +44,25 @@ struct Place {
   int64_t at;  // in values[scale]
 };
 
-// Value `index` of an orientation, counted over all scales.
-SW_PLANES_INLINE Place place_of(const Planes& planes, int orientation, int64_t index) {
-  int scale = 0;
-  while (scale + 1 < planes.scales && index >= planes.count[scale]) index -= planes.count[scale], ++scale;
-  const int64_t line = index / planes.width[scale];
-  return {scale, int(line % planes.height[scale]), int(index - line * planes.width[scale]),
-          index + orientation * planes.count[scale]};
+// Value `index` of a scale and an orientation. Planes have fewer than 2^31 values.
+SW_PLANES_INLINE Place place_of(const Planes& planes, int orientation, int scale, int index) {
+  const unsigned at = unsigned(index), width = unsigned(planes.width[scale]), line = at / width;
+  return {scale, int(line % unsigned(planes.height[scale])), int(at - line * width),
+          at + orientation * planes.count[scale]};
 }
 
 // Neighbour i of a place: rows down, columns right.
 SW_PLANES_INLINE int down_of(int i) { return i < 5 ? -2 : i < 10 ? -1 : 0; }
 SW_PLANES_INLINE int right_of(int i) { return (i < 10 ? i % 5 : i - 10) - 2; }
 
-SW_PLANES_INLINE bool has_neighbor(const Planes& planes, const Place& place, int i) {
-  const int column = place.column + right_of(i);
-  return place.row + down_of(i) >= 0 && column >= 0 && column < planes.width[place.scale];
+// Neighbours that a place has, a bit each.
+SW_PLANES_INLINE unsigned neighbors_of(const Planes& planes, const Place& place) {
+  constexpr int kAcross = 2 * kBeside + 1;
+  unsigned across = 0;
+  for (int i = 0; i < kAcross; ++i)
+    across |= unsigned(unsigned(place.column + i - kBeside) < unsigned(planes.width[place.scale])) << i;
+  return (place.row > 1 ? across : 0) | (place.row > 0 ? across << kAcross : 0) |
+         (across & ((1u << kBeside) - 1)) << (kAbove * kAcross);
 }
 
 SW_PLANES_INLINE int64_t neighbor_of(const Planes& planes, const Place& place, int i) {

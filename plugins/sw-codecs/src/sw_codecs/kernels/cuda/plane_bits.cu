@@ -1,257 +1,459 @@
-// Bits of planes and all their gradients in one pass: a thread a value, whose layers stay in registers on the way
-// forward and back.
+// Bits of planes and all their gradients in one pass, on tensor cores: a warp goes with 32 values from their neighbours
+// to the sums of gradients, and meets the others of its block only in the end. Needs sm_80.
 //
-// A gradient of a weight is a sum over all values of input times derivative. A block keeps the inputs of all layers of
-// its values in shared memory, and the derivatives of one layer at a time; its threads then take the products in tiles
-// of 4 x 4 weights, eight threads a tile, and hold their sums in registers until the block has no more values.
+// Tensor cores multiply bfloat16s, so each float is split into some that add up to it: three on the way forward, whose
+// products are those of floats; two, which are 16 bits, where sums of gradients are taken. Sums are floats.
+//
+// Values are taken in two tiles of 16 rows: rows g and g + 8 of tile m are values 4g + 2m and 4g + 2m + 1, and a thread
+// (g = lane / 4, t = lane % 4) holds columns 2t, 2t + 1, 2t + 8 and 2t + 9 of both. So value `lane` is a thread's own,
+// and what a layer gives lies as the next one takes it.
+#include <cuda_bf16.h>
+
 #include "plane_bits.h"
 
 namespace sw_planes::cuda {
 namespace {
 
-constexpr int kThreads = 128, kGroups = kThreads / 16;  // 16 tiles make 16 x 16 weights
+constexpr unsigned kAllLanes = 0xffffffffu;
+constexpr int kWarp = 32, kWarps = 4, kThreads = kWarp * kWarps;
 constexpr int kBlocksPerProcessor = 3;
-constexpr int kParametersPadded = (kParameters + 3) / 4 * 4;
-// Numbers of shared memory: parameters; neighbours; inputs of the other four layers; derivatives of one layer.
-constexpr int kAtNeighbors = kParametersPadded, kAtInputs = kAtNeighbors + kThreads * kNeighbors;
-constexpr int kAtDerivatives = kAtInputs + (kResiduals + 1) * kThreads * kHidden;
-constexpr int kShared = kAtDerivatives + kThreads * kHidden;
-constexpr int kSumsInShared = (kResiduals + 1) * kGroups * kHidden * kHidden;
-static_assert(kSumsInShared <= kShared - kAtNeighbors, "the sums of all groups of threads fit behind the parameters");
+constexpr int kLayers = kResiduals + 1;  // but the last
+constexpr int kForward = 3, kBackward = 2;  // parts of a float
 
-// Four numbers of a row of 16: swapped among the rows so that eight threads in a row meet all banks.
-__device__ __forceinline__ float4* four_of(float* rows, int row, int four) {
-  return reinterpret_cast<float4*>(rows) + row * (kHidden / 4) + (four ^ (row >> 1 & 3));
+// Words of shared memory. A matrix: 32 values by 16 bfloat16s as 4 x 2 blocks of 8 x 8: rows 4g + j of all g, half of
+// the columns.
+constexpr int kBlock = 32, kMatrix = 8 * kBlock;
+constexpr int kAtBackward = kLayers * kForward * kWarp * 4, kAtBiases = kAtBackward + kLayers * kBackward * kWarp * 4;
+constexpr int kAtLast = kAtBiases + kResiduals * 2 * kHidden, kAtWarps = kAtLast + 2 * kHidden;
+// Of each warp: inputs of each layer, and what is of one layer at a time: derivatives, or what the neighbours lack.
+constexpr int kAtDerivatives = kLayers * kBackward * kMatrix, kOfWarp = kAtDerivatives + kBackward * kMatrix;
+constexpr int kShared = kAtWarps + kWarps * kOfWarp;
+static_assert(kWarps * kSums <= kShared && kWarp * kNeighbors <= kBackward * kMatrix && kAtWarps % 4 == 0);
+
+// Numbers of a tile: [columns 8 n ..][rows g twice, rows g + 8 twice].
+using Tile = float[2][4];
+using Parts = uint32_t[4];  // those of a tile in twos: rows g, g + 8, then the other columns
+struct Rows {
+  uint32_t* tile[2];  // of a matrix: the row of which a thread gives the address when blocks are read or written
+};
+
+// c += a b: a [16, 16] as a tile's parts; b [16, 8]: rows 2t .. and 2t + 8 .. of column g; c as half a tile.
+__device__ __forceinline__ void multiply(float (&c)[4], const Parts& a, uint32_t b0, uint32_t b1) {
+#if __CUDA_ARCH__ >= 800
+  asm("mma.sync.aligned.m16n8k16.row.col.f32.bf16.bf16.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
+      "{%0, %1, %2, %3};"
+      : "+f"(c[0]), "+f"(c[1]), "+f"(c[2]), "+f"(c[3])
+      : "r"(a[0]), "r"(a[1]), "r"(a[2]), "r"(a[3]), "r"(b0), "r"(b1));
+#else
+  __trap();  // plane_kernels.py offers it from compute capability 8.0 on
+#endif
 }
 
-__device__ __forceinline__ void put_row(float* rows, int row, const float* from) {
-#pragma unroll
-  for (int i = 0; i < kHidden / 4; ++i)
-    *four_of(rows, row, i) = make_float4(from[4 * i], from[4 * i + 1], from[4 * i + 2], from[4 * i + 3]);
+// Parts of a tile are its blocks in the order 0, 2, 1, 3: the first word of row lane % 8 of the block lane / 8 in it.
+__device__ __forceinline__ int row_of(int lane) { return (lane / 8 % 2 * 2 + lane / 16) * kBlock + lane % 8 * 4; }
+
+// Four blocks of a matrix, of each two numbers of row g, columns 2t and 2t + 1. `row`: of block lane / 8, row lane % 8.
+__device__ __forceinline__ void load(Parts& to, const uint32_t* row) {
+#if __CUDA_ARCH__ >= 800
+  asm volatile("ldmatrix.sync.aligned.m8n8.x4.shared.b16 {%0, %1, %2, %3}, [%4];"
+               : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+               : "r"(unsigned(__cvta_generic_to_shared(row)))
+               : "memory");
+#endif
 }
 
-// out = bias + weights in, outputs one after the other.
-template <int kInputs, int kOutputs>
-__device__ __forceinline__ void forward(const float* weights, const float* bias, const float* in, float* out) {
+// The same of transposed blocks.
+__device__ __forceinline__ void load_transposed(Parts& to, const uint32_t* row) {
+#if __CUDA_ARCH__ >= 800
+  asm volatile("ldmatrix.sync.aligned.m8n8.x4.trans.shared.b16 {%0, %1, %2, %3}, [%4];"
+               : "=r"(to[0]), "=r"(to[1]), "=r"(to[2]), "=r"(to[3])
+               : "r"(unsigned(__cvta_generic_to_shared(row)))
+               : "memory");
+#endif
+}
+
+// The inverse of `load`, of a tile.
+__device__ __forceinline__ void store(uint32_t* row, const Parts& from) {
+#if __CUDA_ARCH__ >= 900
+  asm volatile("stmatrix.sync.aligned.m8n8.x4.shared.b16 [%0], {%1, %2, %3, %4};" ::"r"(
+                   unsigned(__cvta_generic_to_shared(row))),
+               "r"(from[0]), "r"(from[1]), "r"(from[2]), "r"(from[3])
+               : "memory");
+#else
+  const int lane = int(threadIdx.x) % kWarp;
+  uint32_t* const word = row - row_of(lane) + lane;
 #pragma unroll
-  for (int o = 0; o < kOutputs; ++o) {
-    float sum = bias[o];
+  for (int at = 0; at < 4; ++at) word[(at % 2 * 2 + at / 2) * kBlock] = from[at];
+#endif
+}
+
+// x and y as bfloat16s, x in the low half; leaves what they lack.
+__device__ __forceinline__ uint32_t split_off(float& x, float& y) {
+  const __nv_bfloat162 both = __floats2bfloat162_rn(x, y);
+  const uint32_t bits = reinterpret_cast<const uint32_t&>(both);
+  x -= __uint_as_float(bits << 16), y -= __uint_as_float(bits & 0xffff0000u);
+  return bits;
+}
+
+template <int kParts>
+__device__ __forceinline__ void split(const Tile& tile, Parts (&parts)[kParts]) {
 #pragma unroll
-    for (int i = 0; i < kInputs; i += 4) {
-      const float4 w = *reinterpret_cast<const float4*>(weights + o * kInputs + i);
-      sum += w.x * in[i] + w.y * in[i + 1] + w.z * in[i + 2] + w.w * in[i + 3];
-    }
-    out[o] = sum;
+  for (int at = 0; at < 4; ++at) {
+    float x = tile[at / 2][at % 2 * 2], y = tile[at / 2][at % 2 * 2 + 1];
+#pragma unroll
+    for (int part = 0; part < kParts; ++part) parts[part][at] = split_off(x, y);
   }
 }
 
-// in += transposed weights out.
-template <int kInputs, int kOutputs>
-__device__ __forceinline__ void backward(const float* weights, const float* out, float* in) {
+// c += a b of split numbers, small products first: one that is smaller than what the parts lack is left out.
+template <int kParts>
+__device__ __forceinline__ void multiply(Tile& c, const Parts (&a)[kParts], const uint4 (&b)[kParts]) {
 #pragma unroll
-  for (int o = 0; o < kOutputs; ++o)
+  for (int both = kParts - 1; both >= 0; --both)
 #pragma unroll
-    for (int i = 0; i < kInputs; i += 4) {
-      const float4 w = *reinterpret_cast<const float4*>(weights + o * kInputs + i);
-      in[i] += w.x * out[o], in[i + 1] += w.y * out[o], in[i + 2] += w.z * out[o], in[i + 3] += w.w * out[o];
+    for (int part = both; part >= 0; --part) {
+      multiply(c[0], a[part], b[both - part].x, b[both - part].y);
+      multiply(c[1], a[part], b[both - part].z, b[both - part].w);
     }
 }
 
-__device__ __forceinline__ void add_products(float* sums, const float4& d, const float4& a) {
-  const float out[4] = {d.x, d.y, d.z, d.w}, in[4] = {a.x, a.y, a.z, a.w};
-#pragma unroll
-  for (int o = 0; o < 4; ++o)
-#pragma unroll
-    for (int i = 0; i < 4; ++i) sums[4 * o + i] += out[o] * in[i];
+// Weights [outputs, inputs] of a layer; those of the first go on with its bias, whose input is 1.
+__device__ float weight_of(const float* weights, int layer, int out, int in) {
+  if (layer > 0) return weights[kMiddle + (layer - 1) * kMiddleSize + out * kHidden + in];
+  return in < kNeighbors ? weights[kFirst + out * kNeighbors + in] : in == kNeighbors ? weights[kFirstBias + out] : 0.f;
 }
 
-__device__ __forceinline__ float component(const float4& v, int i) {
-  return i == 0 ? v.x : i == 1 ? v.y : i == 2 ? v.z : v.w;
+// The weights as what the threads of a warp take of b, forward (inputs by outputs) and backward (outputs by inputs).
+template <int kParts>
+__device__ __forceinline__ void put_weights(const float* weights, uint32_t* to) {
+  constexpr bool kIsForward = kParts == kForward;
+  for (int at = int(threadIdx.x); at < kLayers * kWarp * 4; at += kThreads) {
+    const int word = at % 4, lane = at / 4 % kWarp, layer = at / (4 * kWarp);
+    const int column = word / 2 * 8 + lane / 4, row = word % 2 * 8 + lane % 4 * 2;
+    float x = kIsForward ? weight_of(weights, layer, column, row) : weight_of(weights, layer, row, column);
+    float y = kIsForward ? weight_of(weights, layer, column, row + 1) : weight_of(weights, layer, row + 1, column);
+    if (kIsForward && layer > 0) x += float(row == column), y += float(row + 1 == column);  // the input goes on too
+#pragma unroll
+    for (int part = 0; part < kParts; ++part)
+      to[((layer * kParts + part) * kWarp + lane) * 4 + word] = split_off(x, y);
+  }
+}
+
+template <int kParts>
+__device__ __forceinline__ void get_weights(const uint32_t* from, int layer, int lane, uint4 (&weights)[kParts]) {
+#pragma unroll
+  for (int part = 0; part < kParts; ++part)
+    weights[part] = reinterpret_cast<const uint4*>(from)[(layer * kParts + part) * kWarp + lane];
+}
+
+// sums [outputs, inputs] += transposed derivatives [values, outputs] times inputs [values, inputs], of both tiles.
+__device__ __forceinline__ void add_products(Tile& sums, const Rows& of_derivatives, const Rows& of_inputs) {
+  Parts a[2][kBackward], b[2][kBackward];
+#pragma unroll
+  for (int m = 0; m < 2; ++m)
+#pragma unroll
+    for (int part = 0; part < kBackward; ++part) {
+      load_transposed(a[m][part], of_derivatives.tile[m] + part * kMatrix);
+      load_transposed(b[m][part], of_inputs.tile[m] + part * kMatrix);
+    }
+  // Tensor cores do not round sums to the nearest: those of many values are taken apart.
+  Tile found{};
+#pragma unroll
+  for (int order = 0; order < 3; ++order)
+#pragma unroll
+    for (int m = 0; m < 2; ++m)
+#pragma unroll
+      for (int n = 0; n < 2; ++n)
+        multiply(found[n], a[m][order == 0], b[m][order == 1][2 * n], b[m][order == 1][2 * n + 1]);
+#pragma unroll
+  for (int n = 0; n < 2; ++n)
+#pragma unroll
+    for (int i = 0; i < 4; ++i) sums[n][i] += found[n][i];
+}
+
+// Sum over the threads of a warp that have the same t; over all with `kAll`.
+template <bool kAll = false>
+__device__ __forceinline__ float sum_of(float x) {
+#pragma unroll
+  for (int step = kAll ? 1 : 4; step < kWarp; step *= 2) x += __shfl_xor_sync(kAllLanes, x, step);
+  return x;
+}
+
+// Add derivatives by a value's neighbours, and by itself, to planes. Values of a warp follow each other: for each line,
+// their sums are taken first, those within the places of the 32 values and those beyond.
+__device__ __forceinline__ void add_to_plane(const Planes& planes, const Place& place, unsigned has, const float* by,
+                                             float by_itself, int lane) {
+#pragma unroll
+  for (int line = 0; line <= kAbove; ++line) {
+    float within = line == kAbove ? by_itself : 0.f, beyond = 0.f;
+#pragma unroll
+    for (int i = 0; i < kNeighbors; ++i)
+      if (down_of(i) == line - kAbove) {
+        const int from = lane - right_of(i);  // the value whose neighbour is at this thread's place
+        const float x = __shfl_sync(kAllLanes, has >> i & 1 ? by[i] : 0.f, from & (kWarp - 1));
+        (from == (from & (kWarp - 1)) ? within : beyond) += x;
+      }
+    float* const to = planes.to[place.scale] + place.at + int64_t(line - kAbove) * planes.width[place.scale];
+    // What would go beyond the planes is 0.
+    if (within != 0.f) atomicAdd(to, within);
+    if (beyond != 0.f) atomicAdd(lane < kWarp / 2 ? to + kWarp : to - kWarp, beyond);
+  }
+}
+
+__host__ __device__ __forceinline__ int groups_of(const Planes& planes, int scale) {
+  return int((planes.count[scale] + kWarp - 1) / kWarp);
 }
 
 __global__ void __launch_bounds__(kThreads, kBlocksPerProcessor)
     bits_kernel(const __grid_constant__ Planes planes, const float* weights, float* partial) {
-  extern __shared__ __align__(16) float shared[];
-  const int thread = int(threadIdx.x), orientation = int(blockIdx.y);
-  float* const neighbors = shared + kAtNeighbors;
-  float* const derivatives = shared + kAtDerivatives;
-  for (int i = thread; i < kParameters; i += kThreads) shared[i] = weights[int64_t(orientation) * kParameters + i];
+  extern __shared__ __align__(16) uint32_t shared[];
+  const int thread = int(threadIdx.x), lane = thread % kWarp, orientation = int(blockIdx.y);
+  const int g = lane / 4, t = lane % 4;
+  weights += int64_t(orientation) * kParameters;
+  put_weights<kForward>(weights, shared);
+  put_weights<kBackward>(weights, shared + kAtBackward);
+  float* const biases = reinterpret_cast<float*>(shared + kAtBiases);  // [layer][columns' half][t][twice two]
+  float* const last = reinterpret_cast<float*>(shared + kAtLast);
+  for (int i = thread; i < kResiduals * 2 * kHidden; i += kThreads)
+    biases[i] = weights[kMiddle + i / (2 * kHidden) * kMiddleSize + kHidden * kHidden + i / kHidden % 2 * 8 +
+                        i / 4 % 4 * 2 + i % 2];
+  for (int i = thread; i < 2 * kHidden; i += kThreads) last[i] = weights[kLast + i];
+  const float last_biases[2] = {weights[kLastBias], weights[kLastBias + 1]};
 
-  // Of the tile of weights of this thread: outputs 4 tile_out .., inputs 4 tile_in ..; of values group, group + 8, ...
-  const int tile_in = thread & 3, tile_out = thread >> 2 & 3, group = thread >> 4;
-  float first_sums[16] = {}, middle_sums[kResiduals][16] = {}, bias_sums[kResiduals + 1] = {};
-  float last_sums[4] = {}, last_bias[2] = {}, bits = 0.f;
+  // Neighbours come from each value's own thread: rows of their blocks are swapped, or else four would meet in a bank.
+  uint32_t* const of_warp = shared + kAtWarps + thread / kWarp * kOfWarp;
+  const int row = row_of(lane), swapped = row ^ lane / 8 % 2 * 8;
+  const Rows neighbors{{of_warp + swapped, of_warp + 4 * kBlock + (swapped ^ 16)}};
+  const Rows inputs{{of_warp + row, of_warp + 4 * kBlock + row}};
+  const Rows derivatives{{inputs.tile[0] + kAtDerivatives, inputs.tile[1] + kAtDerivatives}};
+  const Rows transposed{{of_warp + kAtDerivatives + lane * 4, of_warp + kAtDerivatives + 4 * kBlock + lane * 4}};
 
-  int64_t count = 0;
-  for (int scale = 0; scale < planes.scales; ++scale) count += planes.count[scale];
+  Tile first_sums{}, middle_sums[kResiduals]{};
+  float bias_sums[kResiduals][4]{}, last_sums[2][4]{}, last_bias_sums[2]{}, bits = 0.f;
+
+  int groups = 0;
+  for (int scale = 0; scale < planes.scales; ++scale) groups += groups_of(planes, scale);
   __syncthreads();
 
-  for (int64_t start = int64_t(blockIdx.x) * kThreads; start < count; start += int64_t(gridDim.x) * kThreads) {
-    const bool valid = start + thread < count;
-    const Place place = place_of(planes, orientation, valid ? start + thread : 0);
-    const float* const values = planes.values[place.scale];
-    float a[kHidden], b[kHidden];
+  for (int group = int(blockIdx.x) * kWarps + thread / kWarp; group < groups; group += int(gridDim.x) * kWarps) {
+    int scale = 0, in_scale = group;
+    while (in_scale >= groups_of(planes, scale)) in_scale -= groups_of(planes, scale), ++scale;
+    const int index = in_scale * kWarp + lane;
+    const bool valid = index < planes.count[scale];
+    const Place place = place_of(planes, orientation, scale, index);
+    const float* const values = planes.values[scale];
+    const float value = valid ? values[place.at] : 0.f;
+    const unsigned has = valid ? neighbors_of(planes, place) : 0;
+    float around[kHidden] = {};
 #pragma unroll
-    for (int i = 0; i < kNeighbors; ++i)
-      a[i] = valid && has_neighbor(planes, place, i) ? values[neighbor_of(planes, place, i)] : 0.f;
-#pragma unroll
-    for (int i = 0; i < kNeighbors; i += 4)
-      *reinterpret_cast<float4*>(neighbors + thread * kNeighbors + i) = make_float4(a[i], a[i + 1], a[i + 2], a[i + 3]);
+    for (int i = 0; i < kNeighbors; ++i) around[i] = has >> i & 1 ? values[neighbor_of(planes, place, i)] : 0.f;
+    around[kNeighbors] = 1.f;
 
-    uint32_t alive[2] = {0, 0};  // bits of outputs > 0, of two layers each
-    forward<kNeighbors, kHidden>(shared + kFirst, shared + kFirstBias, a, b);
+    __syncwarp();  // all have read what they need of the values before
 #pragma unroll
-    for (int layer = 0; layer <= kResiduals; ++layer) {
+    for (int part = 0; part < kForward; ++part) {
+      uint32_t* const to = of_warp + (part < kBackward ? part * kMatrix : kAtDerivatives);
 #pragma unroll
-      for (int i = 0; i < kHidden; ++i) {
-        a[i] = fmaxf(layer == 0 ? b[i] : a[i] + b[i], 0.f);
-        alive[layer / 2] |= uint32_t(a[i] > 0.f) << (layer % 2 * kHidden + i);
+      for (int half = 0; half < 2; ++half) {
+        uint32_t words[4];
+#pragma unroll
+        for (int i = 0; i < 4; ++i) words[i] = split_off(around[half * 8 + 2 * i], around[half * 8 + 2 * i + 1]);
+        *reinterpret_cast<uint4*>(to + (2 * t + half) * kBlock + (g ^ 2 * t) * 4) =
+            make_uint4(words[0], words[1], words[2], words[3]);
       }
-      put_row(shared + kAtInputs + layer * kThreads * kHidden, thread, a);
-      const float* const next = shared + kMiddle + layer * kMiddleSize;
-      if (layer < kResiduals) forward<kHidden, kHidden>(next, next + kHidden * kHidden, a, b);
     }
+    __syncwarp();
+
+    Tile tiles[2]{};
+    {
+      uint4 b[kForward];
+      get_weights(shared, 0, lane, b);
+#pragma unroll
+      for (int m = 0; m < 2; ++m) {
+        Parts a[kForward];
+#pragma unroll
+        for (int part = 0; part < kForward; ++part)
+          load(a[part], neighbors.tile[m] + (part < kBackward ? part * kMatrix : kAtDerivatives));
+        multiply(tiles[m], a, b);
+#pragma unroll
+        for (int at = 0; at < 8; ++at) tiles[m][at / 4][at % 4] = fmaxf(tiles[m][at / 4][at % 4], 0.f);
+      }
+    }
+#pragma unroll
+    for (int layer = 1; layer < kLayers; ++layer) {
+      uint4 b[kForward];
+      get_weights(shared, layer, lane, b);
+      float4 bias[2];
+#pragma unroll
+      for (int n = 0; n < 2; ++n) bias[n] = reinterpret_cast<const float4*>(biases)[((layer - 1) * 2 + n) * 4 + t];
+#pragma unroll
+      for (int m = 0; m < 2; ++m) {
+        Parts a[kForward];
+        split(tiles[m], a);
+#pragma unroll
+        for (int part = 0; part < kBackward; ++part)
+          store(inputs.tile[m] + (layer * kBackward + part) * kMatrix, a[part]);
+#pragma unroll
+        for (int n = 0; n < 2; ++n)
+          tiles[m][n][0] = tiles[m][n][2] = bias[n].x, tiles[m][n][1] = tiles[m][n][3] = bias[n].y;
+        multiply(tiles[m], a, b);
+#pragma unroll
+        for (int at = 0; at < 8; ++at) tiles[m][at / 4][at % 4] = fmaxf(tiles[m][at / 4][at % 4], 0.f);
+      }
+    }
+
+    // The last layer, in floats: sums over a thread's columns of its four rows, then over four threads, each of which
+    // keeps the row of its value.
+    float last_weights[2][4];  // of the thread's columns
+#pragma unroll
+    for (int i = 0; i < 8; ++i) last_weights[i / 4][i % 4] = last[i / 4 * kHidden + i % 4 / 2 * 8 + 2 * t + i % 2];
     float found[2];
-    forward<kHidden, 2>(shared + kLast, shared + kLastBias, a, found);
+#pragma unroll
+    for (int which = 0; which < 2; ++which) {
+      float sums[4] = {};
+#pragma unroll
+      for (int j = 0; j < 4; ++j)
+#pragma unroll
+        for (int i = 0; i < 4; ++i) sums[j] += last_weights[which][i] * tiles[j / 2][i / 2][j % 2 * 2 + i % 2];
+#pragma unroll
+      for (int j = 0; j < 2; ++j) {
+        const float other = __shfl_xor_sync(kAllLanes, t < 2 ? sums[j + 2] : sums[j], 2);
+        sums[j] = (t < 2 ? sums[j] : sums[j + 2]) + other;
+      }
+      const float other = __shfl_xor_sync(kAllLanes, t % 2 == 0 ? sums[1] : sums[0], 1);
+      found[which] = (t % 2 == 0 ? sums[0] : sums[1]) + other + last_biases[which];
+    }
 
     Slopes slope{};
-    float out[2] = {};
-    if (valid) {
-      bits += laplace_bits(values[place.at], found[0], found[1], slope);
-      out[0] = slope.mean, out[1] = slope.s;
-    }
-    last_bias[0] += out[0], last_bias[1] += out[1];
+    if (valid) bits += laplace_bits(value, found[0], found[1], slope);
+    last_bias_sums[0] += slope.mean, last_bias_sums[1] += slope.s;
 
-    // The last layer: 2 x 4 tiles of 1 x 4 weights, sixteen threads a tile.
-    *reinterpret_cast<float2*>(derivatives + 2 * thread) = make_float2(out[0], out[1]);
-    __syncthreads();
-    {
-      const int four = thread & 3, which = thread >> 2 & 1;
-      float* const inputs = shared + kAtInputs + kResiduals * kThreads * kHidden;
-      for (int row = thread >> 3; row < kThreads; row += kThreads / 8) {
-        const float4 in = *four_of(inputs, row, four);
-        const float d = derivatives[2 * row + which];
-        last_sums[0] += d * in.x, last_sums[1] += d * in.y, last_sums[2] += d * in.z, last_sums[3] += d * in.w;
+    // From here on, `tiles` are derivatives.
+#pragma unroll
+    for (int j = 0; j < 4; ++j) {
+      const float by_mean = __shfl_sync(kAllLanes, slope.mean, lane - t + j);
+      const float by_s = __shfl_sync(kAllLanes, slope.s, lane - t + j);
+#pragma unroll
+      for (int i = 0; i < 4; ++i) {
+        float& x = tiles[j / 2][i / 2][j % 2 * 2 + i % 2];
+        last_sums[0][i] += by_mean * x, last_sums[1][i] += by_s * x;
+        x = x > 0.f ? by_mean * last_weights[0][i] + by_s * last_weights[1][i] : 0.f;
       }
     }
-#pragma unroll
-    for (int i = 0; i < kHidden; ++i) a[i] = 0.f;
-    backward<kHidden, 2>(shared + kLast, out, a);
-
 #pragma unroll
     for (int layer = kResiduals; layer >= 0; --layer) {
+      Parts a[2][kBackward];
+      split(tiles[0], a[0]), split(tiles[1], a[1]);
+      __syncwarp();  // all have read the derivatives of the layer behind
 #pragma unroll
-      for (int i = 0; i < kHidden; ++i)
-        if (!(alive[layer / 2] >> (layer % 2 * kHidden + i) & 1)) a[i] = 0.f;
-      __syncthreads();  // all have read the derivatives of the layer behind
-      put_row(derivatives, thread, a);
-      __syncthreads();
+      for (int m = 0; m < 2; ++m)
+#pragma unroll
+        for (int part = 0; part < kBackward; ++part) store(derivatives.tile[m] + part * kMatrix, a[m][part]);
+      __syncwarp();
+      uint4 b[kBackward];
+      get_weights(shared + kAtBackward, layer, lane, b);
       if (layer > 0) {
-        float* const inputs = shared + kAtInputs + (layer - 1) * kThreads * kHidden;
-        for (int row = group; row < kThreads; row += kGroups) {
-          const float4 d = *four_of(derivatives, row, tile_out);
-          add_products(middle_sums[layer > 0 ? layer - 1 : 0], d, *four_of(inputs, row, tile_in));
-          bias_sums[layer] += component(d, tile_in);
-        }
-        // The input itself goes on too: b is what comes back, a what came in.
+        const int at_layer = layer * kBackward * kMatrix;
+        const Rows of_layer{{inputs.tile[0] + at_layer, inputs.tile[1] + at_layer}};
+        add_products(middle_sums[layer > 0 ? layer - 1 : 0], transposed, of_layer);
 #pragma unroll
-        for (int i = 0; i < kHidden; ++i) b[i] = a[i];
-        backward<kHidden, kHidden>(shared + kMiddle + (layer - 1) * kMiddleSize, b, a);
-      } else {
-        for (int row = group; row < kThreads; row += kGroups) {
-          const float4 d = *four_of(derivatives, row, tile_out);
-          // The fourth tile has no inputs.
-          if (tile_in < kNeighbors / 4)
-            add_products(first_sums, d, *reinterpret_cast<const float4*>(neighbors + row * kNeighbors + 4 * tile_in));
-          bias_sums[0] += component(d, tile_in);
+        for (int i = 0; i < 4; ++i)
+          bias_sums[layer > 0 ? layer - 1 : 0][i] += (tiles[0][i / 2][i % 2] + tiles[0][i / 2][i % 2 + 2]) +
+                                                     (tiles[1][i / 2][i % 2] + tiles[1][i / 2][i % 2 + 2]);
+#pragma unroll
+        for (int m = 0; m < 2; ++m) {
+          multiply(tiles[m], a[m], b);  // what is there goes on too, as the input itself does
+          Parts from;  // inputs, which are not negative
+          load(from, of_layer.tile[m]);
+#pragma unroll
+          for (int at = 0; at < 4; ++at) {
+            if ((from[at] & 0xffffu) == 0) tiles[m][at / 2][at % 2 * 2] = 0.f;
+            if (from[at] >> 16 == 0) tiles[m][at / 2][at % 2 * 2 + 1] = 0.f;
+          }
         }
+      } else {
+        add_products(first_sums, transposed, neighbors);
+        if (planes.to[scale] == nullptr) continue;
+        __syncwarp();
+        float* const by = reinterpret_cast<float*>(of_warp + kAtDerivatives);
+#pragma unroll
+        for (int m = 0; m < 2; ++m) {
+          Tile c{};
+          multiply(c, a[m], b);
+#pragma unroll
+          for (int at = 0; at < 4; ++at)
+            if (at / 2 == 0 || t < 2)
+              *reinterpret_cast<float2*>(by + (4 * g + 2 * m + at % 2) * kNeighbors + at / 2 * 8 + 2 * t) =
+                  make_float2(c[at / 2][at % 2 * 2], c[at / 2][at % 2 * 2 + 1]);
+        }
+        __syncwarp();
+#pragma unroll
+        for (int i = 0; i < kNeighbors; i += 4) {
+          const float4 four = *reinterpret_cast<const float4*>(by + lane * kNeighbors + i);
+          around[i] = four.x, around[i + 1] = four.y, around[i + 2] = four.z, around[i + 3] = four.w;
+        }
+        add_to_plane(planes, place, has, around, slope.x, lane);
       }
     }
-    if (valid && planes.to[place.scale] != nullptr) {
-      float* const to = planes.to[place.scale];
-#pragma unroll
-      for (int i = 0; i < kNeighbors; ++i) b[i] = 0.f;
-      backward<kNeighbors, kHidden>(shared + kFirst, a, b);
-      atomicAdd(to + place.at, slope.x);
-#pragma unroll
-      for (int i = 0; i < kNeighbors; ++i)
-        if (has_neighbor(planes, place, i)) atomicAdd(to + neighbor_of(planes, place, i), b[i]);
-    }
-    __syncthreads();  // before the next values overwrite what others still read
   }
 
-  // Sums of the groups, in their order: those of layer l at [l][group][16][16].
-  float* const sums = shared + kAtNeighbors;
+  // Sums of each warp, as `partial` has them, then those of the block.
+  __syncthreads();
+  float* const sums = reinterpret_cast<float*>(shared) + thread / kWarp * kSums;
 #pragma unroll
-  for (int layer = 0; layer <= kResiduals; ++layer)
+  for (int at = 0; at < 8; ++at) {
+    const int out = g + at % 4 / 2 * 8, in = at / 4 * 8 + 2 * t + at % 2;
+    if (in <= kNeighbors)
+      sums[in < kNeighbors ? kFirst + out * kNeighbors + in : kFirstBias + out] = first_sums[at / 4][at % 4];
 #pragma unroll
-    for (int o = 0; o < 4; ++o)
+    for (int layer = 0; layer < kResiduals; ++layer)
+      sums[kMiddle + layer * kMiddleSize + out * kHidden + in] = middle_sums[layer][at / 4][at % 4];
+  }
 #pragma unroll
-      for (int i = 0; i < 4; ++i)
-        sums[((layer * kGroups + group) * kHidden + 4 * tile_out + o) * kHidden + 4 * tile_in + i] =
-            layer == 0 ? first_sums[4 * o + i] : middle_sums[layer > 0 ? layer - 1 : 0][4 * o + i];
+  for (int i = 0; i < 4; ++i) {
+    const int column = i / 2 * 8 + 2 * t + i % 2;
+#pragma unroll
+    for (int layer = 0; layer < kResiduals; ++layer) {
+      const float sum = sum_of(bias_sums[layer][i]);
+      if (g == 0) sums[kMiddle + layer * kMiddleSize + kHidden * kHidden + column] = sum;
+    }
+#pragma unroll
+    for (int which = 0; which < 2; ++which) {
+      const float sum = sum_of(last_sums[which][i]);
+      if (g == 0) sums[kLast + which * kHidden + column] = sum;
+    }
+  }
+  const float rest[3] = {sum_of<true>(last_bias_sums[0]), sum_of<true>(last_bias_sums[1]), sum_of<true>(bits)};
+  if (lane == 0)
+    sums[kLastBias] = rest[0], sums[kLastBias + 1] = rest[1], sums[kParameters] = rest[2], sums[kParameters + 1] = 0.f;
   __syncthreads();
   float* const to = partial + (int64_t(orientation) * gridDim.x + blockIdx.x) * kSums;
-  for (int at = thread; at < (kResiduals + 1) * kHidden * kHidden; at += kThreads) {
-    const int layer = at / (kHidden * kHidden), o = at / kHidden % kHidden, i = at % kHidden;
+  for (int at = thread; at < kSums; at += kThreads) {
     float sum = 0.f;
-    for (int each = 0; each < kGroups; ++each) sum += sums[((layer * kGroups + each) * kHidden + o) * kHidden + i];
-    if (layer > 0)
-      to[kMiddle + (layer - 1) * kMiddleSize + o * kHidden + i] = sum;
-    else if (i < kNeighbors)
-      to[kFirst + o * kNeighbors + i] = sum;
-  }
-  __syncthreads();
-  // Biases [l][group][16]; the last layer [16 rows][2][16]; its biases and the bits, each [128].
-  float* const last = sums + (kResiduals + 1) * kGroups * kHidden;
-  float* const rest = last + kThreads / 8 * 2 * kHidden;
-#pragma unroll
-  for (int layer = 0; layer <= kResiduals; ++layer)
-    sums[(layer * kGroups + group) * kHidden + 4 * tile_out + tile_in] = bias_sums[layer];
-#pragma unroll
-  for (int i = 0; i < 4; ++i)
-    last[((thread >> 3) * 2 + (thread >> 2 & 1)) * kHidden + 4 * (thread & 3) + i] = last_sums[i];
-  rest[thread] = last_bias[0], rest[kThreads + thread] = last_bias[1], rest[2 * kThreads + thread] = bits;
-  __syncthreads();
-  if (thread < (kResiduals + 1) * kHidden) {
-    const int layer = thread / kHidden, o = thread % kHidden;
-    float sum = 0.f;
-    for (int each = 0; each < kGroups; ++each) sum += sums[(layer * kGroups + each) * kHidden + o];
-    to[layer == 0 ? kFirstBias + o : kMiddle + (layer - 1) * kMiddleSize + kHidden * kHidden + o] = sum;
-  } else if (thread < (kResiduals + 1) * kHidden + 2 * kHidden) {
-    const int at = thread - (kResiduals + 1) * kHidden;
-    float sum = 0.f;
-    for (int each = 0; each < kThreads / 8; ++each) sum += last[each * 2 * kHidden + at];
-    to[kLast + at] = sum;
-  } else if (thread < (kResiduals + 1) * kHidden + 2 * kHidden + 3) {
-    const int at = thread - (kResiduals + 1) * kHidden - 2 * kHidden;
-    float sum = 0.f;
-    for (int each = 0; each < kThreads; ++each) sum += rest[at * kThreads + each];
-    to[kLastBias + at] = sum;
-  } else if (thread == kThreads - 1) {
-    to[kSums - 1] = 0.f;
+    for (int warp = 0; warp < kWarps; ++warp) sum += reinterpret_cast<const float*>(shared)[warp * kSums + at];
+    to[at] = sum;
   }
 }
 
-static_assert(kThreads > (kResiduals + 1) * kHidden + 2 * kHidden + 3 && kLastBias + 2 == kParameters);
+static_assert(kLastBias + 2 == kParameters && kParameters + 2 == kSums);
 
 }  // namespace
 
 int parts_of(const Planes& planes) {
-  int64_t count = 0;
-  for (int scale = 0; scale < planes.scales; ++scale) count += planes.count[scale];
+  int64_t groups = 0;
+  for (int scale = 0; scale < planes.scales; ++scale) groups += groups_of(planes, scale);
   int device = 0, processors = 1;
   cudaGetDevice(&device);
   cudaDeviceGetAttribute(&processors, cudaDevAttrMultiProcessorCount, device);
-  const int64_t tiles = (count + kThreads - 1) / kThreads;
+  const int64_t full = (groups + kWarps - 1) / kWarps;
   const int64_t at_once = (int64_t(processors) * kBlocksPerProcessor + planes.orientations - 1) / planes.orientations;
-  return int(tiles < at_once ? tiles : at_once);
+  return int(full < at_once ? full : at_once);
 }
 
 void bits(const Planes& planes, const float* weights, float* partial, cudaStream_t stream) {
   const int parts = parts_of(planes);
   if (parts == 0 || planes.orientations == 0) return;
-  const int bytes = kShared * int(sizeof(float));
+  const int bytes = kShared * int(sizeof(uint32_t));
   cudaFuncSetAttribute(bits_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
   bits_kernel<<<dim3(unsigned(parts), unsigned(planes.orientations)), kThreads, bytes, stream>>>(planes, weights,
                                                                                                  partial);
