@@ -1,11 +1,11 @@
-// The three networks of anchors on tensor cores, in one pass each way. A warp takes 16 anchors, or 16 rows of the weights'
-// gradients, which stay in registers until the block has no more tiles of 64 anchors; a block keeps all weights in shared
-// memory. Tensor cores round factors to 11 bits: each is taken as the sum of two such numbers, of whose four products the
-// smallest is left out, which leaves the accuracy of float32. Needs sm_80.
+// The three networks of anchors on tensor cores, in one pass each way. A warp takes 16 anchors, or 16 rows of weights'
+// gradients, which stay in registers until the block has no more tiles of 64 anchors; a block keeps all weights in
+// shared memory. Tensor cores round factors to 11 bits: each is taken as the sum of two such numbers, of whose four
+// products the smallest is left out, which leaves the accuracy of float32. Needs sm_80.
 //
 // Biases are weights of an input that is 1. Hidden layers stand side by side, kHidden numbers each; outputs too, each
 // network's from `output_start` on. Numbers that no network has are 0. Rows in shared memory are 8 or 24 numbers longer
-// than a multiple of 32: then neither 8 numbers of 4 rows nor 8 neighbours of 4 columns share a bank.
+// than a multiple of 32: then the 8 next numbers of 4 rows, one below the other, share no bank.
 #include "networks.h"
 
 #include <cuda_pipeline_primitives.h>
@@ -49,12 +49,14 @@ __device__ __forceinline__ Parts parts_of(float number) {
   return {big, __float_as_uint(number - __uint_as_float(big))};  // tensor cores drop the last 13 bits by themselves
 }
 
-// d += a b, 16 by 8 of 8 products each. Of lane l, with r = l / 4 and q = l % 4: d has row r, columns 2 q and 2 q + 1, then
-// row r + 8; a has rows r and r + 8 at q, then at q + 4; b has q and q + 4 of column r.
+// d += a b, 16 by 8 of 8 products each. Of lane l, with r = l / 4 and q = l % 4: d has row r, columns 2 q and 2 q + 1,
+// then row r + 8; a has rows r and r + 8 at q, then at q + 4; b has q and q + 4 of column r.
 __device__ __forceinline__ void multiply(float (&d)[4], unsigned a0, unsigned a1, unsigned a2, unsigned a3, unsigned b0,
                                          unsigned b1) {
 #if __CUDA_ARCH__ >= 800
-  asm("mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
+  // volatile: in the order given, since a product waits for the one before it with the same sums.
+  asm volatile(
+      "mma.sync.aligned.m16n8k8.row.col.f32.tf32.tf32.f32 {%0, %1, %2, %3}, {%4, %5, %6, %7}, {%8, %9}, "
       "{%0, %1, %2, %3};"
       : "+f"(d[0]), "+f"(d[1]), "+f"(d[2]), "+f"(d[3])
       : "r"(a0), "r"(a1), "r"(a2), "r"(a3), "r"(b0), "r"(b1));
@@ -63,12 +65,22 @@ __device__ __forceinline__ void multiply(float (&d)[4], unsigned a0, unsigned a1
 #endif
 }
 
-// The same with float32 factors; `rest` gets the small products, and may be d.
-__device__ __forceinline__ void multiply(float (&d)[4], float (&rest)[4], const Parts (&a)[4], float first, float second) {
-  const Parts b[2] = {parts_of(first), parts_of(second)};
-  multiply(rest, a[0].small, a[1].small, a[2].small, a[3].small, b[0].big, b[1].big);
-  multiply(rest, a[0].big, a[1].big, a[2].big, a[3].big, b[0].small, b[1].small);
-  multiply(d, a[0].big, a[1].big, a[2].big, a[3].big, b[0].big, b[1].big);
+// The same with float32 factors, for columns in eights; `rest` gets the small products, and may be d.
+template <int kCount>
+__device__ __forceinline__ void multiply(float (&d)[kCount][4], float (&rest)[kCount][4], const Parts (&a)[4],
+                                         const float2 (&b)[kCount]) {
+  Parts first[kCount], second[kCount];
+#pragma unroll
+  for (int i = 0; i < kCount; ++i) first[i] = parts_of(b[i].x), second[i] = parts_of(b[i].y);
+#pragma unroll
+  for (int i = 0; i < kCount; ++i)
+    multiply(rest[i], a[0].small, a[1].small, a[2].small, a[3].small, first[i].big, second[i].big);
+#pragma unroll
+  for (int i = 0; i < kCount; ++i)
+    multiply(rest[i], a[0].big, a[1].big, a[2].big, a[3].big, first[i].small, second[i].small);
+#pragma unroll
+  for (int i = 0; i < kCount; ++i)
+    multiply(d[i], a[0].big, a[1].big, a[2].big, a[3].big, first[i].big, second[i].big);
 }
 
 __device__ __forceinline__ const float2& two(const float* at) { return *reinterpret_cast<const float2*>(at); }
@@ -128,7 +140,8 @@ __device__ void load_directions(const Viewed& viewed, int features, int64_t star
 
 // Copies gradients by the outputs of a network; wait for it.
 template <int n>
-__device__ void load_slopes(const float* slopes, const float* alpha, int outputs, int64_t start, int64_t count, float* to) {
+__device__ void load_slopes(const float* slopes, const float* alpha, int outputs, int64_t start, int64_t count,
+                            float* to) {
   constexpr int kRoom = output_start(n + 1) - output_start(n);
   for (int at = int(threadIdx.x); at < kTile * kRoom; at += int(blockDim.x)) {
     const int anchor = at / kRoom, output = at % kRoom;
@@ -155,12 +168,11 @@ __device__ __forceinline__ void hidden_layer(int hidden, const float* first, con
 #pragma unroll 1
   for (int step = 0; step < kSteps; ++step) {
     Parts a[4];
+    float2 b[kWidth];
     take_rows(a, inputs + 8 * step, kInputs);
 #pragma unroll
-    for (int i = 0; i < kWidth; ++i) {
-      const float2 b = two(first + 8 * (i * kInputs + step));
-      multiply(sums[i], rest[i], a, b.x, b.y);
-    }
+    for (int i = 0; i < kWidth; ++i) b[i] = two(first + 8 * (i * kInputs + step));
+    multiply(sums, rest, a, b);
   }
 #pragma unroll
   for (int i = 0; i < kWidth; ++i)
@@ -187,7 +199,8 @@ __global__ void __launch_bounds__(32 * kForwardWarps)
   __syncthreads();
   // A block's neighbours take the next anchors: then all processors share what is left of them.
   const int64_t apart = int64_t(gridDim.x) * kGroup;
-  for (int64_t start = warp * apart + int64_t(blockIdx.x) * kGroup; start < viewed.count; start += kForwardWarps * apart) {
+  const int64_t own = int64_t(blockIdx.x) * kGroup;
+  for (int64_t start = warp * apart + own; start < viewed.count; start += kForwardWarps * apart) {
     load_features<kGroup>(viewed, networks.features, start, thread, 32, inputs);
     __pipeline_commit();
     load_directions<kGroup>(viewed, networks.features, start, thread, inputs);
@@ -207,12 +220,11 @@ __global__ void __launch_bounds__(32 * kForwardWarps)
       for (int output = 0; output < outputs; output += 16) {
         float sums[2][4] = {}, rest[2][4] = {};
 #pragma unroll
-        for (int step = 0; step < kWidth; ++step)
-#pragma unroll
-          for (int i = 0; i < 2; ++i) {
-            const float2 b = two(last + (output_start(n) + output + 8 * i) * kHidden + 8 * step);
-            multiply(sums[i], rest[i], a[step], b.x, b.y);
-          }
+        for (int step = 0; step < kWidth; ++step) {
+          const float* const at = last + (output_start(n) + output) * kHidden + 8 * step;
+          const float2 b[2] = {two(at), two(at + 8 * kHidden)};
+          multiply(sums, rest, a[step], b);
+        }
 #pragma unroll
         for (int i = 0; i < 2; ++i)
 #pragma unroll
@@ -238,8 +250,10 @@ __device__ __forceinline__ void add_products(float (&sums)[kWidth][4], const flo
 #pragma unroll 1
   for (int step = 0; step < kTile / 8; ++step, a += 8 * a_row, b += 8 * b_row) {
     const Parts of[4] = {parts_of(a[0]), parts_of(a[8]), parts_of(a[4 * a_row]), parts_of(a[4 * a_row + 8])};
+    float2 by[kWidth];
 #pragma unroll
-    for (int i = 0; i < kWidth; ++i) multiply(now[i], now[i], of, b[8 * i], b[8 * i + 4 * b_row]);
+    for (int i = 0; i < kWidth; ++i) by[i] = make_float2(b[8 * i], b[8 * i + 4 * b_row]);
+    multiply(now, now, of, by);
   }
 #pragma unroll
   for (int i = 0; i < kWidth; ++i)
@@ -305,19 +319,18 @@ __global__ void __launch_bounds__(32 * kBackwardWarps)
     __pipeline_wait_prior(0);
     __syncthreads();
 
+    if (has_outputs)
+      add_products(sums[0], by_output + output_group * kGroup, kSlopeRow, columns + network * kHidden, kColumns);
     float by_hidden[kWidth][4] = {};
 #pragma unroll 1
     for (int output = output_start(n); output < output_start(n) + networks.outputs[n]; output += 8) {
       Parts a[4];
+      float2 b[kWidth];
       take_rows(a, by_output + own_row * kSlopeRow + output + lane.pair, kSlopeRow);
 #pragma unroll
-      for (int i = 0; i < kWidth; ++i) {
-        const float2 b = two(last + (8 * i + lane.row) * kSlopeRow + output + lane.pair);
-        multiply(by_hidden[i], by_hidden[i], a, b.x, b.y);
-      }
+      for (int i = 0; i < kWidth; ++i) b[i] = two(last + (8 * i + lane.row) * kSlopeRow + output + lane.pair);
+      multiply(by_hidden, by_hidden, a, b);
     }
-    if (has_outputs)
-      add_products(sums[0], by_output + output_group * kGroup, kSlopeRow, columns + network * kHidden, kColumns);
     __syncthreads();  // all have taken their products with the hidden layers, which their gradients now replace
 #pragma unroll
     for (int i = 0; i < kWidth; ++i)
@@ -337,10 +350,12 @@ __global__ void __launch_bounds__(32 * kBackwardWarps)
 #pragma unroll 1
       for (int column = 0; column < kColumns; column += 8) {
         Parts a[4];
+        float2 b[kWidth];
         take_rows(a, columns + own_row * kColumns + column + lane.pair, kColumns);
-        const float* b = first + (column + lane.pair) * kInputs + lane.row;
+        const float* const from = first + (column + lane.pair) * kInputs + lane.row;
 #pragma unroll
-        for (int i = 0; i < kWidth; ++i) multiply(by_input[i], by_input[i], a, b[8 * i], b[8 * i + kInputs]);
+        for (int i = 0; i < kWidth; ++i) b[i] = make_float2(from[8 * i], from[8 * i + kInputs]);
+        multiply(by_input, by_input, a, b);
       }
 #pragma unroll
       for (int i = 0; i < kWidth; ++i)
@@ -381,6 +396,7 @@ __global__ void __launch_bounds__(kSumThreads)
     from = (output_start(n) + own) * kHidden + hidden, count = networks.outputs[n];
   float sum = 0.f;
   if (own < count)
+#pragma unroll 12
     for (int part = 0; part < parts; ++part) sum += partial[int64_t(part) * kSums + from];
   to[at] = sum;
 }
