@@ -19,14 +19,17 @@ constexpr int kWidth = 7, kSteps = 7;  // eights of inputs and of a hidden layer
 static_assert(kMostInputs < kInputs && kMostHidden < kHidden && 8 * kWidth == kHidden && 8 * kSteps == kInputs);
 
 // Numbers of shared memory on the way back: inputs, gradients by outputs and hidden layers, each [anchor][number];
-// weights [column][input] and [hidden number][output]. The last of 16 columns at a time end behind the hidden layers.
+// weights [column][input] and [hidden number][output]; alpha. The last of 16 columns at a time end behind the hidden
+// layers.
 constexpr int kAtSlopes = kTile * kInputs, kAtColumns = kAtSlopes + kTile * kSlopeRow;
 constexpr int kAtFirst = kAtColumns + kTile * kColumns, kAtLast = kAtFirst + kColumns * kInputs;
-constexpr int kShared = kAtLast + kHidden * kSlopeRow;
+constexpr int kAtAlpha = kAtLast + kHidden * kSlopeRow, kAlphas = kMostOutputs[0];
+constexpr int kShared = kAtAlpha + kTile * kAlphas;
 // On the way forth: weights [column][input] and [output][hidden number], inputs of each warp.
 constexpr int kForwardWarps = 16, kForwardLast = kColumns * kInputs;
 constexpr int kForwardInputs = kForwardLast + kOutputs * kHidden;
 constexpr int kForwardShared = kForwardInputs + kForwardWarps * kGroup * kInputs;
+static_assert(kShared * sizeof(float) == 164'352 && kForwardShared <= kShared);  // BLOCK_BYTES of view_networks.py
 // A warp for each network of 16 anchors; sums of a block: [kOutputs][kHidden] and [kColumns, in sixteens][kInputs].
 constexpr int kRowGroups = kTile / kGroup, kBackwardWarps = kRowGroups * kNetworks;
 constexpr int kColumnGroups = (kColumns + kGroup - 1) / kGroup, kFirstSums = kOutputs * kHidden;
@@ -138,21 +141,17 @@ __device__ void load_directions(const Viewed& viewed, int features, int64_t star
   to[0] = x / distance, to[1] = y / distance, to[2] = z / distance, to[3] = distance, to[4] = 1.f;
 }
 
-// Copies gradients by the outputs of a network; wait for it.
+// Copies numbers that belong to the outputs of network n; wait for it.
 template <int n>
-__device__ void load_slopes(const float* slopes, const float* alpha, int outputs, int64_t start, int64_t count,
-                            float* to) {
+__device__ void load_outputs(const float* from, int outputs, int64_t start, int64_t count, float* to, int row) {
   constexpr int kRoom = output_start(n + 1) - output_start(n);
   for (int at = int(threadIdx.x); at < kTile * kRoom; at += int(blockDim.x)) {
     const int anchor = at / kRoom, output = at % kRoom;
-    float* const place = to + anchor * kSlopeRow + output_start(n) + output;
-    const int64_t from = (start + anchor) * outputs + output;
-    if (output >= outputs || start + anchor >= count)
-      *place = 0.f;
-    else if constexpr (n == 0)
-      *place = slopes[from] * (1.f - alpha[from] * alpha[from]);  // by what tanh was taken of
+    float* const place = to + anchor * row + output;
+    if (output < outputs && start + anchor < count)
+      __pipeline_memcpy_async(place, from + (start + anchor) * outputs + output, 4);
     else
-      __pipeline_memcpy_async(place, slopes + from, 4);
+      *place = 0.f;
   }
 }
 
@@ -277,6 +276,7 @@ __global__ void __launch_bounds__(32 * kBackwardWarps)
   float* const inputs = shared;
   float* const by_output = shared + kAtSlopes;
   float* const columns = shared + kAtColumns;
+  float* const alphas = shared + kAtAlpha;
   const float* const first = shared + kAtFirst;
   const float* const last = shared + kAtLast;
   const Lane lane;
@@ -290,7 +290,7 @@ __global__ void __launch_bounds__(32 * kBackwardWarps)
   const bool has_outputs = n != 1, has_columns = n < 2 && column_group < kColumnGroups;
   float sums[2][kWidth][4] = {};
 
-  clear(shared + kAtFirst, kShared - kAtFirst);
+  clear(shared + kAtFirst, kAtAlpha - kAtFirst);
   load_first(networks, shared + kAtFirst);
   for (int each = 0; each < kNetworks; ++each)
     load_layer(networks.last[each], networks.last_bias[each], networks.outputs[each], networks.hidden,
@@ -299,10 +299,11 @@ __global__ void __launch_bounds__(32 * kBackwardWarps)
   for (int64_t start = int64_t(blockIdx.x) * kTile; start < viewed.count; start += int64_t(gridDim.x) * kTile) {
     load_features<kTile>(viewed, networks.features, start, int(threadIdx.x), int(blockDim.x), inputs);
     __pipeline_commit();
-    load_slopes<1>(slopes.of[1], alpha, networks.outputs[1], start, viewed.count, by_output);
-    load_slopes<2>(slopes.of[2], alpha, networks.outputs[2], start, viewed.count, by_output);
+    load_outputs<0>(alpha, networks.outputs[0], start, viewed.count, alphas, kAlphas);
+    load_outputs<0>(slopes.of[0], networks.outputs[0], start, viewed.count, by_output, kSlopeRow);
+    load_outputs<1>(slopes.of[1], networks.outputs[1], start, viewed.count, by_output + output_start(1), kSlopeRow);
+    load_outputs<2>(slopes.of[2], networks.outputs[2], start, viewed.count, by_output + output_start(2), kSlopeRow);
     __pipeline_commit();
-    load_slopes<0>(slopes.of[0], alpha, networks.outputs[0], start, viewed.count, by_output);
     load_directions<kTile>(viewed, networks.features, start, int(threadIdx.x), inputs);
     __pipeline_wait_prior(1);
     __syncthreads();
@@ -317,6 +318,9 @@ __global__ void __launch_bounds__(32 * kBackwardWarps)
           *reinterpret_cast<float2*>(own + j * 4 * kColumns + 8 * i) = make_float2(hidden[i][j], hidden[i][j + 1]);
     }
     __pipeline_wait_prior(0);
+    // By what tanh was taken of; a thread has just those numbers that it copied itself.
+    for (int at = int(threadIdx.x); at < kTile * kAlphas; at += int(blockDim.x))
+      by_output[at / kAlphas * kSlopeRow + at % kAlphas] *= 1.f - alphas[at] * alphas[at];
     __syncthreads();
 
     if (has_outputs)
@@ -439,7 +443,8 @@ void networks_backward(const Viewed& viewed, const Networks& networks, const flo
   const Layout layout = layout_of(networks);
   if (blocks > 0) {
     cudaFuncSetAttribute(backward_kernel, cudaFuncAttributeMaxDynamicSharedMemorySize, bytes);
-    backward_kernel<<<blocks, 32 * kBackwardWarps, bytes, stream>>>(viewed, networks, alpha, slopes, to_features, partial);
+    backward_kernel<<<blocks, 32 * kBackwardWarps, bytes, stream>>>(viewed, networks, alpha, slopes, to_features,
+                                                                    partial);
   }
   const int wide = (layout.total + kSumThreads - 1) / kSumThreads;
   sum_kernel<<<wide, kSumThreads, 0, stream>>>(networks, layout, partial, blocks, to_parameters);
