@@ -155,6 +155,7 @@ class Watch:
     window: int
     syncs: bool
     kernels: int
+    brief: bool
     losses: collections.deque[torch.Tensor] = field(default_factory=lambda: collections.deque(maxlen=500))
     _since: float = 0.0
     _settled_since: float = 0.0
@@ -186,7 +187,8 @@ class Watch:
         elif step == middle + length and self._profile is not None:
             self._now()
             self._profile.__exit__(None, None, None)
-            phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.num_rows)
+            if not self.brief:
+                phase.lines = report(self._profile, length, cuda=self.device.type == "cuda", rows=record.num_rows)
             phase.busy = sum(t for t, _ in kernel_times(self._profile).values()) / length
             phase.lines += longest_kernels(self._profile, length, self.kernels)
             self._profile = None
@@ -283,7 +285,7 @@ def anchors(
         phases[-1].end = last
         if args.last:
             phases = phases[-1:]
-        watch = Watch(session.device, phases, args.window, args.syncs, args.kernels)
+        watch = Watch(session.device, phases, args.window, args.syncs, args.kernels, args.brief)
         drawn: list[Any] = []
         render = trainer.rasterizer.render
 
@@ -319,7 +321,7 @@ def anchors(
     for phase in phases:
         used = f", GPU busy {phase.busy * phase.rate / 10:.0f} % ({phase.busy:.2f} ms a step)" if cuda else ""
         print(f"    {phase.name:20} steps {phase.start + 1:,} to {phase.end:,}: {phase.rate:7.1f} it/s{used}")
-        if not args.brief:
+        if phase.lines:
             print("\n".join(phase.lines), flush=True)
     found = Summary(method, phases[-1].rate, phases[-1].settled, phases[-1].busy, peak, loss, trainer.model.num_rows)
     if args.baseline_steps < 1:

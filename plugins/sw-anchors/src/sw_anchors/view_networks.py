@@ -19,7 +19,7 @@ Networks = tuple[nn.Sequential, nn.Sequential, nn.Sequential]
 """Opacity (-> k), covariance (-> 7 k) and colour (-> 3 k), each Linear, ReLU, Linear on F + 4 inputs."""
 
 
-MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 162_112
+MOST_FEATURES, MOST_HIDDEN, MOST_OUTPUTS, BLOCK_BYTES = 51, 51, (16, 80, 32), 164_352
 """That the CUDA kernel has room for, and the shared memory of its blocks: see kernels/cuda/networks.h."""
 
 
