@@ -95,9 +95,9 @@ def scene_name(scene: str) -> str:
 
 
 def parse_scene(text: str) -> tuple[str, str]:
-    """Split SCENE[:PICTURES]; demo:tiny is a scene."""
+    """Split SCENE[:PICTURES]; demo:tiny is a scene, and so is FAMILY:FOLDER."""
     scene, _, images = ("demo", "", "") if text == "demo" else text.rpartition(":")
-    return (text, "") if not scene or scene.startswith("demo") else (scene, images)
+    return (text, "") if not scene or scene.startswith("demo") or "/" in images else (scene, images)
 
 
 def asked(text: str) -> tuple[str, str, str]:

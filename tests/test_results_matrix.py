@@ -114,6 +114,7 @@ def test_after_the_deadline_nothing_begins(start, capsys):
 def test_scenes_with_and_without_pictures(script):
     assert script.parse_scene("data/fox:images_2") == ("data/fox", "images_2")
     assert script.parse_scene("data/lego") == ("data/lego", "")
+    assert script.parse_scene("nerf_synthetic:data/lego") == ("nerf_synthetic:data/lego", "")
     assert script.parse_scene("demo:tiny") == ("demo:tiny", "")
     assert script.parse_scene("demo") == ("demo", "")
 
