@@ -18,7 +18,7 @@ from sw_codecs.context.integer_mlp import FRACTION
 UNIT = 4
 """Widths of matrices are multiples of it, so that GPUs read 16 bytes at once."""
 CONSTANTS = (0.0, 1.0)
-"""What stands before the parameters."""
+"""Contents before the parameters."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class _Slice:
 
 
 class ChannelNetworks:
-    """Where the parameters of a ChannelMixture go; holds none of them.
+    """Places of the parameters of a ChannelMixture, of which it holds none.
 
     columns     [3,F] int32: columns of mean, scale and logit of each channel in the outputs [S,3F]
 
@@ -96,7 +96,7 @@ class ChannelNetworks:
         return found
 
     def _places_of(self, sources: Tensor) -> Tensor:
-        """Where each number of the parameters stands among the packed ones; each parameter starts at a UNIT."""
+        """Index of each number of the parameters among the packed ones; each parameter starts at a UNIT."""
         places = torch.zeros(int(sources.max()) + 1, dtype=torch.int64)
         places[sources] = torch.arange(len(sources))
         padded = [torch.zeros(_padded(each.numel()), dtype=torch.int64) for each in self._numbered()]

@@ -426,7 +426,7 @@ class CodedAnchors(AnchorModel):
         return AnchorRate(bits * (share / numbers.clamp(min=1)), by_group, numbers, forecast.own_bits)
 
     def read_as(self, units: Tensor, masks: MaskKind) -> Predicted:
-        """How the outputs of the context's network give bits: `units` [W] of the outputs, and what masks do to them."""
+        """Reading of the context network: `units` [W] of its outputs, and the effect of masks on bits."""
         bounds = (self.smallest_probability, SMALLEST_SCALE, self.scale_floor)
         return Predicted(units, self.base_steps[0], *bounds, masks)
 

@@ -29,7 +29,7 @@ class ExpectedRows:
             self._copied.record()
 
     def number(self) -> int:
-        """How many are seen, which may be more than there are places. Waits until the device has counted them."""
+        """Number of seen rows, perhaps more than there are places. Waits until the device has counted them."""
         if self._copied is not None:
             self._copied.synchronize()
         return int(self._on_host)

@@ -19,7 +19,7 @@ from sw_anchors.row_kernels import bits_fit_kernel
 
 
 class MaskKind(IntEnum):
-    """What masks do to the bits of their anchor: `MaskKind` of kernels/mixture.h."""
+    """Effect of masks on the bits of their anchor: `MaskKind` of kernels/mixture.h."""
 
     ALONE = 0
     GATED = 1
@@ -28,7 +28,7 @@ class MaskKind(IntEnum):
 
 @dataclass(frozen=True)
 class Predicted:
-    """How outputs of networks are read.
+    """Reading of the outputs of networks.
 
     units           [W] factors of the outputs
     base            base step of the features, in which the networks of channels count
