@@ -142,7 +142,7 @@ def test_early_statistics_are_dropped():
 def test_the_loss_adds_volume_and_what_a_method_adds():
     class More(CodedAnchorStage):
         def extra_loss(self, model, result, step):
-            return {"more": (0.5, torch.tensor(0.5 * step))}
+            return {"more": (0.5, torch.tensor(0.5 * step)), "as it is": torch.tensor(0.125)}
 
     stage = More(CodedAnchorParams())
     model, view = begin(stage, model_of()), scene_of().views[0]
@@ -153,7 +153,7 @@ def test_the_loss_adds_volume_and_what_a_method_adds():
     volume = 0.01 * float(result.inputs.scales.detach().prod(1).mean())
     assert float(pack.parts["volume"]) == pytest.approx(volume)
     assert float(pack.parts["more"]) == 0.5
-    expected = 0.8 * float(pack.parts["l1"]) + 0.2 * (1 - float(pack.parts["ssim"])) + volume + 0.5
+    expected = 0.8 * float(pack.parts["l1"]) + 0.2 * (1 - float(pack.parts["ssim"])) + volume + 0.5 + 0.125
     assert float(pack.total.detach()) == pytest.approx(expected, rel=1e-5)
 
 

@@ -158,8 +158,8 @@ class AnchorStage(Stage):
     def raster_options(self, step: int, background: Tensor) -> RasterOptions:
         return RasterOptions(background=background, grad2d=True)
 
-    def extra_loss(self, model: Any, result: RenderResult, step: int) -> dict[str, Weighted]:
-        """Further terms of the loss by name: (weight, scalar)."""
+    def extra_loss(self, model: Any, result: RenderResult, step: int) -> Mapping[str, Weighted | Tensor]:
+        """Further terms of the loss by name: a scalar, or its weight and the scalar, which costs a GPU less."""
         return {}
 
     def mean_volume(self, result: RenderResult) -> Tensor:
@@ -172,7 +172,7 @@ class AnchorStage(Stage):
         truth = view.image(background, result.image.device)
         found = photometric_loss(result.image, truth, lambda_dssim=settings.lambda_dssim)
         terms = {"volume": (settings.volume, self.mean_volume(result)), **self.extra_loss(model, result, step)}
-        total, *weighted = weighted_sum(found.total, *terms.values())
+        total, *weighted = weighted_sum(found.total, *(t if isinstance(t, tuple) else (1.0, t) for t in terms.values()))
         return LossPack(total, found.parts | dict(zip(terms, weighted, strict=True)))
 
 
