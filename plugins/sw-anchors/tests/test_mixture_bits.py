@@ -46,7 +46,7 @@ def sample_of(count, features, k, *, seed=0, logits=True):
 
 
 def by_torch(x, outputs, steps, masks, counted, predicted, channel):
-    """The same bits, operator by operator."""
+    """Compute the same bits, operator by operator."""
     k = masks.shape[1]
     f = x.shape[1] - 6 - 3 * k
     outputs = outputs * predicted.units

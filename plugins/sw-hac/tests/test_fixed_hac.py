@@ -148,6 +148,33 @@ def test_anchors_are_expected_in_proportion_to_how_many_there_are():
     assert fixed.expected(front_camera(), N) is None  # another camera, though it stands there too
 
 
+def test_no_more_places_are_asked_for_than_all_anchors_need():
+    model, camera, fixed = trained().train(), front_camera(), FixedDecoder(graphs=False)
+    model.fixed = fixed
+    model.decode(camera, torch.arange(N))
+    assert capacity_of(1030) > capacity_of(1000)
+    assert fixed.expected(camera, 1000) == capacity_of(1000)
+
+
+def test_a_model_without_anchors_is_decoded_and_may_grow_again():
+    model, camera = trained().train(), front_camera()
+    model.phase, model.fixed = FULL, FixedDecoder(graphs=False)
+    rows = {name: getattr(model, name) for name in model.ROWS}
+    model.gaussians(camera, Seen(range(10)))
+
+    def take(count):
+        for name, tensor in rows.items():
+            part = tensor.detach()[:count].clone()
+            setattr(model, name, torch.nn.Parameter(part) if isinstance(tensor, torch.nn.Parameter) else part)
+
+    take(0)
+    for _ in range(2):
+        assert len(model.gaussians(camera, Seen([])).means) == 0
+    take(40)
+    for _ in range(2):
+        assert sorted(model.gaussians(camera, Seen([3, 9])).extras["anchors"].rows.tolist()) == [3, 9]
+
+
 @pytest.mark.parametrize("seen", [0, 1, 9, 10, 11, 50])
 def test_rows_beyond_the_places_are_left_out_and_told(seen):
     order = torch.randperm(50, generator=torch.Generator().manual_seed(0))
@@ -236,3 +263,13 @@ def test_graphs_of_a_view_that_comes_again_wait_for_no_count():
         torch.cuda.set_sync_debug_mode("default")
     assert rows.number() == 334
     assert rows.rows[:334].tolist() == list(range(0, 1000, 3))
+
+
+@pytest.mark.cuda
+@pytest.mark.skipif(torch.cuda.device_count() < 2, reason="needs a GPU that is not the current one")
+def test_the_count_is_waited_for_on_the_device_of_the_anchors():
+    order = torch.arange(1000, device="cuda:1")
+    ExpectedRows(order, order < 5, 512).number()  # memory of the host is set aside before
+    with torch.cuda.device(1):
+        torch.cuda._sleep(1_000_000_000)
+    assert ExpectedRows(order, order % 3 == 0, 512).number() == 334

@@ -1,4 +1,4 @@
-"""The networks of a ChannelMixture as two products: one for all first layers, one a slice for the last ones.
+"""Networks of a ChannelMixture as two products: one for all first layers, one a slice for the last ones.
 
 Weights and biases stand in one row of numbers, with zeros where a slice must not look. A hidden number of each slice is
 always 1, so that biases are weights: their gradients come out of the products too.
@@ -23,7 +23,7 @@ CONSTANTS = (0.0, 1.0)
 
 @dataclass(frozen=True)
 class _Slice:
-    """A slice's columns of the hidden layer and of the outputs, and where its last weights start."""
+    """Columns of a slice in the hidden layer and in the outputs, and where its last weights start."""
 
     hidden: slice
     outputs: slice
@@ -110,7 +110,7 @@ class ChannelNetworks:
         return torch.cat([constants, *(p.reshape(-1) for p in parameters)]).index_select(0, self._sources)
 
     def unpacked(self, packed: Tensor, factor: Tensor) -> list[Tensor]:
-        """The numbers of each parameter among packed ones, times a scalar."""
+        """Numbers of each parameter among packed ones, times a scalar."""
         taken = packed.index_select(0, self._places).mul_(factor)
         sizes = [_padded(shape.numel()) for shape in self._shapes]
         parts = zip(torch.split(taken, sizes), self._shapes, strict=True)

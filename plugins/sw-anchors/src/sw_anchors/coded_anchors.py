@@ -335,7 +335,7 @@ class CodedAnchors(AnchorModel):
         return draws((rows, numbers), self.own_generator(), self.device)
 
     def own_generator(self) -> torch.Generator | None:
-        """The generator of noise, if it draws on the model's device."""
+        """Generator of noise, if it draws on the model's device."""
         own = self.noise is not None and self.noise.device.type == self.device.type
         return self.noise if own else None
 

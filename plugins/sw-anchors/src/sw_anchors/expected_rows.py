@@ -25,8 +25,9 @@ class ExpectedRows:
         if order.is_cuda:
             self._on_host = torch.empty((), dtype=torch.int64, pin_memory=True)
             self._on_host.copy_(self.count, non_blocking=True)
-            self._copied = torch.cuda.Event()
-            self._copied.record()
+            self._copied = torch.cuda.Event()  # type: ignore[no-untyped-call]
+            # Of its own device: another may be the current one, whose stream has nothing to do with the copy.
+            self._copied.record(torch.cuda.current_stream(order.device))
 
     def number(self) -> int:
         """Number of seen rows, perhaps more than there are places. Waits until the device has counted them."""

@@ -69,14 +69,14 @@ class FixedDecoder:
         self._seen: WeakKeyDictionary[Camera, tuple[int, int]] = WeakKeyDictionary()  # anchors, and of how many
 
     def expected(self, camera: Camera, num_rows: int) -> int | None:
-        """Places for the anchors that this camera sees, of `num_rows`; None: it was not drawn before.
+        """Places for the anchors that this camera sees, of `num_rows`; None: not drawn before, or there are none.
 
         A little more than it saw last: between two of its turns anchors grow, are pruned and change their size.
         """
-        if self._failed or camera not in self._seen:
+        seen, of = self._seen.get(camera, (0, 0))
+        if self._failed or not of or not num_rows:
             return None
-        seen, of = self._seen[camera]
-        return capacity_of(math.ceil(seen * num_rows / of * MORE))
+        return capacity_of(min(math.ceil(seen * num_rows / of * MORE), num_rows))
 
     def decode(self, model: CodedAnchors, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs | None:
         """Decode the anchors `rows` [V]: their Gaussians with opacity > 0.

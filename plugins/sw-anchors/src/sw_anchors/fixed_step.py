@@ -72,8 +72,7 @@ class FixedRows:
 
     def draw(self, model: CodedAnchors) -> None:
         """Draw noise and sample."""
-        own = model.noise is not None and model.noise.device.type == self.random.device.type
-        self.random.uniform_(-0.5, 0.5, generator=model.noise if own else None)
+        self.random.uniform_(-0.5, 0.5, generator=model.own_generator())
 
 
 def decode_rows(model: CodedAnchors, at: FixedRows, pool: PoolRows | None) -> Found:

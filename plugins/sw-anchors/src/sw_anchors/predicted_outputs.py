@@ -1,4 +1,4 @@
-"""A network of two layers whose outputs are steps for all anchors, and everything for the last of them: one node.
+"""Network of two layers whose outputs are steps for all anchors, and everything for the last of them: one node.
 
 Of the anchors that a view sees only the quantiser steps are needed; those of a sample of all are behind them, and have
 distributions too. So the wide layer is computed for the sample alone, and no gradient is zeros for most rows.

@@ -173,7 +173,7 @@ class HACPlusAnchors(GridAnchors):
         return bits.sum(), bits.detach().sum(dim=0) @ self._columns(bits)[1]
 
     def _networks_on(self, device: torch.device) -> ChannelNetworks | None:
-        """The layout of the networks of channels; none replaces another: graphs read their tensors where they stand."""
+        """Layout of the networks of channels; none replaces another: graphs read their tensors where they stand."""
         if self.channel is not None and device not in self._layouts:
             self._layouts[device] = ChannelNetworks(self.channel, device)
         return self._layouts.get(device)
