@@ -52,6 +52,6 @@ class GridStage(CodedAnchorStage):
         weights = self.opt.rate_term
         terms = {
             "rate": (weights.weight, rate.bits),
-            "grid": (weights.weight / (model.num_rows * sum(model.shape.widths)), rate.own_bits),
+            "grid": (weights.weight / max(model.num_rows * sum(model.shape.widths), 1), rate.own_bits),
         }
         return {**terms, "masks": (weights.masks, model.soft_masks().mean())} if weights.masks else terms
