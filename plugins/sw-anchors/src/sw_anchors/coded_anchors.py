@@ -153,7 +153,8 @@ class CodedAnchors(AnchorModel):
 
     def gaussians(self, camera: Camera, rasterizer: Rasterizer) -> GaussianInputs:
         """As of AnchorModel. A view that was drawn before is decoded before the host knows how many anchors it sees."""
-        places = self.fixed.expected(camera, self.num_rows) if self.fixed is not None and self._replays() else None
+        fixed = self._replaying()
+        places = None if fixed is None else fixed.expected(camera, self.num_rows)
         if places is None:
             return super().gaussians(camera, rasterizer)
         with torch.no_grad():
@@ -250,16 +251,17 @@ class CodedAnchors(AnchorModel):
         rate = self.sample, self.smallest_probability, self.scale_floor
         return self.phase, *rate, self.noise_factor, tuple(self.base_steps)
 
-    def _replays(self) -> bool:
-        """Whether a FixedDecoder, if there is one, decodes."""
-        return self.training and torch.is_grad_enabled() and self.features.requires_grad
+    def _replaying(self) -> FixedDecoder | None:
+        """Decoder of fixed sizes, where there is one and it decodes: in a step of training."""
+        return self.fixed if self.training and torch.is_grad_enabled() and self.features.requires_grad else None
 
     def decode(self, camera: Camera, rows: Tensor | ExpectedRows) -> GaussianInputs:
-        if self.fixed is not None and self._replays():
-            found = self.fixed.decode(self, camera, rows)
+        fixed = self._replaying()
+        if fixed is not None:
+            found = fixed.decode(self, camera, rows)
             if found is None and isinstance(rows, ExpectedRows):
                 rows = rows.known()
-                found = self.fixed.decode(self, camera, rows)
+                found = fixed.decode(self, camera, rows)
             if found is not None:
                 return found
         return super().decode(camera, rows if isinstance(rows, Tensor) else rows.known())
