@@ -4,6 +4,7 @@ import math
 
 import pytest
 import torch
+from sw_gaussians import fragments
 from sw_gaussians.config import MCMC
 from sw_gaussians.fused_adam import FusingOptimizer
 from sw_gaussians.mcmc import draw
@@ -67,10 +68,15 @@ def test_a_step_between_densifications_waits_for_nothing_that_torch_sees(channel
 
 @pytest.mark.parametrize(
     "settings",
-    [{"mcmc": MCMC(enabled=True)}, {"sparse_adam": "none"}, {"sparse_adam": "per_row"}],
-    ids=["mcmc", "sparse", "sparse-per-row"],
+    [
+        {"mcmc": MCMC(enabled=True)},
+        {"sparse_adam": "none"},
+        {"sparse_adam": "per_row"},
+        {"fast": {"densify": "budget"}},
+    ],
+    ids=["mcmc", "sparse", "sparse-per-row", "fast"],
 )
-def test_nor_does_it_with_noise_or_with_sparse_updates(settings):
+def test_nor_does_it_with_noise_sparse_updates_or_opacity_gradients(settings):
     scene = small_scene(3)
     assert keep_pictures(scene.train, "cuda")
     waits_for_nothing(make_trainer(scene, ThreeDGSConfig(iterations=7000, **settings)))
@@ -180,6 +186,25 @@ def test_statistics_of_one_launch_are_those_of_many():
         torch.testing.assert_close(getattr(ours, name), getattr(theirs, name), rtol=1e-6, atol=0)
     accumulate_statistics(ours, gradients.double(), radii)  # what no kernel takes goes the other way
     assert ours.denom.sum() > theirs.denom.sum()
+
+
+def test_sums_over_fragments_of_one_launch_are_those_of_many():
+    generator = torch.Generator().manual_seed(6)
+    ours, theirs = (torch.zeros(500, 3, device="cuda") for _ in range(2))
+    for _ in range(3):
+        gradients, logits = (torch.randn(500, generator=generator).cuda() for _ in range(2))
+        logits[:4] = torch.tensor([-40.0, 17.0, 90.0, float("nan")])
+        found = torch.rand(500, 2, generator=generator).cuda()
+        assert torch.ops.splatwizard_gaussians.fragment_statistics(
+            gradients, logits, found, ours, fragments.LEAST_CLEAR
+        )
+        fragments.accumulate_fragments_in_torch(theirs, gradients, logits, found)
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6, equal_nan=True)
+    assert ours[3, 0].isnan()
+    assert ours[:3].isfinite().all()
+    fragments.accumulate_fragments(ours, gradients, logits, found.double())  # what no kernel takes goes the other way
+    fragments.accumulate_fragments_in_torch(theirs, gradients, logits, found)
+    torch.testing.assert_close(ours, theirs, rtol=1e-5, atol=1e-6, equal_nan=True)
 
 
 def test_a_picture_on_a_gpu_is_the_one_on_the_host():

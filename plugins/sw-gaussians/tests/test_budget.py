@@ -13,7 +13,17 @@ from sw_gaussians.start import logit
 from sw_gaussians.statistics import collect_statistics
 from sw_reference.rasterizer import ReferenceRasterizer
 
-from splatwizard_core.api import Camera, EmptyModel, GaussianModel, ParamGroup, RasterOptions, SplatOptimizer, stream
+from splatwizard_core.api import (
+    Camera,
+    EmptyModel,
+    GaussianModel,
+    GradBuffer,
+    ParamGroup,
+    RasterOptions,
+    RenderResult,
+    SplatOptimizer,
+    stream,
+)
 
 EXTENT = 10.0  # largest scales up to 0.1 are copied
 SMALL, LARGE = math.log(0.05), math.log(0.5)
@@ -247,6 +257,21 @@ def test_morton_order_changes_neither_picture_nor_statistics_nor_the_exported_se
     first, second = (load_ply(tmp_path / f"{name}.ply") for name in ("before", "after"))
     for name in GaussianModel.RAW:
         assert torch.equal(getattr(second, name), getattr(first, name)[order]), name
+
+
+def test_opacity_gradients_are_added_view_by_view():
+    model = model_of(3)
+    model.opacity_logits.data = torch.tensor([0.0, 90.0, 0.0])
+    found = GradBuffer()
+    found.set(torch.tensor([[4.0, 2.0], [1.0, 1.0], [0.0, 0.0]]))
+    result = RenderResult(torch.zeros(3, 1, 1), torch.ones(3, dtype=torch.int32), None, fragment_grad=found)
+    fragments.collect_opacity_gradients(model, result)
+    assert (model.fragments == 0).all()  # another task has taken the gradient
+    model.opacity_logits.grad = torch.tensor([0.25, 1e-6, 0.0])
+    for _ in range(2):
+        fragments.collect_opacity_gradients(model, result)
+    # g = dL/dlogit / (1 - o), and at least LEAST_CLEAR is divided by
+    torch.testing.assert_close(model.fragments, torch.tensor([[1.0, 8.0, 4.0], [2.0, 2.0, 2.0], [0.0, 0.0, 0.0]]))
 
 
 def test_the_buffer_goes_as_it_came():

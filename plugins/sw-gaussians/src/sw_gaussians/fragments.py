@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from splatwizard_core.api import GaussianModel, RenderResult
+from sw_gaussians.native import GAUSSIANS
 
 BUFFER = "fragments"
 """Buffer [N,3] of a model: sum of g, sum of g^2, number of fragments, with g = o dL/do of one pixel of one view."""
@@ -53,10 +54,26 @@ def collect_opacity_gradients(model: GaussianModel, result: RenderResult) -> Non
             "opacity gradients need a stage that renders them, with RasterOptions(fragment_grad=True), and a model "
             "with the buffer of sw_gaussians.fragments.add_buffer (of 3DGS: with fast.densify=budget)"
         )
-    gradient = model.opacity_logits.grad
-    if gradient is None:
-        return
-    sums: Tensor = model.get_buffer(BUFFER)
-    clear = (1 - model.opacities.detach()).clamp_min_(LEAST_CLEAR)
-    sums[:, 0].addcdiv_(gradient, clear)  # do/dlogit = o (1 - o)
-    sums[:, 1:].add_(result.fragment_grad.value)
+    logits = model.opacity_logits
+    if logits.grad is not None:
+        accumulate_fragments(model.get_buffer(BUFFER), logits.grad, logits.detach(), result.fragment_grad.value)
+
+
+def accumulate_fragments(sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor) -> None:
+    """Add one view to `BUFFER`, in place; on CUDA in one launch, with the same sums.
+
+    sums        [N,3] the buffer
+    gradients   [N] derivative of the loss by the logits [N] of the opacities
+    fragments   [N,2] sum of g^2, and number of fragments (RenderResult.fragment_grad)
+    """
+    by_kernel = sums.is_cuda and GAUSSIANS.has_cuda()
+    ops = torch.ops.splatwizard_gaussians
+    if not (by_kernel and ops.fragment_statistics(gradients, logits, fragments, sums, LEAST_CLEAR)):
+        accumulate_fragments_in_torch(sums, gradients, logits, fragments)
+
+
+def accumulate_fragments_in_torch(sums: Tensor, gradients: Tensor, logits: Tensor, fragments: Tensor) -> None:
+    """Do what `accumulate_fragments` does, without a kernel."""
+    clear = (1 - torch.sigmoid(logits)).clamp_min_(LEAST_CLEAR)
+    sums[:, 0].addcdiv_(gradients, clear)  # do/dlogit = o (1 - o)
+    sums[:, 1:].add_(fragments)

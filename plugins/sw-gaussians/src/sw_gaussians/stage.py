@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -133,7 +134,7 @@ class ThreeDGSStage(Stage):
         assert isinstance(found, range)
         return found
 
-    @property
+    @functools.cached_property  # the rasterizer's options ask for it at each step
     def settled(self) -> int:
         """Step of this run at which density control ends."""
         chain = self.config.mcmc
@@ -338,7 +339,7 @@ class ThreeDGSStage(Stage):
         if self.fuses_updates:
             self._offer_updates(step)
         # The variance of opacity gradients costs time in the backward pass; the last step asks for all there is.
-        fragment = self._fragments and (step < self.steps(self.config.densify.stop) or step >= self.iterations)
+        fragment = self._fragments and (step < self.settled or step >= self.iterations)
         options = self._options
         if options is None or options.background is not background or options.fragment_grad != fragment:
             statistics, absgrad = not self.config.mcmc.enabled, self.config.densify.absgrad

@@ -58,6 +58,8 @@ TORCH_LIBRARY(splatwizard_gaussians, m) {
         " Tensor(d!)[] row_steps, Tensor mask, float[] lrs, float[] beta1s, float[] beta2s, float[] epss) -> int[]");
   m.def("view_statistics(Tensor gradients, Tensor radii, Tensor(a!) grad_accum, Tensor(b!) denom,"
         " Tensor(c!) max_radii) -> ()");
+  m.def("fragment_statistics(Tensor gradients, Tensor logits, Tensor fragments, Tensor(a!) sums, float least_clear)"
+        " -> bool");
   m.def("disagreement(Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center) -> Tensor");
   m.def("disagreement_backward(Tensor grad, Tensor depth, Tensor normals, Tensor alpha, float[] focal_and_center)"
         " -> (Tensor, Tensor)");

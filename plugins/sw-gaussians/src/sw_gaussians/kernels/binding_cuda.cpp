@@ -50,6 +50,26 @@ void view_statistics(const at::Tensor& gradients, const at::Tensor& radii, const
   C10_CUDA_KERNEL_LAUNCH_CHECK();
 }
 
+// False: the kernel does not take these tensors, and nothing is done.
+bool fragment_statistics(const at::Tensor& gradients, const at::Tensor& logits, const at::Tensor& fragments,
+                         const at::Tensor& sums, double least_clear) {
+  const int64_t count = logits.numel();
+  const std::pair<const at::Tensor*, int64_t> sizes[] = {
+      {&gradients, count}, {&logits, count}, {&fragments, 2 * count}, {&sums, 3 * count}};
+  for (const auto& [tensor, size] : sizes)
+    if (!tensor->is_cuda() || tensor->device() != sums.device() || tensor->scalar_type() != at::kFloat ||
+        !tensor->is_contiguous() || tensor->numel() != size)
+      return false;
+  if (reinterpret_cast<uintptr_t>(fragments.const_data_ptr()) % 8 != 0) return false;
+  const c10::cuda::CUDAGuard guard(sums.device());
+  kernels::fragment_statistics({gradients.const_data_ptr<float>(), logits.const_data_ptr<float>(),
+                                fragments.const_data_ptr<float>(), sums.mutable_data_ptr<float>(),
+                                float(least_clear), count},
+                               c10::cuda::getCurrentCUDAStream());
+  C10_CUDA_KERNEL_LAUNCH_CHECK();
+  return true;
+}
+
 // Whether the kernel can update this parameter: float32, contiguous and aligned, on the mask's GPU, a row a mark.
 bool fits_sparse_adam(const at::Tensor& mask, const at::Tensor& steps,
                       std::initializer_list<const at::Tensor*> tensors) {
@@ -144,6 +164,7 @@ std::tuple<at::Tensor, at::Tensor> disagreement_backward(const at::Tensor& grad,
 TORCH_LIBRARY_IMPL(splatwizard_gaussians, CUDA, m) {
   m.impl("sparse_adam_many", sparse_adam_many);
   m.impl("view_statistics", view_statistics);
+  m.impl("fragment_statistics", fragment_statistics);
   m.impl("disagreement", disagreement);
   m.impl("disagreement_backward", disagreement_backward);
 }

@@ -18,6 +18,18 @@ struct Statistics {
 
 void statistics(const Statistics& args, cudaStream_t stream);
 
+// Adds one view to the sums of opacity gradients over fragments, [count, 3]: g / (1 - opacity), and `fragments`.
+struct FragmentStatistics {
+  const float* gradients;  // [count] g, by the logits
+  const float* logits;     // [count] of the opacities
+  const float* fragments;  // [count, 2] 8-byte aligned
+  float* sums;             // [count, 3]
+  float least_clear;       // floor of 1 - opacity
+  int64_t count;
+};
+
+void fragment_statistics(const FragmentStatistics& args, cudaStream_t stream);
+
 // Adam of the marked rows of a [rows, width] parameter; 16-byte aligned.
 struct SparseAdamTensor {
   float* param;

@@ -17,7 +17,25 @@ __global__ void __launch_bounds__(kThreads) statistics_kernel(const Statistics s
   s.max_radii[i] = fmaxf(s.max_radii[i], float(radius));
 }
 
+__global__ void __launch_bounds__(kThreads) fragment_statistics_kernel(const FragmentStatistics s) {
+  const int64_t i = int64_t(blockIdx.x) * kThreads + threadIdx.x;
+  if (i >= s.count) return;
+  // In the order of the torch operations, so that the sums are theirs to the last bit; NaN stays NaN.
+  const float opacity = 1.f / (1.f + expf(-s.logits[i]));
+  const float clear = 1.f - opacity;
+  const float2 view = reinterpret_cast<const float2*>(s.fragments)[i];
+  float* sums = s.sums + 3 * i;
+  sums[0] += s.gradients[i] / (clear < s.least_clear ? s.least_clear : clear);
+  sums[1] += view.x;
+  sums[2] += view.y;
+}
+
 }  // namespace
+
+void fragment_statistics(const FragmentStatistics& args, cudaStream_t stream) {
+  if (args.count > 0)
+    fragment_statistics_kernel<<<unsigned((args.count + kThreads - 1) / kThreads), kThreads, 0, stream>>>(args);
+}
 
 void statistics(const Statistics& args, cudaStream_t stream) {
   if (args.count > 0)
